@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
@@ -25,6 +26,7 @@ from sags_node.config.schema import (
     Ros2Robot,
     RosGraph,
     Section,
+    Segments,
     SentSource,
 )
 
@@ -69,7 +71,7 @@ WORDS: dict[Any, str] = {
     str: "text",
     Path: "path",
     Box: "`[x, y, width, height]`, px",
-    dict[str, tuple[int, int]]: "map",
+    Segments: "map",
 }
 MANY = {"whole number": "whole numbers", "number": "numbers", "path": "paths", "text": "texts"}
 
@@ -161,7 +163,8 @@ def _yaml(value: Any) -> str:
 
 
 def _value(field: FieldInfo) -> str:
-    return _type(field.annotation) + _limits(field.metadata)
+    alternatives = [get_args(one)[1:] for one in get_args(field.annotation) if get_origin(one) is Annotated]
+    return _type(field.annotation) + _limits([*field.metadata, *chain.from_iterable(alternatives)])
 
 
 def _type(annotation: Any) -> str:

@@ -5,19 +5,32 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+from annotated_types import Ge, Gt, Le
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-Box = tuple[int, int, int, int]  # x, y, width, height in px
+# Every number has a lower and an upper limit: a slip is told when it is read, not by what it leads to.
+Pixels = Annotated[int, Ge(0), Le(65536)]
+Box = tuple[Pixels, Pixels, Pixels, Pixels]  # x, y, width, height in px
+ClassNumber = Annotated[int, Ge(0), Le(65535)]
+FrameNumber = Annotated[int, Ge(0), Le(1_000_000_000)]
+Segments = dict[str, tuple[FrameNumber, FrameNumber]]
+Rate = Annotated[float, Ge(0.001), Le(1000)]  # per second
+Seconds = Annotated[float, Gt(0), Le(3600)]
+Apart = Annotated[float, Gt(0), Le(1000)]  # ms between the stamps of a pair
+Depth = Annotated[float, Ge(0.001), Le(10)]  # m
+DepthUnit = Annotated[float, Gt(0), Le(1)]  # metres per count
 Paths = Annotated[
     tuple[Path, ...], BeforeValidator(lambda said: [said] if isinstance(said, str | Path) else said)
 ]
-Positive = Annotated[float, Field(gt=0)]
-Side = Annotated[int, Field(ge=16, le=4096)]  # px
+Share = Annotated[float, Ge(0), Le(1)]
+Finite = Annotated[float, Ge(-1_000_000), Le(1_000_000)]
+Positive = Annotated[float, Ge(1e-6), Le(1_000_000)]
+Side = Annotated[int, Ge(16), Le(4096)]  # px
 NAMESPACE = r"^[A-Za-z0-9_][A-Za-z0-9_/]*$"
 
 
 class Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 # ---- source ----------------------------------------------------------------------------------------------
@@ -27,7 +40,7 @@ class ReferenceConfig(Section):
     """Where a recording keeps what is known to be true. Used by `sags eval` only."""
 
     depth: Path | None = Field(None, description="folder of 16-bit PNGs named by frame number")
-    depth_unit: float = Field(1e-5, gt=0, description="metres per count")
+    depth_unit: DepthUnit = Field(1e-5, description="metres per count")
     depth_kind: Literal["exact", "structured_light", "ct", "stereo_network"] = Field(
         "exact", description="how the depth became known; reports name it"
     )
@@ -42,17 +55,16 @@ class RecordedSource(Section):
         description="realtime: the recording's clock, late frames are replaced; fast: as fast as the node "
         "takes frames, none lost, stamped at release; step: the same with the recording's own stamps",
     )
-    rate: float | None = Field(None, gt=0, description="frames per second; default: the recording's own")
+    rate: Rate | None = Field(None, description="frames per second; default: the recording's own")
     loop: bool = Field(False, description="begin again at the end")
-    start: float = Field(0.0, ge=0, description="seconds to skip at the beginning")
-    frames: int | None = Field(None, gt=0, description="stop after this many frames; default: all")
-    warm_up: int = Field(
+    start: float = Field(0.0, ge=0, le=1_000_000, description="seconds to skip at the beginning")
+    frames: FrameNumber | None = Field(None, ge=1, description="stop after this many frames; default: all")
+    warm_up: FrameNumber = Field(
         0,
-        ge=0,
         description="the first frames of these are played so that the model settles, and then left out: "
         "nothing of them is published, measured, exported or fitted",
     )
-    stride: int = Field(1, ge=1, description="play only each stride-th frame")
+    stride: FrameNumber = Field(1, ge=1, description="play only each stride-th frame")
     poses: Path | None = Field(None, description="npz with T_world_cam [T, 4, 4] (m)")
     reference: ReferenceConfig = ReferenceConfig()
 
@@ -93,7 +105,7 @@ class GeometryConfig(Section):
     flip: Literal["none", "horizontal", "vertical", "both"] = Field(
         "none", description="of each eye's picture: mirrored, upside down, or turned by 180 degrees (both)"
     )
-    levels: tuple[float, float] = Field(
+    levels: tuple[Share, Share] = Field(
         (0.0, 1.0),
         description="what becomes black and white, in units of the brightest value; of 10, 12 and 16 bit "
         "pictures the eight bits that are used then lie where the picture has its tones",
@@ -106,11 +118,11 @@ class GeometryConfig(Section):
         if self.layout == "panes" and (self.crop is None or self.crop_right is None):
             raise ValueError("panes needs crop and crop_right: the boxes [x, y, width, height] of the eyes")
         for box in (self.crop, self.crop_right):
-            if box is not None and (min(box) < 0 or min(box[2:]) < 1):
+            if box is not None and min(box[2:]) < 1:
                 raise ValueError(
                     f"{list(box)} is no box [x, y, width, height]: it needs a width and a height"
                 )
-        if not 0 <= self.levels[0] < self.levels[1] <= 1:
+        if self.levels[0] >= self.levels[1]:
             raise ValueError(f"levels {list(self.levels)} should be 0 <= black < white <= 1")
         return self
 
@@ -144,8 +156,8 @@ class EndoNerfSource(RecordedSource):
 
     kind: Literal["endonerf"] = "endonerf"
     folder: Path = Field(description="holds images/, masks/, depth/ and poses_bounds.npy")
-    rate: float | None = Field(15.0, gt=0, description="frames per second; the files do not say it")
-    depth_unit: float = Field(1e-3, gt=0, description="metres per count of depth/; the files do not say it")
+    rate: Rate | None = Field(15.0, description="frames per second; the files do not say it")
+    depth_unit: DepthUnit = Field(1e-3, description="metres per count of depth/; the files do not say it")
     instruments: Literal["white", "black"] = Field("white", description="how masks/ shows them")
     baseline: float | None = Field(
         None,
@@ -186,7 +198,7 @@ class BagSource(RecordedSource):
     right_info: str | None = Field(
         None, description="camera_info topic of the right eye; default: beside its pictures"
     )
-    tolerance: float = Field(0.02, gt=0, description="s; how far the stamps of a pair may lie apart")
+    tolerance: float = Field(0.02, gt=0, le=1, description="s; how far the stamps of a pair may lie apart")
     clocks: Literal["one", "two"] = Field(
         "one",
         description="one: both eyes are stamped by one clock; two: by clocks that differ, and the right "
@@ -226,7 +238,7 @@ class PhantomSource(RecordedSource):
     seconds: float = Field(4.0, gt=0, le=600, description="length of the session")
     width: int = Field(640, ge=64, le=4096, description="of a picture, px")
     height: int = Field(512, ge=64, le=4096, description="of a picture, px")
-    seed: int = Field(0, description="another number gives another tissue")
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="another number gives another tissue")
     camera_motion: Annotated[
         CameraMotion, BeforeValidator(lambda said: _MOVES.get(said, said) if isinstance(said, bool) else said)
     ] = Field(
@@ -253,9 +265,9 @@ class V4l2Source(LiveSource):
         "/dev/video0", description="device; the only one where source.geometry.layout says it shows both eyes"
     )
     right: str | None = Field("/dev/video2", description="device of the right eye")
-    width: int = Field(640, gt=0, description="of one device's picture, px")
-    height: int = Field(480, gt=0, description="of one device's picture, px")
-    rate: float = Field(30.0, gt=0, description="frames per second")
+    width: Pixels = Field(640, ge=1, description="of one device's picture, px")
+    height: Pixels = Field(480, ge=1, description="of one device's picture, px")
+    rate: Rate = Field(30.0, description="frames per second")
     fourcc: str | None = Field(
         None,
         min_length=3,
@@ -263,9 +275,9 @@ class V4l2Source(LiveSource):
         description="pixel format, e.g. YUYV, MJPG, or with more than 8 bit Y10, Y12, Y16; default: the "
         "device's",
     )
-    deadline: float = Field(1.0, gt=0, description="seconds without a picture before the device is reopened")
-    pair_tolerance_ms: float = Field(
-        20.0, gt=0, description="how far the stamps of a pair may lie apart, two devices"
+    deadline: Seconds = Field(1.0, description="seconds without a picture before the device is reopened")
+    pair_tolerance_ms: Apart = Field(
+        20.0, description="how far the stamps of a pair may lie apart, two devices"
     )
 
     @model_validator(mode="before")
@@ -291,11 +303,10 @@ class GstSource(LiveSource):
         None, description="launch string of the left eye, ending open; instead of source.launch"
     )
     right: str | None = Field(None, description="launch string of the right eye, ending open")
-    start: float = Field(15.0, gt=0, description="seconds until the first picture of each eye, at most")
-    deadline: float = Field(2.0, gt=0, description="seconds without a picture before it is started again")
-    pair_tolerance_ms: float = Field(
+    start: Seconds = Field(15.0, description="seconds until the first picture of each eye, at most")
+    deadline: Seconds = Field(2.0, description="seconds without a picture before it is started again")
+    pair_tolerance_ms: Apart = Field(
         5.0,
-        gt=0,
         description="how far the stamps of a pair may lie apart; cameras that are not synchronised need half "
         "a frame",
     )
@@ -323,8 +334,8 @@ class GstSource(LiveSource):
 class SentSource(LiveSource):
     """What all live pictures have in common that another program stamps and sends."""
 
-    rate: float = Field(30.0, gt=0, description="pictures per second that each eye should come with")
-    pair_tolerance_ms: float = Field(5.0, gt=0, description="how far the stamps of a pair may lie apart")
+    rate: Rate = Field(30.0, description="pictures per second that each eye should come with")
+    pair_tolerance_ms: Apart = Field(5.0, description="how far the stamps of a pair may lie apart")
     stamps: Literal["wall", "own"] = Field(
         "wall",
         description="wall: of this machine's clock, or one that is set by it; own: of another clock, brought "
@@ -459,13 +470,12 @@ class StereoConfig(Section):
     scale: Literal[1, 2, 4] | None = Field(
         None, description="divide the working size by this for matching; default: 2 from 480 px width, else 1"
     )
-    min_depth: float | None = Field(
+    min_depth: Depth | None = Field(
         None,
-        gt=0,
         description="m; nothing is looked for nearer; default: 0.03, and down to 0.01 where the pictures "
         "show something so near",
     )
-    max_depth: float = Field(0.30, gt=0, description="m; nothing is looked for beyond")
+    max_depth: Depth = Field(0.30, description="m; nothing is looked for beyond")
 
     @model_validator(mode="after")
     def _ordered(self) -> StereoConfig:
@@ -482,7 +492,7 @@ class StereoConfig(Section):
 class Normalization(Section):
     """A network is fed (value / 255 - mean) / std: one number for all channels, or three for R, G and B."""
 
-    mean: tuple[float] | tuple[float, float, float] = (0.0,)
+    mean: tuple[Finite] | tuple[Finite, Finite, Finite] = (0.0,)
     std: tuple[Positive] | tuple[Positive, Positive, Positive] = (1.0,)
 
 
@@ -530,7 +540,7 @@ class NetworkFormat(Section):
     meaning: Literal["disparity", "depth", "inverse_depth"] | None = Field(
         None, description="of the output's numbers; to be set"
     )
-    scale: float | None = Field(
+    scale: Finite | None = Field(
         None,
         description="the output's numbers times this are px of the picture that the network gets, or m; -1: "
         "disparities are negative; default: 1",
@@ -552,8 +562,8 @@ class OnnxConfig(NetworkFormat):
     fallback: bool = Field(
         True, description="true: depth is matched where the network fails; false: the run ends"
     )
-    declared_depth: float | None = Field(
-        None, gt=0, description="m to the middle of the first picture: the scale of one camera alone"
+    declared_depth: Depth | None = Field(
+        None, description="m to the middle of the first picture: the scale of one camera alone"
     )
 
 
@@ -566,7 +576,7 @@ class TissueConfig(Section):
         "process's; none: every pixel",
     )
     path: Path | None = Field(None, description="the .onnx file of a segmentation network, for onnx")
-    tissue_is: Literal["white", "black"] | tuple[int, ...] | None = Field(
+    tissue_is: Literal["white", "black"] | tuple[ClassNumber, ...] | None = Field(
         None,
         description="what shows tissue, for onnx and topic: white (class 1 and above), black (class 0), or a "
         "list of a network's class numbers",
@@ -607,7 +617,7 @@ class VisionConfig(Section):
         le=4096,
         description="px; default: the calibration's, or what keeps its proportions where vision.width is set",
     )
-    scale: Literal["auto"] | Annotated[float, Field(ge=0.25, le=1)] = Field(
+    scale: Literal["auto"] | Annotated[float, Ge(0.25), Le(1)] = Field(
         "auto",
         description="share of that size that is worked at and published. auto: where frames come in "
         "real time what shows most on this machine, from 1 down to 0.25; else 1",
@@ -663,13 +673,17 @@ class MappingConfig(Section):
     budget_ms: float | None = Field(
         None,
         gt=0,
+        le=1000,
         description="wall time of one frame, all stages; default: nine tenths of the time until the next "
         "one comes, 100 at most; 33 where a recording is not played in real time",
     )
-    iterations: int | None = Field(None, ge=0, description="fixed steps per frame instead of the budget")
+    iterations: int | None = Field(
+        None, ge=0, le=10_000, description="fixed steps per frame instead of the budget"
+    )
     rung: int | None = Field(
         None,
         ge=0,
+        le=100,
         description="stay on this rung of the ladder of quality, 0 the cheapest; default: what the machine "
         "affords",
     )
@@ -754,7 +768,7 @@ class LaunchConfig(Section):
     engine: EngineConfig = EngineConfig()
     mapping: MappingConfig = MappingConfig()
     publish: PublishConfig = PublishConfig()
-    segments: dict[str, tuple[int, int]] = Field(
+    segments: Segments = Field(
         {}, description="stretches that `sags eval` measures apart, `{name: [first, last frame]}`"
     )
 

@@ -15,8 +15,7 @@ from sags_node.errors import UsageError
 
 KEY_DISTANCE = 64  # of 255: an object's colour nearer than this to the key colour could be taken for it
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Place = tuple[Number, Number, Number]  # m
+Place = tuple[float, float, float]  # m
 Byte = Annotated[int, Field(ge=0, le=255)]
 Color = tuple[Byte, Byte, Byte]  # RGB
 Shape = Literal["target", "sphere"]
@@ -26,7 +25,7 @@ SHAPES: tuple[str, ...] = get_args(Shape)
 class AnchorSpec(Section):
     """One point of the tissue that holds an object."""
 
-    pixel: tuple[Number, Number] | None = Field(None, description="u v of the left picture, first good frame")
+    pixel: tuple[float, float] | None = Field(None, description="u v of the left picture, first good frame")
     place: Place | None = Field(None, description="x y z in the world, m")
     at: Place | None = Field(None, description="the point of the object that lies there, m")
 

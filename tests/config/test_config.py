@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import runpy
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin
 
 import pytest
+from annotated_types import Ge, Gt, Le
 from places import ROOT
 
 from sags_node.config.launch_file import load_launch, with_parameters
@@ -17,6 +19,7 @@ from sags_node.config.schema import (
     FoldersSource,
     LaunchConfig,
     MappingConfig,
+    Section,
     VideosSource,
     VisionConfig,
 )
@@ -128,6 +131,54 @@ def test_a_kind_that_is_gone_says_what_stands_in_its_place(kind: str, tmp_path: 
         load_launch(tmp_path)
     said = f"there is no source.kind {kind} any more: {REMOVED_KINDS[kind]}"
     assert str(caught.value) == f"{tmp_path / 'launch.yaml'}: {said}"
+
+
+def numbers(kind: Any, key: str, limits: tuple[object, ...] = ()) -> Iterator[tuple[str, tuple[object, ...]]]:
+    """Every number of the configuration: its key, and what limits it."""
+    if get_origin(kind) is Annotated:
+        inner, *more = get_args(kind)
+        yield from numbers(inner, key, (*limits, *more))
+    elif isinstance(kind, type) and issubclass(kind, Section):
+        for name, field in kind.model_fields.items():
+            yield from numbers(field.annotation, f"{kind.__name__}.{name}", tuple(field.metadata))
+    elif kind in (int, float):
+        yield key, limits
+    else:
+        for inner in get_args(kind):
+            yield from numbers(inner, key, limits)
+
+
+def test_every_number_has_a_lower_and_an_upper_limit() -> None:
+    every = dict(numbers(LaunchConfig, ""))
+    assert {"MappingConfig.budget_ms", "GeometryConfig.crop", "LaunchConfig.segments"} <= set(every)
+    endless = [
+        key
+        for key, limits in every.items()
+        if not any(isinstance(one, Ge | Gt) for one in limits)
+        or not any(isinstance(one, Le) for one in limits)
+    ]
+    assert endless == []
+
+
+@pytest.mark.parametrize("number", [".inf", "-.inf", ".nan", "1e300", "1e-300"])
+@pytest.mark.parametrize(
+    "key",
+    [
+        "source.start",
+        "source.rate",
+        "vision.stereo.max_depth",
+        "vision.stereo.min_depth",
+        "mapping.budget_ms",
+    ],
+)
+def test_a_number_beyond_its_limits_is_told(key: str, number: str) -> None:
+    if number == "1e-300" and key in ("source.start", "mapping.budget_ms"):
+        assert load_launch(None, [f"{key}:=1.0e-300"])  # little, not wrong
+    else:
+        with pytest.raises(UsageError, match=re.escape(key)):
+            load_launch(None, [f"{key}:={number.replace('e', '.0e')}"])
+    with pytest.raises(UsageError, match="less than or equal to 1000"):
+        with_parameters(LaunchConfig(), {"mapping.budget_ms": 33000})
 
 
 def test_parameters_are_validated_like_a_file() -> None:
