@@ -45,9 +45,17 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "no_frames": "source",
     "source_drops": "source",
     "frames_missed": "capture",
+    "mapping_hangs": "capture",
+    "recording_ended": "recording",
+    "recording_silent": "recording",
+    "recording_loses": "recording",
+    "recording_rejects": "recording",
+    "recording_disk_low": "recording",
 }
 
-OF_THE_FLOW = frozenset({"source", "capture"})  # stages whose warnings make nothing that is shown less sure
+# Stages whose warnings make nothing that is shown less sure.
+OF_THE_FLOW = frozenset({"source", "capture", "recording"})
+UNHEALTHY = frozenset({"recording_ended"})  # whatever the state
 
 Findings = Mapping[str, tuple[Finding, ...]]  # by stage; a stage without any is left out
 NOTHING: Findings = {}

@@ -438,3 +438,4 @@ class NodeHealth:
     rung: RungState | None = None  # None: fixed steps, or no frame yet
     motion: MotionState | None = None  # None: nobody asks for it, or too little is known yet
     clock: ClockStatus | None = None  # None: a recording, or pictures without stamps
+    recording: Mapping[str, object] | None = None  # how the one that was asked for goes; None: none was

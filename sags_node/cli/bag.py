@@ -146,10 +146,14 @@ def record(
             "a recording is recorded as a whole: no --snapshot-mode, --stdin, --seconds, --endpoint"
         )
 
+    from sags_node.findings import by_code, by_stage
     from sags_node.messaging.stream import check_topic
     from sags_node.recording.bag_writer import Limits
     from sags_node.recording.message_writer import Compression
     from sags_node.recording.recorder import Recorder, RecordOptions
+    from sags_node.recording.state import findings
+    from sags_node.terminal.console import tell as warn
+    from sags_node.terminal.notices import Notices
 
     def tell(said: dict[str, Any]) -> None:
         if from_stdin:
@@ -175,6 +179,14 @@ def record(
             summary = _recorded(words, options)
             show(summary if json_out else say.recorded_table(summary))
             return
+        notices = Notices(warn)
+
+        def progress(summary: dict[str, Any]) -> None:
+            if from_stdin:
+                tell({"progress": {key: said for key, said in summary.items() if key != "topics"}})
+            else:
+                notices.update(by_code(by_stage(findings(summary))))
+
         recorder = Recorder(options)
         on_stop_signals(recorder.stop)
         signal.signal(signal.SIGUSR1, lambda *_: recorder.snapshot())
@@ -184,7 +196,11 @@ def record(
             timer = threading.Timer(seconds, recorder.stop)
             timer.daemon = True
             timer.start()
-        summary = recorder.run(tell)
+        try:
+            summary = recorder.run(tell, progress)
+        except KeyboardInterrupt:
+            warn(f"broken off: save what is there with: sags bag recover {options.folder} -o OUT")
+            raise
     show(summary if json_out else say.recorded_table(summary))
 
 
@@ -318,8 +334,10 @@ def _on_lines(call: Callable[[], None], at_the_end: Callable[[], None] = lambda:
     """Call for each line that comes on stdin, from a thread of its own."""
 
     def read() -> None:
-        for _ in sys.stdin:
-            call()
-        at_the_end()
+        try:
+            for _ in sys.stdin:
+                call()
+        finally:
+            at_the_end()
 
     threading.Thread(target=read, name="stdin", daemon=True).start()

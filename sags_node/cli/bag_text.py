@@ -8,6 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from sags_node.errors import UsageError
+from sags_node.recording.state import SILENT_SECONDS
 from sags_node.terminal import text
 
 
@@ -35,7 +36,10 @@ def recorded_table(summary: Mapping[str, Any]) -> Table:
     for name, row in summary["topics"].items():
         table.add_row(name, str(row["messages"]), str(row["dropped"]), str(row["lost"]))
     table.add_row("in all", str(summary["messages"]), str(summary["dropped"]), str(summary["lost"]))
-    table.caption = f"{summary['folder']}: {summary['bytes'] / 1e6:.1f} MB at {summary['mb_per_s']} MB/s"
+    silent = summary["silent_s"]
+    ended = f"; nothing came in the last {silent:.0f} s" if silent > SILENT_SECONDS else ""
+    size = f"{summary['bytes'] / 1e6:.1f} MB at {summary['mb_per_s']} MB/s"
+    table.caption = f"{summary['folder']}: {size}{ended}"
     return table
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.confidence import confidence_of, error_of
-from sags_node.findings import by_code, in_words
+from sags_node.findings import UNHEALTHY, by_code, in_words
 from sags_node.geometry import project
 from sags_node.messaging import cdr
 from sags_node.messaging.cdr import Content, Status
@@ -256,9 +256,11 @@ def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
 
 
 def health_answer(health: NodeHealth) -> dict[str, Any]:
-    """Whether the node does its work: frames come and are shown, or it was paused."""
+    """Whether the node does its work: frames come and are shown, or it was paused; and what it was asked to
+    record is recorded."""
     codes = list(by_code(health.warnings))
-    return {"healthy": health.state in HEALTHY, "state": health.state, "warnings": codes}
+    healthy = health.state in HEALTHY and UNHEALTHY.isdisjoint(codes)
+    return {"healthy": healthy, "state": health.state, "warnings": codes}
 
 
 def json_text(value: Mapping[str, Any]) -> Content:

@@ -115,8 +115,15 @@ class Statistics:
         views: Mapping[str, ViewStatus],
         clock: ClockStatus | None = None,
         missed: str = TOO_SLOW,
+        working: float = 0.0,
+        recording: Mapping[str, object] | None = None,
     ) -> NodeHealth:
-        """`missed`: why frames are left out, if they are, and the remedy."""
+        """What is true now.
+
+        Args:
+            missed: why frames are left out, if they are, and the remedy.
+            working: s for which the newest frame has been worked on; 0: none is.
+        """
         with self._lock:
             now = time.monotonic()
             waiting = self._is_waiting(now)
@@ -144,18 +151,22 @@ class Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
-                warnings={**warnings, **by_stage(self._findings(state, now, missed))},
+                warnings={**warnings, **by_stage(self._findings(state, now, missed, working))},
                 connections=connections,
                 views=views,
                 rung=self._rung,
                 motion=self._motion,
                 clock=clock,
+                recording=recording,
             )
 
-    def _findings(self, state: str, now: float, missed: str) -> list[Finding]:
+    def _findings(self, state: str, now: float, missed: str, working: float) -> list[Finding]:
         """What the flow of frames says; asked with the lock held."""
         found = []
-        if state == "waiting":
+        if state == "waiting" and working > WAITING_AFTER:
+            said = f"one frame has been worked on for {working:.0f} s, as {missed}"
+            found.append(Finding("mapping_hangs", f"{said}; if it stays, restart the node"))
+        elif state == "waiting":
             said = f"no frame for {now - self._published[-1]:.0f} s" if self._published else "no frame comes"
             found.append(Finding("no_frames", f"{said}: {self._nothing_comes}"))
         if self._leaves_out_too_many("source"):

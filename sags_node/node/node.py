@@ -23,7 +23,7 @@ from typing import Any
 
 from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError
-from sags_node.findings import by_code
+from sags_node.findings import by_code, by_stage
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import backend_of
 from sags_node.messaging import content
@@ -48,7 +48,8 @@ from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, S
 log = logging.getLogger(__name__)
 
 HEALTH_PERIOD = 1.0  # s
-STOP_SECONDS = 10.0  # longest wait for each thread to end
+STOP_SECONDS = 10.0  # longest wait for all threads to end
+LAST_WORDS = 1.0  # s for the last health message, where another thread hangs
 REQUEST_WAIT = 0.05  # s: how soon a request is served while no frames come
 
 OnResult = Callable[[FrameResult, float], None]  # a published result and its latency, ms
@@ -107,6 +108,7 @@ class Node:
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
+        self._working_since: float | None = None  # when the frame came that is worked on
         self._publisher = Publisher(
             config.publish, config.ns, uuid.uuid4().hex, self._handlers(), thins=True, metric=rig.metric
         )
@@ -153,9 +155,14 @@ class Node:
         self._stopping.set()
         self._source.stop()
         self._frames.close()
-        for thread, ended in zip(self._threads, self._ended.values(), strict=True):
-            if thread.ident is not None:  # it was started
-                ended.wait(STOP_SECONDS)
+        until = time.monotonic() + STOP_SECONDS
+        for thread, (name, ended) in zip(self._threads, self._ended.items(), strict=True):
+            was_started = thread.ident is not None
+            if was_started and not ended.wait(max(0.0, until - time.monotonic())):
+                log.warning("the %s thread does not end in %g s; it is left behind", name, STOP_SECONDS)
+                self._close_results()  # publishing ends, and nobody finds this node any more
+                self._ended["publishing"].wait(LAST_WORDS)
+                break
         self._operations.finish(STOP_SECONDS)
         self._recorder.close()
         if self._masks is not None:
@@ -178,7 +185,9 @@ class Node:
             stopping=self._stopping.is_set(),
             paused=self._state.paused.is_set(),
             error=self._error,
-            warnings=self._state.pipeline.warnings,
+            warnings={**self._state.pipeline.warnings, **by_stage(self._recorder.findings())},
+            working=time.monotonic() - began if (began := self._working_since) is not None else 0.0,
+            recording=self._recorder.status(),
             missed=why_missed(self._state.config.mapping, self._state.pipeline.rate),
             connections=self._publisher.connections,
             views=self._state.views.status,
@@ -247,7 +256,9 @@ class Node:
                     self._operations.reconfigure()
                 waited = time.monotonic() - at if self._live else 0.0
                 request = FrameRequest(waited, self._right_is_watched, self._state.statistics.latency_s)
+                self._working_since = time.monotonic()
                 result = self._state.pipeline.process(frame, self._state.budget, request)
+                self._working_since = None
                 if frame.warm_up:
                     continue
                 give(result)

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -22,6 +22,8 @@ import msgspec
 
 from sags_node.errors import SagsError
 from sags_node.processes import KILL_SECONDS, end
+from sags_node.recording import state
+from sags_node.types import Finding
 
 START_SECONDS = 60.0  # for the child to load and to open its file
 SNAPSHOT_SECONDS = 60.0  # to write what the ring holds
@@ -68,6 +70,23 @@ class RecorderProcess:
     def stop(self) -> Future[Any]:
         """Finish the recording; the answer is its summary."""
         return self._worker.submit(self._stop)
+
+    def status(self) -> dict[str, Any] | None:
+        """How the recording goes, as the recorder said it last, and under `ended` why it has ended by itself.
+        None: nothing is being recorded. Any thread may call this."""
+        child = self._child
+        if child is None or not child.has_begun:
+            return None
+        return {"folder": str(child.folder), **child.progress, "ended": child.ended}
+
+    def findings(self) -> Iterator[Finding]:
+        """What a person should know of the recording. Any thread may call this."""
+        said = self.status()
+        if said is not None and said["ended"] is not None:
+            text = f"the recording to {said['folder']} has ended: {said['ended']}; begin another one"
+            yield Finding("recording_ended", text)
+        elif said is not None and "seconds" in said:
+            yield from state.findings(said)
 
     def close(self) -> None:
         """Finish a recording that is still running. A Ctrl-C meanwhile ends it at once."""
@@ -117,7 +136,9 @@ class RecorderProcess:
                 command += [option, str(value)]
         self._child = _Child(command, folder, has_ring=request.snapshot_seconds is not None)
         try:
-            return self._child.answer(START_SECONDS)
+            answer = self._child.answer(START_SECONDS)
+            self._child.has_begun = True
+            return answer
         except SagsError:  # it has said why, and ends
             self._child.kill()
             self._child = None
@@ -182,10 +203,13 @@ class _Child:
             raise SagsError("path and topics cannot hold a zero character")
         self.folder = folder
         self.has_ring = has_ring
+        self.has_begun = False
+        self.progress: dict[str, Any] = {}  # once a second
+        self.ended: str | None = None  # why, where nobody has asked for it
         self._errors = tempfile.TemporaryFile(
             "w+", errors="replace"
         )  # a pipe that is full would stop the child
-        self._lines: SimpleQueue[str | None] = SimpleQueue()  # None: there will be no more
+        self._lines: SimpleQueue[dict[str, Any] | None] = SimpleQueue()  # None: there will be no more
         pipe = subprocess.PIPE
         try:
             self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._errors, text=True)
@@ -248,11 +272,22 @@ class _Child:
 
     def _listen(self) -> None:
         assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self._lines.put(line)
-        self._lines.put(None)
+        error = None
+        try:
+            for line in self._process.stdout:
+                said = json.loads(line)
+                if "progress" in said:
+                    self.progress = said["progress"]
+                else:
+                    error = said.get("error")
+                    self._lines.put(said)
+        except ValueError:  # no JSON
+            log.exception("the recorder of %s says what nobody understands", self.folder)
+        finally:
+            self.ended = error or self._last_words()
+            self._lines.put(None)
 
-    def _next_line(self, seconds: float) -> str | None:
+    def _next_line(self, seconds: float) -> dict[str, Any] | None:
         """None when there will be no more, however often it is asked."""
         try:
             line = self._lines.get(timeout=seconds)
@@ -262,11 +297,10 @@ class _Child:
             self._lines.put(None)
         return line
 
-    def _said(self, line: str | None) -> Any:
-        """What a line says; a failure where it says `error`, or there is none."""
-        if line is None:
+    def _said(self, said: dict[str, Any] | None) -> Any:
+        """What it says; a failure where it says `error`, or nothing more."""
+        if said is None:
             raise SagsError(self._last_words())
-        said = json.loads(line)
         if "error" in said:
             raise SagsError(said["error"])
         return said
@@ -279,4 +313,6 @@ class _Child:
             return "the recorder closed its output and did not end"
         self._errors.seek(0)
         said = " ".join(self._errors.read().split())
-        return f"the recorder failed: {said}" if said else "the recorder ended without a word"
+        if said:
+            return f"the recorder failed: {said}"
+        return f"the recorder was ended; save what it wrote with: sags bag recover {self.folder} -o OUT"

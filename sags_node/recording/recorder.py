@@ -6,30 +6,37 @@ counted, and so is what never arrived (gaps in `seq`).
 
 from __future__ import annotations
 
+import logging
+import shutil
 import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError
+from sags_node.files import check_folder
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.freshness import Freshness
 from sags_node.messaging.stream import listen_to
-from sags_node.messaging.wire import WireError
 from sags_node.recording.backlog import Arrived, Backlog
 from sags_node.recording.bag_writer import NO_LIMITS, Limits
 from sags_node.recording.message_writer import Compression, MessageWriter
 from sags_node.recording.ring import Ring
 
+log = logging.getLogger(__name__)
+
 FLUSH_PERIOD = 0.5  # s; what a killed recorder loses at most, if the disk keeps up
 TAKE_SECONDS = 0.1
+TELL_PERIOD = 1.0  # s
 HIGH_WATER = 10 * len(topics.TOPICS)  # messages: ten whole frames, while the writer holds the interpreter
 DEFAULT_CACHE_MB = 256.0
+
+Tell = Callable[[dict[str, Any]], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +76,10 @@ class Recorder:
         self._topics: dict[str, _Topic] = {}
         self._rejected = 0
         self._bytes = 0
-        self._began = time.monotonic()
+        self._free: int | None = None  # bytes of the disk
+        self._began = self._last_came = time.monotonic()
         self._error: SagsError | None = None
+        self._progress: Tell = lambda said: None
 
     def stop(self) -> None:
         """End `run` as soon as everything received is written."""
@@ -80,18 +89,21 @@ class Recorder:
         """Write what the ring holds; only with `snapshot_seconds`."""
         self._snapshot_wanted.set()
 
-    def run(self, tell: Callable[[dict[str, Any]], None] = lambda said: None) -> dict[str, Any]:
+    def run(self, tell: Tell = lambda said: None, progress: Tell = lambda said: None) -> dict[str, Any]:
         """Record until `stop`; returns the summary that `sags bag record --json` prints.
 
         Args:
-            tell: called with `{"recording": folder}` when the file is open, and with
-                `{"snapshot": folder, "messages": count}` for every snapshot.
+            tell: called with `{"recording": folder}` when the file is open, and for every snapshot with
+                `{"snapshot": folder, "messages": count}`, or with `{"error": text}` where it failed.
+            progress: called with the summary once a second.
 
         Raises:
             UsageError: something is at the folder already, or an unknown topic.
-            SagsError: no node is known, it refuses this client, or the disk is full.
+            SagsError: no node is known, it refuses this client, the disk is full, or what came was not
+                written for another reason.
         """
-        self._began = time.monotonic()
+        self._began = self._last_came = time.monotonic()
+        self._progress = progress
         if self._options.snapshot_seconds is None:
             self._record(tell)
         else:
@@ -102,19 +114,22 @@ class Recorder:
 
     def summary(self) -> dict[str, Any]:
         """What was recorded until now, see `run`. Any thread may call this."""
-        seconds = time.monotonic() - self._began
+        now = time.monotonic()
+        recorded = max(self._last_came - self._began, 1e-3)
         rows = {
             name: {"messages": topic.messages, "dropped": topic.dropped, "lost": topic.fresh.lost}
-            for name, topic in sorted(self._topics.items())
+            for name, topic in sorted(self._topics.copy().items())
         }
         totals = {key: sum(row[key] for row in rows.values()) for key in ("messages", "dropped", "lost")}
         return {
             "folder": str(self._options.folder),
-            "seconds": round(seconds, 3),
+            "seconds": round(now - self._began, 3),
+            "silent_s": round(now - self._last_came, 3),
             **totals,
             "rejected": self._rejected,
             "bytes": self._bytes,
-            "mb_per_s": round(self._bytes / 1e6 / seconds, 2),
+            "mb_per_s": round(self._bytes / 1e6 / recorded, 2),
+            "free_bytes": self._free,
             "topics": rows,
         }
 
@@ -122,10 +137,17 @@ class Recorder:
         """Every new message once, None now and then while nothing comes; ends after `stop`."""
         options = self._options
         thin = topics.full_name(options.node.ns, topics.THIN)
+        next_tell = time.monotonic() + TELL_PERIOD
         with closing(listen_to(options.node, options.topics, None, HIGH_WATER)) as heard:
             for arrived in heard:
                 if self._stopping.is_set() or self._error is not None:
                     return
+                now = time.monotonic()
+                if arrived is not None:
+                    self._last_came = now
+                if now >= next_tell:
+                    next_tell = now + TELL_PERIOD
+                    self._progress(self.summary())
                 if arrived is None:
                     yield None
                     continue
@@ -145,7 +167,7 @@ class Recorder:
 
     # ---- everything ----------------------------------------------------------------------------------
 
-    def _record(self, tell: Callable[[dict[str, Any]], None]) -> None:
+    def _record(self, tell: Tell) -> None:
         options = self._options
         backlog = Backlog(self._most_bytes)
         with closing(self._messages()) as messages:
@@ -167,31 +189,38 @@ class Recorder:
         """The second thread."""
         try:
             with writer.bag:
-                next_flush = time.monotonic() + FLUSH_PERIOD
+                next_flush = time.monotonic()
                 while not backlog.finished:
                     arrived = backlog.take(TAKE_SECONDS)
                     if arrived is not None:
                         self._write_one(writer, arrived)
                     if time.monotonic() >= next_flush:
                         writer.bag.flush()
+                        self._bytes = writer.bag.bytes
+                        with suppress(OSError):  # writing will say it
+                            self._free = shutil.disk_usage(self._options.folder).free
                         next_flush = time.monotonic() + FLUSH_PERIOD
-        except OSError as error:
-            self._error = _disk_error(self._options.folder, error)
-        self._bytes += writer.bag.bytes
+        except Exception as error:  # `run` raises it: nothing is lost silently
+            self._error = _told(self._options.folder, error)
+        self._bytes = writer.bag.bytes
 
     def _write_one(self, writer: MessageWriter, arrived: Arrived) -> None:
         try:
             writer.write(arrived)
-        except (WireError, UsageError):
+        except SagsError as error:  # of this message alone
+            if not self._rejected:
+                log.warning("left out: %s", error)
             self._rejected += 1
             return
         self._topics[arrived.message.topic].messages += 1
 
     # ---- only the last seconds -----------------------------------------------------------------------
 
-    def _keep_last(self, seconds: float, tell: Callable[[dict[str, Any]], None]) -> None:
+    def _keep_last(self, seconds: float, tell: Tell) -> None:
+        check_folder(self._options.folder)
         ring = Ring(seconds, self._most_bytes)
         saving: list[threading.Thread] = []
+        number = 0
         with closing(self._messages()) as messages:
             first = next(messages, None)
             tell({"recording": str(self._options.folder)})
@@ -201,37 +230,45 @@ class Recorder:
                         self._topics[pushed_out.message.topic].dropped += 1
                 if self._snapshot_wanted.is_set():
                     self._snapshot_wanted.clear()
-                    folder = self._options.folder / f"snapshot_{len(saving):03d}"
-                    content = ring.content()
-                    saving.append(
-                        threading.Thread(target=self._save, args=(folder, content, tell), daemon=True)
-                    )
+                    number = next(n for n in count(number) if not self._snapshot(n).exists())
+                    saved = self._snapshot(number), ring.content(), tell
+                    saving.append(threading.Thread(target=self._save, args=saved, daemon=True))
                     saving[-1].start()
+                    number += 1
         for thread in saving:
             thread.join()
+
+    def _snapshot(self, number: int) -> Path:
+        return self._options.folder / f"snapshot_{number:03d}"
 
     def _is_latched(self, arrived: Arrived) -> bool:
         known = topics.BY_NAME.get(arrived.message.topic.removeprefix(f"{self._options.node.ns}/"))
         return known is not None and known.cached
 
-    def _save(self, folder: Path, messages: list[Arrived], tell: Callable[[dict[str, Any]], None]) -> None:
-        """A thread for each snapshot, so that receiving goes on."""
+    def _save(self, folder: Path, messages: list[Arrived], tell: Tell) -> None:
+        """A thread for each snapshot, so that receiving goes on. One that fails ends nothing: what the ring
+        holds can be saved elsewhere."""
         try:
             writer = self._writer(folder)
             with writer.bag:
                 for arrived in messages:
                     self._write_one(writer, arrived)
-        except OSError as error:
-            self._error = _disk_error(folder, error)
-            return
-        except SagsError as error:
-            self._error = error
+        except Exception as error:  # nothing is lost silently
+            tell({"error": str(_told(folder, error))})
             return
         self._bytes += writer.bag.bytes
         tell({"snapshot": str(folder), "messages": writer.bag.messages})
 
 
-def _disk_error(folder: Path, error: OSError) -> SagsError:
+def _told(folder: Path, error: Exception) -> SagsError:
+    """What a failure of a thread that writes is for people."""
+    if isinstance(error, SagsError):
+        return error
+    if isinstance(error, OSError):
+        what = error.strerror
+    else:
+        log.error("writing %s failed", folder, exc_info=error)
+        what = f"{type(error).__name__}: {error}"
     return SagsError(
-        f"cannot write {folder}: {error.strerror}; save what is there with: sags bag recover {folder} -o OUT"
+        f"cannot write {folder}: {what}; save what is there with: sags bag recover {folder} -o OUT"
     )

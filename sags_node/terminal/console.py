@@ -21,6 +21,7 @@ from rich.table import Table
 
 WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
 
+SAME_SIGNAL = 0.5  # s
 LOOK_AGAIN = 0.02  # s until a Ctrl-C that could not come through is tried again
 LONGEST_WAIT = 10.0  # s, after which it is tried whatever becomes of it
 _IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
@@ -142,12 +143,17 @@ interrupt = _Interrupt()
 def on_stop_signals(stop: Callable[[], None]) -> None:
     """Let Ctrl-C, a service manager's stop and the end of the terminal call this; a second one breaks off.
 
-    For what runs until then: the exception that they raise otherwise is lost if it meets a finaliser.
+    For what runs until then: the exception that they raise otherwise is lost if it meets a finaliser. What
+    comes right after the first is the same one: a wrapper or a shell that hands it on sends it twice.
     """
+    first: dict[int, float] = {}
 
-    def handle(number: int, frame: object) -> None:
-        signal.signal(number, interrupt)
-        stop()
+    def handle(number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if now - first.setdefault(number, now) > SAME_SIGNAL:
+            interrupt(number, frame)
+        else:
+            stop()
 
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as after nohup
         signal.signal(signal.SIGINT, handle)

@@ -244,7 +244,13 @@ def test_a_ctrl_c_that_is_ignored_stays_so() -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_second_ctrl_c_breaks_off(stop: threading.Event) -> None:
+def test_a_second_ctrl_c_breaks_off(stop: threading.Event, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that a wrapper hands on right after the first is the same one."""
+    now = [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
     signal.raise_signal(signal.SIGINT)
+    now[0] += terminal.SAME_SIGNAL
+    signal.raise_signal(signal.SIGINT)
+    now[0] += 0.01
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)

@@ -17,10 +17,13 @@ from sags_node.errors import SagsError
 from sags_node.messaging import cdr, content, topics
 from sags_node.model.ply import write_ply
 from sags_node.node import health as health_module
+from sags_node.node import node as node_module
 from sags_node.node import operations as node_operations
 from sags_node.node.health import WAITING_AFTER, Statistics
 from sags_node.node.latest import Latest
 from sags_node.node.operations import NodeState, Operations
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
 from sags_node.types import FrameResult, Gaussians, NodeHealth
 
 
@@ -93,7 +96,43 @@ class Node:
         for _ in range(round(seconds / PERIOD)):
             self.now += PERIOD
             self._statistics.add(HELD if held else TAKEN_IN, 40.0, {})
-        return self._statistics.health({}, False, False, None, {}, {}, {})
+        return self.health()
+
+    def health(self, working: float = 0.0) -> NodeHealth:
+        return self._statistics.health({}, False, False, None, {}, {}, {}, working=working)
+
+
+def test_a_frame_that_takes_for_ever_is_no_fault_of_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = Node(monkeypatch)
+    node.publish(1.0)
+    node.now += 2 * WAITING_AFTER
+    for working, code in ((0.0, "no_frames"), (2.0, "mapping_hangs")):
+        said = node.health(working)
+        assert content.health_answer(said) == {"healthy": False, "state": "waiting", "warnings": [code]}
+
+
+@pytest.mark.fault("mapping: it hangs while the node stops")
+def test_a_node_ends_beside_a_frame_that_does_not(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    began, goes_on = threading.Event(), threading.Event()
+
+    def hang(*_: object) -> FrameResult:
+        began.set()
+        goes_on.wait()
+        raise SagsError("too late")
+
+    monkeypatch.setattr(Pipeline, "process", hang)
+    monkeypatch.setattr(node_module, "STOP_SECONDS", 0.1)
+    own = ["publish.data:=[]", "publish.control:=null", f"publish.run_dir:={tmp_path / 'run'}"]
+    session = open_session(phantom_session, own)
+    running = node_module.Node(session.config, session.rig, session.source)
+    running.start()
+    assert began.wait(60) and (tmp_path / "run/sags.json").exists()
+    running.stop()
+    assert not (tmp_path / "run/sags.json").exists()  # nobody finds it any more
+    assert "the mapping thread does not end" in caplog.text
+    goes_on.set()
 
 
 @pytest.mark.fault("camera: its cap is on, for longer than a second")

@@ -10,11 +10,15 @@ from pathlib import Path
 
 import pytest
 from synthetic import publisher, stream
+from waiting import until
 
 from sags_node.errors import SagsError
+from sags_node.findings import by_stage
+from sags_node.messaging.content import health_answer
 from sags_node.processes import children
 from sags_node.recording import child
 from sags_node.recording.child import RecorderProcess
+from sags_node.types import NodeHealth
 
 pytestmark = pytest.mark.live
 
@@ -75,6 +79,48 @@ def test_a_node_ends_beside_a_recorder_that_does_not(
     monkeypatch.setattr(child, "FINISH_SECONDS", 0.2)
     recorder.close()
     assert recorders() == []
+
+
+@pytest.mark.fault("process: the recorder is killed while a node records")
+def test_a_recording_that_has_ended_by_itself_is_told(recorder: RecorderProcess, tmp_path: Path) -> None:
+    assert recorder.status() is None and not list(recorder.findings())
+    recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
+    until(lambda: (recorder.status() or {}).get("messages"))
+    assert recorder.status()["ended"] is None and not list(recorder.findings())
+    (process,) = recorders()
+    os.kill(process, signal.SIGKILL)
+    (told,) = until(lambda: list(recorder.findings()))
+    assert told.code == "recording_ended" and f"sags bag recover {tmp_path / 'bag'}" in told.text
+    health = NodeHealth("running", 30.0, {}, {}, {}, {}, 1, 1.0, {}, warnings=by_stage([told]))
+    assert health_answer(health) == {"healthy": False, "state": "running", "warnings": ["recording_ended"]}
+    with pytest.raises(SagsError, match="the recorder was ended; save what it wrote"):
+        recorder.stop().result(ANSWER)
+    recorder.start({"path": str(tmp_path / "next")}).result(ANSWER)
+    assert not list(recorder.findings())
+    recorder.stop().result(ANSWER)
+    assert recorder.status() is None
+
+
+def test_a_ring_takes_the_next_free_name_and_outlives_a_snapshot_that_fails(
+    recorder: RecorderProcess, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SagsError, match="cannot write"):
+        recorder.start({"path": str(tmp_path / "file"), "snapshot_seconds": 5}).result(ANSWER)
+    ring = tmp_path / "ring"
+    (ring / "snapshot_000").mkdir(parents=True)
+    (ring / "snapshot_000/of_yesterday").touch()
+    recorder.start({"path": str(ring), "snapshot_seconds": 50}).result(ANSWER)
+    ring.rename(tmp_path / "away")
+    ring.touch()
+    with pytest.raises(SagsError, match="cannot write"):
+        recorder.snapshot().result(ANSWER)
+    ring.unlink()
+    (tmp_path / "away").rename(ring)
+    taken = recorder.snapshot().result(ANSWER)
+    assert taken["snapshot"] == str(ring / "snapshot_001") and taken["messages"] > 0
+    assert (ring / "snapshot_000/of_yesterday").exists()
+    recorder.stop().result(ANSWER)
 
 
 @pytest.mark.fault("process: the recorder does not begin")

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -15,13 +18,19 @@ from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
 from waiting import until
 
+from sags_node.cli.bag_text import recorded_table
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging import cdr
+from sags_node.findings import by_stage
+from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
+from sags_node.messaging.cdr import Content
 from sags_node.messaging.wire import Message, encode
+from sags_node.recording import recorder as recorder_module
 from sags_node.recording.backlog import Arrived, Backlog
+from sags_node.recording.bag_writer import BagWriter
 from sags_node.recording.info import bag_info
-from sags_node.recording.recorder import RecordOptions
+from sags_node.recording.recorder import Recorder, RecordOptions
+from sags_node.recording.state import LOW_SECONDS, SILENT_SECONDS, findings
 
 pytestmark = pytest.mark.live
 
@@ -47,6 +56,66 @@ def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
     assert row == {"messages": 5, "dropped": 0, "lost": 2 + 3} and said[-1]["rejected"] == 1
     (listed,) = bag_info(tmp_path / "bag")["topics"]
     assert listed["messages"] == 5 and listed["lost"] == 5
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError("of a library"), MemoryError()], ids=repr)
+def test_what_cannot_be_written_ends_nothing_in_silence(
+    error: Exception | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A damaged message is left out and counted. A bug, and no memory, end the recording with an error."""
+    endpoint = f"ipc://{tmp_path / 'data'}"
+    options = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))
+    if error is not None:
+        monkeypatch.setattr(BagWriter, "attach", Mock(side_effect=error))
+    name, kind = ("left/camera_info", topics.CAMERA_INFO) if error is None else ("parameters", topics.STRING)
+    body = Content(kind, (b"\0\1\0\0" + bytes(5),)) if error is None else cdr.string("{}")
+    with (
+        zmq_socket(zmq.XPUB, endpoint, bind=True) as socket,
+        nullcontext() if error is None else pytest.raises(SagsError, match=r"cannot write .*bag: .*Error"),
+        recording(options) as (recorder, said),
+    ):
+        socket.recv()  # the subscription
+        socket.send_multipart(encode(message_of(name, body, 1, 1, frame_id=1)))
+        for seq in range(1, 9):
+            socket.send_multipart(encode(text_message(seq)))
+        until(lambda: recorder.summary()["messages"] == 8 or error)
+    if error is None:
+        assert said[-1]["messages"] == 8 and said[-1]["rejected"] == 1
+        assert bag_info(tmp_path / "bag")["messages"] == 8
+
+
+def test_what_a_person_should_know_of_a_recording() -> None:
+    good = {"folder": "bag", "silent_s": 0.1, "dropped": 0, "lost": 0, "rejected": 0, "mb_per_s": 100.0}
+    assert not list(findings({**good, "free_bytes": None}))
+    assert not list(findings({**good, "free_bytes": 100e6 * LOW_SECONDS}))
+    codes = {
+        "recording_silent": {"silent_s": SILENT_SECONDS + 0.1}, "recording_loses": {"lost": 1},
+        "recording_rejects": {"rejected": 1}, "recording_disk_low": {"free_bytes": 1e9},
+    }  # fmt: skip
+    for code, wrong in codes.items():
+        (told,) = findings({**good, "free_bytes": 1e15, **wrong})
+        assert told.code == code and by_stage([told])
+    assert "full in 10 s at 100.0 MB/s" in told.text
+
+
+@pytest.mark.fault("node: killed while it is recorded")
+def test_a_recorder_says_that_nothing_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And its rate is that of the time in which something came."""
+    endpoint, told = f"ipc://{tmp_path / 'data'}", []
+    recorder = Recorder(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint)))
+    monkeypatch.setattr(recorder_module, "TELL_PERIOD", 0.01)
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        thread = threading.Thread(target=recorder.run, args=(lambda said: None, told.append))
+        thread.start()
+        socket.recv()
+        socket.send_multipart(encode(text_message(1, "y" * 100_000)))
+        until(lambda: told and told[-1]["bytes"] > 0)
+    rate = told[-1]["mb_per_s"]
+    until(lambda: told[-1]["silent_s"] > 1)
+    recorder.stop()
+    thread.join(60)
+    assert told[-1]["mb_per_s"] == rate
+    assert "nothing came in the last" in str(recorded_table({**recorder.summary(), "silent_s": 12.3}).caption)
 
 
 def test_the_backlog_is_bounded() -> None:
