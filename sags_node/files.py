@@ -79,17 +79,24 @@ def writing(target: Path) -> Iterator[None]:
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def whole(path: Path, new: bool = False) -> Iterator[Path]:
     """A place on the same disk to write a file or folder to. When nothing went wrong it becomes `path`; else
     nothing of it is left, and what stood at `path` stays.
 
+    Args:
+        new: it takes the place of no other file, also of none that comes while it is written.
+
     Raises:
-        SagsError: it cannot be written.
+        SagsError: it cannot be written, or is there already.
     """
     target = path.resolve()  # through a link, not over it
+    if new and target.exists():
+        raise SagsError(f"{path} exists already; choose another name")
     with writing(path), tempfile.TemporaryDirectory(prefix=".sags-", dir=target.parent) as passing:
         partial = Path(passing) / path.name
         yield partial
+        if new:
+            target.open("xb").close()  # only one can make it
         partial.replace(target)
 
 

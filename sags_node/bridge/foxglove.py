@@ -54,7 +54,9 @@ def outputs(options: FoxgloveOptions) -> list[Output]:
     offered = [(options.node.ns, topic) for topic in topics.TOPICS]
     offered += [(options.overlay.ns, topic) for topic in topics.OVERLAY_TOPICS]
     channels = [
-        Output(f"/{topics.full_name(ns, topic.name)}", (Source(ns, topic.name),), period)
+        Output(
+            f"/{topics.full_name(ns, topic.name)}", (Source(ns, topic.name),), period, lengths=topic.in_metres
+        )
         for ns, topic in offered
     ]
     if importlib.util.find_spec("av") is not None:
@@ -236,7 +238,7 @@ class _Messages:
         self._channel = foxglove.Channel(output.name, schema=schema, message_encoding="cdr", context=context)
 
     def show(self, received: Received, grown: bool) -> None:
-        self._channel.log(received.cdr(), log_time=received.stamp_ns)
+        self._channel.log(received.ros(), log_time=received.stamp_ns)
 
     def blank(self, shown: Received, reason: str) -> None:
         now_ns = time.time_ns()

@@ -94,9 +94,9 @@ def outputs(options: IgtlOptions) -> list[Output]:
         "picture": Output("Picture", of_node(PICTURE, INFO), often),
         "render": Output("Render", of_node(RENDER, INFO), often),
         "overlay": Output("Overlay", overlaid, often, optional=True),
-        "surface": Output("Surface", surface, seldom, pulse=Source(node, POSE)),
-        "anchors": Output("Anchors", of_node(ANCHORS), often),
-        "camera": Output("LeftCamera", of_node(POSE), often),
+        "surface": Output("Surface", surface, seldom, pulse=Source(node, POSE), lengths=True),
+        "anchors": Output("Anchors", of_node(ANCHORS), often, lengths=True),
+        "camera": Output("LeftCamera", of_node(POSE), often, lengths=True),
     }
     unknown = [name for name in options.send if name not in offered]
     if unknown:

@@ -21,6 +21,7 @@ from sags_node.messaging.wire import Meta
 MAX_AGE = 0.4  # s since capture: with `LOOK` and the way to a peer, what stops is taken back within 0.5 s
 LOOK = 0.04  # s; how soon it is noticed that something has become too old
 LEAD = 0.2  # s before it is due that a rare output's topics are asked for: a subscription takes up to 0.1 s
+NO_UNIT = "its lengths have no unit, as nobody has calibrated the eyes; docs/calibration.md"
 GRACE = 0.5  # s for the first message of what was asked for, before it is said that none comes
 
 
@@ -42,6 +43,7 @@ class Output:
         pulse: for an output with a long period: a small topic of the same sender that comes with every frame.
             Between two of this output only that is asked for, and tells that the sender goes on.
         optional: it is not missed before it has come once.
+        lengths: it is of lengths, which peers take for metres: nothing is passed on while they have no unit.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Output:
     period: float = 0.0
     pulse: Source | None = None
     optional: bool = False
+    lengths: bool = False
 
 
 class Outlet(Protocol):
@@ -174,6 +177,10 @@ class Relay:
             problem = self._feeds[source.ns].problem(source.topic)
             if problem is not None:
                 return f"{topics.full_name(*source)}: {problem}"
+        first = output.sources[0]
+        leading = self._feeds[first.ns].latest(first.topic) if output.lengths else None
+        if leading is not None and not leading.metric:
+            return f"{topics.full_name(*first)}: {NO_UNIT}"
         if course.shown_ns is None or not _is_periodic(output):
             return None
         seconds = any(source.topic in EVERY_SECOND for source in output.sources)

@@ -95,7 +95,8 @@ def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool
     delivery = _delivery(topic, options.max_age)
 
     def offer(added: str, kind: str, make: Make) -> Offer:
-        output = Output(f"{name}{added}", (Source(ns, topic.name),), optional=optional)
+        sources = (Source(ns, topic.name),)
+        output = Output(f"{name}{added}", sources, optional=optional, lengths=topic.in_metres)
         return Offer(output, kind, delivery, make)
 
     if topic.type == topics.IMAGE:
@@ -106,7 +107,7 @@ def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool
         return [thinned, offer(ALL_POINTS, topic.type, Received.cdr)]
     if topic.type == topics.DIAGNOSTICS:
         return [offer("", topic.type, partial(_named, ns=ns))]
-    return [offer("", topic.type, Received.cdr)]
+    return [offer("", topic.type, Received.ros)]
 
 
 def _delivery(topic: topics.Topic, max_age: float) -> Delivery:

@@ -54,6 +54,7 @@ class Content:
     dtype: DType = ""
     scale: float = 0.0  # of a thin picture whose numbers are whole; 0: none
     window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture for one of its own
+    relative: bool = False  # its lengths have no unit
 
     def cdr(self) -> bytes:
         """The whole message."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any, Self
@@ -16,7 +17,7 @@ from typing import Annotated, Any, Self
 import msgspec
 import zmq
 
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError, UsageError, brief
 from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect
 from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
@@ -33,7 +34,9 @@ MAX_PENDING = 64
 MAX_PENDING_OF_ONE = MAX_PENDING // 2  # client, so that the others are still answered
 RECEIVE_HIGH_WATER = 8  # requests one peer may have waiting
 SEND_HIGH_WATER = 2 * MAX_REQUESTS_AT_ONCE  # answers, before a peer that does not read loses some
+HERE = ("ipc:", "tcp://127.", "tcp://localhost", "tcp://[::1]")  # endpoints of this machine
 LOOK_MS = 100  # how soon a client notices that its node is another one
+TOO_LATE = "it was not begun in the time that its sender waits, and is not done"
 ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls who has no key
 PLAIN = Client("a client without a key")  # it came in all the same, so it may do everything
 
@@ -49,6 +52,16 @@ class Request(msgspec.Struct, frozen=True):
     id: Identifier
     op: Annotated[str, msgspec.Meta(max_length=64)]
     args: dict[str, Any] = msgspec.field(default_factory=dict)
+    # For how long it is waited for: what has not begun by then is not done any more. By the wall clock, too,
+    # where that is the same one: a node that was stopped for a while does not know how long.
+    within_s: float | None = None
+    until_ns: int | None = None
+
+    @property
+    def left(self) -> float:
+        """s that are left for it now."""
+        left = inf if self.until_ns is None else (self.until_ns - time.time_ns()) * 1e-9
+        return left if self.within_s is None else min(left, self.within_s)
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -108,7 +121,7 @@ class ControlServer:
         self._rate = RequestRate()
         self.refused = Counter[str](requests_not_allowed=0, requests_too_often=0)
         self._seldom = RateLimitedLog()
-        self._pending: list[tuple[_Sender, Identifier, Future[Any]]] = []
+        self._pending: list[tuple[_Sender, Identifier, Future[Any], float]] = []  # and until when, monotonic
         self._request = msgspec.msgpack.Decoder(Request)
 
     @property
@@ -127,8 +140,11 @@ class ControlServer:
             self._took(int(frames[-1].get(zmq.SRCFD)), sum(map(len, parts)))
             if len(parts) in (2, 3):
                 self._handle(self._sender(frames[-1], parts[:-1]), parts[-1])
-        finished = [entry for entry in self._pending if entry[2].done()]
-        for sender, identifier, future in finished:
+        now = time.monotonic()
+        finished = [
+            entry for entry in self._pending if entry[2].done() or (entry[3] < now and entry[2].cancel())
+        ]
+        for sender, identifier, future, _ in finished:
             self._answer(sender, identifier, future.result)
         self._pending = [entry for entry in self._pending if entry not in finished]
 
@@ -147,12 +163,13 @@ class ControlServer:
         except _BAD_BYTES as error:
             self._send(sender, Reply(PROTOCOL, None, False, error=f"not a request: {error}"))
             return
-        refusal = self._refusal(sender, request)
+        too_late = Reply(PROTOCOL, request.id, False, error=TOO_LATE) if request.left <= 0 else None
+        refusal = too_late or self._refusal(sender, request)
         if refusal is not None:
             self._send(sender, refusal)
             return
         handler = self._handlers[request.op]
-        self._answer(sender, request.id, lambda: handler(request.args))
+        self._answer(sender, request.id, lambda: handler(request.args), time.monotonic() + request.left)
 
     def _refusal(self, sender: _Sender, request: Request) -> Reply | None:
         """What speaks against a request, before it is looked at further."""
@@ -176,7 +193,7 @@ class ControlServer:
                 f"move {client.name}.pub into the folder '{role}' of the node's publish.allow"
             )
             return refused(error=text, code="not_allowed")
-        of_sender = sum(waiting.id == sender.id for waiting, _, _ in self._pending)
+        of_sender = sum(waiting.id == sender.id for waiting, *_ in self._pending)
         if len(self._pending) >= MAX_PENDING or of_sender >= MAX_PENDING_OF_ONE:
             return refused(error="too many requests are waiting for an answer; try again later")
         return None
@@ -184,18 +201,22 @@ class ControlServer:
     def _count(self, why: str, sender: _Sender, op: str) -> None:
         self.refused[why] += 1
         if self._seldom.due():
-            log.warning("refused %s of %s; since the start: %s", op, sender.client, dict(self.refused))
+            log.warning("refused %s of %s; since the start: %s", brief(op), sender.client, dict(self.refused))
 
-    def _answer(self, sender: _Sender, identifier: Identifier, work: Callable[[], Any]) -> None:
+    def _answer(
+        self, sender: _Sender, identifier: Identifier, work: Callable[[], Any], until: float = inf
+    ) -> None:
         try:
             result = work()
             if isinstance(result, Future):
-                self._pending.append((sender, identifier, result))
+                self._pending.append((sender, identifier, result, until))
                 return
             self._send(sender, Reply(PROTOCOL, identifier, True, result=result))
         except SagsError as error:
             self._send(sender, Reply(PROTOCOL, identifier, False, error=str(error)))
-        except (Exception, CancelledError) as error:  # a request must not end the node
+        except CancelledError:
+            self._send(sender, Reply(PROTOCOL, identifier, False, error=TOO_LATE))
+        except Exception as error:  # a request must not end the node
             log.exception("a control request failed")
             text = f"internal error: {type(error).__name__}: {error}"
             self._send(sender, Reply(PROTOCOL, identifier, False, error=text))
@@ -244,17 +265,25 @@ class ControlClient:
         return self._address.endpoint
 
     def request(self, op: str, args: Mapping[str, Any] | None = None, timeout: float = 2.0) -> Any:
-        """The result of an operation. It is asked for once: what may have been done is not repeated.
+        """The result of an operation. It is asked for once: what may have been done is not repeated. What the
+        node has not begun within `timeout` it does not do any more.
 
         Raises:
             SagsError: the node refused (its own words), refuses this client altogether, is another one before
                 it answered, or did not answer within `timeout` seconds.
             UsageError: the node wants keys that are not given, or the other way round.
         """
-        deadline = time.monotonic() + timeout
+        deadline, until_ns = time.monotonic() + timeout, time.time_ns() + round(timeout * 1e9)
+        silence = f"no answer from {self.endpoint} in {timeout:g} s; is the node running?"
         self._follow(deadline)
+        while not self._socket.poll(LOOK_MS, zmq.POLLOUT):  # nothing is left waiting for a node to come
+            if (refusal := self._watch.refusal()) is not None or time.monotonic() > deadline:
+                raise SagsError(refusal or silence)
+            self._follow(deadline)
         self._last_id += 1
-        request = msgspec.msgpack.encode(Request(PROTOCOL, self._last_id, op, dict(args or {})))
+        is_here = self.endpoint.startswith(HERE)
+        asked = Request(PROTOCOL, self._last_id, op, dict(args or {}), timeout, until_ns if is_here else None)
+        request = msgspec.msgpack.encode(asked)
         self._socket.send(request, zmq.NOBLOCK)
         while (left := deadline - time.monotonic()) > 0:
             if not self._socket.poll(min(int(left * 1000) + 1, LOOK_MS)):
@@ -274,7 +303,6 @@ class ControlClient:
                 if not reply.ok:
                     raise SagsError(f"{op}: {reply.error}")
                 return reply.result
-        silence = f"no answer from {self.endpoint} in {timeout:g} s; is the node running?"
         raise SagsError(self._watch.refusal() or silence)
 
     def _follow(self, deadline: float) -> None:
@@ -307,6 +335,7 @@ class ControlClient:
     def _connect(self, address: Address) -> None:
         self._context, self._address = zmq.Context(), address
         self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)
         try:
             self._watch = connect(self._socket, address, MAX_REPLY_BYTES)
         except SagsError:

@@ -97,11 +97,12 @@ class Publisher:
         }
         self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
         self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
+        self._any_view = False  # more views were subscribed to than are noted: each one may be meant
         self.thin: Mapping[str, topics.ThinPicture] = {}
         self._thins = thins
         self._recording = recording
         self._metric = metric
-        self._thin_seq = 0  # where the numbers of the next one begin
+        self._thin_seq = self._view_seq = 0  # where the numbers of the next one begin
         self._last: FrameResult | None = None
         self._dropped = 0
         self._pictured = -1  # the newest frame whose picture went before its result
@@ -211,7 +212,7 @@ class Publisher:
         """Send the topics of the view `name` to those who asked for them."""
         shown, ahead_ns = next(iter(drawn.eyes.values())), round(drawn.ahead_s * 1e9)
         for topic, body in content.view(name, drawn).items():
-            self._seq[topic] = self._seq.get(topic, 0) + 1
+            self._seq[topic] = self._seq.get(topic, self._view_seq) + 1
             if drawn.still or body.type == topics.CAMERA_INFO:
                 self._kept[topic] = _Kept(body, shown.t_capture_ns, shown.frame_id, drawn.epoch, ahead_ns)
             if self.wanted(topic):
@@ -224,19 +225,22 @@ class Publisher:
             self.publish_content(name, pictures[name], pair.frame_id, pair.t_capture_ns, result.epoch)
 
     def forget_view(self, name: str) -> None:
-        """Nothing is sent again of a view that was closed."""
-        for topic in [kept for kept in self._kept if kept.startswith(f"view/{name}/")]:
-            del self._kept[topic]
+        """Nothing is sent again of a view that was closed, and its numbers do not come again."""
+        for topic in [topic for topic in self._seq if topic.startswith(f"view/{name}/")]:
+            self._view_seq = max(self._view_seq, self._seq.pop(topic))
+            self._kept.pop(topic, None)
 
     def watches_view(self, name: str) -> bool:
         """True while somebody subscribes to a topic of the view `name`."""
         start = topics.full_name(self.ns, f"view/{name}/")
-        return any(start.startswith(prefix) or prefix.startswith(start) for prefix in self._subscribed)
+        noted = any(start.startswith(prefix) or prefix.startswith(start) for prefix in self._subscribed)
+        return noted or self._any_view
 
     def wanted(self, name: str) -> bool:
         """True while somebody subscribes to the topic `name` (without the namespace)."""
         full = topics.full_name(self.ns, name)
-        return any(full.startswith(prefix) for prefix in self._subscribed)
+        noted = any(full.startswith(prefix) for prefix in self._subscribed)
+        return noted or (self._any_view and name.startswith("view/"))
 
     def looked_at(self, picture: str) -> bool:
         """True while somebody subscribes to that topic, or to a thin form of it."""
@@ -281,7 +285,7 @@ class Publisher:
             ahead_ns=ahead_ns or msgspec.UNSET,
             scale=body.scale or msgspec.UNSET,
             window=list(body.window) or msgspec.UNSET,
-            units=msgspec.UNSET if self._metric else "relative",
+            units="relative" if body.relative or not self._metric else msgspec.UNSET,
         )
         frames = encode(Message(topics.full_name(self.ns, name), meta, body.parts))
         # An XPUB socket drops for a full peer instead of blocking. Arrays are never written again, so
@@ -344,8 +348,11 @@ class Publisher:
         matching = [topic for full, topic in self._names.items() if full.startswith(prefix)]
         views = topics.full_name(self.ns, "view/")
         of_views = prefix.startswith(views) or views.startswith(prefix)
-        if message[:1] == b"\x01" and (matching or (of_views and len(self._subscribed) < MAX_PREFIXES)):
-            self._subscribed.add(prefix)
+        if message[:1] == b"\x01" and (matching or of_views):
+            if matching or len(self._subscribed) < MAX_PREFIXES:
+                self._subscribed.add(prefix)
+            else:
+                self._any_view = True
             resend.update(topic.name for topic in matching if topic.cached)
             if of_views:
                 resend.update(name for name in self._kept if self._is_kept_view(name, prefix))

@@ -46,6 +46,10 @@ class Received:
         """The ROS 2 message that came, byte for byte."""
         return b"".join(self.parts)
 
+    def ros(self) -> bytes:
+        """The message for readers that are told no `units`: a camera that nobody has calibrated says so."""
+        return told_in_ros(self.meta, self.cdr())
+
 
 @dataclass(frozen=True, slots=True)
 class ReceivedImage(Received):
@@ -135,6 +139,12 @@ _KINDS: dict[str, type[Received]] = {
     topics.CAMERA_INFO: ReceivedCameraInfo,
     topics.STRING: ReceivedText,
 }
+
+
+def told_in_ros(meta: Meta, data: bytes) -> bytes:
+    """The CDR of a message for readers that get nothing of `meta`, see `Received.ros`."""
+    guessed = meta.type == topics.CAMERA_INFO and meta.units is not msgspec.UNSET
+    return cdr.uncalibrated(data) if guessed else data
 
 
 class TopicName(str, Generic[R]):

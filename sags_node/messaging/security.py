@@ -70,7 +70,7 @@ def write_key_pair(folder: Path, name: str) -> tuple[Path, Path]:
             raise UsageError(f"{file} exists already; choose another name or remove it")
     with writing(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with whole(secret_file) as secret_part, whole(public_file) as public_part:
+    with whole(secret_file, new=True) as secret_part, whole(public_file, new=True) as public_part:
         secret_part.touch(0o600)  # never with a moment in which others can read it
         secret_part.write_text(private, encoding="ascii")
         public_part.write_text(shared, encoding="ascii")

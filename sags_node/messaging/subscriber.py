@@ -211,8 +211,8 @@ class Receiver:
         return matches if len(matches) == len(names) else None
 
     def _problem(self, name: str, max_age: float | None) -> str | None:
-        if name in self._refused:
-            return self._refused[name]
+        if (refused := self._refused.get(name)) is not None:  # another thread may take it out
+            return refused
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
         if problem is not None and self.refusal is not None:
             return self.refusal

@@ -32,6 +32,11 @@ class Topic:
     cached: bool = False  # the last value is sent again to whoever subscribes
     periodic: bool = True  # repeats with every frame or every second, so silence means stale
 
+    @property
+    def in_metres(self) -> bool:
+        """Whether it is of lengths. So is a camera_info, but that can say that nobody has calibrated it."""
+        return self.type in (POINT_CLOUD, TF) or self.name.endswith("/depth")
+
 
 TOPICS = (
     Topic("left/image_rect_color", IMAGE, "rgb8, the rectified input"),

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.confidence import confidence_of
-from sags_node.errors import SagsError
 from sags_node.files import whole
 from sags_node.model.constant_colours import with_constant_colours
 from sags_node.types import SH_DEGREE_0, Gaussians
@@ -17,11 +16,14 @@ _FIELDS = (
 )
 
 
-def write_ply(path: Path, gaussians: Gaussians, force: bool = False) -> None:
+def write_ply(path: Path, gaussians: Gaussians, force: bool = False, metric: bool = True) -> None:
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
     logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter and slopes are
     folded in (`model.constant_colours`): viewers know neither. Where the errors of depth are known,
     `confidence` comes last, see `sags_node.confidence`; readers take properties by name.
+
+    Args:
+        metric: False: lengths have no unit, which a comment says.
 
     Raises:
         SagsError: the file exists already and `force` is not given, or it cannot be written.
@@ -44,11 +46,10 @@ def write_ply(path: Path, gaussians: Gaussians, force: bool = False) -> None:
     if gaussians.depth_errors is not None:
         fields = [*_FIELDS, "confidence"]
         columns = np.column_stack([columns, confidence_of(gaussians.depth_errors)])
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians)}"]
+    header = ["ply", "format binary_little_endian 1.0", *([] if metric else ["comment units relative"])]
+    header += [f"element vertex {len(gaussians)}"]
     header += [f"property float {name}" for name in fields]
     header += ["end_header", ""]
-    if path.exists() and not force:
-        raise SagsError(f"{path} exists already; choose another name")
-    with whole(path) as partial, partial.open("wb") as file:
+    with whole(path, new=not force) as partial, partial.open("wb") as file:
         file.write("\n".join(header).encode())
         file.write(np.ascontiguousarray(columns, "<f4").tobytes())

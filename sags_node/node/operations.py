@@ -22,7 +22,7 @@ from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.uncalibrated import MOST
+from sags_node.pipeline.uncalibrated import MOST, unsure
 from sags_node.types import DrawnView, FrameResult
 
 
@@ -92,6 +92,7 @@ class Operations:
 
     def _reset_model(self) -> dict[str, Any]:
         self._state.pipeline.reset()
+        self._state.scene = None  # a view that is opened now waits for the new model
         return {}
 
     def _pause(self) -> dict[str, Any]:
@@ -154,10 +155,12 @@ class Operations:
         newest = self._state.pipeline.newest
         if newest is None or len(newest.snapshot.gaussians) == 0:
             raise SagsError("there is no model yet; wait for the first frame")
+        metric = self._state.pipeline.metric
+        newest = newest if metric else unsure(newest)
         file, gaussians = Path(path).absolute(), newest.snapshot.gaussians  # never changed any more
 
         def write() -> dict[str, Any]:
-            write_ply(file, gaussians)
+            write_ply(file, gaussians, metric=metric)
             return {"path": str(file), "gaussians": len(gaussians)}
 
         saved: Future[Any] = Future()
@@ -192,7 +195,9 @@ class Requests:
 
 
 def _answer(future: Future[Any], work: Callable[[], Any]) -> None:
-    """Do it; its failure is the answer, and does not end the thread."""
+    """Do it, unless nobody waits for it any more; its failure is the answer, and does not end the thread."""
+    if not future.set_running_or_notify_cancel():
+        return
     try:
         future.set_result(work())
     except Exception as error:

@@ -27,6 +27,7 @@ from sags_node.recording.mcap_file import MAGIC, MAX_RECORD_BYTES, DamagedError,
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
+RELATIVE = {"sags_units": "relative"}  # metadata of a channel whose lengths have no unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,7 @@ class BagMessage:
     publish_ns: int
     sequence: int  # 0 where the format has none
     data: bytes | memoryview  # CDR
+    relative: bool = False  # its lengths have no unit: it is of a node that nobody has calibrated
 
 
 def read_messages(
@@ -167,7 +169,13 @@ def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Ite
                         record.publish_ns,
                         record.sequence,
                         record.data,
+                        unitless(channel),
                     )
+
+
+def unitless(channel: Channel) -> bool:
+    """Whether lengths have no unit in the messages of a channel."""
+    return bool(RELATIVE.items() <= channel.metadata.items())
 
 
 def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:

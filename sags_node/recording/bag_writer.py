@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from sags_node import __version__
 from sags_node.errors import UsageError
 from sags_node.files import writing
-from sags_node.recording.bag import METADATA
+from sags_node.recording.bag import METADATA, RELATIVE
 from sags_node.recording.bag_metadata import Part, Topic, describe, quality
 
 CHUNK_BYTES = 1 << 20  # what is lost at most when the process is killed between two flushes
@@ -68,7 +68,13 @@ class BagWriter:
             self._begin_file()
 
     def add_topic(
-        self, name: str, kind: str, schema: Schema, type_hash: str = "", latched: bool = False
+        self,
+        name: str,
+        kind: str,
+        schema: Schema,
+        type_hash: str = "",
+        latched: bool = False,
+        relative: bool = False,
     ) -> int:
         """Announce a topic; its number for `write`.
 
@@ -76,6 +82,7 @@ class BagWriter:
             kind: ROS 2 name of the type.
             schema: its definition; the number in it is not used.
             latched: late subscribers get the last message too (durability transient_local).
+            relative: its lengths have no unit.
         """
         key = (schema.name, schema.encoding, schema.data)
         if key not in self._schemas:
@@ -83,6 +90,7 @@ class BagWriter:
         metadata = {
             "offered_qos_profiles": yaml.safe_dump(quality(latched), sort_keys=False),
             "topic_type_hash": type_hash,
+            **(RELATIVE if relative else {}),
         }
         schema_id = self._schemas[key]
         channel: int = self._say_first(

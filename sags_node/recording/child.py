@@ -262,7 +262,7 @@ class _Child:
             said = line
         summary = self._said(said)
         if self._process.returncode != 0:
-            raise SagsError(self._last_words())
+            raise SagsError(self.ended)
         return summary
 
     def kill(self) -> None:
@@ -300,7 +300,7 @@ class _Child:
     def _said(self, said: dict[str, Any] | None) -> Any:
         """What it says; a failure where it says `error`, or nothing more."""
         if said is None:
-            raise SagsError(self._last_words())
+            raise SagsError(self.ended)
         if "error" in said:
             raise SagsError(said["error"])
         return said

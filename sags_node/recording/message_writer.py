@@ -13,6 +13,7 @@ from sags_node import __version__
 from sags_node.errors import SagsError
 from sags_node.media.picture_file import PNG
 from sags_node.messaging import cdr, topics
+from sags_node.messaging.received import told_in_ros
 from sags_node.messaging.topics import CAMERA_INFO, IMAGE
 from sags_node.messaging.wire import PROTOCOL, Message, WireError
 from sags_node.recording.backlog import Arrived
@@ -43,7 +44,7 @@ class MessageWriter:
         self.bag = BagWriter(folder, limits)
         self._ns = ns
         self._compression = compression
-        self._channels: dict[str, int] = {}
+        self._channels: dict[tuple[str, str, bool], int] = {}  # topic, type, and whether lengths have no unit
         self._attached: set[str] = set()
         self._session = ""
 
@@ -60,24 +61,23 @@ class MessageWriter:
                 "sags",
                 {"session": meta.session, "protocol": PROTOCOL, "ns": self._ns, "version": __version__},
             )
-        guessed = meta.type == CAMERA_INFO and meta.units is not msgspec.UNSET
-        if not guessed:
+        relative = meta.units is not msgspec.UNSET
+        if not (relative and meta.type == CAMERA_INFO):
             self._attach(arrived)
-        name, kind, data = message.topic, meta.type, b"".join(message.parts)
-        if guessed:  # a bag tells no units: played as a source it must not pass for calibrated
-            data = cdr.uncalibrated(data)
+        name, kind, data = message.topic, meta.type, told_in_ros(meta, b"".join(message.parts))
         if self._compression != "none" and kind == IMAGE and meta.encoding in _COMPRESSIBLE:
             form = "jpeg" if self._compression == "jpeg" and meta.encoding == "rgb8" else "png"
             name, kind, data = f"{name}/compressed", cdr.COMPRESSED, _compressed(message, data, form)
-        if name not in self._channels:
-            self._channels[name] = self._announce(name, kind)
-        self.bag.write(self._channels[name], arrived.received_ns, meta.stamp_ns, meta.seq, data)
+        key = name, kind, relative  # the node may be another one, calibrated by now
+        if key not in self._channels:
+            self._channels[key] = self._announce(*key)
+        self.bag.write(self._channels[key], arrived.received_ns, meta.stamp_ns, meta.seq, data)
 
-    def _announce(self, name: str, kind: str) -> int:
+    def _announce(self, name: str, kind: str, relative: bool) -> int:
         known = topics.BY_NAME.get(name.removeprefix(f"{self._ns}/"))
         schema = Schema(id=0, name=kind, encoding="ros2msg", data=cdr.definition(kind).encode())
         latched = known is not None and known.cached
-        return self.bag.add_topic(f"/{name}", kind, schema, cdr.type_hash(kind), latched)
+        return self.bag.add_topic(f"/{name}", kind, schema, cdr.type_hash(kind), latched, relative)
 
     def _attach(self, arrived: Arrived) -> None:
         """Calibration and parameters lie in the file as files too, for people who open it years later."""

@@ -6,7 +6,7 @@ import threading
 import time
 import uuid
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +111,7 @@ class Player:
             name, content = outgoing(message, stamp_ns)
             number = self._frame_number(original) if content.type in FRAME_TYPES else -1
             name = name.removeprefix(f"{self._ns}/")
+            content = replace(content, relative=message.relative)
             publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, epoch)
             self._sent += 1
 

@@ -15,7 +15,14 @@ from mcap.records import Channel, Schema
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.recording import mcap_file
-from sags_node.recording.bag import Channels, files_in, read_messages, records_of, storage_files
+from sags_node.recording.bag import (
+    Channels,
+    files_in,
+    read_messages,
+    records_of,
+    storage_files,
+    unitless,
+)
 from sags_node.recording.bag_writer import BagWriter
 from sags_node.recording.mcap_file import HEAD, MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head
 
@@ -81,16 +88,21 @@ class _Writer:
     def __init__(self, bag: BagWriter, done: Recovery) -> None:
         self._bag = bag
         self._done = done
-        self._known: dict[tuple[str, str, bytes], int] = {}  # topic, type and schema: channel
+        self._known: dict[tuple[str, str, bytes, bool], int] = {}  # topic, type, schema, units: channel
         self._attached: set[tuple[str, bytes]] = set()  # name and digest: each file of a bag has them all
 
     def write(self, entry: Entry, channel: Channel, schema: Schema) -> None:
-        key = (channel.topic, schema.name, schema.data)
+        metadata = channel.metadata
+        key = (channel.topic, schema.name, schema.data, unitless(channel))
         if key not in self._known:
-            metadata = channel.metadata
             latched = "transient_local" in metadata.get("offered_qos_profiles", "")
             self._known[key] = self._bag.add_topic(
-                channel.topic, schema.name, schema, metadata.get("topic_type_hash", ""), latched
+                channel.topic,
+                schema.name,
+                schema,
+                metadata.get("topic_type_hash", ""),
+                latched,
+                unitless(channel),
             )
         self._bag.write(self._known[key], entry.log_ns, entry.publish_ns, entry.sequence, entry.data)
         self._done.messages += 1

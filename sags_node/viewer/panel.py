@@ -84,6 +84,8 @@ class Panel:
         if self._history.add(moment):
             for plot, figures in self._plots:
                 plot.data = self._history.series(*figures)
+        status = moment.status
+        self._unit = "no unit" if status is not None and "uncalibrated" in status.warning_codes else "mm"
         self._list_anchors(moment.anchors)
 
     # ---- building ------------------------------------------------------------------------------------
@@ -190,7 +192,7 @@ class Panel:
 
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
         rows = [] if anchors is None else list(anchors)
-        self._anchor_rows.content = _anchor_table(rows)
+        self._anchor_rows.content = _anchor_table(rows, self._unit)
         if anchors is None:  # nothing fresh came: what somebody has chosen stays
             return
         numbers = (NONE, *(str(int(row["id"])) for row in rows))
@@ -237,8 +239,8 @@ def _warnings(status: Status) -> str:
     )
 
 
-def _anchor_table(rows: list[Any]) -> str:
-    """Where each anchor is (mm), and how sure it is."""
+def _anchor_table(rows: list[Any], unit: str) -> str:
+    """Where each anchor is, and how sure it is."""
     if not rows:
         return '<div style="padding:0 1em;opacity:0.7">none yet</div>'
     cells = []
@@ -247,5 +249,5 @@ def _anchor_table(rows: list[Any]) -> str:
         seen, sure = f"{100 * row['visibility']:.0f} %", f"{100 * row['confidence']:.0f} %"
         values = (int(row["id"]), place, seen, sure)
         cells.append("<tr>" + "".join(f"<td>{value}</td>" for value in values) + "</tr>")
-    heads = "".join(f"<th align=left>{head}</th>" for head in ("", "x y z (mm)", "seen", "sure"))
+    heads = "".join(f"<th align=left>{head}</th>" for head in ("", f"x y z ({unit})", "seen", "sure"))
     return f'<table style="padding:0 1em;width:100%"><tr>{heads}</tr>{"".join(cells)}</table>'

@@ -58,7 +58,7 @@ class Node:
 
     def latest(self, name: str) -> Any:
         last = self.fresh[name].last
-        return None if last is None else SimpleNamespace(meta=last, stamp_ns=last.stamp_ns)
+        return None if last is None else SimpleNamespace(meta=last, stamp_ns=last.stamp_ns, metric=False)
 
     def frame(self, names: Iterable[str], stamp_ns: int) -> Frame:
         return Frame({name: self.latest(name) for name in names})
@@ -116,6 +116,14 @@ def test_what_stops_is_taken_back_within_half_a_second(monkeypatch: pytest.Monke
         age = blanked - shown[-1][0] + ages[-1]
         assert MAX_AGE < age <= MAX_AGE + LOOK + 1e-6
     assert MAX_AGE + LOOK < BLANK_WITHIN, "there is time left for the way to the peer"
+
+
+def test_lengths_without_a_unit_are_not_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Peers would take them for metres. Pictures go on."""
+    for lengths in (False, True):
+        output = Output("pose", (Source("sags", POSE),), lengths=lengths)
+        _, peer = bridged(monkeypatch, 1, output, 2.0, 3.0)
+        assert bool(peer.shown) != lengths
 
 
 def test_what_comes_seldom_is_asked_for_when_due(monkeypatch: pytest.MonkeyPatch) -> None:

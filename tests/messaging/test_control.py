@@ -17,6 +17,7 @@ import msgpack
 import msgspec
 import pytest
 import zmq
+from ports import free_port
 from waiting import repeating, until
 
 from sags_node.config.schema import PublishConfig
@@ -24,6 +25,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.rundir import Connection
+from sags_node.node.operations import Requests
 
 pytestmark = pytest.mark.live
 
@@ -83,6 +85,7 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
 
     def later(args: dict[str, Any]) -> Future[Any]:
         waiting.append(Future())
+        waiting[-1].set_running_or_notify_cancel()  # it has begun
         return waiting[-1]
 
     with node(tmp_path / "run", {"later": later}) as endpoint:
@@ -113,6 +116,33 @@ def test_what_is_owed_is_bounded(tmp_path: Path) -> None:
         refused = [msgpack.unpackb(asker.recv()) for _ in range(5) if asker.poll(GUARD_MS)]
         assert [reply["ok"] for reply in refused] == [False] * 5
         assert "waiting" in refused[0]["error"]
+
+
+@pytest.mark.fault("socket: a request that nobody waits for any more")
+def test_what_has_failed_is_not_done_later(tmp_path: Path) -> None:
+    """By a node that comes later, that was stopped, or whose mapping was busy meanwhile."""
+    done: list[str] = []
+    waiting, posted = Requests(), list[Future[Any]]()
+    handlers: dict[str, Handler] = {
+        "pause": lambda args: done.append("pause"),
+        "reset_model": lambda args: posted.append(waiting.post(lambda: done.append("reset"))) or posted[0],
+    }
+    config = PublishConfig(data=(), control=f"tcp://127.0.0.1:{free_port()}", run_dir=tmp_path / "run")
+    with ControlClient(config.control) as asker:
+        with pytest.raises(SagsError, match="no answer"):
+            asker.request("pause", timeout=0.2)
+        with Publisher(config, "sags", "session-1", handlers) as running:
+            with repeating(lambda _: running.poll(20)):
+                assert asker.request("ping", timeout=60) == "pong"
+            with pytest.raises(SagsError, match="no answer"):
+                asker.request("pause", timeout=0.2)
+            with repeating(lambda _: running.poll(20)):
+                assert asker.request("ping", timeout=60) == "pong"
+                with pytest.raises(SagsError, match="no answer"):
+                    asker.request("reset_model", timeout=0.2)
+                until(posted[0].cancelled)
+                waiting.serve()
+    assert done == []
 
 
 def test_silence_is_an_error() -> None:

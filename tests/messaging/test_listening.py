@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
+from independent_client import zmq_socket
 from synthetic import health, publisher, stream
 from waiting import until
 
@@ -49,6 +51,43 @@ def test_a_damaged_connection_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "sags.json").write_bytes(b"{" * 100_000)
     with pytest.raises(SagsError, match="damaged"):
         read_connection("sags", tmp_path)
+
+
+@pytest.mark.fault("run directory: somebody else may have written the connection file")
+def test_a_connection_file_of_somebody_else_is_not_believed(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    with publisher(run_dir) as running:
+        for path, wrong, right in ((run_dir, 0o720, 0o700), (run_dir / "sags.json", 0o602, 0o600)):
+            path.chmod(wrong)
+            with pytest.raises(UsageError, match=f"chmod go-w {path}"):
+                read_connection("sags", run_dir)
+            path.chmod(right)
+        (tmp_path / "link").symlink_to(run_dir)
+        with pytest.raises(UsageError, match="not yours alone"):
+            read_connection("sags", tmp_path / "link")
+        if os.getuid() == 0:
+            os.chown(run_dir, 65534, -1)
+            with pytest.raises(UsageError, match="not yours alone"):
+                read_connection("sags", run_dir)
+            os.chown(run_dir, 0, -1)
+        assert read_connection("sags", run_dir) == running.connection
+
+
+@pytest.mark.fault("socket: one subscriber asks for more views than are noted")
+def test_one_subscriber_takes_no_view_from_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publishing, "MAX_PREFIXES", 4)
+    with publisher(tmp_path / "run") as running, ExitStack() as stay:
+        endpoint = running.connection.data[-1]
+        with zmq_socket(zmq.SUB, endpoint) as greedy:
+            for number in range(5):
+                greedy.subscribe(f"sags/view/{number}")
+            until(lambda: running.poll(10) or running.watches_view("4"))
+            other = stay.enter_context(zmq_socket(zmq.SUB, endpoint))
+            other.subscribe("sags/view/surgeon/image")
+            until(lambda: running.poll(10) or running.connections["data"]["open"] == 2)
+        until(lambda: running.poll(10) or running.connections["data"]["open"] == 1)
+        assert running.watches_view("surgeon") and running.wanted("view/surgeon/image")
+        assert not running.wanted("left/depth")
 
 
 @pytest.mark.parametrize(

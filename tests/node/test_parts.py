@@ -9,11 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from synthetic import plane_result
 
+from sags_node.confidence import SURE
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
+from sags_node.files import whole
 from sags_node.messaging import cdr, content, topics
 from sags_node.model.ply import write_ply
 from sags_node.node import health as health_module
@@ -179,8 +182,8 @@ def test_the_latency_is_told_while_the_health_is_being_counted(monkeypatch: pyte
 # ---- `save_model`: the disk is written by a thread that nobody waits for -------------------------------
 
 
-def operations(newest: FrameResult | None) -> Operations:
-    pipeline = SimpleNamespace(newest=newest, mapper=None)
+def operations(newest: FrameResult | None, metric: bool = True) -> Operations:
+    pipeline = SimpleNamespace(newest=newest, mapper=None, metric=metric)
     return Operations(NodeState(LaunchConfig(), pipeline, None, None), lambda *_: None)  # type: ignore[arg-type]
 
 
@@ -188,9 +191,9 @@ def operations(newest: FrameResult | None) -> Operations:
 def test_a_disk_that_hangs_keeps_no_frame_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     goes_on = threading.Event()
 
-    def write(file: Path, gaussians: Gaussians) -> None:
+    def write(file: Path, gaussians: Gaussians, metric: bool) -> None:
         assert goes_on.wait(30)
-        write_ply(file, gaussians)
+        write_ply(file, gaussians, metric=metric)
 
     monkeypatch.setattr(node_operations, "write_ply", write)
     asked = operations(plane_result())
@@ -207,6 +210,21 @@ def test_a_disk_that_hangs_keeps_no_frame_waiting(tmp_path: Path, monkeypatch: p
     assert file.stat().st_size > 0
     with pytest.raises(SagsError, match="exists already"):
         asked.handlers()["save_model"]({"path": str(file)}).result(30)
+    with pytest.raises(SagsError, match="File exists"), whole(tmp_path / "other", new=True) as late:
+        late.touch()  # and meanwhile somebody else is quicker
+        (tmp_path / "other").write_text("somebody else's work")
+    assert (tmp_path / "other").read_text() == "somebody else's work"
+
+
+def test_a_model_without_a_calibration_says_so_and_is_nowhere_sure(tmp_path: Path) -> None:
+    most = {}
+    for metric in (True, False):
+        file = tmp_path / f"{metric}.ply"
+        operations(plane_result(), metric).handlers()["save_model"]({"path": str(file)}).result(30)
+        head, body = file.read_bytes().split(b"end_header\n")
+        assert (b"comment units relative" in head) == (not metric)
+        most[metric] = np.frombuffer(body, "<f4").reshape(-1, head.count(b"property"))[:, -1].max()
+    assert most[True] > SURE > most[False]
 
 
 def test_before_the_first_frame_there_is_nothing_to_save(tmp_path: Path) -> None:

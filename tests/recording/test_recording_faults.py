@@ -10,26 +10,31 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import msgspec
+import numpy as np
 import pytest
 import zmq
 from independent_client import zmq_socket
 from made_messages import message_of
 from recorded_plane import by_topic, recording
-from synthetic import HEIGHT, WIDTH, at_frame, plane_result, publisher, stream
+from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher, stream
 from waiting import until
 
 from sags_node.cli.bag_text import recorded_table
+from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.findings import by_stage
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.cdr import Content
+from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, encode
 from sags_node.recording import recorder as recorder_module
 from sags_node.recording.backlog import Arrived, Backlog
 from sags_node.recording.bag_writer import BagWriter
 from sags_node.recording.info import bag_info
+from sags_node.recording.player import Player, PlayOptions
 from sags_node.recording.recorder import Recorder, RecordOptions
+from sags_node.recording.recover import recover
 from sags_node.recording.state import LOW_SECONDS, SILENT_SECONDS, findings
 
 pytestmark = pytest.mark.live
@@ -65,8 +70,8 @@ def test_what_cannot_be_written_ends_nothing_in_silence(
     """A damaged message is left out and counted. A bug, and no memory, end the recording with an error."""
     endpoint = f"ipc://{tmp_path / 'data'}"
     options = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))
-    if error is not None:
-        monkeypatch.setattr(BagWriter, "attach", Mock(side_effect=error))
+    attach = Mock(side_effect=error)
+    monkeypatch.setattr(BagWriter, "attach", attach)
     name, kind = ("left/camera_info", topics.CAMERA_INFO) if error is None else ("parameters", topics.STRING)
     body = Content(kind, (b"\0\1\0\0" + bytes(5),)) if error is None else cdr.string("{}")
     with (
@@ -78,10 +83,38 @@ def test_what_cannot_be_written_ends_nothing_in_silence(
         socket.send_multipart(encode(message_of(name, body, 1, 1, frame_id=1)))
         for seq in range(1, 9):
             socket.send_multipart(encode(text_message(seq)))
-        until(lambda: recorder.summary()["messages"] == 8 or error)
+        until(lambda: attach.called or recorder.summary()["messages"] == 8)
     if error is None:
         assert said[-1]["messages"] == 8 and said[-1]["rejected"] == 1
         assert bag_info(tmp_path / "bag")["messages"] == 8
+
+
+def test_lengths_without_a_unit_stay_so_in_a_bag_and_when_it_is_played(tmp_path: Path) -> None:
+    """Beside those of a node that is calibrated by then."""
+    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
+    depth, info = cdr.image(np.ones((4, 4), np.float32), "32FC1", 1), cdr.camera_info(plane_camera(), 1)
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))) as (recorder, _):
+            socket.recv()
+            for seq, units in ((1, "relative"), (2, msgspec.UNSET)):
+                for name, body in (("left/depth", depth), ("left/camera_info", info)):
+                    socket.send_multipart(encode(message_of(name, body, seq, seq, units=units)))
+            until(lambda: recorder.summary()["messages"] == 4)
+    recover(tmp_path / "bag", tmp_path / "saved")
+    for folder in ("bag", "saved"):
+        found = by_topic(tmp_path / folder)
+        assert [message.relative for message in found["left/depth"]] == [True, False]
+        K = [cdr.decode(m.data, m.type).k.any() for m in found["left/camera_info"]]
+        assert K == [False, True]
+    config = PublishConfig(data=(), control=None, run_dir=run_dir)
+    player = Player(tmp_path / "bag", PlayOptions(loop=True), config)
+    thread = threading.Thread(target=player.play)
+    thread.start()
+    until((run_dir / "sags.json").exists)
+    with Subscriber(["left/depth"], run_dir=run_dir) as subscriber:
+        until(lambda: (got := subscriber.wait("left/depth", 1)) is not None and not got.metric)
+    player.stop()
+    thread.join(60)
 
 
 def test_what_a_person_should_know_of_a_recording() -> None:
