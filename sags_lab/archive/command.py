@@ -20,6 +20,7 @@ from sags_node.cli.launching import (
     check_files,
     figures_option,
     force_option,
+    from_zero,
     launch_argument,
     positive,
     split_recording,
@@ -64,7 +65,7 @@ def archive() -> None:
 )
 @click.option(
     "--warm-up",
-    type=click.FloatRange(0),
+    type=from_zero,
     default=2.0,
     show_default=True,
     metavar="SECONDS",

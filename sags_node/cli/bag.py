@@ -17,6 +17,7 @@ from rich.markup import escape
 from sags_node.cli import bag_text as say
 from sags_node.cli.launching import (
     as_json,
+    from_zero,
     launch_argument,
     open_launched,
     played_instead,
@@ -80,7 +81,7 @@ def bag() -> None:
 @click.option(
     "-d",
     "--max-bag-duration",
-    type=click.FloatRange(0),
+    type=from_zero,
     default=0.0,
     show_default=True,
     metavar="SECONDS",
@@ -221,7 +222,7 @@ def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
 @recording
 @click.option("-r", "--rate", type=positive, default=1.0, show_default=True, help="Times as fast.")
 @click.option("-l", "--loop", is_flag=True, help="Begin anew at the end.")
-@click.option("-d", "--delay", type=click.FloatRange(0), default=0.0, help="Seconds to wait before.")
+@click.option("-d", "--delay", type=from_zero, default=0.0, help="Seconds to wait before.")
 @click.option(
     "--clock",
     "clock_hz",
@@ -232,7 +233,7 @@ def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
     help="Publish the recording's time on the topic clock, so often; without a number 40 Hz.",
 )
 @click.option("-p", "--start-paused", is_flag=True, help="Wait for the first Enter.")
-@click.option("--start-offset", type=click.FloatRange(0), default=0.0, help="Seconds to leave out.")
+@click.option("--start-offset", type=from_zero, default=0.0, help="Seconds to leave out.")
 @click.option("--playback-duration", type=positive, help="Seconds of the recording to play.")
 @click.option("--topics", multiple=True, metavar="NAME", help="Play only this; may be repeated.")
 @click.option("-x", "--exclude", multiple=True, metavar="NAME", help="Do not play this; may be repeated.")

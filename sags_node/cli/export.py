@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import click
 
 from sags_node.cli.launching import (
+    Number,
     as_json,
     check_files,
     file_option,
     force_option,
+    from_zero,
     launch_argument,
     open_launched,
     played_instead,
@@ -34,7 +36,7 @@ NO_CAMERAS = "live cameras are exported from the running node; name no recording
 @click.command()
 @launch_argument
 @session_option
-@click.option("--at", type=click.FloatRange(min=0), help="Seconds into the session; default: its end.")
+@click.option("--at", type=from_zero, help="Seconds into the session; default: its end.")
 @click.option(
     "--fit",
     metavar="FOLDER",
@@ -70,7 +72,7 @@ NO_CAMERAS = "live cameras are exported from the running node; name no recording
 )
 @click.option(
     "--orbit-degrees",
-    type=click.FloatRange(0, 60),
+    type=Number(0, 60),
     default=12.0,
     show_default=True,
     help="How far the camera of the video tilts from where it was.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,19 @@ if TYPE_CHECKING:
     from sags_node.engine.device import Device
     from sags_node.pipeline.session import Session
 
-positive = click.FloatRange(min=0, min_open=True)
+
+class Number(click.FloatRange):
+    """A number of an option. What is no number is in no range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if math.isnan(number):
+            self.fail(f"{value} is not in the range {self._describe_range()}.", param, ctx)
+        return number
+
+
+positive = Number(0, 1_000_000, min_open=True)
+from_zero = Number(0, 1_000_000)
 
 launch_argument = click.argument(
     "launch", nargs=-1, metavar="[FOLDER | VIDEO | LAUNCH.yaml] [key:=value ...]"

@@ -100,6 +100,8 @@ def test_every_mistake_of_a_launch_file_is_named(tmp_path: Path) -> None:
         ["run", "--seconds", "0"],
         ["topic", "hz", "tf", "--seconds", "-1"],
         ["topic", "echo", "tf", "--count", "0"],
+        ["bag", "record", "--max-cache", "inf"],
+        ["bag", "play", "bag", "--start-offset", "nan"],
         ["eval", "--every", "0"],
         ["eval", "--hold-out", "-1"],
         ["eval", "--iterations", "-1"],
