@@ -160,25 +160,11 @@ def test_every_number_has_a_lower_and_an_upper_limit() -> None:
     assert endless == []
 
 
-@pytest.mark.parametrize("number", [".inf", "-.inf", ".nan", "1e300", "1e-300"])
-@pytest.mark.parametrize(
-    "key",
-    [
-        "source.start",
-        "source.rate",
-        "vision.stereo.max_depth",
-        "vision.stereo.min_depth",
-        "mapping.budget_ms",
-    ],
-)
-def test_a_number_beyond_its_limits_is_told(key: str, number: str) -> None:
-    if number == "1e-300" and key in ("source.start", "mapping.budget_ms"):
-        assert load_launch(None, [f"{key}:=1.0e-300"])  # little, not wrong
-    else:
+@pytest.mark.parametrize("number", [".inf", "-.inf", ".nan", "1.0e300"])
+def test_a_number_beyond_its_limits_is_told(number: str) -> None:
+    for key in ("source.start", "source.rate", "vision.stereo.max_depth", "mapping.budget_ms"):
         with pytest.raises(UsageError, match=re.escape(key)):
-            load_launch(None, [f"{key}:={number.replace('e', '.0e')}"])
-    with pytest.raises(UsageError, match="less than or equal to 1000"):
-        with_parameters(LaunchConfig(), {"mapping.budget_ms": 33000})
+            load_launch(None, [f"{key}:={number}"])
 
 
 def test_parameters_are_validated_like_a_file() -> None:
@@ -186,6 +172,8 @@ def test_parameters_are_validated_like_a_file() -> None:
     assert with_parameters(config, {"mapping.budget_ms": 20}).mapping.budget_ms == 20
     with pytest.raises(UsageError, match="budget_ms"):
         with_parameters(config, {"mapping.budget_ms": "soon"})
+    with pytest.raises(UsageError, match="less than or equal to 1000"):
+        with_parameters(config, {"mapping.budget_ms": 33000})
 
 
 # ---- the page of launch keys says what the configuration says ------------------------------------------
