@@ -8,7 +8,6 @@ from typing import Any
 from rich.table import Table
 
 from sags_node.errors import UsageError
-from sags_node.recording.state import SILENT_SECONDS
 from sags_node.terminal import text
 
 
@@ -32,6 +31,8 @@ def plain(name: str, ns: str) -> str:
 
 def recorded_table(summary: Mapping[str, Any]) -> Table:
     """What a recorder wrote and what it could not."""
+    from sags_node.recording.state import SILENT_SECONDS  # brings NumPy along, which --help does not need
+
     table = text.table("topic", "messages", "dropped", "lost")
     for name, row in summary["topics"].items():
         table.add_row(name, str(row["messages"]), str(row["dropped"]), str(row["lost"]))

@@ -156,9 +156,9 @@ def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
     folder = run_dir or default_run_dir()
     file = connection_path(folder, ns)
     try:
-        _check_ours(folder, folder.lstat())  # first: nobody else has put a pipe or a link there then
+        _check_ours(folder, folder.stat(), folder.lstat().st_uid)  # first: then no pipe of others is there
         with file.open("rb") as opened:
-            _check_ours(file, os.fstat(opened.fileno()))
+            _check_ours(file, info := os.fstat(opened.fileno()), info.st_uid)
             content = opened.read(MAX_CONNECTION_FILE_BYTES)
     except OSError:
         raise SagsError(f"no node runs as '{ns}' (no {file}); start one with: sags run") from None
@@ -168,10 +168,10 @@ def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
         raise SagsError(f"{file} is damaged; restart the node to write it again") from None
 
 
-def _check_ours(path: Path, info: os.stat_result) -> None:
+def _check_ours(path: Path, info: os.stat_result, linked_by: int) -> None:
     """Raises UsageError for what somebody else, but for root, may have written: anybody can make a folder in
-    /tmp, and say there that a node of his own is the one that is looked for."""
-    if info.st_uid not in (os.getuid(), 0) or info.st_mode & 0o022:  # as a link is, too
+    /tmp, or a link, and say there that a node of his own is the one that is looked for."""
+    if not {info.st_uid, linked_by} <= {os.getuid(), 0} or info.st_mode & 0o022:
         raise UsageError(
             f"{path} is not yours alone, so it is not believed where the node is; say it (--endpoint and "
             f"--control), or run: chmod go-w {path}, if it is yours"
