@@ -81,7 +81,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
                 node.stop()
         consumed = _finish_overlay(overlay)
         with whole(out / VIDEO) as partial:
-            video = H264File(partial, session.source.rate, session.working_size)
+            video = H264File(partial, session.source.rate, session.published_size)
             shown = Shown(video, read_layers(spool.folder / LAYERS))
             outcome = measure(
                 session, spool, _OPTIONS, (), lambda what, done: progress(done, frames, what), shown.add

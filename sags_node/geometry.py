@@ -95,6 +95,12 @@ def scale_intrinsics(K: F64, size: tuple[int, int], new_size: tuple[int, int]) -
     return scaled
 
 
+def scale_pixels(pixels: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
+    """Pixels [..., 2] of a picture resized from `size` to `new_size` (width, height), in the resized one."""
+    factors = np.array(new_size, np.float64) / size
+    return (pixels + 0.5) * factors - 0.5
+
+
 def disparity_to_depth(disparity: F32, focal_px: float, baseline: float) -> F32:
     """Depth (m) of a disparity picture (px); where disparity <= 0 the depth is 0, unknown."""
     return np.divide(

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -41,7 +41,7 @@ Side = Literal["left", "right"]
 # What is drawn small is learnt from means over small pixels. A mean differs from what is in the middle by
 # 1/24 of the second difference along each axis (Taylor). Measured: 0.15 to 0.3 dB for taking it out.
 MIDDLES = np.array([-1 / 24, 26 / 24, -1 / 24], np.float32)
-_ENLARGING = threading.Lock()  # one for all: it is held for less than 0.5 ms, and pictures stay copyable
+_ENLARGING = threading.Lock()  # one for all: it is held for a millisecond or two, and pictures stay copyable
 SH_DEGREE_0 = 0.5 / math.sqrt(math.pi)  # Y_00, the constant spherical harmonic: rgb = 0.5 + Y_00 f_dc
 
 
@@ -150,6 +150,14 @@ class GrayPyramid:
 
 
 @dataclass(frozen=True, slots=True)
+class Published:
+    """How a frame is seen from outside: in a size that no machine's speed changes (`messaging.published`)."""
+
+    camera: Camera  # left eye, at the world's origin
+    picture: Callable[[Side], U8]  # [H, W, 3] RGB, rectified; made when it is asked for, once
+
+
+@dataclass(frozen=True, slots=True)
 class RectifiedPair:
     """Row-aligned, undistorted pictures at the working size."""
 
@@ -160,6 +168,7 @@ class RectifiedPair:
     left: U8  # [H, W, 3] RGB
     right: U8 | None  # [H, W, 3] RGB; None where the session has no right eye
     gray: tuple[GrayPyramid, GrayPyramid | None] | None = None  # of both, where they are made already
+    published: Published | None = None  # None: in the size in which it is worked
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,30 +268,35 @@ class Colours:
         small: [h, w, 3] RGB.
     """
 
-    __slots__ = ("_size", "_whole", "small")
+    __slots__ = ("_made", "_size", "small")
 
     def __init__(self, small: U8, width: int | None = None, height: int | None = None) -> None:
-        """`width`, `height`: in which they are shown, px; None: as they are."""
+        """`width`, `height`: of the view that they are of, px; None: as they are."""
         self.small = small
         self._size = width or small.shape[1], height or small.shape[0]
-        self._whole: U8 | None = small if self._is_whole else None
+        self._made: dict[tuple[int, int], U8] = {(small.shape[1], small.shape[0]): small}
 
     @property
     def whole(self) -> U8:
-        """[H, W, 3] by cubic polynomials, which keep twice the sharpness of straight lines. Any thread may
-        ask."""
+        """[H, W, 3] in the size of the view, as `at`."""
+        return self.at(*self._size)
+
+    def at(self, width: int, height: int) -> U8:
+        """[height, width, 3] by cubic polynomials, which keep twice the sharpness of straight lines. Any
+        thread may ask."""
         import cv2  # a client that only reads these types need not load it
 
+        size = width, height
         with _ENLARGING:
-            if self._whole is None:
+            if size not in self._made:
                 middles = cv2.sepFilter2D(self.small, -1, MIDDLES, MIDDLES, borderType=cv2.BORDER_REPLICATE)
-                self._whole = np.asarray(cv2.resize(middles, self._size, interpolation=cv2.INTER_CUBIC))
-            return self._whole
+                self._made[size] = np.asarray(cv2.resize(middles, size, interpolation=cv2.INTER_CUBIC))
+            return self._made[size]
 
     def every(self, step: int) -> U8:
         """Every `step` th pixel of every `step` th row of the whole, less sharp where it was drawn small. It
         is the same whether somebody asked for the whole or not."""
-        if self._is_whole:
+        if self._size == self.small.shape[1::-1]:
             return self.small[::step, ::step]
         import cv2
 
@@ -293,10 +307,6 @@ class Colours:
         return np.asarray(
             cv2.warpAffine(self.small, places, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         )
-
-    @property
-    def _is_whole(self) -> bool:
-        return self._size == self.small.shape[1::-1]
 
 
 @dataclass(frozen=True, slots=True)

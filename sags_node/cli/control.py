@@ -55,8 +55,8 @@ def anchor() -> None:
 def pin(pixel: tuple[float, float], json_out: bool, node: NodeAddress) -> None:
     """Pin an anchor at pixel U V of the left picture.
 
-    Prints its number. The picture is the node's own, left/image_rect_color: its size is in left/camera_info.
-    A pixel without depth is refused.
+    Prints its number. The picture is left/image_rect_color. It has the calibration's size, or that of
+    vision.width and height in the launch file, on every machine. A pixel without depth is refused.
 
     \b
     sags anchor pin 320 256

@@ -127,8 +127,12 @@ def open_launched(path: str | None, overrides: Sequence[str], guess: bool = Fals
     with console.status("loading kernels (compiled once per machine, about half a minute)"):
         warm_up(session.config)
     session = at_best_scale(session)
-    width, height = session.working_size
-    console.print(f"{_runs_on(device_of(session.config))}, pictures of {width}x{height} px", soft_wrap=True)
+    (width, height), worked = session.published_size, session.working_size
+    console.print(
+        f"{_runs_on(device_of(session.config))}, pictures of {width}x{height} px"
+        + ("" if worked == (width, height) else f", worked at {worked[0]}x{worked[1]} px"),
+        soft_wrap=True,
+    )
     return session
 
 

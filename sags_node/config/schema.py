@@ -602,14 +602,14 @@ PoseWay = Literal["session", "fixed", "estimate", "refine"]
 
 
 class VisionConfig(Section):
-    """The pictures that are worked on, and where the camera is."""
+    """The pictures that are published and worked on, and where the camera is."""
 
     width: int | None = Field(
         None,
         ge=16,
         le=4096,
-        description="px; pictures are brought to this size; default: the calibration's, or what keeps its "
-        "proportions where vision.height is set",
+        description="px; all that is published and all pixels that are asked for are of this size; default: "
+        "the calibration's, or what keeps its proportions where vision.height is set",
     )
     height: int | None = Field(
         None,
@@ -619,8 +619,9 @@ class VisionConfig(Section):
     )
     scale: Literal["auto"] | Annotated[float, Ge(0.25), Le(1)] = Field(
         "auto",
-        description="share of that size that is worked at and published. auto: where frames come in "
-        "real time what shows most on this machine, from 1 down to 0.25; else 1",
+        description="share of that size that is worked at; it changes no pixel that is published or asked "
+        "for. auto: where frames come in real time what shows most on this machine, from 1 down to 0.25; "
+        "else 1",
     )
     stereo: StereoConfig = StereoConfig()
     onnx: OnnxConfig = OnnxConfig()
@@ -632,14 +633,20 @@ class VisionConfig(Section):
         "as session, and the pictures take out what it is slowly off by",
     )
 
-    def working_size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of the pictures that are worked on, for a camera of `width` x `height` px. Where
-        one is set, the other keeps the proportions. A scale that is still to be chosen counts as 1."""
+    def published_size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of the pictures that are published, for a camera of `width` x `height` px. Where
+        one is set, the other keeps the proportions."""
         if self.width is not None:
-            width, height = self.width, self.height or round(height * self.width / width)
-        elif self.height is not None:
-            width, height = round(width * self.height / height), self.height
+            return self.width, self.height or round(height * self.width / width)
+        if self.height is not None:
+            return round(width * self.height / height), self.height
+        return width, height
+
+    def working_size(self, width: int, height: int) -> tuple[int, int]:
+        """Of the pictures that are worked on, as `published_size`. A scale that is still to be chosen counts
+        as 1."""
         scale = 1.0 if self.scale == "auto" else self.scale
+        width, height = self.published_size(width, height)
         return round(scale * width), round(scale * height)
 
 

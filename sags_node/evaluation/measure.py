@@ -26,6 +26,7 @@ from sags_node.evaluation.views import between, extrapolated
 from sags_node.evaluation.warp import warp_to_right
 from sags_node.geometry import transform
 from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.messaging import published
 from sags_node.types import F32, F64, I64, U8, Bool, Camera, Gaussians, RectifiedPair, Reference, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
@@ -167,7 +168,7 @@ class Measurer:
             if frame.warm_up:
                 continue
             pair = self._rectifier(frame)
-            self._on_picture(frame.frame_id, pair.left)
+            self._on_picture(frame.frame_id, published.picture(pair, "left"))
             seconds = frame.t_capture_ns * 1e-9
             place = self._places.get(frame.frame_id)
             if place is not None:

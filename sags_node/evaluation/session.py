@@ -126,7 +126,7 @@ def measure(
     """Measure a finished run against the recording it was played from, which is read once more.
 
     Args:
-        on_picture: called with each frame's number and its rectified left picture.
+        on_picture: called with each frame's number and its rectified left picture, as it is published.
 
     Raises:
         SagsError: nothing was processed, or the recording cannot be read again.
@@ -197,7 +197,7 @@ def _measured(
 ) -> Measurer:  # fmt: skip
     """Read the recording again, with its truth, and measure every frame."""
     config = session.config
-    rectifier = Rectifier(session.rig, *session.working_size)
+    rectifier = Rectifier(session.rig, *session.working_size, session.published_size)
     tissue = TissueMask(config.vision.tissue, rectifier)
     exclude = config.vision.tissue.exclude
     backend = backend_of(config)

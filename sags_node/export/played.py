@@ -15,6 +15,7 @@ from sags_node.export.scene import Advance
 from sags_node.files import check_folder, whole, writing
 from sags_node.kernels.threads import configure_threads
 from sags_node.media.video_file import VideoFile
+from sags_node.messaging import published
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.types import F32, AnchorStates, FrameResult
@@ -64,7 +65,7 @@ def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance)
         products = {}
         for kind, path in wanted.items():
             with writing(path):
-                products[kind] = KINDS[kind].make(partial[kind], session.source.rate, session.working_size)
+                products[kind] = KINDS[kind].make(partial[kind], session.source.rate, session.published_size)
         for done, (result, anchors) in enumerate(_played(session), 1):
             for kind, product in products.items():
                 with writing(wanted[kind]):
@@ -116,9 +117,9 @@ def _pin(pipeline: Pipeline, result: FrameResult) -> None:
 
 
 def depth_of(result: FrameResult) -> F32:
-    """The model's depth [H, W], m; 0 where it is not known, and everywhere in a frame that was not taken in:
-    the model is that of an older one."""
-    depth = result.views["left"].depth
+    """The model's depth [H, W], m, as published; 0 where it is not known, and everywhere in a frame that was
+    not taken in: the model is that of an older one."""
+    depth = published.nearest(result.pair, result.views["left"].depth)
     return np.zeros_like(depth) if result.held else depth
 
 
@@ -182,8 +183,9 @@ class Renders:
         self._holds = 0
 
     def add(self, result: FrameResult, anchors: AnchorStates) -> None:
-        view = result.views["left"]
-        self._video.add(view.rgb * (view.alpha[..., None] > 0) * np.uint8(not result.held))
+        pair, view = result.pair, result.views["left"]
+        shown = published.alpha(pair, view)[..., None] > 0
+        self._video.add(published.colours(pair, view) * shown * np.uint8(not result.held))
         self._holds += 1
 
     def finish(self) -> int:

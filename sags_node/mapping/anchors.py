@@ -15,7 +15,7 @@ import numpy as np
 
 from sags_node.confidence import confidence_of
 from sags_node.errors import SagsError
-from sags_node.geometry import project, unproject
+from sags_node.geometry import project, scale_pixels, unproject
 from sags_node.mapping.motion import BEHIND_TOLERANCE
 from sags_node.mapping.recall import Place, Recall, fits_depth, straightened
 from sags_node.model.forecast import points_ahead, reached
@@ -114,18 +114,29 @@ class Anchors:
         return len(self._table.ids)
 
     def add_pixel(
-        self, u: float, v: float, observation: Observation, snapshot: Snapshot, view: RenderedView
+        self,
+        u: float,
+        v: float,
+        observation: Observation,
+        snapshot: Snapshot,
+        view: RenderedView,
+        size: tuple[int, int] | None = None,
     ) -> int:
         """Pin the tissue seen at a pixel (u, v) of the left picture; returns the anchor's id.
+
+        Args:
+            size: width and height of the picture that (u, v) is a pixel of; default: the observation's.
 
         Raises:
             SagsError: the pixel is outside the picture, excluded, on an instrument or without depth, or there
                 are too many anchors.
         """
-        height, width = observation.tissue.shape
+        working = observation.tissue.shape[1], observation.tissue.shape[0]
+        width, height = size or working
         if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
             raise SagsError(f"pixel ({u:g}, {v:g}) is outside the left picture of {width}x{height} px")
-        row, column = round(v), round(u)
+        pixel = scale_pixels(np.array([u, v], np.float64), (width, height), working)
+        column, row = np.clip(np.rint(pixel), 0, np.subtract(working, 1)).astype(int).tolist()
         if not observation.tissue[row, column]:
             why = "shows an instrument, or what lies on a lens"
             if self._usable is not None and not self._usable[row, column]:
@@ -137,7 +148,7 @@ class Anchors:
                 f"there is no depth at pixel ({u:g}, {v:g}) in this frame, or only one borrowed from afar; "
                 "choose another"
             )
-        point = unproject(observation.camera, np.array([u, v], np.float64), np.array(depth))
+        point = unproject(observation.camera, pixel, np.array(depth))
         return self.add_point(np.asarray(point), observation, snapshot, view)
 
     def add_point(self, point: F64, observation: Observation, snapshot: Snapshot, view: RenderedView) -> int:

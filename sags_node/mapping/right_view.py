@@ -12,7 +12,7 @@ nor from the right one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.model.gaussians import GaussianModel, for_right_eye
-from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, Observation, RenderedView
+from sags_node.types import F32, F64, U8, Bool, Camera, Colours, Gaussians, Observation, RenderedView
 
 LEARNING = 0.5  # of what a Gaussian lacks in the right eye, taken in from every other frame
 FADING = 0.94  # in two frames, of what was not seen again: a highlight of a second ago lies elsewhere by now
@@ -88,6 +88,7 @@ class RightView:
         camera = snapshot.camera.moved_right(observation.baseline)
         planes = show(for_right_eye(snapshot.gaussians, snapshot), camera)
         view = to_view(planes, camera, left.frame_id, left.t_capture_ns)
+        view = replace(view, colours=Colours(view.rgb))  # detail is added to it: larger ones are made of that
         height, width = view.depth.shape
         brought = np.zeros((-(-height // EVERY), -(-width // EVERY), 3), f4)
         if learn:

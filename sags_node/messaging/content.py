@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sags_node.confidence import confidence_of, error_of
 from sags_node.findings import UNHEALTHY, by_code, in_words
 from sags_node.geometry import project
-from sags_node.messaging import cdr
+from sags_node.messaging import cdr, published
 from sags_node.messaging.cdr import Content, Status
 from sags_node.types import (
     F32,
@@ -26,7 +26,7 @@ from sags_node.types import (
     Gaussians,
     NodeHealth,
     RectifiedPair,
-    RenderedView,
+    Side,
 )
 
 SLOPE_FIELDS = ("slope_0", "slope_1", "slope_2")
@@ -97,7 +97,7 @@ def points(result: FrameResult) -> Content:
 
 def anchors(result: FrameResult) -> Content:
     """The points pinned to the tissue, as rows of `ANCHOR_FIELDS`; the position of a lost one is NaN."""
-    states = result.anchors
+    states = published.anchors(result.pair, result.anchors)
     rows = np.empty((len(states), len(ANCHOR_FIELDS)), np.float32)
     rows[:, 0:3] = states.points
     rows.view(np.uint32)[:, 3] = states.ids.astype(np.uint32)
@@ -128,7 +128,7 @@ def view(name: str, drawn: DrawnView) -> dict[str, Content]:
         frame = f"{topic[:-1].replace('/', '_')}_optical_frame"
         stamp_ns, baseline = picture.t_capture_ns, drawn.baseline if eye == "right" else 0.0
         said[f"{topic}camera_info"] = cdr.camera_info(picture.camera, stamp_ns, frame, baseline)
-        said[f"{topic}image"] = cdr.image(_rgba(picture), "rgba8", stamp_ns, frame)
+        said[f"{topic}image"] = cdr.image(_rgba(picture.rgb, picture.alpha), "rgba8", stamp_ns, frame)
         if drawn.depth:
             said[f"{topic}depth"] = cdr.image(_depth(picture.depth), "32FC1", stamp_ns, frame)
             if picture.confidence is not None:
@@ -151,11 +151,17 @@ def _visible(result: FrameResult) -> Bool:
     return visible
 
 
-def _rgba(picture: RenderedView) -> U8:
+def _rgba(rgb: U8, coverage: F32) -> U8:
     """Straight-alpha picture [H, W, 4] of a rendered view."""
-    rgba = cv2.cvtColor(picture.rgb, cv2.COLOR_RGB2RGBA)
-    alpha = cv2.convertScaleAbs(picture.alpha, alpha=255.0)  # scales, rounds and saturates in one pass
+    rgba = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
+    alpha = cv2.convertScaleAbs(coverage, alpha=255.0)  # scales, rounds and saturates in one pass
     return np.asarray(cv2.insertChannel(alpha, rgba, 3), np.uint8)
+
+
+def _drawn(result: FrameResult, side: Side) -> Content:
+    pair, view = result.pair, result.views[side]
+    rgba = _rgba(published.colours(pair, view), published.alpha(pair, view))
+    return cdr.image(rgba, "rgba8", pair.t_capture_ns, cdr.LEFT_FRAME if side == "left" else cdr.RIGHT_FRAME)
 
 
 def _confidence(gaussians: Gaussians) -> F32:
@@ -168,7 +174,7 @@ def _confidence(gaussians: Gaussians) -> F32:
 def _depth_confidence(result: FrameResult) -> Content:
     confidence = result.views["left"].confidence
     assert confidence is not None  # else it is not published
-    return cdr.image(confidence, "32FC1", result.pair.t_capture_ns)
+    return cdr.image(published.nearest(result.pair, confidence), "32FC1", result.pair.t_capture_ns)
 
 
 def _depth(depth: F32) -> F32:
@@ -176,36 +182,41 @@ def _depth(depth: F32) -> F32:
     return np.where(depth > 0, depth, np.float32(np.nan))
 
 
+def _depth_image(pair: RectifiedPair, depth: F32) -> Content:
+    return cdr.image(_depth(published.nearest(pair, depth)), "32FC1", pair.t_capture_ns)
+
+
+def _mask(result: FrameResult) -> Content:
+    tissue = published.nearest(result.pair, result.observation.tissue)
+    return cdr.image(tissue.view(np.uint8) * np.uint8(255), "mono8", result.pair.t_capture_ns)
+
+
 def left_image(pair: RectifiedPair) -> Content:
     """The rectified left picture."""
-    return cdr.image(pair.left, "rgb8", pair.t_capture_ns)
+    return cdr.image(published.picture(pair, "left"), "rgb8", pair.t_capture_ns)
 
 
 def _right_image(result: FrameResult) -> Content:
-    assert result.pair.right is not None  # else it is not published
-    return cdr.image(result.pair.right, "rgb8", result.pair.t_capture_ns, cdr.RIGHT_FRAME)
+    pair = result.pair
+    return cdr.image(published.picture(pair, "right"), "rgb8", pair.t_capture_ns, cdr.RIGHT_FRAME)
 
 
 def _right_camera_info(result: FrameResult) -> Content:
     pair = result.pair
-    return cdr.camera_info(pair.camera, pair.t_capture_ns, cdr.RIGHT_FRAME, pair.baseline)
+    return cdr.camera_info(published.camera_of(pair), pair.t_capture_ns, cdr.RIGHT_FRAME, pair.baseline)
 
 
 FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
     "left/image_rect_color": lambda r: left_image(r.pair),
     "right/image_rect_color": _right_image,
-    "left/camera_info": lambda r: cdr.camera_info(r.pair.camera, r.pair.t_capture_ns),
+    "left/camera_info": lambda r: cdr.camera_info(published.camera_of(r.pair), r.pair.t_capture_ns),
     "right/camera_info": _right_camera_info,
-    "left/render/image": lambda r: cdr.image(_rgba(r.views["left"]), "rgba8", r.pair.t_capture_ns),
-    "right/render/image": lambda r: cdr.image(
-        _rgba(r.views["right"]), "rgba8", r.pair.t_capture_ns, cdr.RIGHT_FRAME
-    ),
-    "left/render/depth": lambda r: cdr.image(_depth(r.views["left"].depth), "32FC1", r.pair.t_capture_ns),
+    "left/render/image": lambda r: _drawn(r, "left"),
+    "right/render/image": lambda r: _drawn(r, "right"),
+    "left/render/depth": lambda r: _depth_image(r.pair, r.views["left"].depth),
     "left/render/depth_confidence": _depth_confidence,
-    "left/depth": lambda r: cdr.image(_depth(r.observation.depth), "32FC1", r.pair.t_capture_ns),
-    "left/tissue_mask": lambda r: cdr.image(
-        r.observation.tissue.view(np.uint8) * np.uint8(255), "mono8", r.pair.t_capture_ns
-    ),
+    "left/depth": lambda r: _depth_image(r.pair, r.observation.depth),
+    "left/tissue_mask": _mask,
     "points": points,
     "splats": splats,
     "anchors": anchors,

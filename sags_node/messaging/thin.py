@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from sags_node.errors import SagsError
 from sags_node.media.picture_file import PNG
 from sags_node.media.picture_file import decode as decode_file
-from sags_node.messaging import cdr
+from sags_node.messaging import cdr, published
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.content import tells_of
 from sags_node.messaging.topics import ThinPicture
 from sags_node.messaging.wire import Buffer, WireError
-from sags_node.types import F32, U8, FrameResult, RenderedView
+from sags_node.types import F32, U8, FrameResult, Side
 
 DEPTH_STEP = 5e-5  # m: 25 um at most beside the depth, far below what any depth here is sure to; up to 3.2 m
 CONFIDENCE_STEP = 1 / 255
@@ -40,7 +40,7 @@ def thin_pictures(
     Args:
         logged: topics whose failure was logged; those that fail now are added.
     """
-    height, width = result.pair.left.shape[:2]
+    width, height = published.size_of(result.pair)
     logged = set() if logged is None else logged
     made: dict[str, Content] = {}
     for name, thin in asked.items():
@@ -67,7 +67,7 @@ def _thin(
     if thin.form == "jpeg":
         encoding, picture = "rgb8", _averaged(_colour(result, thin.topic, part), thin.every)
     elif thin.form == "alpha":
-        picture = _averaged(_alpha(_view(result, thin.topic), part), thin.every)
+        picture = _averaged(_alpha(result, thin.topic, part), thin.every)
     else:
         scale, encoding, picture = _numbers(result, thin.topic, part, np.s_[:: thin.every, :: thin.every])
     is_jpeg = thin.form == "jpeg"
@@ -79,24 +79,23 @@ def _thin(
     return cdr.thin_picture(file, kind, encoding, result.pair.t_capture_ns, frame, scale, window)
 
 
-def _view(result: FrameResult, topic: str) -> RenderedView:
-    return result.views[topic.partition("/")[0]]
-
-
 def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
     """[H, W, 3]; what was drawn lies over black."""
-    if topic == "left/image_rect_color":
-        return result.pair.left[part]
-    if topic == "right/image_rect_color":
-        assert result.pair.right is not None  # else it is not published
-        return result.pair.right[part]
-    view = _view(result, topic)
-    over_black: U8 = cv2.multiply(view.rgb[part], cv2.merge([_alpha(view, part)] * 3), scale=1 / 255)
+    side, pair = _side(topic), result.pair
+    if topic.endswith("image_rect_color"):
+        return published.picture(pair, side)[part]
+    colours, coverage = published.colours(pair, result.views[side])[part], _alpha(result, topic, part)
+    over_black: U8 = cv2.multiply(colours, cv2.merge([coverage] * 3), scale=1 / 255)
     return over_black
 
 
-def _alpha(view: RenderedView, part: tuple[slice, slice]) -> U8:
-    alpha: U8 = cv2.convertScaleAbs(view.alpha[part], alpha=255.0)
+def _side(topic: str) -> Side:
+    return "left" if topic.startswith("left/") else "right"
+
+
+def _alpha(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
+    whole = published.alpha(result.pair, result.views[_side(topic)])
+    alpha: U8 = cv2.convertScaleAbs(whole[part], alpha=255.0)
     return alpha
 
 
@@ -105,14 +104,16 @@ def _numbers(
 ) -> tuple[float, str, NDArray[Any]]:
     """What must not be averaged: its scale (0: none), its encoding, and itself."""
     if topic == "left/tissue_mask":
-        return 0.0, "mono8", result.observation.tissue[part][few].view(np.uint8) * np.uint8(255)
+        tissue = published.nearest(result.pair, result.observation.tissue)
+        return 0.0, "mono8", tissue[part][few].view(np.uint8) * np.uint8(255)
     view = result.views["left"]
     if topic == "left/render/depth_confidence":
         assert view.confidence is not None  # else it is not published
-        steps = cv2.convertScaleAbs(view.confidence[part][few], alpha=1 / CONFIDENCE_STEP)
+        confidence = published.nearest(result.pair, view.confidence)
+        steps = cv2.convertScaleAbs(confidence[part][few], alpha=1 / CONFIDENCE_STEP)
         return CONFIDENCE_STEP, "mono8", steps
     depth = view.depth if topic == "left/render/depth" else result.observation.depth
-    return DEPTH_STEP, "16UC1", _in_steps(depth[part][few])
+    return DEPTH_STEP, "16UC1", _in_steps(published.nearest(result.pair, depth)[part][few])
 
 
 def _averaged(picture: U8, every: int) -> U8:

@@ -16,7 +16,7 @@ from sags_node.config.launch_file import with_parameters
 from sags_node.config.schema import LIVE_PARAMETERS, REMOVED, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import Budget
-from sags_node.messaging import content
+from sags_node.messaging import content, published
 from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
 from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
@@ -114,7 +114,8 @@ class Operations:
             raise SagsError("there is no model yet; wait for the first frame")
         frame = newest.observation, newest.snapshot, newest.views["left"]
         if request.u is not None and request.v is not None:
-            anchor = self._state.pipeline.anchors.add_pixel(request.u, request.v, *frame)
+            size = published.size_of(newest.pair)
+            anchor = self._state.pipeline.anchors.add_pixel(request.u, request.v, *frame, size)
         else:
             point = np.array([request.x, request.y, request.z], np.float64)
             anchor = self._state.pipeline.anchors.add_point(point, *frame)

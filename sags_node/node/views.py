@@ -20,6 +20,7 @@ from sags_node.engine.rasterizer.confidence import with_confidence
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.geometry import scale_intrinsics
+from sags_node.messaging import published
 from sags_node.messaging.requests import ViewRequest
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.model.gaussians import for_right_eye
@@ -153,7 +154,8 @@ class Views:
         request = view.request
         started = self._processor_clock()
         snapshot = scene.snapshot
-        camera = view_camera(request, snapshot.camera)
+        left = replace(published.camera_of(scene.pair), T_world_cam=snapshot.camera.T_world_cam)
+        camera = view_camera(request, left)
         eyes = {"": camera}
         if request.stereo:
             eyes = {"left": camera, "right": camera.moved_right(scene.pair.baseline)}
@@ -226,14 +228,14 @@ class Views:
 def _published(scene: FrameResult, camera: Camera) -> RenderedView | None:
     """The right eye as the node shows it, where that is this camera's; its depth may be written."""
     shown = scene.views.get("right")
-    if shown is None or (shown.camera.width, shown.camera.height) != (camera.width, camera.height):
+    if shown is None or published.size_of(scene.pair) != (camera.width, camera.height):
         return None
     if not (
-        np.array_equal(shown.camera.K, camera.K)
+        np.array_equal(published.camera_of(scene.pair).K, camera.K)
         and np.array_equal(shown.camera.T_world_cam, camera.T_world_cam)
     ):
         return None
-    return replace(shown, depth=shown.depth.copy())
+    return published.view(scene.pair, shown)
 
 
 def view_camera(request: ViewRequest, left: Camera) -> Camera:

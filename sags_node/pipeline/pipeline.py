@@ -97,8 +97,9 @@ class Pipeline:
         self.metric = rig.metric
         self._skips = skips
         vision = config.vision
-        width, height = vision.working_size(rig.left.width, rig.left.height)
-        self.rectifier = Rectifier(rig, width, height)
+        raw_size = rig.left.width, rig.left.height
+        width, height = vision.working_size(*raw_size)
+        self.rectifier = Rectifier(rig, width, height, vision.published_size(*raw_size))
         self.tissue = TissueMask(vision.tissue, self.rectifier, masks)
         self._on_rectified = on_rectified
         self.depth = DepthChoice(vision, self.rectifier)

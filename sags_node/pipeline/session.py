@@ -46,6 +46,11 @@ class Session:
         """Width and height of the pictures that the mapper works on, px."""
         return self.config.vision.working_size(self.rig.left.width, self.rig.left.height)
 
+    @property
+    def published_size(self) -> tuple[int, int]:
+        """Width and height of the pictures that consumers get, px."""
+        return self.config.vision.published_size(self.rig.left.width, self.rig.left.height)
+
 
 def open_session(
     launch: Path | str | None,

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
 from sags_node import geometry
 from sags_node.errors import SagsError, UsageError
 from sags_node.rig import rectified_camera
-from sags_node.types import F32, F64, U8, Bool, Camera, Eye, RectifiedPair, StereoFrame, StereoRig
+from sags_node.types import (
+    F32,
+    F64,
+    U8,
+    Bool,
+    Camera,
+    Eye,
+    Published,
+    RectifiedPair,
+    Side,
+    StereoFrame,
+    StereoRig,
+)
 from sags_node.vision.pyramid import gray_pyramid
 
 
@@ -74,7 +88,10 @@ class Rectifier:
         raw_size: width and height of the pictures it takes, px.
     """
 
-    def __init__(self, rig: StereoRig, width: int, height: int) -> None:
+    def __init__(
+        self, rig: StereoRig, width: int, height: int, published: tuple[int, int] | None = None
+    ) -> None:
+        """`published`: width and height in which frames are published; default: those they are worked in."""
         self.camera = rectified_camera(rig, width, height)
         self.baseline = rig.baseline
         self._size = width, height
@@ -82,6 +99,7 @@ class Rectifier:
         K_rectified = rig.left.P[:, :3]
         self._left = _EyeMap(rig.left, K_rectified, self.camera)
         self._right = _EyeMap(rig.right, K_rectified, self.camera)
+        self._published = None if published in (None, self._size) else Rectifier(rig, *published)
 
     def __call__(self, frame: StereoFrame) -> RectifiedPair:
         """Rectify one frame, and make its gray pictures; the camera takes the frame's pose, or stays at the
@@ -112,7 +130,20 @@ class Rectifier:
             left=left,
             right=right,
             gray=(gray_pyramid(left), None if right is None else gray_pyramid(right)),
+            published=None if self._published is None else self._published.later(frame),
         )
+
+    def later(self, frame: StereoFrame) -> Published:
+        """One frame to be rectified by who asks for a picture of it."""
+
+        @cache
+        def picture(side: Side) -> U8:
+            if side == "left":
+                return self._left.image(frame.left)
+            assert frame.right is not None  # else nobody asks
+            return self._right.image(frame.right)
+
+        return Published(self.camera, picture)
 
     def mask(self, mask: Bool) -> Bool:
         """A mask of the raw left picture, rectified at the working size; False outside the raw picture.

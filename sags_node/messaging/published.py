@@ -1,0 +1,85 @@
+"""What is seen of a frame from outside has one size on every machine, whatever size it is worked at.
+
+Here, and nowhere else, what was worked out becomes what is published. Depths, confidences and masks are those
+of the nearest working pixel: a mean across an edge is a surface that does not exist.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from sags_node.geometry import scale_pixels
+from sags_node.types import F32, U8, AnchorStates, Bool, Camera, Colours, RectifiedPair, RenderedView, Side
+
+Plane = TypeVar("Plane", F32, Bool)
+
+
+def size_of(pair: RectifiedPair) -> tuple[int, int]:
+    """Width and height of all that is published of a frame, px."""
+    camera = camera_of(pair)
+    return camera.width, camera.height
+
+
+def camera_of(pair: RectifiedPair) -> Camera:
+    """The left eye, as it is published."""
+    if pair.published is None:
+        return pair.camera
+    return replace(pair.published.camera, T_world_cam=pair.camera.T_world_cam)
+
+
+def picture(pair: RectifiedPair, side: Side) -> U8:
+    """The rectified picture [H, W, 3] of an eye that is there: from the camera's own, so none is enlarged."""
+    if pair.published is not None:
+        return pair.published.picture(side)
+    shown = pair.left if side == "left" else pair.right
+    assert shown is not None
+    return shown
+
+
+def nearest(pair: RectifiedPair, plane: Plane) -> Plane:
+    """Depth, confidence or mask [h, w] of the working size, as [H, W]."""
+    if pair.published is None:
+        return plane
+    values = plane.view(np.uint8) if plane.dtype == np.bool_ else plane
+    enlarged = cv2.resize(values, size_of(pair), interpolation=cv2.INTER_NEAREST_EXACT)
+    return np.asarray(enlarged).view(plane.dtype)
+
+
+def colours(pair: RectifiedPair, view: RenderedView) -> U8:
+    """What a view of the frame shows, [H, W, 3] RGB."""
+    return view.colours.at(*size_of(pair))
+
+
+def alpha(pair: RectifiedPair, view: RenderedView) -> F32:
+    """Its coverage, [H, W] 0..1."""
+    if pair.published is None:
+        return view.alpha
+    return np.asarray(cv2.resize(view.alpha, size_of(pair), interpolation=cv2.INTER_LINEAR))
+
+
+def view(pair: RectifiedPair, drawn: RenderedView) -> RenderedView:
+    """All of a view of the frame, in arrays of its own."""
+    size, sure, camera = size_of(pair), drawn.confidence, camera_of(pair)
+    return replace(
+        drawn,
+        camera=replace(camera, T_world_cam=drawn.camera.T_world_cam),
+        colours=Colours(drawn.colours.small, *size),
+        depth=nearest(pair, drawn.depth).copy(),
+        alpha=alpha(pair, drawn),
+        confidence=None if sure is None else nearest(pair, sure),
+    )
+
+
+def anchors(pair: RectifiedPair, states: AnchorStates) -> AnchorStates:
+    """Anchors with the pixels in which they are published."""
+    if pair.published is None:
+        return states
+    sizes = (pair.camera.width, pair.camera.height), size_of(pair)
+    ahead = states.ahead
+    if ahead is not None:
+        ahead = replace(ahead, pixels=scale_pixels(ahead.pixels, *sizes).astype(np.float32))
+    return replace(states, pixels=scale_pixels(states.pixels, *sizes).astype(np.float32), ahead=ahead)
