@@ -139,6 +139,7 @@ class StereoFrame:
     t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
     pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
     warm_up: bool = False  # the model learns from it, and nothing of it is shown or counted
+    recorded_s: float | None = None  # its place in the recording, from 0 again when that loops; None: live
 
 
 @dataclass(frozen=True, slots=True)
@@ -394,6 +395,7 @@ class FrameResult:
     rung: RungState | None = None  # None: fixed steps, no ladder
     held: str = ""  # why the frame was not taken in, so that the model is that of an older one; empty: it was
     hurried: bool = False  # there was no time to measure its depth
+    recorded_s: float | None = None  # as `StereoFrame.recorded_s`
 
 
 @dataclass(frozen=True, slots=True)

@@ -199,7 +199,7 @@ resume = _plain("resume", "resume", "running", "Go on after sags pause.")
 reset = _plain(
     "reset",
     "reset_model",
-    "the next frame begins a new model; anchors are gone",
-    "Forget the model; the next frame begins a new one.\n\nIt is a new epoch, and all anchors are lost. For "
-    "another place, or after a new base frame of the robot.",
+    "the next frame begins a new model; anchors must be recognised anew",
+    "Forget the model; the next frame begins a new one.\n\nIt is a new epoch, and all anchors are lost until "
+    "they are recognised. For another place, or after a new base frame of the robot.",
 )

@@ -266,8 +266,10 @@ class Publisher:
         epoch: int | None = None,
         ahead_ns: int = 0,
     ) -> None:
+        last = self._last
         if epoch is None:
-            epoch = 0 if self._last is None else self._last.epoch
+            epoch = 0 if last is None else last.epoch
+        recorded_s = None if last is None or last.pair.frame_id != frame_id else last.recorded_s
         meta = Meta(
             type=body.type,
             type_hash=type_hash(body.type),
@@ -277,7 +279,7 @@ class Publisher:
             publish_ns=time.time_ns(),
             session=self.session,
             epoch=epoch,
-            step=0 if self._last is None else self._last.snapshot.step,
+            step=0 if last is None else last.snapshot.step,
             encoding=body.encoding,
             shape=list(body.shape),
             dtype=body.dtype,
@@ -285,6 +287,7 @@ class Publisher:
             ahead_ns=ahead_ns or msgspec.UNSET,
             scale=body.scale or msgspec.UNSET,
             window=list(body.window) or msgspec.UNSET,
+            recorded_s=msgspec.UNSET if recorded_s is None else recorded_s,
             units="relative" if body.relative or not self._metric else msgspec.UNSET,
         )
         frames = encode(Message(topics.full_name(self.ns, name), meta, body.parts))

@@ -28,6 +28,7 @@ Stamp = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Text = Annotated[str, msgspec.Meta(max_length=512)]
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1)]
+Seconds = Annotated[float, msgspec.Meta(ge=0)]
 Window = Annotated[
     list[Annotated[int, msgspec.Meta(ge=0, lt=2**31)]], msgspec.Meta(min_length=3, max_length=3)
 ]
@@ -57,6 +58,7 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # shown is what is expected so long after `stamp_ns`
     scale: Scale | msgspec.UnsetType = msgspec.UNSET  # of a thin picture whose numbers are whole
     window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin picture: x, y, and px for one of its own
+    recorded_s: Seconds | msgspec.UnsetType = msgspec.UNSET  # place of the frame in the recording played
     units: Text | msgspec.UnsetType = msgspec.UNSET  # of lengths: "relative", of a guessed rig; unset: metres
 
 

@@ -35,11 +35,15 @@ NOTHING: Mapping[str, str] = {}  # to warn of
 
 
 class Body:
-    """A mesh made ready to be drawn again and again; None: only a label."""
+    """A mesh made ready to be drawn again and again; None: only a label.
+
+    Attributes:
+        corners: [2, 3] m, between which it lies in its own coordinates.
+    """
 
     def __init__(self, mesh: Mesh | None, opacity: float, label: str | None) -> None:
         self.label = label
-        self.middle = np.zeros(3)
+        self.middle, self.corners = np.zeros(3), np.zeros((2, 3))
         self._mesh = mesh
         self._vertices = np.zeros((0, 3)) if mesh is None else mesh.vertices.astype(np.float64)
         if mesh is None:
@@ -50,7 +54,8 @@ class Body:
         self._normals = normals / np.where(lengths > 0, lengths, 1)
         self._centres = corners.mean(1)
         self._alpha = np.uint8(round(255 * opacity))
-        self.middle = (self._vertices.min(0) + self._vertices.max(0)) / 2
+        self.corners = np.stack([self._vertices.min(0), self._vertices.max(0)])
+        self.middle = self.corners.mean(0)
 
     def draw(self, camera: Camera, T_world_body: F64, z: F32, rgba: U8) -> None:
         """Add what one eye sees of it to a picture [H, W, 4] with depths [H, W] (m), in place."""
@@ -89,10 +94,8 @@ def draw(
     note: str = "",
     warnings: Mapping[str, str] = NOTHING,
 ) -> U8:
-    """The overlay [H, W, 4] RGBA, not premultiplied, of the eye `baseline` (m) to the right of the left one.
-
-    `note` is written small into the upper right corner, `warnings` (code -> text) on the lower edge.
-    """
+    """The overlay [H, W, 4] RGBA, not premultiplied, of the eye `baseline` (m) to the right of the left one,
+    with what `annotate` writes into it."""
     height, width = frame.depth.shape
     camera = frame.camera.moved_right(baseline)
     z, rgba = np.full((height, width), np.inf, np.float32), np.zeros((height, width, 4), np.uint8)
@@ -110,14 +113,23 @@ def draw(
     for placed in objects:
         if placed.body.label is not None:
             _label(rgba, frame, camera, placed, baseline)
+    annotate(rgba, frame, baseline, note, warnings)
+    return rgba
+
+
+def annotate(
+    rgba: U8, frame: TissueFrame, baseline: float, note: str = "", warnings: Mapping[str, str] = NOTHING
+) -> None:
+    """Write `note` small into the upper right corner of an overlay, `warnings` (code -> text) on the lower
+    edge, in place."""
+    height, width = frame.depth.shape
     if note:
         (across, down), _ = cv2.getTextSize(note, FONT, _text_scale(height), 1)
         _write(rgba, frame, note, (width - across - 6, down + 6), NEAREST, baseline)
     if warnings:
         known = frame.depth[::8, ::8][frame.depth[::8, ::8] > 0]
-        shift = float(camera.K[0, 0]) * baseline / float(np.median(known)) if known.size else 0.0
+        shift = float(frame.camera.K[0, 0]) * baseline / float(np.median(known)) if known.size else 0.0
         draw_mark(rgba, warnings, round(shift))
-    return rgba
 
 
 def color_key(rgba: U8, key: tuple[int, int, int]) -> U8:

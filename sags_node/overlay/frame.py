@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from sags_node.confidence import SURE, SURE_OF_ANCHOR
@@ -71,6 +72,7 @@ class TissueFrame:
     tissue: Bool  # [H, W], False: instrument
     anchors: dict[int, Anchor]
     sure: Bool | None = None  # [H, W] where the depth may decide what hides what; None: everywhere
+    recorded_s: float | None = None  # its place in the recording that the node plays; None: not said
 
 
 def tissue_frame(
@@ -120,4 +122,5 @@ def tissue_frame(
             for row, place in zip(rows, places, strict=True)
         },
         sure=None if confidence is None else confidence.array >= SURE,
+        recorded_s=None if depth.meta.recorded_s is msgspec.UNSET else depth.meta.recorded_s,
     )

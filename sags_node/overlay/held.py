@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -18,10 +19,16 @@ from sags_node.overlay.scene import ObjectSpec
 from sags_node.types import F64
 
 LEAST_ANCHORS = 3  # for a rigid fit
+FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
+MISFIT = (
+    0.003  # m, of an anchor from where its object's shape has it: nine of ten are found within half of it
+)
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
 GOODBYE = 0.5  # s for the node to take anchors back at the end
 
 Request = dict[str, Any]
+
+log = logging.getLogger(__name__)
 
 
 class Pinner:
@@ -86,20 +93,30 @@ class HeldObject:
 
     Attributes:
         reason: why it has no place in the newest frame; None: it has.
-        is_sure: enough of the anchors that place it are.
+        is_sure: enough of the anchors that place it are, and its shape fits them.
+        unsure: why it is not; None: it is, or it has no place.
         error: how badly its anchors fit its rigid shape (m, RMS); 0 with one anchor.
 
     Args:
         repin: after the model or the node was started anew, pin it once more at the same pixels and places.
         ahead: how far ahead of its frames it is placed, ms or `auto`, see `add_anchor`.
+        corners: [2, 3] m, between which all of it lies, in its own coordinates; None: nobody looks whether it
+            lies at its anchors.
     """
 
     def __init__(
-        self, spec: ObjectSpec, where: str, pinner: Pinner, repin: bool, ahead: float | str = 0.0
+        self,
+        spec: ObjectSpec,
+        where: str,
+        pinner: Pinner,
+        repin: bool,
+        ahead: float | str = 0.0,
+        corners: F64 | None = None,
     ) -> None:
         self.spec = spec
         self.reason: str | None = None
         self.is_sure = False
+        self.unsure: str | None = None
         self.error = 0.0
         self.times_pinned = 0
         self._where = where  # what its anchors are called in messages
@@ -114,6 +131,11 @@ class HeldObject:
         self._right = np.zeros(3)  # where the picture's x axis pointed when it was pinned
         self._normal: F64 | None = None
         self._lost: str | None = None
+        self._corners = corners
+        self._refused: str | None = None  # for good
+        self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
+        self._held_s: float | None = None  # of the newest frame in which its anchors were known
+        self._began_anew = False  # the recording did, since it was lost
 
     def place(self, frame: TissueFrame) -> F64 | None:
         """The pose [4, 4] of the object in the world, or None and a `reason`. Pins it when it is not yet.
@@ -121,30 +143,41 @@ class HeldObject:
         Raises:
             UsageError: a pixel to pin it to lies outside the picture.
         """
-        if self._lost is not None and not self._repin:
-            self.reason = self._lost
-            return None
+        T, self.reason = None, self._unready(frame)
+        if self.reason is None:
+            T, self.reason = self._held(frame, [frame.anchors.get(anchor) for anchor in self._ids])
+        if T is None or self.is_sure:
+            self.unsure = None
+        elif self.unsure is None:
+            self.unsure = "its anchors were not recognised lately"
+        return T
+
+    def _unready(self, frame: TissueFrame) -> str | None:  # noqa: PLR0911, one return per reason
+        """Why its anchors do not hold it, or not yet."""
+        if self._refused is not None:
+            return self._refused
+        if self._lost is not None and not self._may_pin_again(frame):
+            return self._lost
         if self._ids and frame.session != self._session:
             self._pinner.forget(self._ids)
-            self._lose("the node was started anew")
-            return None
+            return self._lose("the node was started anew")
         if not self._ids:
-            self.reason = self._pin(frame)
-            return None
+            return self._pin(frame)
         states = [frame.anchors.get(anchor) for anchor in self._ids]
         known = [state for state in states if state is not None]
         if self._model is None and len(known) < len(states):
-            self.reason = "being pinned"  # the anchors come with one of the next frames
-            return None
+            return "being pinned"  # the anchors come with one of the next frames
         self._states = known
         if not any(np.isfinite(state.place).all() for state in known):
             self._pinner.remove(self._ids)
-            self._lose("the model was started anew" if known else "its anchors were removed")
-            return None
+            return self._lose("the model was started anew" if known else "its anchors were removed")
+        self._held_s = frame.recorded_s
         if self._model is None:
             self._begin(frame, known)
-        T, self.reason = self._held(frame, states)
-        return T
+        if self._refused is not None:
+            self._pinner.remove(self._ids)
+            self._ids, self._states = [], []
+        return self._refused
 
     @property
     def ahead_s(self) -> float:
@@ -157,6 +190,7 @@ class HeldObject:
             "name": self.spec.name,
             "reason": self.reason,
             "sure": self.reason is None and self.is_sure,
+            "unsure": self.unsure,
             "pinned": self.times_pinned,
             "error_mm": round(1e3 * self.error, 3),
             "anchors": [
@@ -172,10 +206,18 @@ class HeldObject:
 
     # ---- pinning -------------------------------------------------------------------------------------------
 
-    def _lose(self, why: str) -> None:
+    def _lose(self, why: str) -> str:
         self._ids, self._states, self._model, self._normal = [], [], None, None
-        self._lost = f"lost: {why}"
-        self.reason = self._lost
+        self._lost, self._began_anew = f"lost: {why}", False
+        return self._lost
+
+    def _may_pin_again(self, frame: TissueFrame) -> bool:
+        """Asked for, or the recording loops and has come again to where it was pinned: its pixels then show
+        the same tissue."""
+        now, held, begun = frame.recorded_s, self._held_s, self._begun_s
+        if now is not None and held is not None and now < held:
+            self._began_anew = True
+        return self._repin or (self._began_anew and now is not None and begun is not None and now >= begun)
 
     def _pin(self, frame: TissueFrame) -> str:
         if self._pinning is None:
@@ -184,6 +226,7 @@ class HeldObject:
                 return requests
             requests = [request | self._asked for request in requests]
             self._pinning, self._session = self._pinner.pin(requests), frame.session
+            self._begun_s = frame.recorded_s if self._begun_s is None else self._begun_s
         elif self._pinning.done():
             done, self._pinning = self._pinning, None
             error = done.exception()
@@ -223,14 +266,50 @@ class HeldObject:
         T_world_cam = frame.camera.T_world_cam
         self._right = T_world_cam[:3, 0].copy()
         said = [anchor.at for anchor in self.spec.anchors]
-        if len(states) < LEAST_ANCHORS:
-            self._model = np.array([said[0] if said and said[0] is not None else (0.0, 0.0, 0.0)])
-        elif said[0] is not None:
-            self._model = np.array(said, np.float64)
+        places = np.stack([state.place for state in states])
+        if said and said[0] is not None:
+            at = np.array(said, np.float64)
+            self._model = at * self._unit(at, places)
+        elif len(states) < LEAST_ANCHORS:
+            self._model = np.zeros((1, 3))
         else:
-            places = np.stack([state.place for state in states])
             in_camera = self.spec.coordinates == "camera"
             self._model = np.asarray(transform(invert(T_world_cam), places)) if in_camera else places
+        far = self._distance(self._model)
+        if far > 0:
+            hint = f"is `at` in the file's units, and is scale: {self.spec.scale:g} right?"
+            if not said or said[0] is None:
+                hint = "the origin of its coordinates is far from it; say `at`"
+                if len(states) >= LEAST_ANCHORS:
+                    hint = (
+                        f"are the file's coordinates those of the {self.spec.coordinates}? If not, say `at`"
+                    )
+            self._refused = f"it lies {1e3 * far:.3g} mm from its anchors: {hint}"
+
+    def _unit(self, at: F64, places: F64) -> float:
+        """m for one of what every `at` [k, 3] is in, by what lies at the anchors (at [k, 3], m)."""
+        scale = 1.0 if self.spec.file is None else self.spec.scale
+        if self.spec.at_units is not None or scale == 1:
+            return scale if self.spec.at_units != "m" else 1.0
+        if len(at) >= LEAST_ANCHORS:  # how far they are apart
+            wide, there = (float(np.linalg.norm(points - points.mean(0))) for points in (at, places))
+            in_metres = abs(wide - there) < abs(scale * wide - there)
+        else:
+            in_metres = bool(at.any()) and self._distance(at) == 0
+        if in_metres:
+            log.warning(
+                "%s: `at` is read in metres; say at_units: m, or give the file's units", self.spec.name
+            )
+        return 1.0 if in_metres else scale
+
+    def _distance(self, points: F64) -> float:
+        """From the object to the nearest of its points [k, 3], m; 0: it is as near as an object may be."""
+        if self._corners is None:
+            return 0.0
+        low, high = self._corners
+        aside = np.maximum(np.maximum(low - points, points - high), 0)
+        distance = float(np.linalg.norm(aside, axis=1).min())
+        return distance if distance > np.linalg.norm(high - low) + FAR else 0.0
 
     def _held(self, frame: TissueFrame, states: Sequence[Anchor | None]) -> tuple[F64 | None, str | None]:
         assert self._model is not None
@@ -245,17 +324,25 @@ class HeldObject:
             return None, f"{len(chosen)} of its {len(states)} anchors hold it, {LEAST_ANCHORS} are needed"
         if on_a_line(model):
             return None, "the anchors that hold it lie on a line"
-        sure = self._model[[i for i, state in chosen.items() if state.is_sure]]
-        self.is_sure = len(sure) >= LEAST_ANCHORS and not on_a_line(sure)
         weights = np.array([state.confidence * state.depth_confidence for state in chosen.values()])
-        T, self.error = rigid_fit(model, np.stack([state.place for state in chosen.values()]), weights)
+        places = np.stack([state.place for state in chosen.values()])
+        T, self.error = rigid_fit(model, places, weights)
+        off = np.linalg.norm(transform(T, model) - places, axis=1)
+        sure = model[[state.is_sure for state in chosen.values()] & (off <= MISFIT)]
+        self.is_sure = len(sure) >= LEAST_ANCHORS and not on_a_line(sure)
+        self.unsure = None
+        if off.max() > MISFIT:
+            self.unsure = (
+                f"an anchor is {1e3 * off.max():.1f} mm from where its shape has it: check `at` and scale, "
+                "unless the tissue was bent"
+            )
         return T, None
 
     def _on_surface(self, frame: TissueFrame, holding: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
         assert self._model is not None
         if not holding:
             return None, "its anchor was not recognised for too long"
-        self.is_sure = holding[0].is_sure
+        self.is_sure, self.unsure = holding[0].is_sure, None
         normal = surface_normal(frame, holding[0].place)
         if normal is not None and self._normal is not None:
             normal = NORMAL_MEMORY * self._normal + (1 - NORMAL_MEMORY) * normal

@@ -1,4 +1,4 @@
-"""The mark at the rim of an overlay: what the node warns of while the overlay is shown.
+"""The mark at the rim of an overlay: what the node warns of while it is shown, or why it is blank.
 
 It lies on the lower edge, over whatever is there: a warning must be seen just where nothing else is sure.
 """
@@ -6,7 +6,7 @@ It lies on the lower edge, over whatever is there: a warning must be seen just w
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -32,7 +32,12 @@ def headlines(warnings: Mapping[str, str]) -> list[str]:
 
 
 def draw_mark(rgba: U8, warnings: Mapping[str, str], shift: int = 0) -> None:
-    """Write the warnings on the lower edge of an overlay [H, W, 4] RGBA, in place.
+    """Write the warnings on the lower edge of an overlay [H, W, 4] RGBA, in place; see `draw_lines`."""
+    draw_lines(rgba, headlines(warnings), shift)
+
+
+def draw_lines(rgba: U8, lines: Sequence[str], shift: int = 0) -> None:
+    """Write some lines on the lower edge, in place.
 
     Args:
         shift: px to the left, of the right eye: so that it lies at the tissue's depth.
@@ -40,7 +45,7 @@ def draw_mark(rgba: U8, warnings: Mapping[str, str], shift: int = 0) -> None:
     height, width = rgba.shape[:2]
     scale = max(height / 1000, 0.4)
     thickness = max(1, round(2 * scale))
-    for number, line in enumerate(reversed(headlines(warnings))):
+    for number, line in enumerate(reversed(lines)):
         text = _fitted(line, width - 4 * MARGIN - 2 * shift, scale, thickness)
         (across, above), below = cv2.getTextSize(text, FONT, scale, thickness)
         tall = above + below + 2 * MARGIN

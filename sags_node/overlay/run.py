@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from sags_node.errors import SagsError, UsageError
@@ -46,6 +47,7 @@ WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
 WAIT_FOR_REST = 0.05  # s for what belongs to the frame
 PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
 LOOK = 0.1  # s between looks for a node
+UNSEEN = "nothing of it is in sight: beyond the picture, or behind an instrument"
 RECENT = 300  # durations are behind the figures in `status`
 
 
@@ -75,10 +77,10 @@ def run_overlay(options: OverlayOptions, tell: Callable[[str], object] = log.war
         tell: what it waits for.
 
     Returns:
-        frames, overlay (frames with one), blanked (reason -> frames), latency_ms (capture to published) and
-        draw_ms (p50, p90, p99), freezes (count, seconds; see `Freezes`), objects (see
-        `HeldObject.status`), lost (messages), endpoints, saved (the
-        file; None when too little was shown to write one).
+        frames, overlay (frames in which something of it was seen), blanked (reason -> frames without),
+        latency_ms (capture to published) and draw_ms (p50, p90, p99), freezes (count, seconds; see
+        `Freezes`), objects (see `HeldObject.status`), lost (messages), endpoints, saved (the file; None when
+        too little was shown to write one).
 
     Raises:
         UsageError: a wrong scene, mesh, pin or kind of file.
@@ -134,8 +136,9 @@ class _Overlay:
                 self._pinner,
                 options.repin,
                 options.ahead,
+                body.corners,
             )
-            for spec in scene.objects
+            for spec, body in zip(scene.objects, bodies, strict=True)
         ]
         self._source: tuple[str, int] | None = None  # session and epoch of the node
         self._epoch = -1  # of what is published: grows with every new `_source`
@@ -248,7 +251,7 @@ class _Overlay:
     # ---- one frame -----------------------------------------------------------------------------------------
 
     def _take(self, leading: Received) -> None:
-        """Show the overlay of one frame, or count why there is none."""
+        """Show the overlay of one frame, and count why there is none, or nothing of it to be seen."""
         self._frames += 1
         rgba, reason = self._overlay(leading.stamp_ns)
         if reason is not None:
@@ -260,11 +263,13 @@ class _Overlay:
         came = self._node.aligned([PICTURE], leading.stamp_ns, WAIT_FOR_REST)
         if came is not None:
             picture = came[PICTURE].array
+            if rgba is None and self._stream.reason is not None:
+                rgba = self._stream.notice((picture.shape[0], picture.shape[1]))
             shown = picture if rgba is None else overlay_draw.over(picture, rgba)
-            self._output.add(shown, rgba is not None, self._node.period(PICTURE))
+            self._output.add(shown, reason is None, self._node.period(PICTURE))
 
     def _overlay(self, stamp_ns: int) -> tuple[U8 | None, str | None]:
-        """The left eye's overlay, published; or why there is none."""
+        """The left eye's overlay, published, where there is one; and why nothing is to be seen of it."""
         messages = self._node.aligned(NEEDED, stamp_ns, WAIT_FOR_REST)
         if (stale := self._stale()) is not None:
             self._stream.blank(stale)
@@ -285,18 +290,20 @@ class _Overlay:
         ]
         if not placed:
             reason = self._objects[0].reason or "nothing to draw"
-            self._stream.blank(reason)
+            self._stream.blank(reason, (frame.camera.height, frame.camera.width))
             return None, reason
-        return self._show(frame, placed), None
+        return self._show(frame, placed)
 
-    def _show(self, frame: TissueFrame, placed: Sequence[Placed]) -> U8:
+    def _show(self, frame: TissueFrame, placed: Sequence[Placed]) -> tuple[U8, str | None]:
         if (frame.session, frame.epoch) != self._source:
             self._source, self._epoch = (frame.session, frame.epoch), self._epoch + 1
         began = time.perf_counter()
         warnings = {
             code: said for code, said in self._warnings.items() if STAGES.get(code) not in OF_THE_FLOW
         }
-        pictures = {"left": overlay_draw.draw(frame, placed, note=self._note(), warnings=warnings)}
+        pictures = {"left": overlay_draw.draw(frame, placed)}
+        is_seen = cv2.hasNonZero(cv2.extractChannel(pictures["left"], 3))
+        overlay_draw.annotate(pictures["left"], frame, 0.0, self._note(), warnings)
         if frame.baseline is not None and self._stream.wants("right"):
             pictures["right"] = overlay_draw.draw(frame, placed, frame.baseline, warnings=warnings)
         ahead = max(held.ahead_s for held in self._objects)
@@ -304,7 +311,7 @@ class _Overlay:
         self._draw_ms.add(1e3 * (time.perf_counter() - began))
         self._freezes.add(time.monotonic())
         self._latency_ms.add(1e-6 * (self._node.now_ns() - frame.stamp_ns))
-        return pictures["left"]
+        return pictures["left"], None if is_seen else UNSEEN
 
     def _right_info(self) -> Any:
         problem = self._node.problem(RIGHT_INFO)

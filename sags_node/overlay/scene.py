@@ -27,7 +27,7 @@ class AnchorSpec(Section):
 
     pixel: tuple[float, float] | None = Field(None, description="u v of the left picture, first good frame")
     place: Place | None = Field(None, description="x y z in the world, m")
-    at: Place | None = Field(None, description="the point of the object that lies there, m")
+    at: Place | None = Field(None, description="the point of the object that lies there, see `at_units`")
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -46,6 +46,11 @@ class ObjectSpec(Section):
     opacity: float = Field(0.85, gt=0, le=1)
     scale: float = Field(1.0, gt=0, le=1000, description="metres per unit of the file")
     point_size: float = Field(5e-4, gt=0, le=0.01, description="radius of each point of a point cloud, m")
+    at_units: Literal["file", "m"] | None = Field(
+        None,
+        description="of every `at`: those of the file, as `scale` says, or metres; default: the file's, or "
+        "metres where only these fit, as scene files had it before",
+    )
     coordinates: Literal["camera", "world"] = Field(
         "camera",
         description="of the file when three or more anchors hold it and none says `at`: the left camera's "

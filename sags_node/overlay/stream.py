@@ -1,13 +1,14 @@
 """What the overlay publishes on its own socket: both eyes' pictures, and what it says of itself.
 
 A picture is never left standing: when nothing fresh can be drawn, an empty one is sent at once and again
-every `BLANK_PERIOD`.
+every `BLANK_PERIOD`. Of these, those of the first `SAID` seconds say why on their lower edge.
 """
 
 from __future__ import annotations
 
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,9 +20,11 @@ from sags_node.messaging import cdr, content
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.topics import OVERLAY_TOPICS
 from sags_node.overlay.draw import color_key
+from sags_node.overlay.mark import draw_lines
 from sags_node.types import U8
 
 BLANK_PERIOD = 0.5  # s
+SAID = 5.0  # s
 STATUS_PERIOD = 1.0  # s
 EYES = {"left": cdr.LEFT_FRAME, "right": cdr.RIGHT_FRAME}
 
@@ -32,17 +35,25 @@ class OverlayStream:
     Args:
         ns: of its topics and its connection file.
         key: RGB of what shows no overlay in the `color_key` topics.
+        clock: s.
 
     Raises:
         SagsError: another overlay has this namespace.
     """
 
-    def __init__(self, ns: str, run_dir: Path | None, key: tuple[int, int, int]) -> None:
+    def __init__(
+        self,
+        ns: str,
+        run_dir: Path | None,
+        key: tuple[int, int, int],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir, right=True)
         self._publisher = Publisher(config, ns, uuid.uuid4().hex, offered=OVERLAY_TOPICS)
-        self._key = key
+        self._key, self._clock = key, clock
         self._size: tuple[int, int] | None = None  # height and width of what was shown last
         self._blank_due = 0.0
+        self._blank_since = 0.0  # for the reason that there is
         self._status_due = 0.0
         self._state: tuple[str, str | None, tuple[str, ...]] | None = None
         self._epoch = 0
@@ -77,33 +88,46 @@ class OverlayStream:
             if self.wants(eye):
                 self._send(eye, pictures.get(eye, self._empty()), frame_id, stamp_ns, ahead_ns)
 
-    def blank(self, reason: str) -> None:
+    def blank(self, reason: str, size: tuple[int, int] | None = None) -> None:
         """Show nothing, because of `reason`; to be called again and again while that is so.
 
         An empty picture shows no frame: its stamp is the time at which it is true.
+
+        Args:
+            size: height and width of the node's pictures, where they are known; default: as before.
         """
-        new = self.reason is None
-        self.reason, self.shown_ns = reason, None
-        if self._size is None or not (new or time.monotonic() >= self._blank_due):
+        new, now = self.reason is None, self._clock()
+        if reason != self.reason:
+            self._blank_since = now
+        self.reason, self.shown_ns, self._size = reason, None, size or self._size
+        if self._size is None or not (new or now >= self._blank_due):
             return
-        self._blank_due = time.monotonic() + BLANK_PERIOD
+        self._blank_due, stamp_ns = now + BLANK_PERIOD, time.time_ns()
         for eye in EYES:
             if self.wants(eye):
-                self._send(eye, self._empty(), -1, time.time_ns())
+                self._send(eye, self.notice(), -1, stamp_ns)
+
+    def notice(self, size: tuple[int, int] | None = None) -> U8:
+        """What stands in the place of an overlay: nothing, or for some seconds why. `size`: see `blank`."""
+        rgba, since = self._empty(size), self._clock() - self._blank_since
+        if self.reason is not None and BLANK_PERIOD <= since < BLANK_PERIOD + SAID:
+            draw_lines(rgba, [f"no overlay: {self.reason}"])
+        return rgba
 
     def tell(self, facts: dict[str, Any]) -> None:
         """Send `status` when it is due, and at once when the state or a warning changes."""
         warned = tuple(facts.get("warning_codes", ()))
         state = ("running" if self.reason is None else "blank", self.reason, warned)
-        if state == self._state and time.monotonic() < self._status_due:
+        if state == self._state and self._clock() < self._status_due:
             return
-        self._state, self._status_due = state, time.monotonic() + STATUS_PERIOD
+        self._state, self._status_due = state, self._clock() + STATUS_PERIOD
         said = {"state": state[0], "reason": state[1], "color_key": self._key, **facts}
         self._publisher.publish_content("status", content.json_text(said), -1, time.time_ns(), self._epoch)
 
-    def _empty(self) -> U8:
-        assert self._size is not None
-        return np.zeros((*self._size, 4), np.uint8)
+    def _empty(self, size: tuple[int, int] | None = None) -> U8:
+        size = size or self._size
+        assert size is not None  # else nothing is sent
+        return np.zeros((*size, 4), np.uint8)
 
     def _send(self, eye: str, rgba: U8, frame_id: int, stamp_ns: int, ahead_ns: int = 0) -> None:
         for kind, encoding in (("image", "rgba8"), ("color_key", "rgb8")):

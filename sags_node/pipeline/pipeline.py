@@ -190,7 +190,7 @@ class Pipeline:
         self, frame: StereoFrame, budget: Budget, request: FrameRequest = NOTHING_ASKED
     ) -> FrameResult:
         """Everything that happens to one frame."""
-        result = self._processed(frame, budget, request)
+        result = replace(self._processed(frame, budget, request), recorded_s=frame.recorded_s)
         return result if self.metric else unsure(result)
 
     def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:

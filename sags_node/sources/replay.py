@@ -202,6 +202,7 @@ class Replay:
                     depth=pair.depth,
                     t_device_ns=0 if self._recorded is None else int(self._recorded[index]),
                     warm_up=frame_id < self.first + self._config.warm_up,
+                    recorded_s=self.seconds_of(index),
                 )
             for _ in range(stride - 1):
                 self._pairs.skip()

@@ -81,7 +81,8 @@ def overlay_table(summary: Record) -> Table:
         anchors = ", ".join(str(anchor["id"]) for anchor in thing["anchors"])
         held = f"held by anchor {anchors}" if anchors else "not held"
         anew = f", {thing['pinned'] - 1} times anew" if thing["pinned"] > 1 else ""
-        made.add_row(thing["name"], held + anew + (f"; {thing['reason']}" if thing["reason"] else ""))
+        why = thing["reason"] or (f"unsure: {thing['unsure']}" if thing["unsure"] else "")
+        made.add_row(thing["name"], held + anew + (f"; {why}" if why else ""))
     made.add_row("lost", f"{summary['lost']} messages")
     if summary["saved"] is not None:
         made.add_row("saved", summary["saved"])

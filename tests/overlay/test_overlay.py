@@ -32,7 +32,7 @@ from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedT
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay.draw import color_key
-from sags_node.overlay.run import OverlayOptions, run_overlay
+from sags_node.overlay.run import UNSEEN, OverlayOptions, run_overlay
 from sags_node.sources.pictures import read_picture
 from sags_node.types import Camera
 
@@ -240,6 +240,16 @@ def test_the_saved_video_is_whole_also_where_there_is_no_overlay(run_dir: Path, 
     capture = cv2.VideoCapture(str(video))
     assert capture.get(cv2.CAP_PROP_FRAME_WIDTH) == 320
     assert capture.get(cv2.CAP_PROP_FRAME_COUNT) >= summary["frames"] - 5
+
+
+@pytest.mark.usefixtures("node")
+def test_what_nobody_sees_is_not_counted_as_an_overlay(run_dir: Path, tmp_path: Path) -> None:
+    """It is held 12 mm beyond the left edge."""
+    scene = tmp_path / "aside.yaml"
+    scene.write_text("objects: [{shape: sphere, anchors: [{pixel: [6, 128], at: [0.012, 0, 0]}]}]")
+    summary = run_overlay(OverlayOptions(NodeAddress(run_dir=run_dir), scene=scene, seconds=3.0))
+    assert summary["overlay"] == 0 and summary["objects"][0]["reason"] is None
+    assert summary["blanked"][UNSEEN] > 5
 
 
 @pytest.mark.usefixtures("node")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from sags_node.overlay.durations import REMEMBERED, Durations
 from sags_node.overlay.frame import TissueFrame
 from sags_node.overlay.mesh import Mesh
 from sags_node.overlay.raster import fill
+from sags_node.overlay.stream import OverlayStream
 from sags_node.types import Camera
 
 K = np.array([[300.0, 0, 80], [0, 300, 60], [0, 0, 1]])
@@ -223,3 +225,17 @@ def test_the_newest_are_kept_in_their_order() -> None:
     assert durations.last()[0] == 10 and len(durations.last()) == REMEMBERED
     last = REMEMBERED + 9
     assert durations.percentiles(101) == {"p50": last - 50, "p90": last - 10, "p99": last - 1}
+
+
+def test_a_blank_overlay_says_why_for_some_seconds(tmp_path: Path) -> None:
+    """The first picture is empty, at once, and so are those after 5.5 s; a new reason is said again."""
+    now = 0.0
+    with OverlayStream("overlay", tmp_path, KEY, lambda: now) as stream:
+        shown = {}
+        for tenths in range(200):
+            now = tenths / 10
+            stream.blank("lost: the model was started anew" if now < 10 else "stale tf", (120, 160))
+            shown[tenths] = bool(stream.notice().any())
+        rows = np.flatnonzero(stream.notice().any((1, 2)))
+    said = [tenths for tenths, any_ in shown.items() if any_]
+    assert said == [*range(5, 55), *range(105, 155)] and len(rows) == 0

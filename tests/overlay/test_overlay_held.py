@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -247,6 +248,99 @@ def test_named_points_of_the_object_come_to_lie_at_its_anchors() -> None:
     assert np.allclose(placed_at(thing, with_anchors(frame, places)), T, atol=1e-6)
     in_world = held([{"place": place.tolist()} for place in places], coordinates="world")
     assert np.allclose(placed_at(in_world, with_anchors(frame, places)), np.eye(4), atol=1e-6)
+
+
+# ---- an object lies where its anchors are, or is not drawn ------------------------------------------------
+
+SCALES = {"mm": 1e-3, "cm": 1e-2, "inch": 0.0254}  # m for one of a file's units
+
+
+def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any) -> tuple[HeldObject, Any]:
+    """A tube of a file, 30 mm long and centred on `around` (m), held by the first of `PIXELS`; the frame."""
+    frame = plane_frame()
+    places = [on_plane(frame, u, v) for u, v in PIXELS[: 4 if at is None else len(at)]]
+    anchors: list[dict[str, Any]] = [{"pixel": pixel} for pixel in PIXELS[: len(places)]]
+    for anchor, said in zip(anchors, [] if at is None else at.tolist(), strict=False):
+        anchor["at"] = said
+    spec = ObjectSpec.model_validate({"file": "tube.stl", "scale": scale, "anchors": anchors, **more})
+    corners = np.array([[-0.015, -0.002, -0.002], [0.015, 0.002, 0.002]]) + (0 if around is None else around)
+    return HeldObject(spec, "pin", FakePinner(), False, 0, corners), with_anchors(frame, places)
+
+
+def local_places(count: int = 4) -> np.ndarray:
+    """Where the anchors lie in an object at the middle of the first four, with the camera's axes, m."""
+    frame = plane_frame()
+    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
+    return np.asarray(transform(invert(frame.camera.T_world_cam), places) - transform(
+        invert(frame.camera.T_world_cam), places.mean(0)))[:count]  # fmt: skip
+
+
+@pytest.mark.parametrize("unit", SCALES)
+@pytest.mark.parametrize("said", ["in the file's units", "in metres, as before", "in metres, and said"])
+def test_named_points_are_read_in_the_files_units_or_in_metres_where_only_these_fit(
+    unit: str, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    in_metres = said != "in the file's units"
+    more = {"at_units": "m"} if said.endswith("said") else {}
+    thing, frame = of_file(local_places() / (1 if in_metres else SCALES[unit]), SCALES[unit], **more)
+    T = placed_at(thing, frame)
+    middle = np.mean([on_plane(frame, u, v) for u, v in PIXELS], axis=0)
+    assert np.allclose(T[:3, 3], middle, atol=1e-6) and thing.is_sure and thing.unsure is None
+    assert ("is read in metres" in caplog.text) == (said == "in metres, as before")  # never without a word
+
+
+@pytest.mark.parametrize(("at", "offset"), [((0, 0, 5), 5e-3), ((0, 0, 0.005), 5e-3), ((0, 0, 0), 0.0)])
+def test_so_is_that_of_a_single_anchor(at: tuple[float, ...], offset: float) -> None:
+    thing, frame = of_file(np.array([at], np.float64), 1e-3)
+    assert np.linalg.norm(placed_at(thing, frame)[:3, 3] - on_plane(frame, *PIXELS[0])) == pytest.approx(
+        offset
+    )
+
+
+@pytest.mark.parametrize(
+    ("at", "around", "said"),
+    [
+        (None, None, r"5\d\.?\d* mm from its anchors: are the file's coordinates those of the camera"),
+        (np.zeros((1, 3)), (0.1, 0, 0), r" 85 mm from its anchors: is `at` in the file's units"),
+        (1e3 * local_places() + (300, 0, 0), None, r"\d mm from its anchors: is `at` in the file's units"),
+    ],
+)  # fmt: skip
+def test_what_does_not_lie_at_its_anchors_is_refused(at: np.ndarray | None, around: Any, said: str) -> None:
+    """By more than its own size and 10 mm: it would flood the picture, or be nowhere."""
+    thing, frame = of_file(at, 1e-3, around)
+    for _ in range(5):
+        assert thing.place(frame) is None
+    assert re.search(said, str(thing.reason)), thing.reason
+    assert thing.status()["reason"] == thing.reason and thing.status()["anchors"] == []
+
+
+@pytest.mark.parametrize(("factor", "sure"), [(1.0, True), (1.1, True), (2.0, False), (0.5, False)])
+def test_what_does_not_fit_its_anchors_is_unsure_and_says_why(factor: float, sure: bool) -> None:
+    """The anchors are up to 22 mm from their middle: at 1.1 of that they are off by 2.2 mm at most."""
+    assert 0.02 < np.linalg.norm(local_places(), axis=1).max() < 0.025
+    thing, frame = of_file(1e3 * factor * local_places(), 1e-3, at_units="file")
+    placed_at(thing, frame)
+    assert thing.is_sure == sure and thing.status()["sure"] == sure
+    assert sure or "mm from where its shape has it: check `at`" in thing.status()["unsure"]
+
+
+def test_a_recording_that_loops_pins_again_where_it_was_pinned() -> None:
+    """Only when it comes to the same place: until then the pixel shows other tissue. A model that is reset
+    meanwhile stays lost until then."""
+    frame = plane_frame()
+    place = on_plane(frame, 30, 40)
+    thing = held([{"pixel": [30, 40]}], pinner=(pinner := FakePinner()))
+    here = with_anchors(frame, [place])
+    for recorded_s in (1.0, 1.1, 1.2):
+        T = thing.place(replace(here, recorded_s=recorded_s))
+    assert T is not None and len(pinner.asked) == 1
+    lost, again = with_anchors(frame, [np.full(3, np.nan)]), with_anchors(frame, [None, place])
+    for recorded_s in (1.3, 5.9, 0.0, 0.9):
+        assert thing.place(replace(lost, recorded_s=recorded_s)) is None
+        assert thing.reason == "lost: the model was started anew" and len(pinner.asked) == 1
+    for recorded_s in (1.0, 1.1, 1.2):
+        T = thing.place(replace(again, recorded_s=recorded_s))
+    assert T is not None and thing.status()["pinned"] == 2
 
 
 def test_it_waits_for_tissue_with_depth_and_for_the_node() -> None:

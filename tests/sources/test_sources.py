@@ -71,6 +71,8 @@ def test_start_frames_and_loop(tmp_path: Path, kind: str) -> None:
         assert source.frame_count == 8
     assert numbers(frames) == [5, 6, 7, 5, 6, 7, 5, 6]
     assert [frame.epoch for frame in frames] == [0, 0, 0, 1, 1, 1, 2, 2]
+    places = [5 / 25, 6 / 25, 7 / 25]
+    assert [frame.recorded_s for frame in frames] == pytest.approx([*places, *places, *places[:2]])
     assert [frame.frame_id for frame in frames] == list(range(5, 13))
     stamps = [frame.t_capture_ns for frame in frames]
     assert stamps == [frame.frame_id * 40_000_000 for frame in frames]
