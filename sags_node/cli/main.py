@@ -238,7 +238,9 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
     scene = section_of(PhantomScene, overrides)
     with progress("rendering") as advance:
         write_session(scene, folder, rate=scene.rate or 30.0, progress=advance)
-    console.print(f"session: [bold]{escape(str(folder))}[/]; play it with: sags run {escape(str(folder))}")
+    console.print(
+        f"session: [bold]{escape(str(folder))}[/]; play it with: sags run {escape(shlex.quote(str(folder)))}"
+    )
 
 
 @main.command()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -74,8 +75,8 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
     show({"launch": None if wrong else str(file), "found": rows} if json_out else text.rows_table(people))
     if wrong:
         raise SagsError(f"{named[0]} cannot be played as it is; see the fixes above")
-    where = escape(str(file))
-    console.print(f"launch file: [bold]{where}[/]; play it: sags run {where}", soft_wrap=True)
+    where, quoted = escape(str(file)), escape(shlex.quote(str(file)))
+    console.print(f"launch file: [bold]{where}[/]; play it: sags run {quoted}", soft_wrap=True)
 
 
 def _asked(out: Path | None) -> tuple[list[Path], Path | None]:
@@ -83,10 +84,19 @@ def _asked(out: Path | None) -> tuple[list[Path], Path | None]:
     if not sys.stdin.isatty():
         raise UsageError("name a folder, a video or a device, e.g. sags new my_folder -o mine.yaml")
     said = click.prompt("Folder, video or device (two: left and right, with a space between)", err=True)
-    named = [Path(word) for word in said.split()]
+    named = _paths(said)
     if out is None:
         out = Path(click.prompt("Launch file", default=f"{named[0].resolve().stem}.yaml", err=True))
     return named, out
+
+
+def _paths(said: str) -> list[Path]:
+    """Paths as in a shell, or one that has spaces and no quotes."""
+    try:
+        words = [said] if os.path.exists(said) else shlex.split(said)
+    except ValueError as error:
+        raise UsageError(f"{said}: {error}; close the quotes") from None
+    return [Path(word) for word in words]
 
 
 def _beside(tree: dict[str, Any], file: Path) -> dict[str, Any]:

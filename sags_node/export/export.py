@@ -70,8 +70,7 @@ def export(scene: Scene, targets: Mapping[str, Path], orbit: Orbit, advance: Adv
         advance(0, None, f"writing {path.name}")
         match kind:
             case "splats":
-                write_ply(path, scene.gaussians, force=True)  # `check_targets` has asked
-                holds = len(scene.gaussians)
+                holds = write_ply(path, scene.gaussians, force=True)  # `check_targets` has asked
             case "points":
                 holds = write_points(path, scene)
             case "mesh":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -45,12 +47,17 @@ def check_folder(folder: Path) -> list[Finding]:
     if contents.level == "error":
         return found
     if any(finding.level == "error" for finding in found):
-        return [*found, Finding("ok", f"to play it: when that is fixed: sags run {folder}")]
+        return [*found, Finding("ok", f"to play it: when that is fixed: sags run {_quoted(folder)}")]
     if contents.instead:
         return [*found, Finding("ok", f"to play it: {contents.instead}")]
     launch = overrides_of(folder)
-    stands_for = f", which stands for {' '.join(launch)}" if launch else ""
-    return [*found, Finding("ok", f"to play it: sags run {folder}{stands_for}")]
+    stands_for = f", which stands for {' '.join(map(_quoted, launch))}" if launch else ""
+    return [*found, Finding("ok", f"to play it: sags run {_quoted(folder)}{stands_for}")]
+
+
+def _quoted(word: Path | str) -> str:
+    """As a shell takes it; brackets stay, as no file is named like the lists in which they stand."""
+    return shlex.quote(str(word)) if shlex.quote(re.sub(r"[\[\]]", "", str(word)))[0] == "'" else str(word)
 
 
 def overrides_of(path: Path) -> list[str]:

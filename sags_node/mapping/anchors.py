@@ -114,14 +114,9 @@ class Anchors:
         return len(self._table.ids)
 
     def add_pixel(
-        self,
-        u: float,
-        v: float,
-        observation: Observation,
-        snapshot: Snapshot,
-        view: RenderedView,
+        self, u: float, v: float, observation: Observation, snapshot: Snapshot, view: RenderedView,
         size: tuple[int, int] | None = None,
-    ) -> int:
+    ) -> int:  # fmt: skip
         """Pin the tissue seen at a pixel (u, v) of the left picture; returns the anchor's id.
 
         Args:

@@ -16,11 +16,12 @@ _FIELDS = (
 )
 
 
-def write_ply(path: Path, gaussians: Gaussians, force: bool = False, metric: bool = True) -> None:
+def write_ply(path: Path, gaussians: Gaussians, force: bool = False, metric: bool = True) -> int:
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
     logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter and slopes are
     folded in (`model.constant_colours`): viewers know neither. Where the errors of depth are known,
-    `confidence` comes last, see `sags_node.confidence`; readers take properties by name.
+    `confidence` comes last, see `sags_node.confidence`; readers take properties by name. Returns how many it
+    holds: one with slopes is written as several.
 
     Args:
         metric: False: lengths have no unit, which a comment says.
@@ -53,3 +54,4 @@ def write_ply(path: Path, gaussians: Gaussians, force: bool = False, metric: boo
     with whole(path, new=not force) as partial, partial.open("wb") as file:
         file.write("\n".join(header).encode())
         file.write(np.ascontiguousarray(columns, "<f4").tobytes())
+    return len(gaussians)

@@ -23,9 +23,8 @@ BACK_AT = 0.8  # of that: a warning ends
 LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is none that is too long
 
 
-TOO_SLOW = (
-    "this machine is too slow for them: end other programs, or lower mapping.max_gaussians or vision.scale"
-)
+LOWER = ", or lower mapping.max_gaussians or vision.scale"  # on the lowest rung nothing is left to lower
+TOO_SLOW = "this machine is too slow for them"
 
 
 def why_missed(mapping: MappingConfig, rate: float | None) -> str:
@@ -56,6 +55,7 @@ class Statistics:
         self._lock = threading.Lock()
         self._published: deque[float] = deque(maxlen=WINDOW)
         self._taken_in = -inf  # when a frame was published that was
+        self._resumed = -inf
         self._latency: deque[float] = deque(maxlen=WINDOW)
         self._worked: deque[float] = deque(maxlen=WINDOW)  # ms on each
         self._stages: dict[str, deque[float]] = {}
@@ -97,12 +97,14 @@ class Statistics:
         return waited
 
     def _is_waiting(self, now: float) -> bool:
-        return not self._published or now - self._published[-1] > WAITING_AFTER
+        last = self._published[-1] if self._published else self._resumed
+        return now - last > WAITING_AFTER
 
-    def forget_rate(self) -> None:
+    def resume(self) -> None:
         """After a pause the time without frames says nothing."""
         with self._lock:
             self._published.clear()
+            self._resumed = self._taken_in = time.monotonic()
 
     def health(
         self,
@@ -124,6 +126,7 @@ class Statistics:
             missed: why frames are left out, if they are, and the remedy.
             working: s for which the newest frame has been worked on; 0: none is.
         """
+        consumers = connections.get("data", {}).get("open", 0)
         with self._lock:
             now = time.monotonic()
             waiting = self._is_waiting(now)
@@ -151,7 +154,7 @@ class Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
-                warnings={**warnings, **by_stage(self._findings(state, now, missed, working))},
+                warnings={**warnings, **by_stage(self._findings(state, now, missed, working, consumers))},
                 connections=connections,
                 views=views,
                 rung=self._rung,
@@ -160,7 +163,7 @@ class Statistics:
                 recording=recording,
             )
 
-    def _findings(self, state: str, now: float, missed: str, working: float) -> list[Finding]:
+    def _findings(self, state: str, now: float, missed: str, working: float, consumers: int) -> list[Finding]:
         """What the flow of frames says; asked with the lock held."""
         found = []
         if state == "waiting" and working > WAITING_AFTER:
@@ -171,8 +174,12 @@ class Statistics:
             found.append(Finding("no_frames", f"{said}: {self._nothing_comes}"))
         if self._leaves_out_too_many("source"):
             said = "the source leaves out over a tenth of its frames"
-            found.append(Finding("source_drops", f"{said}: {self._too_few_come}"))
+            helps = self._too_few_come or f"{_relief(consumers)}, or is the disk slow?"
+            found.append(Finding("source_drops", f"{said}: {helps}"))
         if self._leaves_out_too_many("capture"):
+            if missed == TOO_SLOW:
+                lower = "" if self._rung is not None and self._rung.number == 0 else LOWER
+                missed = f"{missed}: {_relief(consumers)}{lower}"
             found.append(Finding("frames_missed", f"over a tenth of the frames is left out, as {missed}"))
         return found
 
@@ -182,6 +189,14 @@ class Statistics:
             limit = MOST_LEFT_OUT * (BACK_AT if slot in self._too_many else 1.0)
             (self._too_many.add if count > limit * (count + WINDOW - 1) else self._too_many.discard)(slot)
         return slot in self._too_many
+
+
+def _relief(consumers: int) -> str:
+    """What leaves a node more of its machine."""
+    if consumers == 0:
+        return "end other programs"
+    what = "1 consumer takes" if consumers == 1 else f"{consumers} consumers take"
+    return f"{what} messages: end some, or let them subscribe to thin/ topics; end other programs"
 
 
 def _percentiles(values: Sequence[float]) -> dict[str, float]:
@@ -198,7 +213,7 @@ def _remedies(source: Source | None) -> tuple[str, str]:
         case Ros2Source():
             what = f"start what publishes {source.left} and {source.right}"
         case RecordedSource():
-            return "is the disk slow?", "is the disk slow?"
+            return "is the disk slow?", ""  # see `_relief`
         case _:
             what = "check the camera, its cable and the capture card"
             return what, "is one camera away, or source.pair_tolerance_ms too small?"

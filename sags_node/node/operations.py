@@ -102,7 +102,7 @@ class Operations:
 
     def _resume(self) -> dict[str, Any]:
         if self._state.paused.is_set():
-            self._state.statistics.forget_rate()
+            self._state.statistics.resume()
             self._state.paused.clear()
             self._state.status_due.set()
         return {"paused": False}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -35,22 +34,15 @@ class OverlayStream:
     Args:
         ns: of its topics and its connection file.
         key: RGB of what shows no overlay in the `color_key` topics.
-        clock: s.
 
     Raises:
         SagsError: another overlay has this namespace.
     """
 
-    def __init__(
-        self,
-        ns: str,
-        run_dir: Path | None,
-        key: tuple[int, int, int],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, ns: str, run_dir: Path | None, key: tuple[int, int, int]) -> None:
         config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir, right=True)
         self._publisher = Publisher(config, ns, uuid.uuid4().hex, offered=OVERLAY_TOPICS)
-        self._key, self._clock = key, clock
+        self._key = key
         self._size: tuple[int, int] | None = None  # height and width of what was shown last
         self._blank_due = 0.0
         self._blank_since = 0.0  # for the reason that there is
@@ -96,7 +88,7 @@ class OverlayStream:
         Args:
             size: height and width of the node's pictures, where they are known; default: as before.
         """
-        new, now = self.reason is None, self._clock()
+        new, now = self.reason is None, time.monotonic()
         if reason != self.reason:
             self._blank_since = now
         self.reason, self.shown_ns, self._size = reason, None, size or self._size
@@ -109,7 +101,7 @@ class OverlayStream:
 
     def notice(self, size: tuple[int, int] | None = None) -> U8:
         """What stands in the place of an overlay: nothing, or for some seconds why. `size`: see `blank`."""
-        rgba, since = self._empty(size), self._clock() - self._blank_since
+        rgba, since = self._empty(size), time.monotonic() - self._blank_since
         if self.reason is not None and BLANK_PERIOD <= since < BLANK_PERIOD + SAID:
             draw_lines(rgba, [f"no overlay: {self.reason}"])
         return rgba
@@ -118,9 +110,9 @@ class OverlayStream:
         """Send `status` when it is due, and at once when the state or a warning changes."""
         warned = tuple(facts.get("warning_codes", ()))
         state = ("running" if self.reason is None else "blank", self.reason, warned)
-        if state == self._state and self._clock() < self._status_due:
+        if state == self._state and time.monotonic() < self._status_due:
             return
-        self._state, self._status_due = state, self._clock() + STATUS_PERIOD
+        self._state, self._status_due = state, time.monotonic() + STATUS_PERIOD
         said = {"state": state[0], "reason": state[1], "color_key": self._key, **facts}
         self._publisher.publish_content("status", content.json_text(said), -1, time.time_ns(), self._epoch)
 

@@ -10,19 +10,7 @@ import numpy as np
 from sags_node import geometry
 from sags_node.errors import SagsError, UsageError
 from sags_node.rig import rectified_camera
-from sags_node.types import (
-    F32,
-    F64,
-    U8,
-    Bool,
-    Camera,
-    Eye,
-    Published,
-    RectifiedPair,
-    Side,
-    StereoFrame,
-    StereoRig,
-)
+from sags_node.types import F32, F64, U8, Bool, Camera, Eye, Published, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.pyramid import gray_pyramid
 
 
@@ -137,11 +125,10 @@ class Rectifier:
         """One frame to be rectified by who asks for a picture of it."""
 
         @cache
-        def picture(side: Side) -> U8:
-            if side == "left":
-                return self._left.image(frame.left)
-            assert frame.right is not None  # else nobody asks
-            return self._right.image(frame.right)
+        def picture(side: str) -> U8:
+            eye, raw = (self._left, frame.left) if side == "left" else (self._right, frame.right)
+            assert raw is not None  # else nobody asks
+            return eye.image(raw)
 
         return Published(self.camera, picture)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -319,6 +320,14 @@ def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
     (unknown,) = check_folder(tmp_path)
     assert unknown.level == "error" and "nothing that is known" in unknown.what
     assert "P2, P3, d4d, stir" in unknown.fix
+
+
+def test_the_command_that_plays_a_folder_with_spaces_is_one_for_a_shell(tmp_path: Path) -> None:
+    folder = made(tmp_path / "recorded today")
+    said = check_folder(folder)[-1].what.partition("to play it: ")[2]
+    command, _, launch = said.partition(", which stands for ")
+    assert shlex.split(command) == ["sags", "run", str(folder)]
+    assert shlex.split(launch) == overrides_of(folder)
 
 
 def test_the_command(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 from synthetic import plane_result
 
 from sags_node.confidence import SURE
-from sags_node.config.schema import LaunchConfig
+from sags_node.config.schema import FoldersSource, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.files import whole
 from sags_node.messaging import cdr, content, topics
@@ -22,12 +22,12 @@ from sags_node.model.ply import write_ply
 from sags_node.node import health as health_module
 from sags_node.node import node as node_module
 from sags_node.node import operations as node_operations
-from sags_node.node.health import WAITING_AFTER, Statistics
+from sags_node.node.health import WAITING_AFTER, WINDOW, Statistics
 from sags_node.node.latest import Latest
 from sags_node.node.operations import NodeState, Operations
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
-from sags_node.types import FrameResult, Gaussians, NodeHealth
+from sags_node.types import FrameResult, Gaussians, NodeHealth, RungState
 
 
 def test_newest_wins_and_the_replaced_are_counted() -> None:
@@ -153,6 +153,29 @@ def test_a_node_that_takes_no_frame_in_is_not_well(monkeypatch: pytest.MonkeyPat
     assert node.publish(PERIOD).state == "running"
     said = node.publish(0.5, held=True)
     assert said.state == "running" and content.health_answer(said)["healthy"]
+
+
+@pytest.mark.parametrize(
+    ("consumers", "rung", "said"),
+    [
+        (0, 3, "end other programs, or lower mapping.max_gaussians or vision.scale"),
+        (
+            2,
+            0,
+            "2 consumers take messages: end some, or let them subscribe to thin/ topics; end other programs",
+        ),
+    ],
+)
+def test_frames_that_are_missed_are_blamed_on_who_takes_part(consumers: int, rung: int, said: str) -> None:
+    """On the lowest rung nothing is left to lower."""
+    statistics = Statistics(FoldersSource(left=Path("left"), right=Path("right")))
+    result = replace(TAKEN_IN, rung=RungState(rung, 15, "", 5000, 0.5, 1))
+    for number in range(WINDOW):
+        statistics.add(result, 40.0, {"capture": number, "source": number})
+    sockets = {"data": {"open": consumers}}
+    told = content.health_fields(statistics.health({}, False, False, None, {}, sockets, {}))["warning_codes"]
+    assert told["frames_missed"].endswith(f"this machine is too slow for them: {said}")
+    assert told["source_drops"].endswith(f"{said.partition(', or lower')[0]}, or is the disk slow?")
 
 
 def test_the_latency_is_told_while_the_health_is_being_counted(monkeypatch: pytest.MonkeyPatch) -> None:

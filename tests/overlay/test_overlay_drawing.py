@@ -227,10 +227,11 @@ def test_the_newest_are_kept_in_their_order() -> None:
     assert durations.percentiles(101) == {"p50": last - 50, "p90": last - 10, "p99": last - 1}
 
 
-def test_a_blank_overlay_says_why_for_some_seconds(tmp_path: Path) -> None:
+def test_a_blank_overlay_says_why_for_some_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first picture is empty, at once, and so are those after 5.5 s; a new reason is said again."""
     now = 0.0
-    with OverlayStream("overlay", tmp_path, KEY, lambda: now) as stream:
+    with OverlayStream("overlay", tmp_path, KEY) as stream, monkeypatch.context() as patched:
+        patched.setattr("sags_node.overlay.stream.time.monotonic", lambda: now)
         shown = {}
         for tenths in range(200):
             now = tenths / 10

@@ -69,10 +69,19 @@ def test_a_sender_that_was_away_has_lost_nothing() -> None:
         (V4l2Source(), "check the camera, its cable and the capture card"),
     ],
 )
-def test_what_helps_depends_on_where_pictures_come_from(source: Source, said: str) -> None:
+def test_what_helps_depends_on_where_pictures_come_from(
+    source: Source, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 100.0
+    monkeypatch.setattr("sags_node.node.health.time.monotonic", lambda: now)
     statistics = Statistics(source)
     statistics.add(plane_result(), 1.0, {})
-    statistics.forget_rate()
+    now += 10  # of a pause
+    statistics.resume()
+    now += 0.5  # nothing can have come yet
+    health = statistics.health({}, False, False, None, {}, {}, {})
+    assert health.state == "running" and not health.warnings
+    now += 1.0
     warnings = by_code(statistics.health({}, False, False, None, {}, {}, {}).warnings)
     assert warnings["no_frames"] == f"no frame comes: {said}"
 

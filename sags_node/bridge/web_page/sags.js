@@ -5,7 +5,7 @@
 //     sags.anchors("sags/anchors", (rows) => ...);                      // [] when they are not new any more
 //
 // A canvas is cleared, transparent, as soon as what it shows is older than `maxAge`, whatever the reason.
-const NEAR = 0.03, FAR = 0.2; // m, of the colours of depth: warm to cold
+export const NEAR = 0.03, FAR = 0.2; // m, of the colours of depth: warm to cold
 const COLOURS = Uint32Array.from({ length: 256 }, (_, far) => // as an ImageData holds them
   0xff000000 + (far << 16) + ((255 - Math.abs(2 * far - 255)) << 8) + 255 - far);
 const CLOCK_EVERY = 1000, CLOCK_KNOWN = 5000; // ms
