@@ -131,7 +131,7 @@ def check_file(file: Path, force: bool | None = None) -> None:
         if force or is_result(file):
             return
     remedy = "remove it" if force is None else "add --force"
-    raise UsageError(f"{file} exists already and holds no earlier figures; choose another name, or {remedy}")
+    raise UsageError(f"{file} exists already; choose another name, or {remedy}")
 
 
 def check_results(folder: Path, names: Sequence[str], ours: bool) -> None:

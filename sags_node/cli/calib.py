@@ -40,7 +40,8 @@ def _sides(ctx: click.Context, option: click.Parameter, value: str | None) -> tu
         return None
     found = re.fullmatch(r"([1-9]\d{0,4})[xX×]([1-9]\d{0,4})", value)
     if found is None:
-        raise click.BadParameter(f"'{value}' is not like 720x576", ctx, option)
+        like = "10x7" if option.name == "squares" else "720x576"
+        raise click.BadParameter(f"'{value}' is not like {like}", ctx, option)
     return int(found[1]), int(found[2])
 
 

@@ -132,6 +132,8 @@ def _explain(error: ValidationError, file: Path) -> str:
     if first["type"] == "missing":
         return f"{file}: {where} is missing; set it"
     what = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "tuple_type":
+        what = f"this should be a list, e.g. [40, 220, 255] or [230, 180], it is {first['input']!r}"
     if first["type"] == "model_type":
         what = f"this should be a map of keys, it is a {type(first['input']).__name__}"
     return f"{file}: {where + ': ' if where else ''}{what}"

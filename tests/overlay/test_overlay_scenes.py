@@ -133,6 +133,7 @@ def test_a_bad_mesh_is_one_clear_message(name: str, tmp_path: Path) -> None:
         ("objects: [{shape: target, anchors: [{pixel: [.nan, 2]}]}]", "finite number"),
         ("objects: [{shape: target, color: [0, 0, 240]}]", "too near the key colour"),
         ("objects: [{shape: target, opacity: 0}]", "greater than 0"),
+        ("objects: [{shape: target, color: red}]", "this should be a list, e.g. [40, 220, 255]"),
     ],
 )  # fmt: skip
 def test_a_wrong_scene_is_one_clear_message(text: str, said: str, tmp_path: Path) -> None:
