@@ -267,12 +267,12 @@ def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any
     return HeldObject(spec, "pin", FakePinner(), False, 0, corners), with_anchors(frame, places)
 
 
-def local_places(count: int = 4) -> np.ndarray:
-    """Where the anchors lie in an object at the middle of the first four, with the camera's axes, m."""
+def local_places() -> np.ndarray:
+    """Where the anchors lie in an object in their middle with the camera's axes, m."""
     frame = plane_frame()
     places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
-    return np.asarray(transform(invert(frame.camera.T_world_cam), places) - transform(
-        invert(frame.camera.T_world_cam), places.mean(0)))[:count]  # fmt: skip
+    local = np.asarray(transform(invert(frame.camera.T_world_cam), places))
+    return np.asarray(local - local.mean(0))
 
 
 @pytest.mark.parametrize("unit", SCALES)
