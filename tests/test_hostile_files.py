@@ -131,6 +131,25 @@ def test_all_kinds_of_pictures_are_read_and_cut_off_ones_are_refused(suffix: str
             read_picture(file)
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("behind", [b"\0" * 6000, b"\xff" * 700, b"grabber 3.2\n" * 90, PIXELS.tobytes() * 3])
+def test_bytes_behind_the_end_of_a_picture_harm_nothing(suffix: str, behind: bytes, tmp_path: Path) -> None:
+    """Drivers hand over whole buffers; a preview in front has an end of its own."""
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2] if suffix == ".jpg" else []
+    whole = cv2.imencode(suffix, PIXELS, options)[1].tobytes()
+    if suffix == ".jpg":
+        preview = jpeg()
+        whole = whole[:2] + b"\xff\xe1" + struct.pack(">H", len(preview) + 2) + preview + whole[2:]
+    file = tmp_path / f"one{suffix}"
+    file.write_bytes(whole)
+    alone = read_picture(file)
+    file.write_bytes(whole + behind)
+    assert np.array_equal(read_picture(file), alone)
+    file.write_bytes(whole[: len(whole) * 2 // 3] + behind)
+    with pytest.raises(SagsError, match="damaged or cut off"):
+        read_picture(file)
+
+
 def test_gray_pictures_of_sixteen_bit_in_every_kind_that_has_them(tmp_path: Path) -> None:
     depth = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 7
     for suffix in (".png", ".tiff", ".pgm"):

@@ -6,6 +6,7 @@ say nothing.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable
 from contextlib import closing
@@ -31,18 +32,20 @@ from PIL.TiffImagePlugin import (
 
 KINDS = "JPEG, PNG, TIFF, BMP, WebP or binary PGM/PPM"
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm"))
+_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 _READERS: dict[bytes, Callable[[BytesIO], ImageFile]] = {  # by how a file begins
-    b"\xff\xd8": JpegImagePlugin.JpegImageFile,
-    b"\x89PNG\r\n\x1a\n": PngImagePlugin.PngImageFile,
+    _JPEG: JpegImagePlugin.JpegImageFile,
+    _PNG: PngImagePlugin.PngImageFile,
     b"BM": BmpImagePlugin.BmpImageFile,
     b"P5": PpmImagePlugin.PpmImageFile,
     b"P6": PpmImagePlugin.PpmImageFile,
     b"RIFF": WebPImagePlugin.WebPImageFile,
 }
 _TIFF_STRIPS, _TIFF_TILES = (STRIPOFFSETS, STRIPBYTECOUNTS), (TILEOFFSETS, TILEBYTECOUNTS)
-_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89PNG\r\n\x1a\n": b"IEND\xaeB`\x82"}  # marks of a picture's end
+_ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND\xaeB`\x82"}  # marks of a picture's end
+_JPEG_MARK = re.compile(rb"\xff+([^\0\xff\xd0-\xd7])")  # but for those that stand within pixels
 warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # of damaged files; they are refused
-_LONGEST_PADDING = 512  # bytes some cameras write after the end of a picture
+_LONGEST_PADDING = 512  # bytes after the end of a picture, within which its mark is looked for first
 
 
 def claimed_size(data: memoryview) -> tuple[int, int] | None:
@@ -59,9 +62,10 @@ def claimed_size(data: memoryview) -> tuple[int, int] | None:
 
 def is_whole(data: memoryview) -> bool:
     """Whether the end of a picture is there: its mark, or, where a kind has none, all of its pixels."""
-    end = next((end for begin, end in _ENDS.items() if bytes(data[: len(begin)]) == begin), None)
-    if end is not None:
-        return end in bytes(data[-_LONGEST_PADDING:])
+    begin = next((begin for begin in _ENDS if bytes(data[: len(begin)]) == begin), None)
+    if begin is not None:
+        follow = _jpeg_ends if begin == _JPEG else _png_ends
+        return _ENDS[begin] in bytes(data[-_LONGEST_PADDING:]) or follow(data)
     try:
         if _is_tiff(data):
             tags = _tiff_tags(data)
@@ -74,6 +78,23 @@ def is_whole(data: memoryview) -> bool:
     except Exception:  # as above
         return False
     return True
+
+
+def _jpeg_ends(data: memoryview) -> bool:
+    """Whether its segments and scans lead to an end; drivers hand over buffers that are longer."""
+    at = 2
+    while (found := _JPEG_MARK.search(data, at)) is not None and found[1] != b"\xd9":
+        length = int.from_bytes(data[found.end() : found.end() + 2], "big")
+        at = found.end() + max(2, length)
+    return found is not None
+
+
+def _png_ends(data: memoryview) -> bool:
+    """Whether its chunks lead to an end."""
+    at = len(_PNG)
+    while at + 12 <= len(data) and bytes(data[at + 4 : at + 8]) != b"IEND":
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return at + 12 <= len(data)
 
 
 def _is_tiff(data: memoryview) -> bool:

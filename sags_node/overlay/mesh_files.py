@@ -145,14 +145,14 @@ def _obj(data: bytes) -> tuple[F64, list[Face]]:
 def stl_triangles(start: bytes, size: int) -> int | None:
     """How many triangles a binary STL file of so many bytes claims; None: it is one of text."""
     claimed = int.from_bytes(start[STL_START - 4 : STL_START], "little")
-    is_text = start.startswith(b"solid") and size != STL_START + claimed * STL_TRIANGLE
+    is_text = start.lstrip().lower().startswith(b"solid") and size != STL_START + claimed * STL_TRIANGLE
     return None if is_text else claimed
 
 
 def _stl(data: bytes) -> tuple[F64, list[Face]]:
     claimed = stl_triangles(data[:STL_START], len(data))
     if claimed is None:
-        words = data.split()
+        words = data.lower().split()
         places = [number for number, word in enumerate(words) if word == b"vertex"]
         corners = np.array([[float(word) for word in words[at + 1 : at + 4]] for at in places])
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from sags_node.types import U8
 
 IMAGE_TYPES = (IMAGE, cdr.COMPRESSED)
 LARGEST_SIDE = 16384  # px
+_BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)")
 _STAMP = struct.Struct("<iI")
 _BIG_STAMP = struct.Struct(">iI")
 
@@ -79,9 +81,21 @@ def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
     if kind == cdr.COMPRESSED:
         decoded = decode_file(np.asarray(message.data, np.uint8), where)
         channels = 1 if decoded.ndim == 2 else decoded.shape[2]
-        of_file: U8 = cv2.cvtColor(decoded, _FILE_TO_RGB[channels])
+        mosaic = _mosaic(message.format) if channels == 1 else None
+        of_file: U8 = cv2.cvtColor(decoded, _FILE_TO_RGB[channels] if mosaic is None else mosaic)
         return of_file
     return _raw_to_rgb(message, where)
+
+
+def _mosaic(said: str) -> int | None:
+    """OpenCV's conversion of a grey file that is a Bayer mosaic, by the `format` of its message; None: it is
+    none. Who took the mosaic apart names what it became, as in `bayer_rggb8; jpeg compressed mono8`."""
+    before, _, made = said.lower().partition(";")
+    pattern = _BAYER.match(before.strip())
+    target = made.split()[-1:]
+    if pattern is None or target in (["mono8"], ["bgr8"], ["rgb8"]):
+        return None
+    return ENCODINGS[f"{pattern[0]}8"].to_rgb
 
 
 def _raw_to_rgb(message: Any, where: str) -> U8:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,17 @@ def test_meshes_and_points_are_read_in_metres(name: str, tmp_path: Path) -> None
     assert len(mesh.triangles) == (8 * 8 if points else 12)
     room = 0.002 if points else 0.0
     assert np.allclose(np.ptp(mesh.vertices, axis=0), np.array([0.01, 0.02, 0.03]) + room, atol=1e-6)
+
+
+@pytest.mark.parametrize("begins", ["SOLID box", " solid box", "\tSolid", "\r\nsolid"])
+@pytest.mark.parametrize("change", [str, str.upper])
+def test_stl_as_text_in_any_letters(begins: str, change: Callable[[str], str], tmp_path: Path) -> None:
+    corners = "".join(f"vertex {corner}\n" for corner in ("0 0 0", "1e-2 0 0", "0 2.0e-2 0"))
+    facet = change(f"facet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\nendsolid\n")
+    (tmp_path / "a.stl").write_text(f"{begins}\n{facet}")
+    mesh = mesh_of(ObjectSpec(file=tmp_path / "a.stl"))
+    assert mesh is not None and len(mesh.triangles) == 1
+    assert np.allclose(np.ptp(mesh.vertices, axis=0), [0.01, 0.02, 0])
 
 
 PLY = "ply\nformat ascii 1.0\nelement vertex {v}\nproperty float x\nproperty float y\nproperty float z\n"

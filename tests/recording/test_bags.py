@@ -25,6 +25,7 @@ from sags_node.recording import rosbag1_check
 from sags_node.recording.bag import read_messages
 from sags_node.recording.bag_writer import BagWriter, Limits
 from sags_node.recording.info import bag_info
+from sags_node.recording.pictures import decode_picture
 from sags_node.rig import save_rig
 from sags_node.sources.bags import read_rig
 from sags_node.sources.replay import Replay
@@ -104,6 +105,34 @@ def test_compressed_pictures(kind: str, tolerance: int, tmp_path: Path) -> None:
     assert_frames(play(path), [0, 1, 2], tolerance)
     assert_frames(play(path, left="rig/left/image_raw"), [0, 1, 2], tolerance)  # found by its raw name
     assert read_rig(BagSource(path=path)) is not None
+
+
+def mosaic(rgb: np.ndarray, pattern: str) -> np.ndarray:
+    """One channel [H, W]: of each pixel the one that the pattern names, row by row."""
+    made = np.empty(rgb.shape[:2], np.uint8)
+    for at, channel in enumerate(pattern):
+        made[at // 2 :: 2, at % 2 :: 2] = rgb[at // 2 :: 2, at % 2 :: 2, "rgb".index(channel)]
+    return made
+
+
+@pytest.mark.parametrize("kind", ["png", "jpeg"])
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_compressed_mosaics_are_taken_apart(pattern: str, kind: str) -> None:
+    """A plain colour stays what it was; a file that was taken apart before it was packed is left as it is."""
+    rgb = np.full((32, 48, 3), (153, 73, 66), np.uint8)
+    file = cv2.imencode(f".{kind}", mosaic(rgb, pattern), [cv2.IMWRITE_JPEG_QUALITY, 100])[1].ravel()
+    for said, taken_apart in (
+        (f"bayer_{pattern}8; {kind} compressed ", True),
+        (f"bayer_{pattern}8; {kind} compressed bayer_{pattern}8", True),
+        (f"bayer_{pattern}8", True),
+        (f"bayer_{pattern}8; {kind} compressed mono8", False),
+        (f"mono8; {kind} compressed mono8", False),
+        (kind, False),
+    ):
+        message = ROS2.types[files.COMPRESSED](files.header(ROS2, START), said, file)
+        shown = decode_picture(bytes(ROS2.serialize_cdr(message, files.COMPRESSED)), files.COMPRESSED, "")
+        assert (np.abs(shown.mean((0, 1)) - rgb[0, 0]).max() < 3) == taken_apart
+        assert (np.ptp(shown.mean((0, 1))) < 1) == (not taken_apart)
 
 
 def test_playing_from_anywhere_again_and_again(tmp_path: Path) -> None:
