@@ -14,7 +14,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
-from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -47,9 +46,7 @@ from sags_node.sources.gst_process import ELEMENTS, check_launch, installed
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import size_text
 from sags_node.sources.robot import hand_eye_file
-from sags_node.sources.source import open_source
 from sags_node.vision.onnx_session import OnnxSession
-from sags_node.vision.rectify import Rectifier
 
 Level = Literal["ok", "warning", "error"]
 REQUIRED = (
@@ -103,7 +100,10 @@ def _launched(config: LaunchConfig) -> list[Check]:
     source, robot, vision = config.source, config.robot, config.vision
     checks = []
     if isinstance(source, RecordedSource) and not isinstance(source, PhantomSource):
-        checks += [Check("source", each.level, each.what, each.fix) for each in played(config)]
+        for each in played(config):
+            name, _, rest = each.what.partition(": ")
+            row, said = ("calibration", rest) if name.startswith("calibration") else ("source", each.what)
+            checks.append(Check(row, each.level, said, each.fix))
     if isinstance(source, V4l2Source):
         right = () if source.right is None or source.geometry.layout != "separate" else (source.right,)
         checks += [_device(path) for path in (source.left, *right)]
@@ -115,15 +115,15 @@ def _launched(config: LaunchConfig) -> list[Check]:
         if isinstance(part, Ros2Source | Ros2Robot):
             checks.append(_ros(section, part))
     comes_with_pictures = isinstance(source, Ros2Source) and config.rig is None
+    judged = any(check.name == "calibration" for check in checks)
     uncalibrated = False
     with suppress(SagsError):  # a recording that cannot be read was said
         uncalibrated = not isinstance(source, PhantomSource) and lacks_rig(config)
     if uncalibrated:
         fix = "depth has no unit without one; sags calib stereo makes one, then set rig"
         checks.append(Check("calibration", "warning", "no calibration", fix))
-    elif not (isinstance(source, PhantomSource) or comes_with_pictures):
-        readable = all(check.level != "error" for check in checks)
-        checks.append(_tried("calibration", lambda: _check_rig(config, readable), "can be used"))
+    elif not (isinstance(source, PhantomSource) or comes_with_pictures or judged):
+        checks.append(_tried("calibration", lambda: _check_rig(config), "can be used"))
     if robot is not None:
         checks.append(_tried("hand-eye", lambda: read_hand_eye(hand_eye_file(config)), "can be used"))
     if vision.onnx.path is not None:
@@ -143,20 +143,13 @@ def _tried(name: str, look: Callable[[], object], found: str) -> Check:
     return Check(name, "ok", found)
 
 
-def _check_rig(config: LaunchConfig, readable: bool) -> None:
-    """Read the calibration. Where the pictures' size is known without a camera, compare it.
-
-    Args:
-        readable: the pictures of a recording are.
+def _check_rig(config: LaunchConfig) -> None:
+    """Read the calibration. Where the size of a camera's pictures is known without it, compare it.
 
     Raises:
         SagsError: it cannot be used.
     """
     rig, source = rig_of(config), config.source
-    if isinstance(source, RecordedSource) and readable:
-        with open_source(source.model_copy(update={"pace": "step"}), references=False) as opened:
-            for frame in islice(opened, 1):
-                Rectifier(rig, rig.left.width, rig.left.height)(frame)
     if isinstance(source, V4l2Source):
         size = Layout(source.geometry).size(source.width, source.height, source.left)
         if size != (rig.left.width, rig.left.height):

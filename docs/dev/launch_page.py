@@ -73,7 +73,13 @@ WORDS: dict[Any, str] = {
     Box: "`[x, y, width, height]`, px",
     Segments: "map",
 }
-MANY = {"whole number": "whole numbers", "number": "numbers", "path": "paths", "text": "texts"}
+MANY = {
+    "whole number": "whole numbers",
+    "number": "numbers",
+    "path": "paths",
+    "text": "texts",
+    "whole number or text": "whole numbers or texts",
+}
 
 
 def page() -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from sags_node.config.launch_file import VIDEO_SUFFIXES
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources.pictures import check_counts, list_pictures, read_picture, size_text
+from sags_node.sources.pictures import pair_files, read_picture, size_text
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8
 
@@ -31,9 +31,7 @@ def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
             if file.suffix.lower() in VIDEO_SUFFIXES:
                 raise UsageError(f"{file} is a video: name the launch file that plays it with --session")
         if left.is_dir() or right.is_dir():
-            lefts, rights = list_pictures(left), list_pictures(right)
-            check_counts(left, lefts, right, rights)
-            files += zip(lefts, rights, strict=True)
+            files += [(pair[0], pair[1]) for pair in pair_files((left, right))]
         else:
             files.append((left, right))
     pairs = [(read_picture(left), read_picture(right)) for left, right in _spread(files)]

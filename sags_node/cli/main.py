@@ -327,22 +327,24 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     metavar="FOLDER",
     help="Look it over; nothing is changed.",
 )
+@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
 @as_json
-def import_folder(folder: Path, json_out: bool) -> None:
+def import_folder(folder: Path, overrides: tuple[str, ...], json_out: bool) -> None:
     """Say what a folder is, and what is odd in it.
 
     Each thing that is odd or missing comes with its fix. Looked at are layout, counts and gaps, sizes, black
     borders, interlacing, order of the eyes and rows, mask polarity, unit of depth, and the calibration
-    against the pictures. Exit code 1: it cannot be played as it is.
+    against the pictures; and it is opened as sags run opens it. Exit code 1: it cannot be played as it is.
 
     \b
     sags import --check /data/endonerf/pulling_soft_tissues
+    sags import --check my_folder 'source.instruments:=[85,170]'
     """
     from dataclasses import asdict
 
     from sags_node.importing.check import check_folder as look_over
 
-    findings = look_over(folder)
+    findings = look_over(folder, overrides)
     rows = [asdict(finding) for finding in findings]
     people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
     show(rows if json_out else text.rows_table(people))

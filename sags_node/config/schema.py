@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from annotated_types import Ge, Gt, Le
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 # Every number has a lower and an upper limit: a slip is told when it is read, not by what it leads to.
 Pixels = Annotated[int, Ge(0), Le(65536)]
@@ -26,6 +27,34 @@ Share = Annotated[float, Ge(0), Le(1)]
 Finite = Annotated[float, Ge(-1_000_000), Le(1_000_000)]
 Positive = Annotated[float, Ge(1e-6), Le(1_000_000)]
 Side = Annotated[int, Ge(16), Le(4096)]  # px
+
+
+def _possible_levels(levels: tuple[float, float]) -> tuple[float, float]:
+    if levels[0] >= levels[1]:
+        raise ValueError(f"levels {list(levels)} should be 0 <= black < white <= 1")
+    return levels
+
+
+def _values_of_masks(said: object) -> object:
+    known = [
+        0 <= value <= 255 if isinstance(value, int) else re.fullmatch("#[0-9a-f]{6}", str(value))
+        for value in (said if isinstance(said, list | tuple) else ())
+    ]
+    if said not in ("white", "black") and not (known and all(known)):
+        raise ValueError('should be white, black, or a list of values: 0 to 255, or colours as "#00ff00"')
+    return said
+
+
+Levels = Annotated[
+    tuple[Share, Share], AfterValidator(_possible_levels)
+]  # black and white, shares of the range
+Instruments = Annotated[  # in masks
+    Literal["white", "black"] | tuple[int | str, ...], BeforeValidator(_values_of_masks)
+]
+_INSTRUMENTS = (
+    "how masks show them: white (above 127), black, or as one of these values and colours, e.g. [85,170] or "
+    '["#00ff00"]; what has other values is tissue'
+)
 NAMESPACE = r"^[A-Za-z0-9_][A-Za-z0-9_/]*$"
 
 
@@ -77,7 +106,13 @@ class FoldersSource(RecordedSource):
     right: Path | None = Field(
         None, description="folder of the right eye's; null: one camera, with a monocular vision.onnx"
     )
-    tools: Path | None = Field(None, description="folder of mask PNGs, 255 = instrument (not tissue)")
+    tools: Path | None = Field(None, description="folder of masks of the instruments (not tissue)")
+    instruments: Instruments = Field("white", description=_INSTRUMENTS)
+    levels: Levels | None = Field(
+        None,
+        description="what becomes black and white of 10 to 16 bit pictures, in units of the brightest value; "
+        "default: white is the brightest value of the bits that they use",
+    )
 
 
 class GeometryConfig(Section):
@@ -105,7 +140,7 @@ class GeometryConfig(Section):
     flip: Literal["none", "horizontal", "vertical", "both"] = Field(
         "none", description="of each eye's picture: mirrored, upside down, or turned by 180 degrees (both)"
     )
-    levels: tuple[Share, Share] = Field(
+    levels: Levels = Field(
         (0.0, 1.0),
         description="what becomes black and white, in units of the brightest value; of 10, 12 and 16 bit "
         "pictures the eight bits that are used then lie where the picture has its tones",
@@ -122,8 +157,6 @@ class GeometryConfig(Section):
                 raise ValueError(
                     f"{list(box)} is no box [x, y, width, height]: it needs a width and a height"
                 )
-        if self.levels[0] >= self.levels[1]:
-            raise ValueError(f"levels {list(self.levels)} should be 0 <= black < white <= 1")
         return self
 
 
@@ -158,7 +191,7 @@ class EndoNerfSource(RecordedSource):
     folder: Path = Field(description="holds images/, masks/, depth/ and poses_bounds.npy")
     rate: Rate | None = Field(15.0, description="frames per second; the files do not say it")
     depth_unit: DepthUnit = Field(1e-3, description="metres per count of depth/; the files do not say it")
-    instruments: Literal["white", "black"] = Field("white", description="how masks/ shows them")
+    instruments: Instruments = Field("white", description=_INSTRUMENTS)
     baseline: float | None = Field(
         None,
         gt=0,

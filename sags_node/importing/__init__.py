@@ -1,4 +1,4 @@
 """`sags import --check`, `sags new`: what a folder of recordings is, what is odd in it, and how to play it.
 
-Imports calibration, config, media, rig and sources.
+Imports calibration, config, media, pipeline, rig, sources and vision.
 """

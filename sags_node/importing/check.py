@@ -2,31 +2,50 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import shlex
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import islice
+from logging.handlers import BufferingHandler
 from pathlib import Path
 
-from sags_node.calibration.check import check_calibration, judge, rectified_before
-from sags_node.calibration.pictures import Pair, pairs_of_files
+from sags_node.calibration.check import judge, rectified_before
+from sags_node.calibration.pictures import pairs_of_session
 from sags_node.calibration.rows import RECTIFIED
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import EndoNerfSource, LaunchConfig, RecordedSource, VideosSource
+from sags_node.config.schema import (
+    EndoNerfSource,
+    LaunchConfig,
+    LiveSource,
+    PhantomSource,
+    RecordedSource,
+    VideosSource,
+)
 from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures, videos
 from sags_node.importing.folder import Contents, both_eyes, calibration_of, override, recognise
-from sags_node.importing.timing import LOOKED_AT, Timing, check_timing
+from sags_node.importing.timing import LOOKED_AT, Timing
+from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
 from sags_node.rig import Finding, read_rig
 from sags_node.sources.endonerf import is_published
-from sags_node.sources.pictures import FolderPairs, size_text
-from sags_node.sources.rectified import as_named
-from sags_node.sources.replay import Replay
-from sags_node.sources.source import open_source
+from sags_node.sources.pictures import size_text
+from sags_node.sources.rectified import as_pictures_come
+from sags_node.sources.replay import Recording, Replay
+from sags_node.sources.source import open_source, recorded_rig
+from sags_node.vision.rectify import Rectifier
+
+MOST_SAID = 1 << 16  # lines in the log
 
 
-def check_folder(folder: Path) -> list[Finding]:
+def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
     """What a folder is, what is missing or odd, each with a way to fix it; the last says how to play it.
+
+    It is opened and played as `sags run` does it: what that refuses is an error here, with its words.
+
+    Args:
+        overrides: `key:=value` that it is to be played with.
 
     Raises:
         UsageError: it is no folder.
@@ -37,20 +56,22 @@ def check_folder(folder: Path) -> list[Finding]:
     if contents.left is not None:
         found += _pictures(contents, contents.left)
     if contents.videos:
-        looked, pairs = videos.look(contents.videos)
-        found += looked + (_calibrated(folder, contents.videos, pairs) if pairs else [])
-    if contents.config is not None:
-        found += played(contents.config)
-    if not any("clocks_differ_ms" in finding.figures for finding in found):  # else rows tell of the clocks
-        found += _calibration(folder, contents)
-    found = _once(found)
+        found += videos.look(contents.videos)
     if contents.level == "error":
         return found
-    if any(finding.level == "error" for finding in found):
+    launch: list[str] = []
+
+    def look() -> list[Finding]:
+        launch.extend([*overrides_of(folder), *overrides])
+        config = load_launch(folder, launch)
+        plays = played(config)
+        apart = any("clocks_differ_ms" in each.figures for each in plays)  # then rows tell of the clocks
+        judged = [] if apart else calibrated(config)
+        return plays + (judged if _refused(plays) else _as_warnings(judged))
+
+    found = _once(found + _tried("frames", look))
+    if _refused(found):
         return [*found, Finding("ok", f"to play it: when that is fixed: sags run {_quoted(folder)}")]
-    if contents.instead:
-        return [*found, Finding("ok", f"to play it: {contents.instead}")]
-    launch = overrides_of(folder)
     stands_for = f", which stands for {' '.join(map(_quoted, launch))}" if launch else ""
     return [*found, Finding("ok", f"to play it: sags run {_quoted(folder)}{stands_for}")]
 
@@ -81,48 +102,48 @@ def overrides_of(path: Path) -> list[str]:
 
 
 def _once(found: list[Finding]) -> list[Finding]:
-    """One file that cannot be read is met by several who look; the first says it."""
+    """What is wrong is met by several who look; the first says it."""
     said: set[str] = set()
     kept = []
     for finding in found:
-        why = finding.what.partition(": ")[2]
-        if finding.level != "error" or not why or why not in said:
+        why = finding.what.removeprefix(f"{finding.what.partition(': ')[0]}: ")
+        if finding.level == "ok" or why not in said:
             kept.append(finding)
         said.add(why)
     return kept
 
 
+def _refused(found: Sequence[Finding]) -> bool:
+    return any(finding.level == "error" for finding in found)
+
+
+def _as_warnings(found: Sequence[Finding]) -> list[Finding]:
+    """What is wrong, and yet is played."""
+    return [replace(each, level="warning") if each.level == "error" else each for each in found]
+
+
 def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
+    """What some pictures show, before anything plays them."""
     if contents.right is None and contents.config is None:
         return _tried("pictures", lambda: _in_one_folder(left_folder))
-    named = {"left": left_folder, "right": contents.right, "masks": contents.masks}
-    there = {what: each for what, each in named.items() if each is not None}
-    source = None if contents.config is None else contents.config.source
-    clip = source if isinstance(source, EndoNerfSource) else None
-    if clip is not None and contents.depth is not None:
-        there["depth"] = contents.depth
-    found = _tried("pictures", lambda: pictures.check_counts(there))
-    right_folder = contents.right
-    if right_folder is not None and contents.config is None and found[0].level == "ok":
-        found += _tried("pictures", lambda: check_timing(FolderPairs(left_folder, right_folder)))
-    try:
+
+    def look() -> list[Finding]:
+        found = pictures.check_numbers({"left": left_folder, "right": contents.right})
         left = pictures.sample(left_folder)
         right = [] if contents.right is None else pictures.sample(contents.right)
-    except SagsError as error:
-        return [*found, pictures.refused("pictures", error)]
-    found += pictures.check_eye("left", left)
-    if right:
-        found += pictures.check_eye("right", right) + pictures.check_eyes(left, right)
-    size = left[0][1].shape[1], left[0][1].shape[0]
-    masks, depth = contents.masks, contents.depth
-    if masks is not None:
-        polarity = "white" if clip is None else clip.instruments
-        found += _tried("masks", lambda: pictures.check_masks(masks, size, polarity))
-    if depth is not None:
-        unit = None if clip is None else clip.depth_unit
-        stated = clip is not None and clip.depth_unit == 1e-3 and is_published(clip)
-        found += _tried("depth", lambda: pictures.check_depth(depth, size, unit, stated))
-    return found
+        found += pictures.check_eye("left", left)
+        if right:
+            found += pictures.check_eye("right", right) + pictures.check_eyes(left, right)
+        if contents.depth is not None:
+            source = None if contents.config is None else contents.config.source
+            clip = source if isinstance(source, EndoNerfSource) else None
+            unit = None if clip is None else clip.depth_unit
+            stated = clip is not None and clip.depth_unit == 1e-3 and is_published(clip)
+            size = left[0][1].shape[1], left[0][1].shape[0]
+            found += _as_warnings(pictures.check_depth(contents.depth, size, unit, stated))
+        return found
+
+    return _tried("pictures", look)
 
 
 def _in_one_folder(folder: Path) -> list[Finding]:
@@ -133,30 +154,6 @@ def _in_one_folder(folder: Path) -> list[Finding]:
     left, right = (pictures.read_some([pair[eye] for pair in apart]) for eye in (0, 1))
     eyes = pictures.check_eye("left", left) + pictures.check_eye("right", right)
     return eyes + pictures.check_eyes(left, right)
-
-
-def _calibration(folder: Path, contents: Contents) -> list[Finding]:
-    """The calibration beside the pictures, against them; sessions that are played as they are name theirs."""
-    if contents.config is not None and (contents.right is not None or contents.left is None):
-        return _tried("calibration", lambda: odd_or_last(check_calibration(folder)))
-    if contents.right is None or contents.left is None:
-        return []
-    return _calibrated(folder, (contents.left, contents.right))
-
-
-def _calibrated(folder: Path, eyes: tuple[Path, ...], pairs: Sequence[Pair] = ()) -> list[Finding]:
-    """The calibration beside the pictures of both eyes, against some `pairs` of them; default: of the files
-    in two folders."""
-    form = calibration_of(folder)
-    if form is None:
-        return [without_calibration()]
-
-    def compare() -> list[Finding]:
-        looked_at = pairs or pairs_of_files([(eyes[0], eyes[1])])
-        height, width = looked_at[0][0].shape[:2]
-        return odd_or_last(judge(as_named(read_rig(form, (width, height)), *eyes), looked_at))
-
-    return _tried("calibration", compare)
 
 
 def without_calibration() -> Finding:
@@ -171,35 +168,84 @@ def odd_or_last(found: list[Finding]) -> list[Finding]:
 
 
 def played(config: LaunchConfig) -> list[Finding]:
-    """Whether frames come as `sags run` would read them, all of both eyes, and both at one time."""
+    """Whether frames come as `sags run` reads them, by the same code: all of both eyes, both at one time, and
+    of the calibration's size. What that says in the log is a finding, too."""
     source = config.source
     if not isinstance(source, RecordedSource):
         return [
             Finding("ok", f"source.kind {source.kind} is live: sags doctor and sags calib live look at it")
         ]
     source = source.model_copy(update={"pace": "step", "loop": False})
+    found = _tried("frames", lambda: _frames(source))
+    if _refused(found):
+        return found
+    what = "calibration" if config.robot is None else "calibration or robot"
+    return found + _tried(what, lambda: _fits(config.model_copy(update={"source": source})))
 
-    def look() -> list[Finding]:
-        timing, size, ends = Timing(), None, []
-        with open_source(source, references=False) as opened:
-            if isinstance(source, VideosSource) and source.right is not None:
-                frames = round(source.start * opened.rate) + (opened.frame_count or 0)
-                ends = videos.check_ends(source.left, source.right, frames * source.stride)
-            for frame in islice(opened, 1 if ends else LOOKED_AT):
-                size = size or frame.left.shape[1::-1]
-                if frame.right is not None:
-                    timing.add(frame.left, frame.right)
-            if size is None:
-                return [Finding("error", "not one frame can be read", "check the files")]
-            said = f"{opened.frame_count} frames of {size_text(*size)} px at {opened.rate:g} Hz"
-            stamped = list(opened.findings) if isinstance(opened, Replay) else []
-        return [Finding("ok", said), *ends, *(stamped or timing.findings())]
 
-    return _tried("frames", look)
+def _frames(source: Recording | PhantomSource) -> list[Finding]:
+    """The first frame, and those in the middle: do masks mark something, are the eyes of one time?"""
+    with open_source(source, references=False) as opened:
+        count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
+        stamped = list(opened.findings) if isinstance(opened, Replay) else []
+    if first is None:
+        return [Finding("error", "not one frame can be read", "check the files")]
+    found = [Finding("ok", f"{count} frames of {size_text(*first.left.shape[1::-1])} px at {rate:g} Hz")]
+    if isinstance(source, VideosSource) and source.right is not None:
+        frames = round(source.start * rate) + count
+        found += videos.check_ends(source.left, source.right, frames * source.stride)
+    if found[-1].level == "error":
+        return found
+    timing, shares = Timing(), []
+    middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate
+    with open_source(source.model_copy(update={"start": middle}), references=False) as opened:
+        for frame in islice(opened, LOOKED_AT):
+            if frame.right is not None:
+                timing.add(frame.left, frame.right)
+            if frame.tissue is not None:
+                shares.append(1 - float(frame.tissue.mean()))
+    return [*found, *pictures.check_shares(shares), *(stamped or timing.findings())]
+
+
+def _fits(config: LaunchConfig) -> list[Finding]:
+    """Nothing, where a frame and the robot's poses are of the calibration."""
+    rig = rig_to_play(config, guess=True)
+    with open_posed(config, rig, references=False) as opened:
+        for frame in islice(opened, 1):
+            Rectifier(rig, rig.left.width, rig.left.height)(frame)
+    return []
+
+
+def calibrated(config: LaunchConfig) -> list[Finding]:
+    """The calibration with which it is played, against its pictures."""
+
+    def compare() -> list[Finding]:
+        source = config.source
+        one_eyed = isinstance(source, EndoNerfSource) and source.baseline is None
+        if config.one_camera or one_eyed or isinstance(source, LiveSource | PhantomSource):
+            return []
+        if lacks_rig(config):
+            return [without_calibration()]
+        pairs, depths = pairs_of_session(config)
+        size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+        rig = recorded_rig(source) if config.rig is None else read_rig(config.rig, size)
+        assert rig is not None  # else it lacks one
+        return odd_or_last(judge(as_pictures_come(rig, config), pairs, depths))
+
+    return _tried("calibration", compare)
 
 
 def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:
+    """What is found, what is said in the log meanwhile, and an error as a finding."""
+    log, said = logging.getLogger("sags_node"), BufferingHandler(MOST_SAID)
+    said.setLevel(logging.WARNING)
+    log.addHandler(said)
+    log.propagate = False
     try:
-        return look()
+        found = look()
     except SagsError as error:
-        return [pictures.refused(what, error)]
+        found = [pictures.refused(what, error)]
+    finally:
+        log.propagate = True
+        log.removeHandler(said)
+    return [*(pictures.parted("warning", each.getMessage()) for each in said.buffer), *found]

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from sags_node.config.launch_file import VIDEO_SUFFIXES, known_recording, load_launch
+from sags_node.config.launch_file import VIDEO_SUFFIXES, is_launch, known_recording, load_launch
 from sags_node.config.schema import LaunchConfig
 from sags_node.config.yaml_reader import parse_yaml
 from sags_node.errors import UsageError
 from sags_node.media.picture_header import SUFFIXES
 from sags_node.rig import find_form
+from sags_node.sources.names import EYE
 
 EYES = (("left", "right"), ("l", "r"), ("image_left", "image_right"), ("left_rectified", "right_rectified"))
 HAMLYN_EYES = (("image01", "image02"), ("image_0", "image_1"), ("images", "images_right"))
 MASKS = ("masks", "mask", "tools", "toolmask", "tool_mask")
-_EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+LAUNCH_SUFFIXES = (".yaml", ".yml")
 CALIBRATIONS = (".", "calib", "calibration", "camera", "rig")
 DEPTHS = ("depth", "depths", "depth01", "depth_mm_x100")
 
@@ -50,12 +50,12 @@ def recognise(folder: Path) -> Contents:
         raise UsageError(f"{folder} does not exist; check the path")
     if is_video(folder):
         return Contents("one video", videos=(folder,))
-    if not folder.is_dir() and known_recording(folder) is None:
+    if not folder.is_dir() and folder.suffix not in LAUNCH_SUFFIXES and known_recording(folder) is None:
         raise UsageError(f"{folder} is neither a folder nor a video; give the one that holds the recording")
     try:
         config = load_launch(folder)
     except UsageError as error:
-        if (folder / "launch.yaml").is_file():
+        if is_launch(folder):
             return Contents("a session whose launch.yaml is wrong", str(error), "error")
     else:
         return _playable(folder, config)
@@ -94,7 +94,11 @@ def _plain(folder: Path) -> Contents:
     videos = sorted(file for file in folder.iterdir() if is_video(file))
     if videos:
         what = "one video" if len(videos) == 1 else f"{len(videos)} videos"
-        return Contents(what, videos=_eye_videos(videos))
+        of_eyes = _eye_videos(videos)
+        if len(of_eyes) > 2:
+            both = "name both: sags new LEFT RIGHT -o FILE.yaml, or leave only them in the folder"
+            return Contents(f"{what}, whose names do not tell which are the eyes", both, "error")
+        return Contents(what, videos=of_eyes)
     if has_pictures(folder):
         apart = both_eyes(folder)
         both = f" of both eyes, {len(apart)} pairs," if apart else ""
@@ -122,10 +126,10 @@ def _eye_folders(folder: Path) -> tuple[Path, Path] | None:
 
 
 def _eye_videos(videos: list[Path]) -> tuple[Path, ...]:
-    """Left and right one, by their names if these say it."""
+    """Left and right one, by their names if these say it; else all."""
     by_name = {file.stem: file for file in videos}
     named = [(by_name[left], by_name[right]) for left, right in _pairs(by_name)]
-    return named[0] if len(named) == 1 else tuple(videos[:2])
+    return named[0] if len(named) == 1 else tuple(videos)
 
 
 def both_eyes(folder: Path) -> list[tuple[Path, Path]]:
@@ -142,7 +146,7 @@ def _pairs(names: Iterable[str]) -> list[tuple[str, str]]:
     """Names that differ in nothing but the eye: a word `left` or `l` where the other has `right` or `r`."""
     eyes: dict[str, dict[str, str]] = {}
     for name in names:
-        for match in _EYE.finditer(name):
+        for match in EYE.finditer(name):
             rest = f"{name[: match.start()]}*{len(match[0])}*{name[match.end() :]}".replace("*5*", "*4*")
             eyes.setdefault(rest, {})[match[0][0].lower()] = name
     return [(found["l"], found["r"]) for found in eyes.values() if len(found) == 2]
@@ -190,6 +194,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
         Contents(
             "a sequence of StereoMIS-Tracking",
             "sags eval --protocol stereomis FOLDER follows its points (docs/evaluation.md)",
+            "error",
         ),
     ),
     (
@@ -198,6 +203,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
             "clips of D4D",
             "sags eval --protocol d4d FOLDER measures them; to play one, give its left_images_rect and "
             "right_images_rect as source.kind folders (docs/evaluation.md)",
+            "error",
         ),
     ),
     (
@@ -206,6 +212,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
             "a sequence of StereoMIS",
             "sags eval --protocol stereomis FOLDER measures it; to play it, write a launch file with "
             "source.geometry.layout over_under (docs/evaluation.md)",
+            "error",
         ),
     ),
     (
@@ -214,6 +221,7 @@ _KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
             "sequences of STIR",
             "sags eval --protocol stir FOLDER measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
             "are source.kind videos (docs/evaluation.md)",
+            "error",
         ),
     ),
 )
@@ -228,6 +236,5 @@ def _folder_of(value: object) -> Path | None:
 
 
 def _first(folder: Path, names: tuple[str, ...]) -> Path | None:
-    inside = folder.iterdir() if folder.is_dir() else ()
-    by_name = {each.name.lower(): each for each in inside if each.is_dir()}
+    by_name = {each.name.lower(): each for each in folder.glob("*") if each.is_dir()}
     return next((by_name[name] for name in names if name in by_name and has_pictures(by_name[name])), None)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from sags_node.calibration.matches import match_eyes
 from sags_node.errors import SagsError
 from sags_node.rig import Finding
+from sags_node.sources.names import numbers
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.types import U8, Bool
 
@@ -21,39 +22,28 @@ COMB_SHARE = 0.02  # of the pixels, and
 COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direction
 DARK = 12  # grey level of a border
 NARROWEST_BORDER = 4  # px
-POLARITY = 0.5  # share of a mask: instruments cover less
+GAP = 1.5  # times the usual step from number to number
 ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median
 DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0)  # m per count, the usual ones first
 FEWEST_MATCHES = 30
 RIGHT_FIRST = "source.geometry.first:=right"
-SAME_PICTURE = 1.0  # grey levels: less than two cameras' noise
 
 
-def check_counts(named: dict[str, Path]) -> list[Finding]:
-    """Whether folders that belong together hold equally many pictures, without gaps in their numbers."""
-    found, files = [], {what: list_pictures(folder) for what, folder in named.items()}
-    counts = {what: len(each) for what, each in files.items()}
-    if len(set(counts.values())) > 1:
-        said = ", ".join(f"{what} {count}" for what, count in counts.items())
-        found.append(Finding("error", f"not equally many pictures: {said}", _counts_fix(files)))
+def check_numbers(named: Mapping[str, Path | None]) -> list[Finding]:
+    """How many pictures there are, and gaps in their numbers or times."""
+    files = {what: list_pictures(folder) for what, folder in named.items() if folder is not None}
+    found = []
     for what, each in files.items():
-        numbers = [int(part[-1]) for file in each if (part := re.findall(r"\d+", file.stem))]
-        steps = np.diff(numbers)
-        if len(steps) and (odd := np.flatnonzero(steps != np.median(steps))).size:
+        steps = np.diff(np.array(numbers(each), np.float64))
+        if len(steps) and (odd := np.flatnonzero(steps > GAP * np.median(steps))).size:
             where = f"{each[odd[0]].name} and {each[odd[0] + 1].name}"
-            fix = "frames are paired by order, and played evenly: fill the gap or split the recording there"
+            fix = "frames are played evenly: fill the gap or split the recording there"
             found.append(
                 Finding("warning", f"{what}: {odd.size} gaps in the numbers, first between {where}", fix)
             )
-    return found or [Finding("ok", f"{min(counts.values())} pictures each, numbered without gaps")]
-
-
-def _counts_fix(files: dict[str, list[Path]]) -> str:
-    fewest = min(files, key=lambda what: len(files[what]))
-    stems = {file.stem for file in files[fewest]}
-    missing = [file.name for each in files.values() for file in each if file.stem not in stems]
-    named = f", e.g. {missing[0]}" if missing else ""
-    return f"{fewest} lacks some{named}: every picture needs its partner"
+    counts = {len(each) for each in files.values()}
+    said = " and ".join(map(str, sorted(counts)))
+    return found or [Finding("ok", f"{said} pictures each, numbered without gaps")]
 
 
 def sample(folder: Path, flags: int = cv2.IMREAD_COLOR) -> list[tuple[Path, U8]]:
@@ -123,12 +113,10 @@ def lit_box(brightest: U8) -> tuple[int, int, int, int]:
 
 
 def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]) -> list[Finding]:
-    """Of both eyes without a calibration: are they two pictures, in order, and are rows aligned?"""
+    """Of both eyes without a calibration: are they in order, and are rows aligned?"""
     pairs = [(a, b) for (_, a), (_, b) in zip(left, right, strict=False) if a.shape == b.shape]
     if not pairs:
         return [Finding("error", "the eyes' pictures have not one size", "resize both eyes alike")]
-    if np.median([np.mean(cv2.absdiff(a, b)) for a, b in pairs]) < SAME_PICTURE:
-        return [Finding("error", "both eyes show the same picture", "give each eye its own pictures")]
     matches = np.concatenate([match_eyes(a, b) for a, b in pairs])
     if len(matches) < FEWEST_MATCHES:
         fix = "are they of one moment and of one scope? Sharper pictures with more texture tell more"
@@ -148,28 +136,14 @@ def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]
     return [Finding("ok" if aligned else "warning", what, fix, figures)]
 
 
-def check_masks(folder: Path, size: tuple[int, int], instruments: str = "white") -> list[Finding]:
-    """Values, size and polarity of instrument masks; `instruments` as the recording is to be played."""
-    shares = []
-    for file, mask in sample(folder, cv2.IMREAD_GRAYSCALE):
-        if mask.shape[::-1] != size:
-            what = f"masks: {file.name} is {size_text(*mask.shape[::-1])} px, the pictures {size_text(*size)}"
-            return [Finding("error", what, "resize the masks with nearest neighbour")]
-        if 0 < mask.max() < 128:
-            what = f"masks: {file.name} has no value above {mask.max()}"
-            return [Finding("error", what, "a mask holds 0 and 255: multiply it by 255")]
-        shares.append(np.mean((mask >= 128) == (instruments == "white")))
-    share = float(np.median(shares))
-    if share > POLARITY:
-        fix = (
-            f"255 must be the instrument: invert the masks, or for EndoNeRF's layout set "
-            f"source.instruments:={'black' if instruments == 'white' else 'white'}"
-        )
-        return [Finding("error", f"masks: {share:.0%} would be instrument: polarity the other way?", fix)]
-    if share == 0:
+def check_shares(shares: Sequence[float]) -> list[Finding]:
+    """What masks say of frames: the share of each that is instrument."""
+    if not shares:
+        return []
+    if not any(shares):
         fix = "leave masks out, and tissue is found by colour (docs/networks.md)"
-        return [Finding("warning", "masks: none marks an instrument", fix)]
-    return [Finding("ok", f"masks: {share:.0%} of the picture is instrument")]
+        return [Finding("warning", f"masks: none of {len(shares)} marks an instrument", fix)]
+    return [Finding("ok", f"masks: {np.median(shares):.0%} of the picture is instrument")]
 
 
 def check_depth(
@@ -228,6 +202,11 @@ def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
 
 
 def refused(what: str, error: SagsError) -> Finding:
-    """Errors say what is wrong, and after a semicolon how to fix it."""
-    why, _, fix = str(error).partition("; ")
-    return Finding("error", f"{what}: {why}", fix or "fix or remove that file")
+    """An error as a finding."""
+    return parted("error", f"{what}: {error}", "fix or remove that file")
+
+
+def parted(level: Literal["warning", "error"], text: str, otherwise: str = "") -> Finding:
+    """Messages say what is wrong, and after a semicolon how to fix it."""
+    what, _, fix = text.partition("; ")
+    return Finding(level, what, fix or otherwise)

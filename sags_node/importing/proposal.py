@@ -9,19 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from sags_node.calibration.check import judge
 from sags_node.calibration.eyes import look
 from sags_node.calibration.pictures import pairs_of_session
 from sags_node.config.launch_file import known_recording, load_launch
 from sags_node.config.schema import EndoNerfSource, FoldersSource, LaunchConfig, LiveSource
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.importing import pictures, videos
-from sags_node.importing.check import odd_or_last, overrides_of, played, without_calibration
+from sags_node.importing.check import calibrated, overrides_of, played
 from sags_node.importing.folder import is_video, override
-from sags_node.rig import Finding, read_rig
+from sags_node.rig import Finding
 from sags_node.sources.pictures import size_text
-from sags_node.sources.rectified import as_pictures_come
-from sags_node.sources.source import recorded_rig
 
 DEVICES = Path("/dev")
 EYES = ("left", "right")
@@ -65,7 +62,7 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
             if each.launch and each.launch[0] in done
         ]
         looked = _looked_at(load_launch(named[0], launch))
-    return Proposal(launch, [*found, *looked, *_calibration(load_launch(named[0], launch))])
+    return Proposal(launch, [*found, *looked, *calibrated(load_launch(named[0], launch))])
 
 
 def _launch_of(named: Sequence[Path], overrides: Sequence[str]) -> list[str]:
@@ -136,19 +133,3 @@ def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str,
         done[pictures.RIGHT_FIRST] = "left and right are exchanged"
         fixes = [fix for fix in fixes if fix != pictures.RIGHT_FIRST]
     return [*(f"{key}:={value}" for key, value in keys.items()), *fixes], done
-
-
-def _calibration(config: LaunchConfig) -> list[Finding]:
-    recorded = recorded_rig(config.source)
-    if config.rig is None and recorded is None:
-        return [without_calibration()]
-    if isinstance(config.source, EndoNerfSource):
-        return []
-    pairs, depths = pairs_of_session(config)
-    try:
-        height, width = pairs[0][0].shape[:2]
-        rig = recorded if config.rig is None else read_rig(config.rig, (width, height))
-        assert rig is not None
-        return odd_or_last(judge(as_pictures_come(rig, config), pairs, depths))
-    except SagsError as error:
-        return [pictures.refused("calibration", error)]

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 
 from sags_node.rig import Finding
-from sags_node.sources.replay import Pairs
 from sags_node.types import F32, U8
 
 LOOKED_AT = 120  # frames, one after the other
@@ -51,22 +50,6 @@ class Timing:
             "or record both by one clock"
         )
         return [Finding("warning", what, fix, {"right_late_frames": late})]
-
-
-def check_timing(recording: Pairs) -> list[Finding]:
-    """`Timing.findings` of frames in the middle of a recording.
-
-    Raises:
-        SagsError: a picture cannot be read.
-    """
-    timing = Timing()
-    recording.seek(max(0, (recording.count - LOOKED_AT) // 2))
-    for _ in range(LOOKED_AT):
-        pair = recording.read()
-        if pair is None or pair.right is None:
-            break
-        timing.add(pair.left, pair.right)
-    return timing.findings()
 
 
 def _alike(left: F32, right: F32, late: int) -> float:

@@ -11,16 +11,12 @@ import cv2
 import numpy as np
 
 from sags_node.calibration.matches import match_eyes
-from sags_node.calibration.pictures import Pair
-from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures
 from sags_node.importing.folder import override
-from sags_node.importing.timing import check_timing
 from sags_node.rig import Finding
-from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import size_text
-from sags_node.sources.videos import Video, VideoPairs
+from sags_node.sources.videos import Video
 from sags_node.types import U8
 
 LOOKED_AT = 4  # pictures, spread over the video
@@ -65,26 +61,19 @@ _WAYS = (  # a part before the whole: what is found in the one is found in the o
 )
 
 
-def look(files: tuple[Path, ...]) -> tuple[list[Finding], list[Pair]]:
-    """What is odd about the videos of the left and the right eye, or one of both; and some pairs of two.
-    They are played as `launch_of` says."""
+def look(files: tuple[Path, ...]) -> list[Finding]:
+    """What some pictures show, of the videos of the left and the right eye, or of one of both. They are
+    played as `launch_of` says."""
     try:
         found = [_length(file) for file in files]
         shown = [_some(file) for file in files]
     except SagsError as error:
-        return [pictures.refused("video", error)], []
+        return [pictures.refused("video", error)]
     if len(files) == 1:
-        return found + _one(files[0], shown[0]), []
-    (left_file, right_file), (left, right) = files, shown
+        return found + _one(files[0], shown[0])
+    left, right = shown
     found += pictures.check_eye("left", left) + pictures.check_eye("right", right)
-    try:
-        with closing(VideoPairs(left_file, right_file, Layout(GeometryConfig()))) as pairs:
-            ends = check_ends(left_file, right_file, pairs.count)
-            found += ends or check_timing(pairs)
-    except SagsError as error:
-        return [*found, pictures.refused("videos", error)], []
-    found += pictures.check_eyes(left, right)
-    return found, [(a, b) for (_, a), (_, b) in zip(left, right, strict=True)]
+    return found + pictures.check_eyes(left, right)
 
 
 def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:

@@ -76,12 +76,7 @@ def open_session(
                 "publish.right: there is no right eye; set source.baseline, or leave publish.right out"
             )
         config = config.model_copy(update={"publish": config.publish.model_copy(update={"right": False})})
-    if isinstance(config.source, PhantomSource):
-        from sags_node.phantom import cached_session
-
-        rig = load_rig(cached_session(config.source, progress) / "calib")
-    else:
-        rig = guess_rig(config.source) if guess and lacks_rig(config) else rig_of(config)
+    rig = rig_to_play(config, progress, guess)
     source = open_posed(config, rig, references=False)
     return Session(_name(launch), config, rig, source)
 
@@ -118,6 +113,17 @@ def lacks_rig(config: LaunchConfig) -> bool:
     """Whether `open_session` would guess the calibration."""
     opens = isinstance(config.source, RecordedSource | V4l2Source | GstSource)  # by itself: nobody must send
     return config.rig is None and opens and recorded_rig(config.source, judged=False) is None
+
+
+def rig_to_play(
+    config: LaunchConfig, progress: Callable[[int, int], None] | None = None, guess: bool = False
+) -> StereoRig:
+    """The calibration that `open_session` plays with, its arguments as there."""
+    if isinstance(config.source, PhantomSource):
+        from sags_node.phantom import cached_session
+
+        return load_rig(cached_session(config.source, progress) / "calib")
+    return guess_rig(config.source) if guess and lacks_rig(config) else rig_of(config)
 
 
 def rig_of(config: LaunchConfig) -> StereoRig:

@@ -17,14 +17,7 @@ from sags_node import geometry
 from sags_node.config.schema import EndoNerfSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.rig import Finding, check_intrinsics, rectified_rig, refuse_errors
-from sags_node.sources.pictures import (
-    FolderPairs,
-    RawPair,
-    check_counts,
-    list_pictures,
-    read_picture,
-    size_text,
-)
+from sags_node.sources.pictures import FolderPairs, RawPair, pair_files, read_picture, size_text
 from sags_node.sources.pose_axes import READINGS, Seen, reading_that_fits
 from sags_node.sources.truth import load_npy
 from sags_node.types import F32, F64, StereoRig
@@ -35,7 +28,6 @@ PLAUSIBLE_DEPTH = (0.01, 1.0)  # m, the median of a frame: in an endoscope's vie
 PUBLISHED = (640, 512, 569.4682)  # px: width, height and focal length of the clips of EndoNeRF
 PUBLISHED_BASELINE = 4.324e-3  # m, which their author states
 NOMINAL_BASELINE = 0.005  # m; without a right picture nothing depends on it
-CHECKED_MASKS = 9  # spread over the clip
 
 
 class Llff(NamedTuple):
@@ -58,20 +50,20 @@ class EndoNerfPairs:
         folder = config.folder
         right = None if baseline_of(config) is None else folder / "images_right"
         self._llff = read_llff(config)
-        self._pictures = FolderPairs(folder / "images", right, folder / "masks")
+        self._pictures = FolderPairs(
+            folder / "images", right, folder / "masks", instruments=config.instruments, numbered=True
+        )
         self._depth_unit = config.depth_unit
         self._depth_files: list[Path] | None = None
-        self._black = config.instruments == "black"
         self.rate: float | None = None
         self.count = self._pictures.count
         self._next = 0
         self._T_world_cam = self._llff.T_world_cam
         self.findings: tuple[Finding, ...] = ()
         self._check_camera(folder)
-        _check_masks(folder / "masks", config.instruments)
         if (folder / "depth").is_dir():
-            self._depth_files = list_pictures(folder / "depth")
-            check_counts(folder / "images", self._pictures.files, folder / "depth", self._depth_files)
+            pairs = pair_files((folder / "images", folder / "depth"), numbered=True)
+            self._depth_files = [file for _, file in pairs]
             self._check_unit(self._depth_files[0])
         elif right is None:
             raise UsageError(
@@ -115,12 +107,11 @@ class EndoNerfPairs:
             SagsError: a picture is damaged, or of another size or form than it must be.
         """
         pair = self._pictures.read()
-        if pair is None or pair.tissue is None:
+        if pair is None:
             return None
         index = self._next
         self._next += 1
         return pair._replace(
-            tissue=~pair.tissue if self._black else pair.tissue,
             depth=None if self._depth_files is None else self._read_depth(self._depth_files[index]),
             T_world_cam=self._T_world_cam[index],
         )
@@ -240,21 +231,3 @@ def is_published(config: EndoNerfSource) -> bool:
 def _intrinsics(width: int, height: int, focal: float) -> F64:
     """Principal point in the picture's middle; the centre of the first pixel is (0, 0)."""
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
-
-
-def _check_masks(folder: Path, instruments: str) -> None:
-    """Masks of both polarities are in use: a wrong one would show the model nothing but instruments."""
-    files = list_pictures(folder)
-    shares = []
-    for file in files[:: -(-len(files) // CHECKED_MASKS)]:
-        mask = read_picture(file, cv2.IMREAD_GRAYSCALE)
-        if 0 < mask.max() < 128:
-            raise UsageError(f"{file}: no value is above {mask.max()}; a mask holds 0 and 255, scale it")
-        shares.append(np.mean((mask >= 128) == (instruments == "white")))
-    share = float(np.median(shares))
-    if share > 0.5:
-        other = "black" if instruments == "white" else "white"
-        raise UsageError(
-            f"{folder} would take {share:.0%} of the picture for instruments; if {instruments} means tissue "
-            f"there, set source.instruments:={other}"
-        )

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import logging
-import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
+from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.media.picture_file import decode
 from sags_node.media.picture_header import KINDS, SUFFIXES, is_whole
+from sags_node.sources.bit_depth import EightBits
+from sags_node.sources.masks import Masks
+from sags_node.sources.names import in_order, numbers, together
 from sags_node.types import F32, F64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
 
 LARGEST_FILE = 256 << 20  # bytes: more than the largest picture that is decoded can need
 MEND = "replace or remove the pair"
+LOOKED_AT = 9  # pictures, spread over a recording, that tell which value is white
+STORED = cv2.IMREAD_UNCHANGED
+
+F = TypeVar("F")
 
 
 class RawPair(NamedTuple):
@@ -45,17 +55,33 @@ class FolderPairs:
 
     rate: float | None = None  # folders do not know it
 
-    def __init__(self, left: Path, right: Path | None, tools: Path | None = None) -> None:
-        self.files = list_pictures(left)
-        self._right = None if right is None else list_pictures(right)
-        self._tools = None if tools is None else list_pictures(tools)
-        if right is not None and self._right is not None:
-            check_counts(left, self.files, right, self._right)
-            _warn_of_gaps(self.files, self._right)
-        if tools is not None and self._tools is not None:
-            check_counts(left, self.files, tools, self._tools)
+    def __init__(
+        self,
+        left: Path,
+        right: Path | None,
+        tools: Path | None = None,
+        *,
+        instruments: Instruments = "white",
+        levels: Levels | None = None,
+        numbered: bool = False,
+    ) -> None:
+        there = [folder for folder in (left, right, tools) if folder is not None]
+        self._files = pair_files(there, numbered)
+        self.files = [files[0] for files in self._files]
+        self._has_right = right is not None
+        self._masks: Masks | None = None
+        if tools is not None:
+            some = (files[-1] for files in _spread(self._files))
+            self._masks = Masks(tools, ((file, read_picture(file, STORED)) for file in some), instruments)
         self.count = len(self.files)
-        self.size = _size(read_picture(self.files[0]))
+        first = read_samples(self.files[0])
+        self.size = _size(first)
+        self._eight_bits: EightBits | None = None  # there is nothing to do
+        if first.dtype != np.uint8 or levels is not None:
+            eyes = [file for files in self._files for file in files[: 1 + self._has_right]]
+            self._eight_bits = EightBits(map(read_samples, _spread(eyes)), levels)
+            if levels is None:
+                self._eight_bits.tell(left)
         self._next = 0
         self.read()  # the first pair shows whether the eyes fit each other
         self.seek(0)
@@ -77,18 +103,28 @@ class FolderPairs:
         if index >= self.count:
             return None
         self._next += 1
-        left = self._picture(self.files[index])
-        right = None if self._right is None else self._picture(self._right[index])
+        files = self._files[index]
+        left = self._eye(files[0])
+        right = self._eye(files[1]) if self._has_right else None
         tissue = None
-        if self._tools is not None:
-            tissue = self._picture(self._tools[index], cv2.IMREAD_GRAYSCALE) < 128
+        if self._masks is not None:
+            mask = self._checked(read_picture(files[-1], STORED), files[-1])
+            tissue = self._masks.tissue(mask, files[-1])
         return RawPair(left, right, tissue)
 
     def close(self) -> None:
         """Nothing stays open between pictures."""
 
-    def _picture(self, file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
-        picture = read_picture(file, flags)
+    def _eye(self, file: Path) -> U8:
+        samples = self._checked(read_samples(file), file)
+        if self._eight_bits is not None:
+            return self._eight_bits(samples, file)
+        if samples.dtype != np.uint8:
+            raise SagsError(f"{file} holds {samples.dtype}, others 8 bit; save all pictures alike")
+        return samples
+
+    def _checked(self, picture: NDArray[Any], file: Path) -> NDArray[Any]:
+        """Of one size."""
         if _size(picture) != self.size:
             raise SagsError(
                 f"{file} is {size_text(*_size(picture))} px but {self.files[0]} is {size_text(*self.size)}; "
@@ -112,31 +148,43 @@ def list_pictures(folder: Path) -> list[Path]:
             raise UsageError(f"{file} has a picture's name but is no file; remove it from the folder")
     if not pictures:
         raise UsageError(f"picture folder {folder} holds no picture ({KINDS})")
-    return sorted(pictures, key=lambda file: (_natural(file.stem), file.name))
+    return in_order(pictures)
 
 
-def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> U8:
-    """Decode one picture: RGB for `IMREAD_COLOR`, else as OpenCV's flags say.
+def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
+    """Decode one picture: RGB of 8 bit for `IMREAD_COLOR`, else as OpenCV's flags say.
 
     OpenCV fills what is missing of a cut-off picture with grey and says nothing, so its end is checked first.
 
     Raises:
         SagsError: the file is missing, no plain file, cut off, damaged or too large.
     """
+    if flags == cv2.IMREAD_COLOR:
+        samples = read_samples(file)
+        return samples if samples.dtype == np.uint8 else EightBits([samples])(samples, file)
     try:
         data = read_file(file, LARGEST_FILE)
     except OSError as error:
         raise SagsError(f"cannot read picture {file}: {error.strerror}") from None
     if not is_whole(memoryview(data)):
         raise SagsError(f"picture {file} is damaged or cut off ({len(data)} bytes); {MEND}")
-    picture = decode(data, flags, f"picture {file}", MEND)
-    decoded: U8 = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if flags == cv2.IMREAD_COLOR else picture
-    return decoded
+    return decode(data, flags, f"picture {file}", MEND)
 
 
-def _natural(name: str) -> list[str | int]:
-    """'a10b' -> ['a', 10, 'b']: text and numbers alternate, so any two names compare."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+def read_samples(file: Path) -> NDArray[Any]:
+    """Decode one picture: RGB [H, W, 3] as deep as it is.
+
+    Raises:
+        SagsError: as `read_picture`, or its numbers are of another kind.
+    """
+    picture = read_picture(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if picture.dtype.kind == "f":
+        picture = np.nan_to_num(picture, posinf=0.0, neginf=0.0).astype(np.float32)
+    elif picture.dtype not in (np.uint8, np.uint16):
+        raise SagsError(
+            f"picture {file} holds {picture.dtype}, which is not read; save it as PNG of 8 or 16 bit"
+        )
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
 def size_text(width: int, height: int) -> str:
@@ -144,35 +192,57 @@ def size_text(width: int, height: int) -> str:
     return f"{width}x{height}"
 
 
-def _size(picture: U8) -> tuple[int, int]:
+def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Path, ...]]:
+    """The pictures of several folders that belong together: by their names, where most are in all folders,
+    else by order. What is left out, and odd pairs, are said in the log.
+
+    Args:
+        numbered: something else counts on their number, so that none may be left out.
+
+    Raises:
+        UsageError: a folder cannot be read, or they cannot be paired.
+    """
+    files = [list_pictures(folder) for folder in folders]
+    by_name = together(files)
+    most = max(map(len, files))
+    if len(by_name) == most:
+        return by_name
+    if by_name:
+        kept = {file for pair in by_name for file in pair}
+        alone = [file for each in files for file in each if file not in kept]
+        where = " and ".join(map(str, folders))
+        said = f"{len(alone)} pictures of {where} have no partner of their name, e.g. {alone[0]}"
+        if numbered:
+            raise UsageError(f"{said}; poses and depth go by number, so every picture needs its partners")
+        log.warning("%s; they are left out", said)
+        return by_name
+    for folder, each in zip(folders, files, strict=True):
+        if len(each) != len(files[0]):
+            raise UsageError(
+                f"{folders[0]} holds {len(files[0])} pictures but {folder} holds {len(each)}; pairing goes "
+                "by sorted name, so both need the same number, or names that tell which belong together"
+            )
+    for each in files[1:]:
+        _warn_of_gaps(files[0], each)
+    return list(zip(*files, strict=True))
+
+
+def _spread(files: Sequence[F]) -> Sequence[F]:
+    return files[:: -(-len(files) // LOOKED_AT)]
+
+
+def _size(picture: NDArray[Any]) -> tuple[int, int]:
     return picture.shape[1], picture.shape[0]
 
 
-def check_counts(one: Path, one_files: list[Path], other: Path, other_files: list[Path]) -> None:
-    """Refuse two folders that cannot be paired.
-
-    Raises:
-        UsageError: they do not hold the same number of pictures.
-    """
-    if len(one_files) != len(other_files):
-        raise UsageError(
-            f"{one} holds {len(one_files)} pictures but {other} holds {len(other_files)}; "
-            "pairing goes by sorted name, so both need the same number"
+def _warn_of_gaps(left: Sequence[Path], right: Sequence[Path]) -> None:
+    """Equal counts may still hide one missing picture on each side; the names' numbers tell."""
+    one, other = (np.array(numbers(each), np.float64) for each in (left, right))
+    if len(one) != len(other) or len(one) < 2:
+        return
+    odd = np.abs(np.diff(one - other)) > 0.5 * np.median(np.diff(one))
+    if odd.any():
+        at = int(np.argmax(odd)) + 1
+        log.warning(
+            "%s is paired with %s, unlike the pairs before: is a picture missing?", left[at], right[at]
         )
-
-
-def _warn_of_gaps(left: list[Path], right: list[Path]) -> None:
-    """Equal counts may still hide one missing picture on each side; the names' last numbers tell."""
-    shift: int | None = None
-    for left_file, right_file in zip(left, right, strict=True):
-        numbers = [re.findall(r"\d+", file.stem) for file in (left_file, right_file)]
-        if not all(numbers):
-            return
-        difference = int(numbers[0][-1]) - int(numbers[1][-1])
-        if shift is not None and difference != shift:
-            log.warning(
-                "%s is paired with %s, unlike the pairs before: is a picture missing?",
-                *(left_file, right_file),
-            )
-            return
-        shift = difference

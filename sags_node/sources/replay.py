@@ -257,7 +257,13 @@ def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, 
     """The reader that fits the kind of recording; `references`: of the recording's truth, too."""
     match config:
         case cfg.FoldersSource():
-            return FolderPairs(config.left, config.right, config.tools)
+            numbered = config.poses is not None or config.reference != cfg.ReferenceConfig()
+            return FolderPairs(
+                *(config.left, config.right, config.tools),
+                instruments=config.instruments,
+                levels=config.levels,
+                numbered=numbered,
+            )
         case cfg.VideosSource():
             layout = Layout(config.geometry, config.tools)
             if layout.shows_both or layout.is_sequential:

@@ -16,9 +16,10 @@ from places import SESSION
 
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.importing.check import check_folder, overrides_of
 from sags_node.importing.pictures import combing, lit_box
+from sags_node.pipeline.session import open_session
 from sags_node.rig import Finding
 from sags_node.types import U8
 
@@ -102,16 +103,20 @@ def exchanged(folder: Path) -> None:
 
 
 PLANTED = {
-    "masks_inverted": (lambda folder: edit(folder / "masks", invert), "polarity", "invert"),
+    "masks_inverted": (
+        lambda folder: edit(folder / "masks", invert),
+        "polarity",
+        "source.instruments:=black",
+    ),
     "masks_of_ones": (
         lambda folder: edit(folder / "masks", lambda mask: mask // 255),
-        "no value above 1",
-        "255",
+        "masks/000.png holds the values 0, 1, which do not tell",
+        "source.instruments:=[1]",
     ),
     "masks_small": (
         lambda folder: edit(folder / "masks", lambda mask: mask[::2, ::2]),
-        "80x60 px, the pictures 160x120",
-        "nearest",
+        "masks/000.png is 80x60 px but",
+        "one size",
     ),
     "depth_is_disparity": (
         lambda folder: edit(folder / "depth", lambda depth: np.full_like(depth, 2)),
@@ -134,8 +139,8 @@ PLANTED = {
     ),
     "right_one_missing": (
         lambda folder: (folder / "right/002.tiff").unlink(),
-        "left 4, right 3",
-        "right lacks some, e.g. 002.bmp",
+        "have no partner of their name, e.g. ",
+        "they are left out",
     ),
     "gap": (gap, "gaps in the numbers, first between 002", "gap"),
     "cut_off": (
@@ -148,8 +153,8 @@ PLANTED = {
             shutil.copytree(folder / "left", folder / "right", dirs_exist_ok=True)
             and [file.unlink() for file in (folder / "right").glob("*.tiff")]
         ),
-        "both eyes show the same picture",
-        "own",
+        "both eyes get the same picture",
+        "source.right",
     ),
     "exchanged": (exchanged, "eyes exchanged", "exchange left and right"),
     "interlaced": (interlaced, "left: interlaced", "deinterlace"),
@@ -167,6 +172,17 @@ def test_a_planted_oddity_is_named_with_its_fix(name: str, tmp_path: Path) -> No
     other = [each.what for each in found if what not in each.what]
     # One cause may show twice: both eyes have borders, fields in one eye hide its matches.
     assert name in ("interlaced", "borders", "right_one_missing", "gap") or not other, other
+    assert is_refused(folder) == any(each.level == "error" for each in found)
+
+
+def is_refused(folder: Path) -> bool:
+    """By `sags run`."""
+    try:
+        with open_session(folder, overrides_of(folder), guess=True).source as source:
+            next(iter(source))
+    except SagsError:
+        return True
+    return False
 
 
 def test_a_copy_that_broke_off_is_found_among_many(tmp_path: Path) -> None:
@@ -408,7 +424,7 @@ def test_an_eye_that_is_late_is_found(tmp_path: Path, late: int, how: str) -> No
             for number, picture in enumerate(pictures):
                 cv2.imwrite(str(folder / side / f"{number:03}.bmp"), picture)
     if how == "a session":
-        (folder / "launch.yaml").write_text("source: {kind: folders, left: left, right: right}\nrig: gone\n")
+        (folder / "launch.yaml").write_text("source: {kind: folders, left: left, right: right}\n")
     said = [each.what for each in check_folder(folder) if "frames late" in each.what]
     eye = "right" if late > 0 else "left"
     assert [each.partition(":")[0] for each in said] == [f"the {eye} eye is {abs(late)} frames late"] * (

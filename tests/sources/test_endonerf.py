@@ -328,9 +328,9 @@ def torn_poses(clip: Path) -> None:
 EVERY = np.s_[:]
 MISTAKES: list[tuple[Callable[[Path], object], str]] = [
     (lambda clip: shutil.rmtree(clip / "masks"), "masks does not exist; check the path"),
-    (lambda clip: (clip / "masks/000005.png").unlink(), "images holds 12 pictures but .*masks holds 11"),
+    (lambda clip: (clip / "masks/000005.png").unlink(), "1 pictures of .*images and .*masks have no partner"),
     (lambda clip: (clip / "depth/frame-5.png").unlink(), "images holds 12 pictures but .*depth holds 11"),
-    (label_masks, "masks/000000.png: no value is above 1; a mask holds 0 and 255, scale it"),
+    (label_masks, "masks/000000.png holds the values 0, 1, .*set 'source.instruments:=.1.'"),
     (lambda clip: write(clip / "masks/000000.png", instrument(0)[:-2]),
      "masks/000000.png is 160x126 px but .*images/000000.png is 160x128"),
     (lambda clip: depth(clip, depth_counts(0)[:, :-4]),

@@ -70,8 +70,8 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: folders_of(at, "nowhere"), "nowhere does not exist; check the path"),
     (lambda at: folders_of(at, "l/000.png"), "000.png is not a folder; check the path"),
     (lambda at: (at / "empty").mkdir() or folders_of(at, right="empty"), "empty holds no picture"),
-    (lambda at: (at / "r/003.png").unlink() or folders_of(at),
-     "l holds 8 pictures but .*r holds 7; pairing goes by sorted name"),
+    (lambda at: [(at / f"r/00{n}.png").unlink() for n in range(4)] and folders_of(at),
+     "l holds 8 pictures but .*r holds 4; pairing goes by sorted name"),
     (lambda at: write_png(at / "tools/000.png", picture(0)) or folders_of(at, tools=at / "tools"),
      "l holds 8 pictures but .*tools holds 1; pairing"),
     (lambda at: folders_of(at, start=60), "source.start 60.0 s lies behind the recording's end at 0.27 s"),
@@ -135,9 +135,9 @@ def test_missing_pictures_on_both_sides_are_noticed(
 ) -> None:
     (folders.left / "L3.png").unlink()
     (folders.right / "R8.png").unlink()
-    with open_source(folders):
-        pass
-    assert "L4.png is paired with" in caplog.text and "R3.png" in caplog.text
+    with open_source(folders) as source:
+        assert numbers(list(source)) == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11]
+    assert "2 pictures of" in caplog.text and "have no partner of their name" in caplog.text
 
 
 # ---- on the way ------------------------------------------------------------------------------------------

@@ -1,0 +1,152 @@
+"""Which values of a recording's instrument masks are instruments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sags_node.config.schema import Instruments
+from sags_node.errors import UsageError
+from sags_node.types import U8, Bool
+
+HALF = 128  # what is as bright is white
+MOST = 0.5  # share of a picture: instruments cover less
+AREAS = 0.25  # share of pixels between dark and bright whose neighbours are equal: of soft edges fewer are
+LOSSY = (".jpg", ".jpeg", ".webp")
+NEAR = 8  # grey levels: as far as these change a value
+ENDS = 16  # grey levels: so near to black or white a value of these is that; of any, to white
+LABELS = 30  # beside labels below, 255 marks what nobody looked at
+SMALLEST_AREA = 1e-4  # of a coloured mask
+SHOWN = 12  # values in a message
+_BETWEEN = np.array([0, *[1] * 254, 0], np.uint8)
+# https://endovissub2018-roboticscenesegmentation.grand-challenge.org: instruments, threads and clamps; tissue
+ENDOVIS = ("#00ff00", "#00ffff", "#7dff0c", "#bb9b19", "#00ff7d", "#ffff7d", "#7b0faf", "#0cff8d")
+ENDOVIS_TISSUE = ("#000000", "#ff3700", "#18377d", "#7c9b05")
+
+
+class Masks:
+    """Finds the tissue in masks as OpenCV reads them: grey [H, W], or BGR(A) [H, W, C].
+
+    One dark and one bright value tell instruments from tissue, and so do the colours of EndoVis 2018. All
+    else is asked about: `instruments` then lists the values that are instruments, and the others are tissue.
+    What lies between areas, at soft edges, is no value.
+
+    Args:
+        some: masks spread over the recording.
+
+    Raises:
+        UsageError: their values do not tell, or instruments would be most of the picture.
+    """
+
+    def __init__(
+        self, folder: Path, some: Iterable[tuple[Path, NDArray[Any]]], instruments: Instruments = "white"
+    ) -> None:
+        self._instruments = instruments
+        self._values: set[int] = set()
+        share = float(np.median([np.mean(~self.tissue(mask, file)) for file, mask in some]))
+        if share > MOST and isinstance(instruments, str):
+            other = "black" if instruments == "white" else "white"
+            raise UsageError(
+                f"{folder} would take {share:.0%} of the picture for instruments (polarity the other "
+                f"way?); if {instruments} means tissue there, set source.instruments:={other}"
+            )
+
+    def tissue(self, mask: NDArray[Any], file: Path) -> Bool:
+        """[H, W] True where there is no instrument.
+
+        Raises:
+            UsageError: the values, with those of the masks before, do not tell.
+        """
+        lossy = file.suffix.lower() in LOSSY
+        grey = _as_grey(mask, file, NEAR * lossy)
+        if grey.ndim == 3:
+            return self._of_colours(grey, file)
+        if not isinstance(self._instruments, str):
+            listed = np.array([value for value in self._instruments if isinstance(value, int)])
+            away = np.abs(np.arange(256)[:, None] - listed).min(axis=1, initial=256)
+            tissue: Bool = (away > NEAR * lossy)[grey]
+            return tissue
+        self._look(grey, file, lossy)
+        tissue = (grey < HALF) == (self._instruments == "white")
+        return tissue
+
+    def _look(self, mask: U8, file: Path, lossy: bool) -> None:
+        """Be sure that there are one dark and one bright value at most."""
+        if cv2.countNonZero(cv2.LUT(mask, _BETWEEN)):
+            table = np.arange(256, dtype=np.uint8)
+            table[: ENDS * lossy], table[-ENDS:] = 0, 255
+            self._values |= _areas(table[mask], NEAR * lossy)
+        else:
+            self._values |= {int(mask.min()), int(mask.max())}
+        dark, bright = ([v for v in self._values if (v >= HALF) == is_bright] for is_bright in (False, True))
+        if len(dark) > 1 or len(bright) > 1 or (dark not in ([], [0]) and not bright):
+            known = sorted(self._values)
+            labels = known[-1] == 255 and 0 < len(known) - 2 and known[-2] < LABELS
+            raise _question(file, known, [v for v in known if v and not (labels and v == 255)], labels)
+
+    def _of_colours(self, mask: U8, file: Path) -> Bool:
+        """Of a mask [H, W, 3]."""
+        blue, green, red = (plane.astype(np.int32) for plane in cv2.split(mask))
+        codes = blue + (green << 8) + (red << 16)
+        listed = [value for value in self._instruments if isinstance(value, str) and value[0] == "#"]
+        if not listed:
+            found, counts = np.unique(codes[_alike(codes)], return_counts=True)
+            there = [f"#{code:06x}" for code in found[counts > SMALLEST_AREA * codes.size]]
+            if not (isinstance(self._instruments, str) and set(there) <= {*ENDOVIS, *ENDOVIS_TISSUE}):
+                raise _question(file, there, [name for name in there if name != "#000000"])
+            listed = [*ENDOVIS]
+        tissue: Bool = np.logical_and.reduce([codes != int(name[1:], 16) for name in listed])
+        return tissue
+
+
+def _question(
+    file: Path, there: Sequence[int | str], likely: Sequence[int | str], ignore: bool = False
+) -> UsageError:
+    shown = ", ".join(map(str, there[:SHOWN])) + (", ..." if len(there) > SHOWN else "")
+    names = ",".join(f'"{value}"' if isinstance(value, str) else str(value) for value in likely[:SHOWN])
+    why = ". 255 beside labels mostly marks what nobody looked at" if ignore else ""
+    return UsageError(
+        f"{file} holds the values {shown}, which do not tell instruments from tissue; set "
+        f"'source.instruments:=[{names}]', or those of them that are instruments{why}"
+    )
+
+
+def _as_grey(mask: NDArray[Any], file: Path, near: int) -> U8:
+    """Eight bit [H, W]; [H, W, 3] BGR where there are colours."""
+    if mask.dtype == np.uint16:
+        mask = mask >> 8 if mask.max() > 255 else mask
+    elif mask.dtype != np.uint8:
+        raise UsageError(f"{file} holds {mask.dtype}, which is no mask; save it as PNG of 8 bit")
+    eight: U8 = mask.astype(np.uint8)
+    if eight.ndim == 2:
+        return eight
+    planes: list[U8] = [np.asarray(plane, np.uint8) for plane in cv2.split(eight)]
+    if len(planes) == 4 and all(plane.min() == plane.max() for plane in planes[:3]):
+        return planes[3]  # the mask is what can be seen through
+    spread = max(cv2.absdiff(planes[1], planes[at]).max() for at in (0, 2))
+    return eight[..., :3] if spread > near else planes[1]
+
+
+def _areas(mask: U8, near: int) -> set[int]:
+    """The values of the darkest and the brightest area of [H, W], and of those between unless these are soft
+    edges; values that are as near as `near` to each other are one."""
+    values, counts = np.unique(mask[_alike(mask)], return_counts=True)
+    if not len(values):
+        return set()
+    inner = (values > values[0]) & (values < values[-1])
+    between = np.count_nonzero((mask > values[0]) & (mask < values[-1]))
+    if counts[inner].sum() < AREAS * between:
+        values = values[~inner]
+    groups = np.split(values, np.flatnonzero(np.diff(values.astype(np.int32)) > near) + 1)
+    return {int(np.median(group)) for group in groups}
+
+
+def _alike(values: NDArray[Any]) -> Bool:
+    """[H, W] True where all neighbours have the same value."""
+    steps = cv2.morphologyEx(values.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
+    return np.asarray(steps == 0)

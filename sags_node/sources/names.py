@@ -1,0 +1,87 @@
+"""What the names of pictures say: their order, and which pictures of several folders belong together."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+log = logging.getLogger(__name__)
+
+EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
+_LAST = re.compile(r"(\d+)(?:\.(\d+))?(?=\D*$)")  # the last number of a name, and what may be its fraction
+CLEARLY = 2.0  # times as uneven as the other order
+
+
+def in_order(files: Sequence[Path]) -> list[Path]:
+    """Files by their names, numbers compared as numbers.
+
+    Where the length of a fraction changes, as in 0.067 and 0.1, it may be the digits of one number or a whole
+    number by itself (sec.nsec without zeros in front). That order of both counts whose steps are more even.
+    """
+    longest = _longest(files)
+    plain, times = (sorted(files, key=lambda file: (_natural(file.stem, pad), file)) for pad in (0, longest))
+    if plain == times:
+        return plain
+    uneven = [_unevenness(order, longest, pad) for order, pad in ((plain, 0), (times, longest))]
+    if max(uneven) <= CLEARLY * min(uneven):
+        log.warning(
+            "%s: names as %s may be whole numbers or fractions, and their order is a guess; write the same "
+            "number of digits behind the point",
+            *(plain[0].parent, max(files, key=lambda file: len(file.name)).name),
+        )
+    return plain if uneven[0] <= uneven[1] else times
+
+
+def numbers(files: Sequence[Path]) -> list[int]:
+    """The last number in each name of files in order, times in units of their last digit; empty where a name
+    has none."""
+    longest = _longest(files)
+    times, plain = ([_number(file, longest, pad) for file in files] for pad in (longest, 0))
+    found = [number for number in times if number is not None]
+    if found != sorted(found):
+        found = [number for number in plain if number is not None]
+    return found if len(found) == len(files) else []
+
+
+def together(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
+    """Files of several folders whose names agree but for the eye (and the kind of file), in the order of the
+    first folder; none where most have no such partner."""
+    named = [{EYE.sub("*", file.stem): file for file in files} for files in folders]
+    shared = set(named[0]).intersection(*named)
+    twice = any(len(names) < len(files) for names, files in zip(named, folders, strict=True))
+    if twice or 2 * len(shared) <= max(map(len, folders)):
+        return []
+    return [tuple(each[name] for each in named) for name in named[0] if name in shared]
+
+
+def _longest(files: Sequence[Path]) -> int:
+    """Digits of the longest fraction."""
+    return max((len(found[2] or "") for file in files if (found := _LAST.search(file.stem))), default=0)
+
+
+def _natural(name: str, pad: int) -> list[str | int]:
+    """'a10b' -> ['a', 10, 'b']: text and numbers alternate, so any two names compare. The fraction of the
+    last number gets so many digits."""
+    found = _LAST.search(name)
+    if pad and found is not None:
+        name = f"{name[: found.end(1)]}.{(found[2] or '').ljust(pad, '0')}{name[found.end() :]}"
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+
+
+def _number(file: Path, longest: int, pad: int) -> int | None:
+    found = _LAST.search(file.stem)
+    return found and int(found[1]) * 10**longest + int((found[2] or "").ljust(pad, "0") or 0)
+
+
+def _unevenness(files: Sequence[Path], longest: int, pad: int) -> float:
+    """Standard deviation, by the mean, of the steps between files whose names begin alike."""
+    begins = [_LAST.split(file.stem)[0] for file in files]
+    counts = [_number(file, longest, pad) or 0 for file in files]
+    each = zip(pairwise(begins), pairwise(counts), strict=True)
+    steps = [b - a for (one, other), (a, b) in each if one == other]
+    return float(np.std(steps)) / max(float(np.mean(steps)), 1e-9) if steps else 0.0

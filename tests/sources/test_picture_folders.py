@@ -1,0 +1,280 @@
+"""Folders as people bring them: masks of any values, deep pictures, times as names, missing partners."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numbered_pictures import HEIGHT, WIDTH, number_of, numbers, picture, write_png
+
+from sags_node.config import schema as cfg
+from sags_node.config.launch_file import section_of
+from sags_node.errors import SagsError, UsageError
+from sags_node.sources.source import open_source
+from sags_node.types import StereoFrame
+
+
+def played(config: cfg.FoldersSource) -> list[StereoFrame]:
+    with open_source(config) as source:
+        return list(source)
+
+
+def eyes(folder: Path, names: list[str]) -> cfg.FoldersSource:
+    """Pictures of both eyes, numbered as the names are; those that begin with `-` are not of the right eye,
+    with `+` not of the left one."""
+    for number, name in enumerate(names):
+        if name[0] != "+":
+            write_png(folder / f"left/{name.lstrip('-')}.png", picture(number))
+        if name[0] != "-":
+            write_png(folder / f"right/{name.lstrip('+')}.png", picture(number, eye=1))
+    return cfg.FoldersSource(left=folder / "left", right=folder / "right", pace="step", rate=20)
+
+
+# ---- masks -----------------------------------------------------------------------------------------------
+
+COUNT = 12
+TOOL = np.zeros((96, 128), np.bool_)
+TOOL[30:70, :60] = True
+SHAFT, TIP = TOOL.copy(), TOOL.copy()
+SHAFT[:, 40:] = TIP[:, :40] = False
+LOWER, RIM = np.zeros_like(TOOL), np.zeros_like(TOOL)
+LOWER[50:] = True
+RIM[:, -6:] = True
+
+
+def grey(*values: tuple[np.ndarray, int], dtype: type = np.uint8) -> np.ndarray:
+    mask = np.zeros(TOOL.shape, dtype)
+    for where, value in values:
+        mask[where] = value
+    return mask
+
+
+def coloured(*values: tuple[np.ndarray, str]) -> np.ndarray:
+    mask = np.zeros((*TOOL.shape, 3), np.uint8)
+    for where, name in values:
+        mask[where] = [int(name[at : at + 2], 16) for at in (5, 3, 1)]
+    return mask
+
+
+def with_masks(folder: Path, mask: np.ndarray, suffix: str = "png") -> cfg.FoldersSource:
+    for number in range(COUNT):
+        for side in ("left", "right"):
+            write_png(folder / f"{side}/{number}.png", np.full((*TOOL.shape, 3), 90 + number, np.uint8))
+        (folder / "masks").mkdir(exist_ok=True)
+        assert cv2.imwrite(str(folder / f"masks/{number}.{suffix}"), mask)
+    return cfg.FoldersSource(
+        left=folder / "left", right=folder / "right", tools=folder / "masks", pace="step", rate=20
+    )
+
+
+SOFT = cv2.GaussianBlur(grey((TOOL, 255)), (0, 0), 3)
+TOLD = {
+    "two values": (grey((TOOL, 255)), "png"),
+    "soft edges": (SOFT, "png"),
+    "made larger": (cv2.resize(cv2.resize(SOFT, None, fx=0.5, fy=0.5), TOOL.shape[::-1]), "png"),
+    "a rough JPEG, in colour": (cv2.cvtColor(grey((TOOL, 250)), cv2.COLOR_GRAY2BGR), "jpg"),
+    "16 bit": (grey((TOOL, 65535), dtype=np.uint16), "png"),
+    "black below what is clear": (
+        np.dstack([cv2.cvtColor(grey((TOOL, 255)), cv2.COLOR_GRAY2BGR), grey((TOOL, 255))]),
+        "png",
+    ),
+    "clear where there is none": (np.dstack([grey()] * 3 + [grey((TOOL, 255))]), "png"),
+    "EndoVis 2018": (coloured((SHAFT, "#00ff00"), (TIP, "#7b0faf"), (RIM, "#7c9b05")), "png"),
+}
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_masks_that_tell_instruments_from_tissue(name: str, tmp_path: Path) -> None:
+    mask, suffix = TOLD[name]
+    frames = played(with_masks(tmp_path, mask, suffix))
+    edge = cv2.morphologyEx(TOOL.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5))) > 0
+    sure = np.ones_like(TOOL) if len(np.unique(mask)) < 9 and suffix == "png" else ~edge
+    assert len(frames) == COUNT
+    for frame in frames:
+        assert frame.tissue is not None and (frame.tissue == ~TOOL)[sure].all()
+
+
+ASKED = {
+    "0 and 1": (grey((TOOL, 1)), "png", "0, 1"),
+    "one label": (grey((TOOL, 100)), "png", "0, 100"),
+    "parts": (grey((TOOL, 255), (SHAFT, 85), (TIP & LOWER, 170)), "png", "0, 85, 170, 255"),
+    "labels, and 255 to be ignored": (grey((TOOL, 6), (RIM, 255)), "png", "0, 6, 255"),
+    "parts in JPEG": (grey((SHAFT, 85), (TIP, 170)), "jpg", "0, 85, 170"),
+    "16 bit labels": (grey((SHAFT, 1), (TIP, 2), dtype=np.uint16), "png", "0, 1, 2"),
+    "a palette": (coloured((SHAFT, "#800000"), (TIP, "#008000")), "png", "#000000, #008000, #800000"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_other_masks_are_asked_about_and_read_as_is_answered(name: str, tmp_path: Path) -> None:
+    mask, suffix, said = ASKED[name]
+    config = with_masks(tmp_path, mask, suffix)
+    with pytest.raises(UsageError, match=f"holds the values {said}, which do not tell") as caught:
+        open_source(config)
+    answer = re.findall(r"'(source\.instruments:=\[.*?\])'", str(caught.value))
+    instruments = section_of(cfg.FoldersSource, [answer[0].removeprefix("source."), "left:=l"]).instruments
+    sure = np.ones_like(TOOL) if suffix == "png" else cv2.erode(TOOL.astype(np.uint8), np.ones((9, 9))) > 0
+    for frame in played(config.model_copy(update={"instruments": instruments})):
+        assert frame.tissue is not None and (frame.tissue == ~TOOL)[sure].all()
+
+
+def test_a_label_that_comes_late_is_asked_about_there(tmp_path: Path) -> None:
+    config = with_masks(tmp_path, grey((SHAFT, 255)))
+    cv2.imwrite(str(tmp_path / "masks/5.png"), grey((SHAFT, 255), (TIP, 85)))
+    with (
+        open_source(config) as source,
+        pytest.raises(UsageError, match=r"5\.png holds the values 0, 85, 255"),
+    ):
+        assert len(list(source)) == 5
+    tissue = played(config.model_copy(update={"instruments": (255, 85)}))[5].tissue
+    assert tissue is not None and (tissue == ~TOOL).all()
+
+
+def test_inverted_masks_are_refused_and_can_be_told(tmp_path: Path) -> None:
+    config = with_masks(tmp_path, grey((~TOOL, 255)))
+    with pytest.raises(UsageError, match=r"set source\.instruments:=black"):
+        open_source(config)
+    for frame in played(config.model_copy(update={"instruments": "black"})):
+        assert frame.tissue is not None and (frame.tissue == ~TOOL).all()
+
+
+@pytest.mark.parametrize("value", ["[]", "[256]", "[-1]", "grey", "[red]", "85"])
+def test_values_of_masks_are_checked(value: str) -> None:
+    with pytest.raises(UsageError, match="should be white, black, or a list of values"):
+        section_of(cfg.FoldersSource, ["left:=l", f"instruments:={value}"])
+
+
+# ---- more than eight bits --------------------------------------------------------------------------------
+
+RAMP = np.linspace(0, 1, HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3)  # BGR, from black to white
+
+
+def deep(folder: Path, make: Callable[[np.ndarray], np.ndarray], suffix: str) -> cfg.FoldersSource:
+    for side, shown in (("left", RAMP), ("right", RAMP[:, ::-1])):
+        for number in range(4):
+            (folder / side).mkdir(exist_ok=True)
+            assert cv2.imwrite(str(folder / f"{side}/{number}.{suffix}"), make(shown))
+    return cfg.FoldersSource(left=folder / "left", right=folder / "right", pace="step", rate=20)
+
+
+def counts(white: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda shown: np.rint(shown * white).astype(np.uint16)
+
+
+DEEP = {
+    "10 bits": (counts(1023), "png", "10 of 16 bits: 1023 is"),
+    "14 bits": (counts(16383), "ppm", "14 of 16 bits: 16383 is"),
+    "12 bits": (counts(4095), "tiff", "12 of 16 bits: 4095 is"),
+    "16 bits": (counts(65535), "png", ""),
+    "12 bits, moved up": (lambda shown: counts(4095)(shown) << 4, "png", ""),
+    "floats to 1": (lambda shown: shown.astype(np.float32), "tiff", "floating numbers: 1 is"),
+    "floats to 255": (lambda shown: (255 * shown).astype(np.float32), "tiff", "floating numbers: 255 is"),
+    "doubles to 4095": (lambda shown: 4095 * shown, "tiff", "floating numbers: 4095 is"),
+}
+
+
+@pytest.mark.parametrize("name", DEEP)
+def test_deep_pictures_are_read_and_their_bits_are_said(
+    name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    make, suffix, said = DEEP[name]
+    frames = played(deep(tmp_path, make, suffix))
+    for frame in frames:
+        assert frame.right is not None
+        assert np.abs(frame.left / 255 - RAMP[..., ::-1]).max() < 1 / 255
+        assert np.abs(frame.right / 255 - RAMP[:, ::-1, ::-1]).max() < 1 / 255
+    assert (f"{said} taken for white" in caplog.text) == bool(said)
+
+
+def test_levels_of_folders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As the warning says, and other ones; without a word, and also of eight bits."""
+    config = deep(tmp_path, counts(4095), "png")
+    for levels, white in (((0.0, 4095 / 65535), 1.0), ((0.0, 2 * 4095 / 65535), 2.0)):
+        left = played(config.model_copy(update={"levels": levels}))[0].left
+        assert np.abs(left / 255 - RAMP[..., ::-1] / white).max() < 1 / 255
+    config = deep(tmp_path, lambda shown: np.rint(255 * shown).astype(np.uint8), "png")
+    left = played(config.model_copy(update={"levels": (0.0, 0.5)}))[0].left
+    assert np.abs(left / 255 - np.clip(2 * RAMP[..., ::-1], 0, 1)).max() < 2 / 255
+    assert caplog.text == ""
+
+
+def test_a_picture_brighter_than_white_is_no_white_one(tmp_path: Path) -> None:
+    config = deep(tmp_path, counts(1023), "png")
+    for number in range(4, 40):
+        for side in ("left", "right"):
+            white = 16000 if (side, number) == ("left", 23) else 1023
+            cv2.imwrite(str(tmp_path / f"{side}/{number}.png"), counts(white)(RAMP))
+    with (
+        open_source(config) as source,
+        pytest.raises(SagsError, match=r"23\.png holds 16000, .* 1023 is white"),
+    ):
+        list(source)
+
+
+# ---- names -----------------------------------------------------------------------------------------------
+
+
+def nanoseconds(count: int, step: float = 1e9 / 30) -> list[int]:
+    return [1_700_000_000_000_000_000 + round(step * number) for number in range(count)]
+
+
+NAMES = {
+    "seconds": [f"{round(0.1 * number / 3, 3)}" for number in range(24)],
+    "whole seconds too": [f"{number / 4:g}" for number in range(24)],
+    "behind a word": [f"frame_{number / 25!r}_l" for number in range(24)],
+    "minutes": [f"12-{n // 12}-{n % 12 * 5 + 0.25 * (n % 2):g}" for n in range(24)],
+    "jitter": [f"{number / 30 + 0.002 * (number % 3):.4g}" for number in range(24)],
+    "sec.nsec": [f"{each // 10**9}.{each % 10**9}" for each in nanoseconds(24)],
+    "sec.nsec over seconds": [f"{each // 10**9}.{each % 10**9}" for each in nanoseconds(24, 2.7e8)],
+    "sec.msec": [f"17.{33 * number}" for number in range(24)],
+    "a number of numbers": [f"case1.{number}" for number in range(24)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_give_the_order(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert numbers(played(eyes(tmp_path, NAMES[name]))) == list(range(24))
+    assert caplog.text == ""
+
+
+def test_an_order_that_names_do_not_tell_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """1.5 and 1.12 are two halves of a second apart, or seven of something."""
+    played(eyes(tmp_path, ["1.12", "1.5"]))
+    assert "may be whole numbers or fractions" in caplog.text
+
+
+PARTNERS = {
+    "one missing each": [f"{'-' if n == 6 else '+' if n == 18 else ''}{n:03}" for n in range(24)],
+    "times": [f"{'-' if n in (0, 6) else ''}{n / 30:.4g}" for n in range(24)],
+    "many of one": [f"{'+' if 4 <= n < 12 else ''}{n:03}" for n in range(24)],
+}
+
+
+@pytest.mark.parametrize("name", PARTNERS)
+def test_partners_are_found_by_name(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    names = PARTNERS[name]
+    config = eyes(tmp_path, names)
+    alone = [number for number, one in enumerate(names) if one[0] in "-+"]
+    assert numbers(played(config)) == [number for number in range(24) if number not in alone]
+    assert f"{len(alone)} pictures of" in caplog.text and "have no partner of their name" in caplog.text
+    poses = tmp_path / "poses.npz"
+    np.savez(poses, T_world_cam=np.tile(np.eye(4), (24, 1, 1)))
+    with pytest.raises(UsageError, match="go by number, so every picture needs its partners"):
+        open_source(config.model_copy(update={"poses": poses}))
+
+
+def test_eyes_of_other_names_are_paired_in_order(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Stamps of two cameras that jitter are no gap; a picture that is missing on both sides is one."""
+    config = eyes(tmp_path, [f"{each}" for each in nanoseconds(24)])
+    for number, file in enumerate(sorted(config.right.iterdir())):
+        file.rename(config.right / f"{int(file.stem) + 1_000_000 + 300_000 * (number % 4)}.png")
+    assert numbers(played(config)) == list(range(24)) and caplog.text == ""
+    sorted(config.left.iterdir())[5].unlink()
+    sorted(config.right.iterdir())[15].unlink()
+    frames = played(config)
+    assert number_of(frames[5].left) == 6 and number_of(frames[5].right) == 5
+    assert "is paired with" in caplog.text and "is a picture missing?" in caplog.text
