@@ -64,8 +64,8 @@ def is_whole(data: memoryview) -> bool:
     """Whether the end of a picture is there: its mark, or, where a kind has none, all of its pixels."""
     begin = next((begin for begin in _ENDS if bytes(data[: len(begin)]) == begin), None)
     if begin is not None:
-        follow = _jpeg_ends if begin == _JPEG else _png_ends
-        return _ENDS[begin] in bytes(data[-_LONGEST_PADDING:]) or follow(data)
+        near = _ENDS[begin] in bytes(data[-_LONGEST_PADDING:])
+        return near or (_jpeg_ends(data) if begin == _JPEG else _ENDS[begin] in bytes(data))
     try:
         if _is_tiff(data):
             tags = _tiff_tags(data)
@@ -87,14 +87,6 @@ def _jpeg_ends(data: memoryview) -> bool:
         length = int.from_bytes(data[found.end() : found.end() + 2], "big")
         at = found.end() + max(2, length)
     return found is not None
-
-
-def _png_ends(data: memoryview) -> bool:
-    """Whether its chunks lead to an end."""
-    at = len(_PNG)
-    while at + 12 <= len(data) and bytes(data[at + 4 : at + 8]) != b"IEND":
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-    return at + 12 <= len(data)
 
 
 def _is_tiff(data: memoryview) -> bool:

@@ -47,10 +47,8 @@ class EightBits:
         """A new picture.
 
         Raises:
-            SagsError: it is brighter than what was taken for white, or of another type than the others.
+            SagsError: it is brighter than what was taken for white.
         """
-        if picture.dtype != self.dtype:
-            raise SagsError(f"{file} holds {picture.dtype}, others {self.dtype}; save all pictures alike")
         if picture.max() > self.white:
             raise SagsError(
                 f"{file} holds {picture.max():g}, but by others {self.white} is white; set source.levels, or "
@@ -62,14 +60,10 @@ class EightBits:
 
     def tell(self, folder: Path) -> None:
         """Say in the log what was taken for white, where that is not the brightest value of the type."""
-        if self.dtype == np.float32:
+        if self.dtype == np.float32 or self.white != self._full:
+            bits = "floating numbers" if self.dtype == np.float32 else f"{self.white.bit_length()} of 16 bits"
+            share = 1.0 if self.dtype == np.float32 else self.white / self._full
             log.warning(
-                "%s holds floating numbers: %d is taken for white; save PNG of 8 bit if it is another",
-                *(folder, self.white),
-            )
-        elif self.white != self._full:
-            log.warning(
-                "%s holds %d of 16 bits: %d is taken for white; set source.levels:=[0,%.4g] to say so, or "
-                "another share of %d",
-                *(folder, self.white.bit_length(), self.white, self.white / self._full, self._full),
+                "%s holds %s: %d is taken for white; set source.levels:=[0,%.4g] to say so, or another share",
+                *(folder, bits, self.white, share),
             )

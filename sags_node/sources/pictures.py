@@ -75,7 +75,7 @@ class FolderPairs:
             self._masks = Masks(tools, ((file, read_picture(file, STORED)) for file in some), instruments)
         self.count = len(self.files)
         first = read_samples(self.files[0])
-        self.size = _size(first)
+        self.size, self._type = _size(first), first.dtype
         self._eight_bits: EightBits | None = None  # there is nothing to do
         if first.dtype != np.uint8 or levels is not None:
             eyes = [file for files in self._files for file in files[: 1 + self._has_right]]
@@ -117,11 +117,9 @@ class FolderPairs:
 
     def _eye(self, file: Path) -> U8:
         samples = self._checked(read_samples(file), file)
-        if self._eight_bits is not None:
-            return self._eight_bits(samples, file)
-        if samples.dtype != np.uint8:
-            raise SagsError(f"{file} holds {samples.dtype}, others 8 bit; save all pictures alike")
-        return samples
+        if samples.dtype != self._type:
+            raise SagsError(f"{file} holds {samples.dtype}, others {self._type}; save all pictures alike")
+        return samples if self._eight_bits is None else self._eight_bits(samples, file)
 
     def _checked(self, picture: NDArray[Any], file: Path) -> NDArray[Any]:
         """Of one size."""

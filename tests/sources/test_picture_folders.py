@@ -134,14 +134,6 @@ def test_a_label_that_comes_late_is_asked_about_there(tmp_path: Path) -> None:
     assert tissue is not None and (tissue == ~TOOL).all()
 
 
-def test_inverted_masks_are_refused_and_can_be_told(tmp_path: Path) -> None:
-    config = with_masks(tmp_path, grey((~TOOL, 255)))
-    with pytest.raises(UsageError, match=r"set source\.instruments:=black"):
-        open_source(config)
-    for frame in played(config.model_copy(update={"instruments": "black"})):
-        assert frame.tissue is not None and (frame.tissue == ~TOOL).all()
-
-
 @pytest.mark.parametrize("value", ["[]", "[256]", "[-1]", "grey", "[red]", "85"])
 def test_values_of_masks_are_checked(value: str) -> None:
     with pytest.raises(UsageError, match="should be white, black, or a list of values"):
@@ -254,6 +246,7 @@ PARTNERS = {
 }
 
 
+@pytest.mark.fault("file: pictures of both eyes were deleted before it is played")
 @pytest.mark.parametrize("name", PARTNERS)
 def test_partners_are_found_by_name(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     names = PARTNERS[name]

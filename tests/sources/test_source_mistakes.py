@@ -129,17 +129,6 @@ def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path)
         open_source(folders_of(tmp_path, poses=tmp_path / "poses.npz"))
 
 
-@pytest.mark.fault("file: pictures of both eyes were deleted before it is played")
-def test_missing_pictures_on_both_sides_are_noticed(
-    folders: cfg.FoldersSource, caplog: pytest.LogCaptureFixture
-) -> None:
-    (folders.left / "L3.png").unlink()
-    (folders.right / "R8.png").unlink()
-    with open_source(folders) as source:
-        assert numbers(list(source)) == [0, 1, 2, 4, 5, 6, 7, 9, 10, 11]
-    assert "2 pictures of" in caplog.text and "have no partner of their name" in caplog.text
-
-
 # ---- on the way ------------------------------------------------------------------------------------------
 
 
