@@ -49,7 +49,8 @@ Levels = Annotated[
     tuple[Share, Share], AfterValidator(_possible_levels)
 ]  # black and white, shares of the range
 Instruments = Annotated[  # in masks
-    Literal["white", "black"] | tuple[int | str, ...], BeforeValidator(_values_of_masks)
+    Literal["white", "black"] | tuple[Annotated[int, Ge(0), Le(255)] | str, ...],
+    BeforeValidator(_values_of_masks),
 ]
 _INSTRUMENTS = (
     "how masks show them: white (above 127), black, or as one of these values and colours, e.g. [85,170] or "

@@ -188,10 +188,17 @@ def test_wrong_dictionary_and_wrong_charuco(tmp_path: Path) -> None:
     assert "the board has 0 to 9" in small.explain(gray)
 
 
-def test_counts_that_differ(chess_folders: tuple[Path, Path], tmp_path: Path, chess_pairs: Any) -> None:
+def test_counts_that_differ(
+    chess_folders: tuple[Path, Path], tmp_path: Path, chess_pairs: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Names tell the partners; where they do not, numbers must be equal."""
     left, right = write_pairs(tmp_path / "odd", chess_pairs[:7])
     (right / "03.png").unlink()
     code, _, err = sags(left, right, *BOARD, "-o", tmp_path / "rig")
+    assert code == 0 and "03.png; they are left out" in caplog.text
+    for file in right.iterdir():
+        file.rename(right / f"r{file.stem}_.png")
+    code, _, err = sags(left, right, *BOARD, "-o", tmp_path / "other")
     assert code == 2 and "holds 7 pictures" in err and "holds 6" in err
 
 
