@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
+from collections.abc import Callable
 from itertools import pairwise
 from statistics import median
 
@@ -29,13 +31,21 @@ class Freshness:
     Args:
         rate_hz: what the topic must keep; default: every message that its sender sends.
         periodic: False for a topic that speaks only when something changes: it cannot be too old.
+        clock: s, that nobody sets. Stamps tell nothing of a silence where they are ahead.
     """
 
-    def __init__(self, rate_hz: float | None = None, periodic: bool = True) -> None:
+    def __init__(
+        self,
+        rate_hz: float | None = None,
+        periodic: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.lost = 0  # messages of this sender that never came
         self.last: Meta | None = None
         self._rate_hz = rate_hz
         self._periodic = periodic
+        self._clock = clock
+        self._came = 0.0  # when the last message did
         self._window: deque[Meta] = deque(maxlen=WINDOW)
         self._followed: deque[str] = deque(maxlen=SESSIONS)
         self._mixed = 0  # messages of one node that are due until it is believed to be the only one
@@ -55,7 +65,7 @@ class Freshness:
             self._mixed -= 1
         if last is None or meta.session != last.session or meta.epoch != last.epoch:
             self._window.clear()
-        self.last = meta
+        self.last, self._came = meta, self._clock()
         self._window.append(meta)
         return True
 
@@ -108,6 +118,9 @@ class Freshness:
             return f"stamped {-age:.2f} s ahead of this machine's clock; set both clocks"
         if age > limit:
             return f"too old: {age:.2f} s, the limit is {limit:.2f} s"
+        silence = self._clock() - self._came
+        if silence > limit:
+            return f"nothing has come for {silence:.2f} s, the limit is {limit:.2f} s"
         if self.rate < MIN_RATE:
             return f"too few messages: {100 * self.rate:.0f} % of those due"
         return None

@@ -17,7 +17,9 @@ from sags_node.types import ClockStatus
 BIN_NS = 1_000_000_000  # the smallest difference of each second is kept
 KEPT = 120  # s
 SURE = 20  # s: for less the jitter of the way says more than the drift (1 ms in 20 s: 50 ppm)
-SET_NS = 100_000_000  # a difference that much larger for a whole second: the clock was set, not a slow way
+SET_NS = 100_000_000  # a difference that much larger is a slow way
+SET_S = 10  # unless it is in each of so many seconds: then the clock was set
+STARTED_NS = 1_000_000_000  # a stamp so far back: the clock began anew; less: a picture was overtaken
 
 
 class CaptureClock:
@@ -26,6 +28,7 @@ class CaptureClock:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._bins: deque[tuple[int, int]] = deque(maxlen=KEPT)  # stamp and difference, ns
+        self._slow: list[tuple[int, int]] = []  # the last seconds, while the way is slow or the clock was set
         self._begun = 0  # stamp at which the newest bin begins
         self._last = 0
         self._drift = 0.0  # of the line under all differences
@@ -35,25 +38,28 @@ class CaptureClock:
         """A picture of the sender's time `stamp_ns` arrived at `arrival_ns`, wall clock."""
         difference = arrival_ns - stamp_ns
         with self._lock:
-            if stamp_ns < self._last:
+            if stamp_ns < self._last - STARTED_NS:
                 self._bins.clear()  # it was set back, or the sender was started anew
+                self._slow.clear()
+            elif self._bins and stamp_ns < self._last:
+                return  # a picture that was overtaken tells nothing that those before it did not
             self._last = stamp_ns
             if not self._bins or stamp_ns - self._begun >= BIN_NS:
-                if len(self._bins) > 1 and self._bins[-1][1] - self._offset_at(stamp_ns) > SET_NS:
-                    newest = self._bins[-1]
-                    self._bins.clear()
-                    self._bins.append(newest)
+                self._sort_out(stamp_ns)
+                is_slow = bool(self._bins) and difference - self._offset_at(stamp_ns) > SET_NS
                 self._bins.append((stamp_ns, difference))
                 self._begun = stamp_ns
-                self._fit()
+                if not is_slow:
+                    self._fit()
             elif difference < self._bins[-1][1]:
                 self._bins[-1] = stamp_ns, difference
                 self._lowest = min(self._lowest, difference - self._drift * (stamp_ns - self._bins[0][0]))
 
-    def to_wall(self, stamp_ns: int) -> int:
-        """A time of the sender's clock on the wall clock, ns, late by the shortest way; after an `add`."""
+    def to_wall(self, stamp_ns: int) -> int | None:
+        """A time of the sender's clock on the wall clock, ns, late by the shortest way; None before the first
+        picture."""
         with self._lock:
-            return stamp_ns + self._offset_at(stamp_ns)
+            return stamp_ns + self._offset_at(stamp_ns) if self._bins else None
 
     def status(self) -> ClockStatus | None:
         """What is known of the clock; None before the first picture."""
@@ -63,6 +69,18 @@ class CaptureClock:
             seconds = (self._bins[-1][0] - self._bins[0][0]) / BIN_NS
             drift = self._drift * 1e6 if seconds >= SURE else None
             return ClockStatus(self._offset_at(self._last) * 1e-6, drift, seconds)
+
+    def _sort_out(self, stamp_ns: int) -> None:
+        """A second is over: one of a slow way must not count, lest what is late seem new."""
+        if len(self._bins) < 2 or self._bins[-1][1] - self._offset_at(stamp_ns) <= SET_NS:
+            self._slow.clear()
+            return
+        self._slow.append(self._bins.pop())
+        if len(self._slow) == SET_S:
+            self._bins.clear()
+            self._bins.extend(self._slow)
+            self._slow.clear()
+            self._fit()
 
     def _fit(self) -> None:
         """The line under all differences. Its slope: the median of those between far bins (Theil, Sen)."""

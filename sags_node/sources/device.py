@@ -20,7 +20,8 @@ log = logging.getLogger(__name__)
 
 FIRST_PICTURE_S = 3  # cameras need this long to start; OpenCV waits for the first picture in one piece
 DEEP = {"Y10 ": 6, "Y12 ": 4, "Y16 ": 0}  # pixel formats of 16 bit words: bits that they leave free
-PLAUSIBLE_AGE_NS = 1_000_000_000  # of a driver stamp against its arrival
+NEAR_NS = 1_000_000_000  # a stamp so near to its arrival is of the kernel's monotonic clock
+STRANGE = 30  # pictures, none with such a stamp: the driver's clock is another one
 
 
 class Picture(NamedTuple):
@@ -45,6 +46,9 @@ class Shot(NamedTuple):
 class Device:
     """An open camera.
 
+    Most drivers stamp by the kernel's monotonic clock. One that was seen to do so is believed, however old a
+    picture is: the driver's buffers keep those that nobody took for a while.
+
     Args:
         path: device file; a udev link such as /dev/video-left follows its camera from port to port.
         config: size, rate and pixel format to ask for.
@@ -52,6 +56,9 @@ class Device:
     Raises:
         SagsError: the device is missing or cannot be opened, or the driver set another size.
     """
+
+    _is_near = False  # a stamp was near to its arrival
+    _far = 0  # pictures, before there was such a one
 
     def __init__(self, path: str, config: V4l2Source) -> None:
         self._path = path
@@ -123,12 +130,20 @@ class Device:
             return None
         self._last_stamp_ms = stamp_ms
         device_ns, arrival_ns = round(stamp_ms * 1e6), time.time_ns()
-        t_ns = wall_stamp(device_ns, time.monotonic_ns(), arrival_ns)
+        monotonic_ns = time.monotonic_ns()
+        self._learn(device_ns, monotonic_ns)
+        is_believed = self._is_near or self._far < STRANGE
+        t_ns = wall_stamp(device_ns, monotonic_ns, arrival_ns) if is_believed else arrival_ns
         if self._shift is None:
             image: Samples = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
         else:
             image = _deep(picture, self._shift, self.size)
         return Shot(t_ns, image, device_ns=device_ns, arrival_ns=arrival_ns)
+
+    def _learn(self, driver_ns: int, monotonic_ns: int) -> None:
+        if not self._is_near:
+            self._is_near = abs(monotonic_ns - driver_ns) <= NEAR_NS
+            self._far += 1
 
     def close(self) -> None:
         self._capture.release()
@@ -142,7 +157,7 @@ def _deep(picture: Samples, shift: int, size: tuple[int, int]) -> Samples:
 
 
 def wall_stamp(driver_ns: int, monotonic_ns: int, wall_ns: int) -> int:
-    """A driver's monotonic capture stamp on the wall clock, ns; the arrival time where it is no such stamp.
+    """A driver's monotonic capture stamp on the wall clock, ns; the arrival time where it gives none.
 
     No picture is taken after it arrived: where a driver stamps ahead (vivid does), arrival counts.
 
@@ -150,10 +165,7 @@ def wall_stamp(driver_ns: int, monotonic_ns: int, wall_ns: int) -> int:
         driver_ns: the driver's stamp, 0 when it gives none.
         monotonic_ns, wall_ns: both clocks at arrival.
     """
-    age = monotonic_ns - driver_ns
-    if abs(age) > PLAUSIBLE_AGE_NS:
-        return wall_ns
-    return wall_ns - max(age, 0)
+    return wall_ns - max(monotonic_ns - driver_ns, 0) if driver_ns else wall_ns
 
 
 def _present() -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections import deque
+from collections.abc import Callable
 
 from sags_node.sources.device import Picture, Shot
 
@@ -79,15 +81,18 @@ class Alternation:
     """Joins the pictures of one camera that shows the eyes in turn. Not safe for threads by itself.
 
     How much time has passed since the picture before tells which eye one shows, so a picture that is lost
-    does not exchange the eyes.
+    does not exchange the eyes. It passes on the device's clock, or else on one that nobody sets.
 
     Args:
         period_ns: from picture to picture.
+        clock_ns: that nobody sets.
     """
 
-    def __init__(self, period_ns: float) -> None:
+    def __init__(self, period_ns: float, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock_ns = clock_ns
         self._period_ns = period_ns
         self._before: Shot | None = None
+        self._arrived_ns = 0  # when that came
         self._turn = -1  # of the picture before; even: the first eye's
         self.alone = 0
 
@@ -102,4 +107,10 @@ class Alternation:
         return None
 
     def _steps(self, before: Shot | None, picture: Shot) -> int:
-        return 1 if before is None else max(1, round((picture.t_ns - before.t_ns) / self._period_ns))
+        last_ns, self._arrived_ns = self._arrived_ns, self._clock_ns()
+        if before is None:
+            return 1
+        passed_ns = self._arrived_ns - last_ns
+        if picture.device_ns and before.device_ns:
+            passed_ns = picture.device_ns - before.device_ns
+        return max(1, round(passed_ns / self._period_ns))

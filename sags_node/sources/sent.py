@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -19,10 +19,12 @@ from sags_node.types import U8, Side
 OLDEST_NS = 1_000_000_000  # what is older is of no use, or of another clock
 AWAY_NS = 1_000_000_000  # without a picture, and
 AWAY_STEPS = 10  # times the usual step: whoever sends was away, and nothing was lost
+ONE_CLOCK_NS = 100_000_000  # the eyes' clocks apart: it is one, and the ways differ
 AHEAD_NS = 100_000_000  # beyond what clocks that are set by each other differ
 LATE_NS = 200_000_000  # on the way: a hand that is shown so late misses
 SMOOTHED = 0.1  # share of the newest picture in what is said of the last ones
 ENOUGH = 0.9  # of the pictures that should come
+OTHER: Mapping[Side, Side] = {"left": "right", "right": "left"}
 WINDOW = 90  # stamps that the loss is counted over: three seconds
 
 
@@ -93,7 +95,7 @@ class SentPictures:
         both = "side_by_side" if said == "separate" else said
         self._both = Layout(config.geometry.model_copy(update={"layout": both}))
         self._own = config.stamps == "own"
-        self._clock = CaptureClock()
+        self._clocks: Mapping[Side, CaptureClock] = {"left": CaptureClock(), "right": CaptureClock()}
         self._rate = config.rate
         self._age_ns = 0.0  # of pictures when they come
 
@@ -123,24 +125,23 @@ class SentPictures:
         Raises:
             SagsError: it is refused; why, and how to fix it.
         """
-        t_ns = self._on_wall(stamp_ns, arrival_ns)
+        t_ns = self._on_wall(eye, stamp_ns, arrival_ns)
         self.arrivals[eye].add(stamp_ns)
         picture = self._checked(decode(), self._one)
         self.pairs.put(eye, Picture(t_ns, self._one.eye(picture, eye), stamp_ns, arrival_ns))
 
     def put_both(self, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
         """Take one picture of both eyes in, side by side unless the geometry says otherwise; see `put`."""
-        t_ns = self._on_wall(stamp_ns, arrival_ns)
+        t_ns = self._on_wall("left", stamp_ns, arrival_ns)
         for arrivals in self.arrivals.values():
             arrivals.add(stamp_ns)
         eyes = self._both.eyes(self._checked(decode(), self._both))
         left, right = (Picture(t_ns, eye, stamp_ns, arrival_ns) for eye in eyes)
         self.pairs.put_both(left, right)
 
-    def _on_wall(self, stamp_ns: int, arrival_ns: int) -> int:
+    def _on_wall(self, eye: Side, stamp_ns: int, arrival_ns: int) -> int:
         if self._own:
-            self._clock.add(stamp_ns, arrival_ns)
-            return self._clock.to_wall(stamp_ns)
+            return self._own_on_wall(eye, stamp_ns, arrival_ns)
         age = arrival_ns - stamp_ns
         self._age_ns += SMOOTHED * (age - self._age_ns)
         if -AHEAD_NS <= age <= OLDEST_NS:
@@ -150,6 +151,13 @@ class SentPictures:
             f"a picture's stamp is {abs(age) * 1e-9:.1f} s {way}: stamp it by the wall clock when it is "
             "taken and set both clocks by each other, or set source.stamps:=own"
         )
+
+    def _own_on_wall(self, eye: Side, stamp_ns: int, arrival_ns: int) -> int:
+        """Each eye is followed by itself: their pictures come in any order, and may be of two clocks."""
+        self._clocks[eye].add(stamp_ns, arrival_ns)
+        own, other = self._clocks[eye].to_wall(stamp_ns), self._clocks[OTHER[eye]].to_wall(stamp_ns)
+        assert own is not None  # it was just added
+        return own if other is None or abs(other - own) > ONE_CLOCK_NS else min(own, other)
 
     def _checked(self, picture: U8, layout: Layout) -> U8:
         """A picture whose eyes have the right size."""

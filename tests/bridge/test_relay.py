@@ -29,7 +29,7 @@ class Node:
     """Stands for `Feed` and all before it: what a node sends on one topic of frames, and on another."""
 
     def __init__(self, world: World) -> None:
-        self.fresh = {name: Freshness() for name in (PICTURE, POSE)}
+        self.fresh = {name: Freshness(clock=world.monotonic) for name in (PICTURE, POSE)}
         self.asked: list[tuple[float, frozenset[str]]] = []
         self.sends = True
         self._world = world

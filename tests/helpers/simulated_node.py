@@ -245,7 +245,7 @@ class Run:
         self._network = Network(self.world, self._wake)
         self._folder = folder
         self.asked: dict[int, Asked] = {}
-        self.fresh = {f"sags/{name}": Freshness() for name in ("tf", "anchors")}
+        self.fresh = {f"sags/{name}": Freshness(clock=self.world.monotonic) for name in ("tf", "anchors")}
         self.shown = Counter[str]()
         self._seen: dict[str, tuple[int, int, int, int]] = {}
         self._state, self._refused = (

@@ -50,6 +50,18 @@ def test_what_shows_no_frame_is_stale_after_ten_periods() -> None:
     assert "too old" in str(said.problem((30_000 + 10_100) * MS))
 
 
+@pytest.mark.fault("clock: the sender's is 0.9 s ahead, and it falls silent")
+@pytest.mark.parametrize("ahead", [0, 500, 900])
+def test_silence_is_stale_whatever_the_stamps_say(ahead: int) -> None:
+    now = [0.0]
+    fresh = Freshness(clock=lambda: now[0])
+    for seq in range(1, 31):
+        fresh.accept(meta(seq, seq * 33 + ahead))
+    for silent, is_stale in ((0.32, False), (0.34, True)):  # ten periods
+        now[0] = silent
+        assert (fresh.problem(round((30 * 33 + 1000 * silent - 10) * MS)) is not None) == is_stale
+
+
 def test_stale_before_the_period_is_known() -> None:
     assert Freshness().problem(0) == "nothing received yet"
     for max_age, limit in ((None, 1000 * STALE_AFTER), (5.0, 1000)):  # ten of 0.1 s

@@ -148,19 +148,29 @@ def test_what_makes_no_sense_is_refused(said: Any, words: str) -> None:
 # ---- eyes in turn ----------------------------------------------------------------------------------------
 
 
-def shots(indices: list[int], jitter_ms: float = 0.0) -> list[Shot]:
-    """Pictures of a camera of 60 Hz, by number; even ones are of the first eye."""
-    noise = np.random.default_rng(1).uniform(-jitter_ms, jitter_ms, len(indices))
-    return [
-        Shot(round((1000 / 60 * i + late) * 1e6), np.full((2, 2, 3), i, np.uint8))
-        for i, late in zip(indices, noise, strict=True)
-    ]
-
-
-def pairs_of(indices: list[int], jitter_ms: float = 0.0) -> tuple[list[tuple[int, int]], int]:
-    joining = Alternation(1e9 / 60)
-    found = [pair for shot in shots(indices, jitter_ms) if (pair := joining.add(shot)) is not None]
+def pairs_of(
+    indices: list[int], jitter_ms: float = 0.0, stamped: bool = True, set_ms: float = 0.0
+) -> tuple[list[tuple[int, int]], int]:
+    """Of a camera of 60 Hz, by number; even ones are of the first eye. `stamped`: by its clock as well;
+    the wall clock is set before the eleventh."""
+    moments = [round(1e9 / 60 * i) + 1 for i in indices]
+    jitter = np.random.default_rng(1).uniform(-jitter_ms, jitter_ms, len(indices))
+    times = iter([moment + round(late * 1e6) for moment, late in zip(moments, jitter, strict=True)])
+    joining, found = Alternation(1e9 / 60, lambda: next(times)), []
+    for i, moment in zip(indices, moments, strict=True):
+        wall = 10**18 + moment + round((i > 10) * set_ms * 1e6)
+        shot = Shot(wall, np.full((2, 2, 3), i, np.uint8), device_ns=moment if stamped else 0)
+        if (pair := joining.add(shot)) is not None:
+            found.append(pair)
     return [(int(a.image[0, 0, 0]), int(b.image[0, 0, 0])) for a, b in found], joining.alone
+
+
+@pytest.mark.fault("clock: the wall clock is set while the eyes come in turn")
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_clock_that_is_set_does_not_exchange_the_eyes(stamped: bool) -> None:
+    for by in (-1000, -50, 17, 50, 150, 950):
+        pairs, alone = pairs_of(list(range(30)), 4, stamped, by)
+        assert pairs == [(i, i + 1) for i in range(0, 30, 2)] and alone == 0
 
 
 def test_eyes_in_turn_are_paired_in_order() -> None:

@@ -27,7 +27,7 @@ from sags_node.messaging import cdr, content, topics
 from sags_node.node.health import Statistics
 from sags_node.sources.clock import KEPT, CaptureClock
 from sags_node.sources.sent import WINDOW, Arrivals, SentPictures
-from sags_node.types import U8, ClockStatus, StereoFrame
+from sags_node.types import U8, ClockStatus, Side, StereoFrame
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD = 33 * MS
@@ -150,6 +150,31 @@ def test_a_late_first_picture_makes_no_new_epoch() -> None:
     assert sent.dropped == 4
 
 
+@pytest.mark.fault("network: pictures of a sender with a clock of its own get 0.8 s late")
+@pytest.mark.parametrize("apart", [0, -7 * S])
+@pytest.mark.parametrize("order", [("left", "right"), ("right", "left")])
+@pytest.mark.parametrize("skew", [-20, 5, 20])
+def test_what_is_late_is_never_told_as_new(skew: int, order: tuple[Side, Side], apart: int) -> None:
+    """The eyes are exposed one after the other, stamped by one clock or two. One moment overtakes another."""
+    sent = SentPictures(PushSource(stamps="own", pair_tolerance_ms=25), None)
+    frames, numbers = list[StereoFrame](), [*range(60)]
+    numbers[50:52] = 51, 50
+    with ThreadPoolExecutor(1) as taker:
+        taken = taker.submit(lambda: frames.extend(sent.pairs))
+        for count, number in enumerate(numbers):
+            shown, way = 10 * S + number * PERIOD, (10 if number < 40 else 800) * MS
+            for eye in order:
+                stamp = shown + (apart + skew * MS if eye == "right" else 0)
+                sent.put(eye, stamp, 100 * S + shown + max(skew, 0) * MS + way, picture)
+            until(lambda count=count: len(frames) + sent.dropped > count)
+        sent.pairs.end()
+        taken.result(timeout=10)
+    assert len(frames) >= 55
+    for frame in frames:  # 10 ms is the shortest way, and what is exposed first waits for the other
+        for told, late in ((frame.t_capture_ns, 0), (frame.t_capture_right_ns, skew * MS)):
+            assert 0 <= told - (100 * S + frame.t_device_ns + late) <= 50 * MS
+
+
 def test_the_latency_is_taken_off_and_all_stamps_are_kept() -> None:
     sent = SentPictures(PushSource(latency_ms=40), None)
     for eye in ("left", "right"):
@@ -226,8 +251,18 @@ def test_a_short_watch_says_no_drift() -> None:
 def test_a_clock_that_was_set_is_followed_within_three_seconds(jump: int) -> None:
     clock = CaptureClock()
     watched(clock, 30, 0)
-    watched(clock, 3, 0, offset=7 * S + jump, begun=30 * S)
-    assert clock.to_wall(33 * S) == pytest.approx(40 * S + jump + 2 * MS, abs=MS)
+    watched(clock, 3, 0, offset=7 * S - jump, begun=30 * S + jump)
+    assert clock.to_wall(33 * S + jump) == pytest.approx(40 * S + 2 * MS, abs=MS)
+
+
+def test_a_slow_way_is_no_clock_that_was_set_for_ten_seconds() -> None:
+    clock = CaptureClock()
+    watched(clock, 30, 0)
+    for begun in range(30, 39):
+        watched(clock, 1, 0, offset=8 * S, begun=begun * S)
+        assert clock.to_wall(begun * S) == pytest.approx((begun + 7) * S + 2 * MS, abs=MS)
+    watched(clock, 4, 0, offset=8 * S, begun=39 * S)  # after twelve it is
+    assert clock.to_wall(43 * S) == pytest.approx(51 * S + 2 * MS, abs=MS)
 
 
 def test_the_watch_is_bounded() -> None:

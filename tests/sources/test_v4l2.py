@@ -20,7 +20,7 @@ from waiting import repeating, until
 from sags_node.config.schema import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources import live
-from sags_node.sources.device import Device, Picture, Shot, wall_stamp
+from sags_node.sources.device import STRANGE, Device, Picture, Shot, wall_stamp
 from sags_node.sources.live import LiveStereo
 from sags_node.sources.pairing import QUEUE_LENGTH, Pairing
 from sags_node.sources.v4l2 import open_cameras
@@ -176,7 +176,7 @@ def test_recovers_when_the_wall_clock_is_set_back() -> None:
 @pytest.mark.parametrize(
     ("driver_ns", "expected"),
     [
-        (95_000_000_000, 1_000_000_000_000),  # 5 s old: not a stamp of this picture
+        (95_000_000_000, 995_000_000_000),  # 5 s old: it waited in the driver
         (99_980_000_000, 999_980_000_000),  # 20 ms old
         (100_060_000_000, 1_000_000_000_000),  # ahead of its arrival
         (0, 1_000_000_000_000),  # the driver gives none
@@ -185,6 +185,59 @@ def test_recovers_when_the_wall_clock_is_set_back() -> None:
 )
 def test_wall_stamp(driver_ns: int, expected: int) -> None:
     assert wall_stamp(driver_ns, 100_000_000_000, 1_000_000_000_000) == expected
+
+
+@pytest.mark.fault("camera: pictures wait in its driver while the process is stopped")
+@pytest.mark.parametrize("first", [True, False])
+@pytest.mark.parametrize("stopped_s", [0.9, 1.1, 3.0, 3600.0])
+def test_what_waited_in_the_driver_keeps_its_age(
+    stopped_s: float, first: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four buffers of before a stop, also where they are the very first."""
+    old = [stopped_s] * 4
+    for age, told in zip(
+        [0.02] * (not first) + old, taken_at(monkeypatch, [0.02] * (not first) + old), strict=True
+    ):
+        assert told == pytest.approx(age, abs=0.01)
+
+
+def test_stamps_of_a_clock_of_its_own_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A driver that counts from when it was plugged in: what it says is old is new."""
+    told = taken_at(monkeypatch, [1000.0] * 60)
+    assert told[STRANGE:] == [0.0] * (60 - STRANGE)
+
+
+def taken_at(monkeypatch: pytest.MonkeyPatch, ages: list[float]) -> list[float]:
+    """How old pictures are said to be of which a driver says `ages`, s."""
+    wall_ns, monotonic_ns = 10**18, 10**14
+
+    class Capture:
+        read_so_far = 0
+
+        def read(self) -> tuple[bool, np.ndarray]:
+            self.read_so_far += 1
+            return True, np.zeros((4, 8, 3), np.uint8)
+
+        def get(self, what: int) -> float:
+            if what == cv2.CAP_PROP_POS_MSEC:
+                age = ages[self.read_so_far - 1]
+                return 1e-6 * (monotonic_ns + self.read_so_far - round(age * 1e9))  # each is another one
+            return {cv2.CAP_PROP_FRAME_WIDTH: 8.0, cv2.CAP_PROP_FRAME_HEIGHT: 4.0}.get(what, 0.0)
+
+        isOpened = set = release = lambda self, *_: True
+
+    class Opening:
+        waitAny = staticmethod(lambda captures, timeout: (True, [0]))
+        fourcc = staticmethod(lambda *letters: 0)
+
+        def __new__(cls, *_: object) -> Capture:  # type: ignore[misc]
+            return Capture()
+
+    monkeypatch.setattr(cv2, "VideoCapture", Opening)
+    monkeypatch.setattr(time, "time_ns", lambda: wall_ns)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: monotonic_ns)
+    camera = Device("/dev/null", CONFIG)
+    return [(wall_ns - camera.read(1.0).t_ns) * 1e-9 for _ in ages]  # type: ignore[union-attr]
 
 
 # ---- the source ------------------------------------------------------------------------------------------
