@@ -27,6 +27,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "uncalibrated": "calibration",
     "tissue_too_near": "depth",
     "picture_frozen": "picture",
+    "picture_still": "picture",
     "picture_dark": "picture",
     "picture_bright": "picture",
     "picture_covered": "picture",

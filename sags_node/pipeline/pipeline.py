@@ -124,8 +124,9 @@ class Pipeline:
         self.anchors = Anchors(self.tissue.usable)
         self._pose = PoseWatch(needed=vision.pose in ("session", "refine"))
         self._scene = SceneWatch(moving=vision.pose == "estimate")
+        self._freeze = FreezeWatch(vision.tissue.exclude)
         self._watchers: tuple[Watcher, ...] = (
-            self._pose, FreezeWatch(), PairWatch(), self._scene, LensWatch()
+            self._pose, self._freeze, PairWatch(), self._scene, LensWatch()
         )  # fmt: skip
         self._still = StillScene()
         self._reset_due = False
@@ -267,7 +268,7 @@ class Pipeline:
 
     def _repeated(self, frame: StereoFrame, pair: RectifiedPair, clock: Stopwatch) -> FrameResult:
         assert self.newest is not None
-        anchors = self.anchors.at(pair.t_capture_ns, equal=True)
+        anchors = self.anchors.at(pair.t_capture_ns, equal=not self._freeze.findings)
         return repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, anchors)
 
     def _held(

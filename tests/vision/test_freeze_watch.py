@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from watching import judged
 
 from sags_node.types import U8, StereoFrame
-from sags_node.vision.freeze_watch import FreezeWatch
+from sags_node.vision.freeze_watch import Box, FreezeWatch
 
 HEIGHT, WIDTH = 48, 64
 S = 1_000_000_000
+NOISE = np.random.default_rng(5).normal(0, 1, (300, 380, 3)).astype(np.float32)
 
 
 def picture(seed: int) -> U8:
@@ -59,14 +61,88 @@ def test_it_is_over_with_the_first_picture_that_differs() -> None:
     assert again.index(True) >= 9
 
 
-@pytest.mark.parametrize("eye", ["left", "right"])
-@pytest.mark.parametrize("row", [0, HEIGHT // 2, HEIGHT - 1])
-def test_one_bit_in_one_eye_is_a_new_picture(eye: str, row: int) -> None:
-    watch = FreezeWatch()
-    for frame, i in zip(feed(), range(60), strict=False):
-        changed = getattr(frame, eye).copy()
-        changed[row, 7, 1] ^= i % 2
-        assert not told(watch, replace(frame, **{eye: changed}))
+Change = Callable[[U8, int], U8]  # of a picture in a frame
+
+
+def shown(change: Change, captions: tuple[Box, ...] = (), rate: float = 30.0) -> list[bool]:
+    """Which of two seconds' frames are held, of a feed that shows one picture but for the change."""
+    watch, eyes = FreezeWatch(captions), [cv2.resize(picture(seed), (320, 240)) for seed in (0, 1)]
+    return [
+        told(watch, live(i, rate, *(change(eye.copy(), i) for eye in eyes))) for i in range(round(2 * rate))
+    ]
+
+
+def caption(every: int, x: int = 8, y: int = 232) -> Change:
+    """A counter that goes on all so many frames."""
+    return lambda eye, i: cv2.putText(eye, f"{i // every:04d}", (x, y), 0, 0.4, (255, 255, 255), 1)
+
+
+def dot(eye: U8, i: int) -> U8:
+    return cv2.circle(eye, (308, 12), 4, (255, 0, 0) if i // 8 % 2 else (40, 0, 0), -1)
+
+
+def noisy(sigma: float, every: int = 1) -> Change:
+    """Of a sensor; with `every` of a codec, whose pictures are equal from one key frame to the next."""
+
+    def change(eye: U8, i: int) -> U8:
+        moment = i // every
+        noise = NOISE[moment : moment + 240, moment : moment + 320]
+        return np.clip(np.rint(eye + sigma * noise), 0, 255).astype(np.uint8)
+
+    return change
+
+
+def both(first: Change, second: Change) -> Change:
+    return lambda eye, i: second(first(eye, i), i)
+
+
+@pytest.mark.fault("picture: a live feed is frozen under a caption that goes on, or with key frames")
+@pytest.mark.parametrize(
+    "change",
+    [caption(1), caption(3), caption(30, 270, 20), dot, both(caption(3), dot), noisy(1, 9), noisy(2, 15),
+     both(noisy(1, 9), caption(3))],
+)  # fmt: skip
+def test_a_caption_or_key_frames_hide_no_frozen_feed(change: Change) -> None:
+    held = shown(change)
+    assert not any(held[:9]) and all(held[18:]), held  # from half a second and a key frame on
+
+
+def test_what_the_user_leaves_out_counts_for_nothing() -> None:
+    """A monitor's curves over a tenth of the picture, up to its middle."""
+    box = (0, 100, 320, 24)
+
+    def curves(eye: U8, i: int) -> U8:
+        eye[box[1] : box[1] + box[3]] = picture(i)[:24].repeat(5, 1)
+        return eye
+
+    assert not any(shown(curves)) and all(shown(curves, (box,))[9:])
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.7, 2.0])
+def test_a_scope_at_rest_is_not_frozen(sigma: float) -> None:
+    """A sensor has noise everywhere, and beside a caption too; it may come at 5 Hz."""
+    for change in (noisy(sigma), both(noisy(sigma), caption(3)), noisy(sigma, 6)):
+        assert not any(shown(change))
+
+
+@pytest.mark.parametrize("size", [3, 100])
+def test_what_moves_in_the_middle_or_widely_is_alive(size: int) -> None:
+    """Also without any noise, as simulators draw."""
+
+    def moving(eye: U8, i: int) -> U8:
+        return cv2.circle(eye, (160 + i % 7, 120), size, (200, 60, 60), -1)
+
+    assert not any(shown(moving))
+
+
+def test_a_picture_that_hardly_changes_for_two_seconds_is_said() -> None:
+    """Behind a codec that refines it a frozen picture looks as a scene at rest: it is not held."""
+    watch, eye = FreezeWatch(), cv2.resize(picture(0), (320, 240))
+    for i in range(75):
+        refined = eye.copy()
+        refined[100:140, 100 + i : 120 + i] ^= 1
+        assert not judged(watch, live(i, 30, refined, None)).hold
+        assert [finding.code for finding in watch.findings] == ["picture_still"] * (i >= 60)
 
 
 def test_one_eye_that_stands_still_is_no_frozen_feed() -> None:
