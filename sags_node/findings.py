@@ -26,6 +26,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "rows_differ": "calibration",
     "uncalibrated": "calibration",
     "tissue_too_near": "depth",
+    "no_model": "depth",
     "picture_frozen": "picture",
     "picture_still": "picture",
     "picture_dark": "picture",
@@ -56,7 +57,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
 
 # Stages whose warnings make nothing that is shown less sure.
 OF_THE_FLOW = frozenset({"source", "capture", "recording"})
-UNHEALTHY = frozenset({"recording_ended"})  # whatever the state
+UNHEALTHY = frozenset({"recording_ended", "no_model"})  # whatever the state
 
 Findings = Mapping[str, tuple[Finding, ...]]  # by stage; a stage without any is left out
 NOTHING: Findings = {}

@@ -20,6 +20,8 @@ WAITING_AFTER = 1.0  # s without a frame, or without one that was taken in
 WINDOW = 150  # frames behind the published rates and latencies
 MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less often (`messaging.freshness`)
 BACK_AT = 0.8  # of that: a warning ends
+DRAWN = 0.05  # of the tissue, at least: with less nothing is shown
+EVERY = 8  # px: what is drawn is looked at
 LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is none that is too long
 
 
@@ -56,6 +58,8 @@ class Statistics:
         self._published: deque[float] = deque(maxlen=WINDOW)
         self._taken_in = -inf  # when a frame was published that was
         self._resumed = -inf
+        self._drawn = inf  # when one was that shows the model; inf: none is expected yet
+        self._lacks = ""  # why the last one that was taken in does not
         self._latency: deque[float] = deque(maxlen=WINDOW)
         self._worked: deque[float] = deque(maxlen=WINDOW)  # ms on each
         self._stages: dict[str, deque[float]] = {}
@@ -83,6 +87,9 @@ class Statistics:
             self._published.append(time.monotonic())
             if not result.held:
                 self._taken_in = self._published[-1]
+                self._lacks = _lacks(result)
+            if result.held or not self._lacks or waited:
+                self._drawn = self._published[-1]
             self._latency.append(latency_ms)
             self.latency_s = 1e-3 * median(self._latency)
             self._worked.append(sum(result.timings_ms.values()))
@@ -172,6 +179,8 @@ class Statistics:
         elif state == "waiting":
             said = f"no frame for {now - self._published[-1]:.0f} s" if self._published else "no frame comes"
             found.append(Finding("no_frames", f"{said}: {self._nothing_comes}"))
+        if state == "running" and now - self._drawn > WAITING_AFTER:
+            found.append(Finding("no_model", f"nothing is shown: {self._lacks}"))
         if self._leaves_out_too_many("source"):
             said = "the source leaves out over a tenth of its frames"
             helps = self._too_few_come or f"{_relief(consumers)}, or is the disk slow?"
@@ -197,6 +206,20 @@ def _relief(consumers: int) -> str:
         return "end other programs"
     what = "1 consumer takes" if consumers == 1 else f"{consumers} consumers take"
     return f"{what} messages: end some, or let them subscribe to thin/ topics; end other programs"
+
+
+def _lacks(result: FrameResult) -> str:
+    """Why hardly anything of the model is drawn in a frame; empty: it is."""
+    tissue = result.observation.tissue[::EVERY, ::EVERY]
+    if not tissue.any():
+        return "no tissue is seen; is the scope where it should be, and does the mask fit (vision.tissue)?"
+    drawn = result.views["left"].alpha[::EVERY, ::EVERY][tissue] > 0.5
+    if np.mean(drawn) >= DRAWN:
+        return ""
+    return result.skipped.get("depth") or (
+        "there is no depth, as hardly anything matches between the eyes: the tissue is nearer than 10 mm or "
+        "farther than vision.stereo.max_depth, or the calibration is of another scope; sags calib check tells"
+    )
 
 
 def _percentiles(values: Sequence[float]) -> dict[str, float]:

@@ -22,7 +22,7 @@ from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.uncalibrated import MOST, unsure
+from sags_node.pipeline.uncalibrated import unsure
 from sags_node.types import DrawnView, FrameResult
 
 
@@ -114,6 +114,8 @@ class Operations:
             raise SagsError("there is no model yet; wait for the first frame")
         frame = newest.observation, newest.snapshot, newest.views["left"]
         if request.u is not None and request.v is not None:
+            if held := self._state.pipeline.held:  # the picture that was clicked on is another one
+                raise SagsError(f"frames are held: {held}; pin when they are taken in again")
             size = published.size_of(newest.pair)
             anchor = self._state.pipeline.anchors.add_pixel(request.u, request.v, *frame, size)
         else:
@@ -123,8 +125,7 @@ class Operations:
             seconds = None if request.ahead_ms == "auto" else request.ahead_ms * 1e-3
             self._state.pipeline.anchors.look_ahead(anchor, seconds)
             self._state.pipeline.predict_motion()
-        sure = self._state.pipeline.anchors.depth_confidence(anchor)
-        sure = sure if self._state.pipeline.metric else min(sure, MOST)
+        sure = self._state.pipeline.anchor_confidence(anchor)
         return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
 
     def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sags_node.confidence import HALVING
+from sags_node.confidence import HALVING, confidence_of
 from sags_node.config.schema import LaunchConfig
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
@@ -26,7 +26,7 @@ from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.pipeline.repeats import doubted, repeated, unseen
-from sags_node.pipeline.uncalibrated import FINDING, unsure
+from sags_node.pipeline.uncalibrated import FINDING, MOST, unsure
 from sags_node.types import (
     Bool,
     Camera,
@@ -81,6 +81,7 @@ class Pipeline:
     Attributes:
         rate: frames that come a second; None: they come when they are taken. `reconfigure` after a change.
         newest: the frame mapped last; None before the first, and after a reset.
+        held: why the last frame was not taken in; empty: it was.
         metric: lengths are metres: the calibration is no guess.
     """
 
@@ -131,6 +132,7 @@ class Pipeline:
         self._still = StillScene()
         self._reset_due = False
         self.newest: FrameResult | None = None
+        self.held = ""
         self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
         self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
 
@@ -150,6 +152,11 @@ class Pipeline:
         self._still.forget()
         self.newest = self._last = None
         self._unwatched = 0.0
+
+    def anchor_confidence(self, anchor_id: int) -> float:
+        """How far to trust the depth of an anchor that is there, 0..1, now."""
+        sure = self.anchors.depth_confidence(anchor_id) * float(confidence_of(np.float32(self._unwatched)))
+        return sure if self.metric else min(sure, MOST)
 
     def predict_motion(self) -> None:
         """Somebody wants motion predicted. Any thread may call this."""
@@ -192,6 +199,7 @@ class Pipeline:
     ) -> FrameResult:
         """Everything that happens to one frame."""
         result = replace(self._processed(frame, budget, request), recorded_s=frame.recorded_s)
+        self.held = result.held
         return result if self.metric else unsure(result)
 
     def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from places import SESSION
 
 from sags_node.confidence import SURE
+from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import as_float
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import OF_THE_MODEL, tells_of
+from sags_node.node.operations import NodeState, Operations
 from sags_node.pipeline.pipeline import NOTICED_LATE, Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.types import U8, Finding, FrameResult, StereoFrame
@@ -144,6 +147,27 @@ def test_a_live_feed_that_freezes_is_held_and_said(
     kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
     assert kept.mean() > 0.8
     assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+
+
+@pytest.mark.fault("picture: both eyes of a live feed are frozen, and an anchor is pinned")
+def test_a_pixel_of_a_picture_that_is_held_is_not_pinned(session: Session, frames: list[StereoFrame]) -> None:
+    pipeline = Pipeline(session.config, session.rig)
+    operations = Operations(NodeState(session.config, pipeline, None, None), lambda *_: None)  # type: ignore[arg-type]
+
+    def pin(**place: float) -> dict[str, Any]:
+        asked = operations.handlers()["add_anchor"](place)
+        operations.for_mapping.serve()
+        return dict(asked.result(0))
+
+    for i, frame in enumerate(frozen(frames, range(FIRST, FIRST + COUNT))[: FIRST + COUNT]):
+        result = pipeline.process(frame, StepBudget(2))
+        if i == FIRST:
+            assert pin(u=160, v=128)
+    assert result.held
+    with pytest.raises(SagsError, match=r"frames are held: the same picture comes again.*pin when"):
+        pin(u=160, v=128)
+    x, y, z = result.snapshot.gaussians.means[0].tolist()
+    assert pin(x=x, y=y, z=z)["depth_confidence"] < 0.05  # 0.8 s at 20 mm/s: five times what halves it
 
 
 def test_what_a_recording_repeats_is_no_frozen_feed(session: Session, frames: list[StereoFrame]) -> None:

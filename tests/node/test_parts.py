@@ -17,6 +17,7 @@ from sags_node.confidence import SURE
 from sags_node.config.schema import FoldersSource, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.files import whole
+from sags_node.findings import by_code
 from sags_node.messaging import cdr, content, topics
 from sags_node.model.ply import write_ply
 from sags_node.node import health as health_module
@@ -95,10 +96,10 @@ class Node:
         self.now, self._statistics = 0.0, Statistics()
         monkeypatch.setattr(health_module.time, "monotonic", lambda: self.now)
 
-    def publish(self, seconds: float, held: bool = False) -> NodeHealth:
+    def publish(self, seconds: float, held: bool = False, result: FrameResult = TAKEN_IN) -> NodeHealth:
         for _ in range(round(seconds / PERIOD)):
             self.now += PERIOD
-            self._statistics.add(HELD if held else TAKEN_IN, 40.0, {})
+            self._statistics.add(HELD if held else result, 40.0, {})
         return self.health()
 
     def health(self, working: float = 0.0) -> NodeHealth:
@@ -176,6 +177,35 @@ def test_frames_that_are_missed_are_blamed_on_who_takes_part(consumers: int, run
     told = content.health_fields(statistics.health({}, False, False, None, {}, sockets, {}))["warning_codes"]
     assert told["frames_missed"].endswith(f"this machine is too slow for them: {said}")
     assert told["source_drops"].endswith(f"{said.partition(', or lower')[0]}, or is the disk slow?")
+
+
+@pytest.mark.fault("depth: none is found")
+@pytest.mark.parametrize(
+    ("skipped", "tissue", "said"),
+    [({}, True, "nearer than 10 mm or farther than"), ({"depth": "an eye is black"}, True, "an eye is black"),
+     ({}, False, "no tissue is seen")],
+)  # fmt: skip
+def test_a_node_that_shows_nothing_is_not_well(
+    skipped: dict[str, str], tissue: bool, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node, seen, view = Node(monkeypatch), TAKEN_IN.observation, TAKEN_IN.views["left"]
+    blank = replace(
+        TAKEN_IN,
+        views={"left": replace(view, alpha=np.zeros_like(view.alpha))},
+        observation=replace(seen, tissue=seen.tissue & tissue),
+        skipped=skipped,
+    )
+    for before in (0.0, 3.0):  # from the start, and later
+        node.publish(before)
+        assert content.health_answer(node.publish(0.9, result=blank))["healthy"]
+        health = node.publish(0.3, result=blank)
+        assert content.health_answer(health) == {
+            "healthy": False,
+            "state": "running",
+            "warnings": ["no_model"],
+        }
+        assert said in by_code(health.warnings)["no_model"]
+    assert content.health_answer(node.publish(PERIOD))["healthy"]
 
 
 def test_the_latency_is_told_while_the_health_is_being_counted(monkeypatch: pytest.MonkeyPatch) -> None:
