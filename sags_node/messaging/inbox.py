@@ -23,6 +23,7 @@ from sags_node.messaging.peers import Peers
 from sags_node.messaging.receipt import Receipt
 from sags_node.messaging.security import RateLimitedLog, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
+from sags_node.workers import go_on
 
 if TYPE_CHECKING:
     from sags_node.config.schema import Guarded
@@ -97,7 +98,9 @@ class Inbox:
         except BaseException:
             self._resources.close()
             raise
-        self._thread = threading.Thread(target=self._receive, name="inbox", daemon=True)
+        self._thread = threading.Thread(
+            target=go_on, args=(self._receive, self._stopping, section), name="inbox", daemon=True
+        )
         self._thread.start()
 
     def close(self) -> None:
@@ -109,15 +112,14 @@ class Inbox:
     # ---- the receiving thread --------------------------------------------------------------------------
 
     def _receive(self) -> None:
-        while not self._stopping.is_set():
-            if self._socket.poll(POLL_MS):
-                for sender, message, arrival_ns in self._waiting():
-                    try:
-                        self._take(message, arrival_ns)
-                        sender.taken += 1
-                    except SagsError as error:
-                        self._refuse(sender, str(error))
-            self._tell()
+        if self._socket.poll(POLL_MS):
+            for sender, message, arrival_ns in self._waiting():
+                try:
+                    self._take(message, arrival_ns)
+                    sender.taken += 1
+                except SagsError as error:
+                    self._refuse(sender, str(error))
+        self._tell()
 
     def _waiting(self) -> list[tuple[_Sender, wire.Message, int]]:
         """What has come, in its order; of each sender's topics the newest."""

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, Self
 from sags_node.errors import SagsError
 from sags_node.messaging.address import ClientKeys, NodeAddress
 from sags_node.messaging.control import ControlClient
+from sags_node.workers import go_on
 
 DRIFT = 500e-6  # s/s between two clocks, at most: NTP slews by no more (RFC 5905), quartz drifts by a tenth
 PERIOD = 1.0  # s between two looks
@@ -158,19 +159,21 @@ class NodeClock:
         }
 
     def _follow(self) -> None:
-        while not self._stopping.is_set():
-            try:
-                for _ in range(EXCHANGES):
-                    if self._stopping.is_set():
-                        break
-                    exchanged = exchange(self._ask)
-                    with self._lock:
-                        self._answered = time.monotonic()
-                        self._estimate.add(exchanged, self._answered)
-            except SagsError as error:
-                self._why = str(error)
-            self._stopping.wait(PERIOD)
+        go_on(self._look, self._stopping, "the node's clock")
         self._client.close()
+
+    def _look(self) -> None:
+        try:
+            for _ in range(EXCHANGES):
+                if self._stopping.is_set():
+                    break
+                exchanged = exchange(self._ask)
+                with self._lock:
+                    self._answered = time.monotonic()
+                    self._estimate.add(exchanged, self._answered)
+        except SagsError as error:
+            self._why = str(error)
+        self._stopping.wait(PERIOD)
 
     def close(self) -> None:
         """End the thread."""

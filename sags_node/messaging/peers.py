@@ -17,6 +17,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from sags_node.messaging.security import RateLimitedLog
+from sags_node.workers import go_on
 
 MAX_PEERS = 64  # of one socket; ZeroMQ has no such limit of its own
 SMALL_TALK = 1024  # bytes per second that a peer may send besides its messages: heartbeats
@@ -77,7 +78,9 @@ class Peers:
         self._closed_until = 0.0
         self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name=f"sags-{name}-peers", daemon=True)
+        self._thread = threading.Thread(
+            target=go_on, args=(self._follow, self._stopping, name), name=f"sags-{name}-peers", daemon=True
+        )
         self._thread.start()
 
     def counts(self) -> dict[str, int]:
@@ -109,18 +112,17 @@ class Peers:
             peer.connection.close()
 
     def _follow(self) -> None:
-        while not self._stopping.is_set():
-            self._monitor.poll(CHECK_MS)
-            for _ in range(MAX_EVENTS_AT_ONCE):
-                try:
-                    said = recv_monitor_message(self._monitor, zmq.NOBLOCK)
-                except zmq.Again:
-                    break
-                self._note(said["event"], int(said["value"]))
-            self._expel_floods()
-            before, self._revoked = self._revoked, self._revocations()
-            if self._revoked != before:
-                self._expel_all()
+        self._monitor.poll(CHECK_MS)
+        for _ in range(MAX_EVENTS_AT_ONCE):
+            try:
+                said = recv_monitor_message(self._monitor, zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            self._note(said["event"], int(said["value"]))
+        self._expel_floods()
+        before, self._revoked = self._revoked, self._revocations()
+        if self._revoked != before:
+            self._expel_all()
 
     def _expel_floods(self) -> None:
         now = time.monotonic()

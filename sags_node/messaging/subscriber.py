@@ -30,6 +30,7 @@ from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
+from sags_node.workers import go_on
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
 # Of the node, in `status`. While frames are held their pictures are true, and nothing of the model is sent.
@@ -98,7 +99,12 @@ class Receiver:
         self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
         self._connect(self._found(self._patience if patience is None else patience))
-        self._thread = threading.Thread(target=self._receive_all, name="sags-subscriber", daemon=True)
+        self._thread = threading.Thread(
+            target=go_on,
+            args=(self._receive_next, self._stopping, "sags-subscriber"),
+            name="sags-subscriber",
+            daemon=True,
+        )
         self._thread.start()
         atexit.register(self.close)  # the thread must not outlive the interpreter
 
@@ -256,13 +262,12 @@ class Receiver:
         self._resources.close()
         self._resources, self._address, self._subscribed = resources, address, asked
 
-    def _receive_all(self) -> None:
-        while not self._stopping.is_set():
-            self._subscribe()
-            if self._socket.poll(POLL_MS):
-                self._receive_one()
-            else:
-                self._look_for_node()
+    def _receive_next(self) -> None:
+        self._subscribe()
+        if self._socket.poll(POLL_MS):
+            self._receive_one()
+        else:
+            self._look_for_node()
 
     def _subscribe(self) -> None:
         """As it is asked for now; a socket is used by one thread alone."""

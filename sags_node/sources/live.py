@@ -19,6 +19,7 @@ from sags_node.sources.layout import Layout
 from sags_node.sources.live_pairs import LivePairs
 from sags_node.sources.pairing import Alternation
 from sags_node.types import U8, Side, StereoFrame
+from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
 
@@ -202,6 +203,7 @@ class DeviceReader:
         self._device: CaptureDevice | None = device
         self._put = put
         self._stopped = stopped
+        self._pause = FIRST_PAUSE_S  # before the next attempt to open it
         self._thread = threading.Thread(target=self._run, name=f"read {one.name}", daemon=True)
         self.rate = device.rate
 
@@ -220,30 +222,32 @@ class DeviceReader:
         self._close_device()
 
     def _close_device(self) -> None:
-        if self._device is not None:
-            self._device.close()
-            self._device = None
+        device, self._device = self._device, None
+        if device is not None:
+            device.close()
 
     def _run(self) -> None:
-        pause = FIRST_PAUSE_S
-        while not self._stopped.is_set():
-            if self._device is not None:
-                try:
-                    if self._read_until_lost(self._device) > 0:
-                        pause = FIRST_PAUSE_S
-                except EndedError:
-                    self._put(None, None)
-                    return
-                self._close_device()
-            if self._stopped.wait(pause):
-                return
-            pause = min(2 * pause, LONGEST_PAUSE_S)
-            try:
+        go_on(self._read, self._stopped, self._input.name)
+
+    def _read(self) -> bool:
+        """Open the device if it was lost, and read it until it is; False: there is nothing more to come."""
+        try:
+            if self._device is None:
                 self._device = self._open_device(self._input)
                 log.warning("%s is open again", self._input.name)
-            except SagsError as error:
-                if not self._stopped.is_set():
-                    log.warning("%s; next attempt in %.1f s", error, pause)
+            if self._read_until_lost(self._device) > 0:
+                self._pause = FIRST_PAUSE_S
+        except EndedError:
+            self._put(None, None)
+            return False
+        except SagsError as error:
+            if not self._stopped.is_set():
+                log.warning("%s; next attempt in %.1f s", error, self._pause)
+        finally:
+            self._close_device()
+        self._stopped.wait(self._pause)
+        self._pause = min(2 * self._pause, LONGEST_PAUSE_S)
+        return True
 
     def _read_until_lost(self, device: CaptureDevice) -> int:
         """Hand on pictures until the device fails or falls silent, or `stopped`; how many there were."""

@@ -25,6 +25,7 @@ from sags_node.sources.pose_track import POSE_TYPES, NoPoseError, PoseTrack
 from sags_node.sources.ros2 import absolute
 from sags_node.sources.source import Source
 from sags_node.types import F64, StereoFrame, StereoRig
+from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
 
@@ -109,17 +110,18 @@ class _RosPoses:
         self._readers: dict[str, Reader] = {}
         self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._read, name="ros2-poses", daemon=True)
+        self._thread = threading.Thread(
+            target=go_on, args=(self._read, self._stopping, "ros2-poses"), name="ros2-poses", daemon=True
+        )
         self._thread.start()
 
     def _read(self) -> None:
-        while not self._stopping.is_set():
-            self._subscribe()
-            self._graph.wait(POLL_S)
-            for topic, reader in self._readers.items():
-                while messages := list(reader.take()):
-                    for data in messages:
-                        self._add(topic, reader.kind, data)
+        self._subscribe()
+        self._graph.wait(POLL_S)
+        for topic, reader in self._readers.items():
+            while messages := list(reader.take()):
+                for data in messages:
+                    self._add(topic, reader.kind, data)
 
     def _subscribe(self) -> None:
         """As soon as somebody publishes: only then the type is known."""

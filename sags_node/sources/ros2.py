@@ -22,6 +22,7 @@ from sags_node.ros.graph import Graph, receive_buffer
 from sags_node.sources.sent import SentPictures
 from sags_node.types import Eye as Calibrated
 from sags_node.types import Side, StereoFrame, StereoRig
+from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +56,8 @@ class RosCameras:
         self._readers: dict[Side, Reader] = {}
         self._left_out: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
         self._silent: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
-        self._thread = threading.Thread(target=self._read, name="ros2", daemon=True)
+        self._heard = dict.fromkeys(self._names, 0.0)
+        self._thread = threading.Thread(target=self._run, name="ros2", daemon=True)
 
     @property
     def dropped(self) -> int:
@@ -83,18 +85,20 @@ class RosCameras:
 
     # ---- the reading thread ----------------------------------------------------------------------------
 
+    def _run(self) -> None:
+        self._heard = dict.fromkeys(self._names, time.monotonic())
+        go_on(self._read, self._sent.pairs.stopped, "ros2")
+
     def _read(self) -> None:
-        heard = dict.fromkeys(self._names, time.monotonic())
-        while not self._sent.pairs.stopped.is_set():
-            self._subscribe()
-            self._graph.wait(POLL_S)
-            for eye, reader in self._readers.items():
-                for data in reader.take():
-                    heard[eye] = time.monotonic()
-                    self._put(eye, reader.kind, data)
-            for eye, last in heard.items():
-                if time.monotonic() - last > QUIET_S and self._silent[eye].due():
-                    log.warning("%s", self._silence(eye))
+        self._subscribe()
+        self._graph.wait(POLL_S)
+        for eye, reader in self._readers.items():
+            for data in reader.take():
+                self._heard[eye] = time.monotonic()
+                self._put(eye, reader.kind, data)
+        for eye, last in self._heard.items():
+            if time.monotonic() - last > QUIET_S and self._silent[eye].due():
+                log.warning("%s", self._silence(eye))
 
     def _subscribe(self) -> None:
         """As soon as somebody publishes: only then it is known whether the pictures are compressed."""

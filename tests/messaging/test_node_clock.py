@@ -9,13 +9,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
 from synthetic import at_frame, plane_result, publisher, stream
 from waiting import repeating, until
 
+from sags_node import workers
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
+from sags_node.messaging import node_clock
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.introspection import topic_delay
 from sags_node.messaging.node_clock import DRIFT, Exchange, NodeClock, OffsetEstimate
@@ -69,6 +73,23 @@ def test_an_exchange_during_which_a_clock_was_set_says_nothing() -> None:
     estimate = OffsetEstimate()
     estimate.add(Exchange(asked=1000, received=500, answered=2000, came=1400), 1.0)
     assert estimate.at(1.0) is None and estimate.jumps == 0
+
+
+@pytest.mark.fault("node: away for so long that requests fill the socket")
+def test_what_nobody_foresaw_does_not_end_the_watch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a full socket did (`zmq.Again`)."""
+    answers: list[Any] = [zmq.Again(), OSError(), exchanged(time.monotonic(), AHEAD, 0, 0)]
+
+    def ask(_: object) -> Exchange:
+        answer = answers.pop(0) if len(answers) > 1 else answers[0]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(node_clock, "exchange", ask)
+    monkeypatch.setattr(workers, "PAUSE_S", 0.01)
+    with NodeClock("tcp://127.0.0.1:1") as clock:
+        until(lambda: clock.offset is not None)
 
 
 # ---- over sockets ----------------------------------------------------------------------------------------

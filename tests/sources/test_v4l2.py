@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from waiting import repeating, until
 
+from sags_node import workers
 from sags_node.config.schema import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources import live
@@ -40,6 +41,7 @@ class FakeCamera:
     """Delivers what the test puts in; `None` unplugs it, silence is an empty queue."""
 
     rate = 50.0
+    gone: type[Exception] = SagsError
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -52,7 +54,7 @@ class FakeCamera:
         except queue.Empty:
             return None
         if picture is None:
-            raise SagsError("camera is gone")
+            raise self.gone("camera is gone")
         return Shot(*picture)
 
     def close(self) -> None:
@@ -84,6 +86,7 @@ class Plugs:
 def plugs(monkeypatch: pytest.MonkeyPatch) -> Plugs:
     monkeypatch.setattr(live, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(live, "LONGEST_PAUSE_S", 0.04)
+    monkeypatch.setattr(workers, "PAUSE_S", 0.01)
     return Plugs()
 
 
@@ -278,7 +281,12 @@ def test_what_fails_because_all_ends_is_not_told_of(plugs: Plugs, caplog: pytest
 
 
 @pytest.mark.fault("camera: unplugged")
-def test_unplugged_camera_comes_back(plugs: Plugs, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.fault("camera: its driver raises what nobody foresaw")
+@pytest.mark.parametrize("error", [SagsError, ValueError, MemoryError, ConnectionResetError, cv2.error])
+def test_unplugged_camera_comes_back(
+    error: type[Exception], plugs: Plugs, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakeCamera, "gone", error)
     with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         plugs.put(0, value=1)
@@ -295,7 +303,8 @@ def test_unplugged_camera_comes_back(plugs: Plugs, caplog: pytest.LogCaptureFixt
         plugs.put(5000, value=2)
         collector.wait_for(2)
     assert collector.values() == [1, 2]
-    assert "it will be opened again" in caplog.text and "/dev/right is open again" in caplog.text
+    said = "it will be opened again" if error is SagsError else f"internal error: {error.__name__}: camera is"
+    assert said in caplog.text and "/dev/right is open again" in caplog.text
 
 
 @pytest.mark.fault("camera: neither delivers nor fails")
