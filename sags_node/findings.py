@@ -46,6 +46,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "gpu_failed": "device",
     "no_frames": "source",
     "source_drops": "source",
+    "two_senders": "source",
     "frames_missed": "capture",
     "mapping_hangs": "capture",
     "recording_ended": "recording",

@@ -9,10 +9,11 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from math import inf
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import zmq
@@ -23,6 +24,8 @@ from sags_node.messaging.peers import Peers
 from sags_node.messaging.receipt import Receipt
 from sags_node.messaging.security import RateLimitedLog, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, receive_frames
+from sags_node.messaging.wire import Message
+from sags_node.types import Finding
 from sags_node.workers import go_on
 
 if TYPE_CHECKING:
@@ -38,8 +41,15 @@ MOST_AT_ONCE = 64  # messages read in one go
 POLL_MS = 100  # how soon the thread notices that it should end
 RECEIPT_S = 1.0
 FORGOTTEN_S = 10.0  # a sender that is silent for so long
+ALONE_S = 1.0  # after one's last message another may send the same
 
-Take = Callable[[wire.Message, int], None]
+Take = Callable[[Message, int], None]
+
+
+class _Holder(NamedTuple):
+    sender: _Sender
+    session: str
+    heard: float
 
 
 @dataclass(slots=True)
@@ -50,6 +60,7 @@ class _Sender:
     refused: int = 0
     overtaken: int = 0
     problem: str | None = None
+    second: float = -inf  # when it last sent what another one does, too
 
 
 class Inbox:
@@ -63,6 +74,8 @@ class Inbox:
             `SagsError`, which the sender gets.
         advice: what else its sender gets; None: nothing.
         newest: of each topic so many messages are taken from what waits; 0: all.
+        about: what a message is about that only one program may send at a time. The second one is refused,
+            and both are told.
 
     Raises:
         UsageError: the endpoint is open to other machines without keys, or a key file cannot be used.
@@ -77,11 +90,15 @@ class Inbox:
         take: Take,
         advice: Callable[[], str | None] = lambda: None,
         newest: int = 0,
+        about: Callable[[Message], Iterable[str]] = lambda message: (),
     ) -> None:
         check_endpoint(endpoint, config, section)
         self._section = section
         self._take, self._advice, self._newest = take, advice, newest
+        self._about = about
         self._senders: dict[bytes, _Sender] = {}
+        self._holders: dict[str, _Holder] = {}
+        self._two = "", -ALONE_S  # what two programs sent, and when the second one last did
         self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
         self._resources = ExitStack()
@@ -103,6 +120,12 @@ class Inbox:
         )
         self._thread.start()
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with who sends, and how to fix it. May be read from any thread."""
+        said, when = self._two
+        return (Finding("two_senders", said),) if time.monotonic() - when < 2 * ALONE_S else ()
+
     def close(self) -> None:
         """End the thread and close the socket."""
         self._stopping.set()
@@ -115,15 +138,37 @@ class Inbox:
         if self._socket.poll(POLL_MS):
             for sender, message, arrival_ns in self._waiting():
                 try:
+                    things = tuple(self._about(message))
+                    self._refuse_second(sender, message.meta.session, things)
                     self._take(message, arrival_ns)
+                    holder = _Holder(sender, message.meta.session, time.monotonic())
+                    self._holders.update(dict.fromkeys(things, holder))
                     sender.taken += 1
                 except SagsError as error:
                     self._refuse(sender, str(error))
         self._tell()
 
-    def _waiting(self) -> list[tuple[_Sender, wire.Message, int]]:
+    def _refuse_second(self, sender: _Sender, session: str, things: tuple[str, ...]) -> None:
+        """Of two programs that send the same the second one is refused in all: the eyes of both must not
+        become a pair.
+
+        Raises:
+            SagsError: it is one.
+        """
+        now = time.monotonic()
+        for thing in things:
+            holder = self._holders.get(thing)
+            if holder is None or now - holder.heard > ALONE_S:
+                continue
+            if holder.sender is not sender or holder.session != session:
+                said = f"two programs send {thing}: end one of them"
+                self._two, holder.sender.problem, sender.second = (said, now), said, now
+        if things and now - sender.second < ALONE_S:
+            raise SagsError(f"{self._two[0]}; the other's is taken")
+
+    def _waiting(self) -> list[tuple[_Sender, Message, int]]:
         """What has come, in its order; of each sender's topics the newest."""
-        came: list[tuple[_Sender, wire.Message, int]] = []
+        came: list[tuple[_Sender, Message, int]] = []
         while len(came) < MOST_AT_ONCE:
             try:
                 identity, *frames = receive_frames(self._socket, wire.MAX_PARTS + 1)

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from math import inf
 from statistics import median
 
@@ -161,7 +162,9 @@ class Statistics:
                 rss_mb=resident_mb(),
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
-                warnings={**warnings, **by_stage(self._findings(state, now, missed, working, consumers))},
+                warnings=by_stage(
+                    [*chain(*warnings.values()), *self._findings(state, now, missed, working, consumers)]
+                ),
                 connections=connections,
                 views=views,
                 rung=self._rung,

@@ -42,7 +42,7 @@ from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.recording.child import RecorderProcess
 from sags_node.sources.clock import CaptureClock
 from sags_node.sources.rate import FrameRate
-from sags_node.sources.source import Source
+from sags_node.sources.source import Source, findings_of
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
 
 log = logging.getLogger(__name__)
@@ -185,7 +185,10 @@ class Node:
             stopping=self._stopping.is_set(),
             paused=self._state.paused.is_set(),
             error=self._error,
-            warnings={**self._state.pipeline.warnings, **by_stage(self._recorder.findings())},
+            warnings={
+                **self._state.pipeline.warnings,
+                **by_stage([*findings_of(self._source), *self._recorder.findings()]),
+            },
             working=time.monotonic() - began if (began := self._working_since) is not None else 0.0,
             recording=self._recorder.status(),
             missed=why_missed(self._state.config.mapping, self._state.pipeline.rate),

@@ -17,7 +17,7 @@ from sags_node.messaging.topics import IMAGE
 from sags_node.messaging.wire import Message, WireError
 from sags_node.recording.pictures import ENCODINGS, decode_picture
 from sags_node.sources.sent import SentPictures
-from sags_node.types import U8, StereoFrame
+from sags_node.types import U8, Finding, StereoFrame
 
 NEWEST = 2  # of each eye's waiting pictures: what is older will not be shown
 
@@ -37,13 +37,20 @@ class PushedPictures:
     def __init__(self, config: PushSource, size: tuple[int, int] | None = None) -> None:
         self.rate = config.rate
         self._sent = SentPictures(config, size)
-        self._inbox = Inbox(config.endpoint, config, "source", self._take, self._sent.slowness, NEWEST)
+        self._inbox = Inbox(
+            config.endpoint, config, "source", self._take, self._sent.slowness, NEWEST, _eyes_of
+        )
         self.endpoint = self._inbox.endpoint
 
     @property
     def dropped(self) -> int:
         """Pairs that are missing: lost on the way, or without the other eye's picture."""
         return self._sent.dropped
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with who sends, and how to fix it. May be read from any thread."""
+        return self._inbox.findings
 
     def __enter__(self) -> Self:
         return self
@@ -63,9 +70,7 @@ class PushedPictures:
         return iter(self._sent.pairs)
 
     def _take(self, message: Message, arrival_ns: int) -> None:
-        name = message.topic.removesuffix("/compressed")
-        whose, _, last = name.rpartition("/")
-        eye = whose.rpartition("/")[2]
+        eye, last = _eye_and_kind(message)
         stamp_ns = message.meta.stamp_ns
         if last == "image_raw" and eye in ("left", "right"):
             self._sent.put(
@@ -78,6 +83,17 @@ class PushedPictures:
                 f"topic {message.topic}: pictures come on NAME/left/image_raw, NAME/right/image_raw or "
                 "NAME/stereo/image_raw, files of pictures with /compressed behind"
             )
+
+
+def _eye_and_kind(message: Message) -> tuple[str, str]:
+    whose, _, last = message.topic.removesuffix("/compressed").rpartition("/")
+    return whose.rpartition("/")[2], last
+
+
+def _eyes_of(message: Message) -> list[str]:
+    """Whose pictures it brings."""
+    eye = _eye_and_kind(message)[0]
+    return [f"the {one} eye's pictures" for one in ("left", "right") if eye in (one, "stereo")]
 
 
 def _picture(message: Message) -> U8:

@@ -16,6 +16,7 @@ from sags_node.config.schema import BagRobot, BagSource, LaunchConfig, LiveSourc
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.security import RateLimitedLog
+from sags_node.messaging.topics import TF
 from sags_node.messaging.wire import Message
 from sags_node.recording.bag import read_messages
 from sags_node.rig.hand_eye import FILE, read_hand_eye
@@ -23,8 +24,8 @@ from sags_node.ros.endpoints import Delivery, Reader
 from sags_node.ros.graph import Graph
 from sags_node.sources.pose_track import POSE_TYPES, NoPoseError, PoseTrack
 from sags_node.sources.ros2 import absolute
-from sags_node.sources.source import Source
-from sags_node.types import F64, StereoFrame, StereoRig
+from sags_node.sources.source import Source, findings_of
+from sags_node.types import F64, Finding, StereoFrame, StereoRig
 from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
@@ -86,7 +87,7 @@ class _PushedPoses:
 
     def __init__(self, config: PushRobot) -> None:
         self.track = PoseTrack(config.base, config.hand)
-        self._inbox = Inbox(config.endpoint, config, "robot", self._take)
+        self._inbox = Inbox(config.endpoint, config, "robot", self._take, about=_pose_of)
         self.endpoint = self._inbox.endpoint
 
     def _take(self, message: Message, arrival_ns: int) -> None:
@@ -96,8 +97,17 @@ class _PushedPoses:
             )
         self.track.add(message.cdr(), message.meta.type, fixed=message.topic.endswith("tf_static"))
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        return self._inbox.findings
+
     def close(self) -> None:
         self._inbox.close()
+
+
+def _pose_of(message: Message) -> list[str]:
+    """Transforms of a tree may come from several programs."""
+    return [] if message.meta.type == TF else ["the robot's pose"]
 
 
 class _RosPoses:
@@ -203,6 +213,11 @@ class Posed:
     @property
     def frame_count(self) -> int | None:
         return self._source.frame_count
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with who sends pictures or poses, and how to fix it."""
+        return findings_of(self._source) + findings_of(self.robot)
 
     @property
     def dropped(self) -> int:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, runtime_checkable
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
-from sags_node.types import StereoFrame, StereoRig
+from sags_node.types import Finding, StereoFrame, StereoRig
 
 
 class Source(Protocol):
@@ -41,6 +41,20 @@ class Source(Protocol):
 
     def stop(self) -> None:
         """End the iteration promptly, also while it waits. May be called from any thread."""
+
+
+@runtime_checkable
+class Warns(Protocol):
+    """A source that knows of more than frames."""
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong, and how to fix it. May be read from any thread."""
+
+
+def findings_of(source: object) -> tuple[Finding, ...]:
+    """What a source of frames or poses says is wrong."""
+    return source.findings if isinstance(source, Warns) else ()
 
 
 def open_source(

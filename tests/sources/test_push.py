@@ -69,14 +69,32 @@ def test_one_eye_by_one_and_side_by_side_make_pairs() -> None:
         one.send_eye("left", numbered(5), stamp)
         other.send_eye("right", numbered(5), stamp)
         until(lambda: len(taker.numbers) == 1)
-        one.send_side_by_side(numbered(6, 320))
-        until(lambda: len(taker.numbers) == 2)
+        until(lambda: one.send_side_by_side(numbered(6, 320)) and (6, 6) in taker.numbers)  # a second later
         files = [cv2.imencode(".png", numbered(7))[1].tobytes()] * 2
         one.send(*files)
-        until(lambda: len(taker.numbers) == 3)
+        until(lambda: (7, 7) in taker.numbers)
         one.send(*[cv2.cvtColor(numbered(8), cv2.COLOR_RGB2BGRA)] * 2, encoding="bgra8")
-        until(lambda: len(taker.numbers) == 4)
-        assert taker.numbers == [(n, n) for n in (5, 6, 7, 8)]
+        until(lambda: (8, 8) in taker.numbers)
+        assert list(dict.fromkeys(taker.numbers)) == [(n, n) for n in (5, 6, 7, 8)]
+
+
+@pytest.mark.fault("network: two programs send pictures of one eye")
+def test_pictures_of_two_senders_are_not_mixed(source: PushedPictures) -> None:
+    with Taker(source) as taker, FrameSender(source.endpoint) as second:
+        with FrameSender(source.endpoint) as first:
+            until(lambda: first.send(numbered(1), numbered(1)) and taker.numbers)
+
+            def told() -> bool:
+                first.send(numbered(1), numbered(1))
+                second.send_side_by_side(numbered(2, 320))
+                return all("two programs send the" in str(one.problem) for one in (first, second))
+
+            until(told)
+            assert [finding.code for finding in source.findings] == ["two_senders"]
+        assert set(taker.numbers) == {(1, 1)}
+        until(lambda: second.send(numbered(2), numbered(2)) and (2, 2) in taker.numbers)
+        until(lambda: not source.findings)
+    assert set(taker.numbers) == {(1, 1), (2, 2)}
 
 
 def test_a_wrong_size_is_told(source: PushedPictures) -> None:
