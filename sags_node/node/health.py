@@ -219,10 +219,7 @@ def _lacks(result: FrameResult) -> str:
     drawn = result.views["left"].alpha[::EVERY, ::EVERY][tissue] > 0.5
     if np.mean(drawn) >= DRAWN:
         return ""
-    return result.skipped.get("depth") or (
-        "there is no depth, as hardly anything matches between the eyes: the tissue is nearer than 10 mm or "
-        "farther than vision.stereo.max_depth, or the calibration is of another scope; sags calib check tells"
-    )
+    return result.skipped.get("depth") or "no depth is known"
 
 
 def _percentiles(values: Sequence[float]) -> dict[str, float]:

@@ -15,6 +15,11 @@ from sags_node.vision.pyramid import pyramids
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 
+LEAST_MATCHED = 0.05  # of the tissue that both eyes see; less is chance. Clear recordings have over a half
+TOO_FEW = (
+    "hardly anything matches between the eyes, so there is no depth: the tissue is too near or too far, or "
+    "the calibration is of another scope; sags calib check tells"
+)
 FARTHEST = 10.0  # m: what a session says to be beyond is no depth
 
 
@@ -141,4 +146,6 @@ class DepthChoice:
             self._unsound = self._matches(pair.t_capture_ns, self.stereo.rows.newest)
             if self._matches.is_late:
                 self.stereo.rows.withdraw()
+        if np.count_nonzero(measured[0]) < LEAST_MATCHED * np.count_nonzero(tissue):
+            self._unsound = TOO_FEW
         return measured

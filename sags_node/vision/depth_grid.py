@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sags_node.confidence import HALVING
 from sags_node.kernels.jit import kernel
 from sags_node.kernels.vectors import (
     LANES,
@@ -42,6 +43,7 @@ STEEPEST = 1.0  # m deeper per m aside, 45 degrees: more is another surface
 SLOPE = 0.5  # m deeper per m aside: tissue mostly lies flatter
 LEAST_SUPPORT = 0.1  # of the tissue around, measured to be the same surface: less is a speck
 NOMINAL_BASELINE = 4e-3  # m: of depth that no pair of eyes measured; endoscopes have about that
+UNSURE = 1.1 * HALVING  # m, at least, of what was not measured: it decides nothing, however near it is
 JUMP = 0.06  # of the depth: what was not measured lies behind an edge or an instrument often enough
 
 
@@ -76,7 +78,8 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
     lent, square = _borrowed(np.stack([weight, weight * inverse, weight * error * error]))
     away = cv2.distanceTransform((~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
     square += np.square((np.float32(SLOPE * aside) * away + np.float32(JUMP)) * lent)
-    lent_error = np.where(lent > 0, np.sqrt(square), np.float32(np.inf))
+    unsure = np.maximum(np.sqrt(square), np.float32(UNSURE) * lent * lent)
+    lent_error = np.where(lent > 0, unsure, np.float32(np.inf))
     return DepthGrid(float(side), np.where(known, inverse, lent), np.where(known, error, lent_error))
 
 

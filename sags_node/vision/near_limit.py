@@ -24,6 +24,7 @@ AGREED = 2  # looks in a row that show something nearer
 RETREAT = 10  # looks in a row without anything near, after which the limit goes back
 ROOM = 0.7  # of the nearest depth that was found: tissue moves between two looks
 LEAST_SHARE = 0.02  # of the tissue that both eyes see: fewer pixels may be wrong matches, or an instrument's
+BEYOND, BEYOND_SHARE = 0.004, 0.1  # m: what is nearer than can be matched is looked for as far as this
 WINDOW = 9  # px of the small picture
 MATCHES = 0.8  # correlation of two windows; 99 % stay below in pictures that do not belong together
 PLAIN = 2.0  # grey levels, standard deviation in a window: less cannot be matched
@@ -34,8 +35,8 @@ class NearLimit:
 
     Attributes:
         limit: m, no tissue is nearer as far as is known.
-        too_near: m, the depth of what is nearer than a limit that was set; 0: nothing is. May be read from
-            any thread.
+        too_near: m, the depth of what is nearer than a limit that was set, or else than `NEAREST`; 0: nothing
+            is. May be read from any thread.
     """
 
     def __init__(self, config: StereoConfig, focal_baseline: float) -> None:
@@ -49,7 +50,16 @@ class NearLimit:
         self._is_set = config.min_depth is not None
         self._focal_baseline = focal_baseline
         self._looked_ns: int | None = None
+        self._beyond = np.inf  # m, the nearest that was found by searching on
         self._found: deque[float] = deque(maxlen=RETREAT)
+
+    @property
+    def said(self) -> str:
+        """Of what is too near, and what helps."""
+        where = f"tissue lies at {1e3 * self.too_near:.0f} mm, nearer than"
+        if self._is_set:
+            return f"{where} vision.stereo.min_depth: lower it, or leave it out"
+        return f"{where} the {1e3 * NEAREST:.0f} mm from which depth can be matched: move the scope back"
 
     def look(self, t_capture_ns: int, left: GrayPyramid, right: GrayPyramid, tissue: Bool) -> None:
         """Take the pictures of one frame and its tissue [H, W]; most of them are let pass unseen."""
@@ -60,6 +70,10 @@ class NearLimit:
             return
         self._looked_ns = t_capture_ns
         self._found.append(nearest_tissue(left, right, tissue, self._focal_baseline))
+        if not self._is_set:
+            beyond = nearest_tissue(left, right, tissue, self._focal_baseline, BEYOND, BEYOND_SHARE)
+            before, self._beyond = self._beyond, beyond
+            self.too_near = beyond if max(before, beyond) < NEAREST else 0.0
         latest = list(self._found)[-AGREED:]
         agrees = len(latest) == AGREED or first  # before there is a model nothing can be spoilt
         if self._is_set:
@@ -73,11 +87,19 @@ class NearLimit:
             self.limit = min(self._usual, ROOM * min(self._found))
 
 
-def nearest_tissue(left: GrayPyramid, right: GrayPyramid, tissue: Bool, focal_baseline: float) -> float:
-    """Depth of the nearest `LEAST_SHARE` of the tissue [H, W] that both eyes see, m; infinite: nothing tells.
+def nearest_tissue(
+    left: GrayPyramid,
+    right: GrayPyramid,
+    tissue: Bool,
+    focal_baseline: float,
+    end: float = NEAREST,
+    share: float = LEAST_SHARE,
+) -> float:
+    """Depth of the nearest `share` of the tissue [H, W] that both eyes see, m; infinite: nothing tells.
 
     Args:
         focal_baseline: px m, of the whole picture.
+        end: m, nearer is not searched.
     """
     halvings = 0
     while halvings < len(left.halves) and left.full.shape[1] >> halvings > GUESS_WIDTH:
@@ -85,7 +107,7 @@ def nearest_tissue(left: GrayPyramid, right: GrayPyramid, tissue: Bool, focal_ba
     scale = 1 << halvings
     eyes = level(left, halvings), level(right, halvings)
     height, width = (side - 2 * BORDER for side in eyes[0].shape)
-    most = min(focal_baseline / scale / NEAREST, width - 1.0)
+    most = min(focal_baseline / scale / end, width - 1.0)
     disparity = coarse_disparity(*eyes, 0.0, most)
     first, second = (np.ascontiguousarray(inner(eye)) for eye in eyes)
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -94,7 +116,7 @@ def nearest_tissue(left: GrayPyramid, right: GrayPyramid, tissue: Bool, focal_ba
     small = tissue[scale // 2 :: scale, scale // 2 :: scale][:height, :width]
     both = small & (there >= 0)
     known = both & (_agreement(first, seen) > MATCHES)
-    count = round(LEAST_SHARE * np.count_nonzero(both))
+    count = round(share * np.count_nonzero(both))
     found = disparity[known & (disparity > 0)]
     if count == 0 or len(found) < count:
         return np.inf

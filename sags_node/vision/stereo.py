@@ -82,8 +82,7 @@ class StereoDepth:
         if alignment is not None and alignment.warning:
             found.append(Finding("rows_differ", alignment.warning))
         if self._near.too_near > 0:
-            said = f"tissue lies at {1e3 * self._near.too_near:.0f} mm, nearer than vision.stereo.min_depth"
-            found.append(Finding("tissue_too_near", f"{said}: lower it, or leave it out"))
+            found.append(Finding("tissue_too_near", self._near.said))
         return tuple(found)
 
     def judge(self, pair: RectifiedPair, disparity: F32, tissue: Bool) -> tuple[F32, F32]:

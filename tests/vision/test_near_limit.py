@@ -6,14 +6,20 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from places import ROOT
 
-from sags_node.config.schema import USUAL_NEAREST, StereoConfig
+from sags_node.confidence import SURE
+from sags_node.config.schema import USUAL_NEAREST, LaunchConfig, StereoConfig
+from sags_node.findings import by_code
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.rig import rectified_rig
 from sags_node.sources.source import open_source
-from sags_node.types import F32, RectifiedPair, StereoRig
+from sags_node.types import F32, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision import near_limit
 from sags_node.vision.near_limit import AGREED, NEAREST, PERIOD_NS, RETREAT, ROOM, NearLimit
 from sags_node.vision.pyramid import pyramids
@@ -75,6 +81,37 @@ def test_a_limit_that_is_set_stays_and_is_told_of() -> None:
     wide = StereoDepth(StereoConfig(min_depth=NEAREST), pair.camera, pair.baseline)
     wide(pair, everywhere(pair))
     assert "tissue_too_near" not in {found.code for found in wide.findings}
+
+
+@pytest.mark.fault("depth: tissue is nearer than 10 mm")
+@pytest.mark.parametrize("depths", [(5,), (6.5,), (8,), (9,), (20, 6), (6, 30), (8, 15), (15,), (60,)])
+def test_what_is_too_near_to_be_matched_is_told_and_never_surely_farther(
+    depths: tuple[float, ...],
+) -> None:
+    """Planes below each other, mm; a scope that moves along them."""
+    width, height, focal, baseline = 320, 256, 288.0, 4.3e-3
+    K = np.array([[focal, 0, 159.5], [0, focal, 127.5], [0, 0, 1]])
+    config = LaunchConfig.model_validate({"vision": {"tissue": {"method": "none"}, "scale": 1.0}})
+    pipeline = Pipeline(config, rectified_rig("planes", width, height, K, baseline))
+    rng = np.random.default_rng(len(depths))
+    texture = cv2.resize(rng.integers(60, 200, (34, 150, 3), np.uint8), (1200, height)).astype(np.float32)
+    texture = cv2.GaussianBlur(texture, (0, 0), 2)  # so that it is as sharp between its pixels
+    truth = np.repeat(1e-3 * np.array(depths, np.float32), height // len(depths))[:, None]
+    columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in (width, height)))
+    for number in range(4):
+        stamp = number * PERIOD_NS
+        seen = [
+            cv2.remap(texture, columns + 400 + 2 * number + shift, rows, cv2.INTER_LINEAR)
+            for shift in (np.zeros_like(columns), focal * baseline / truth + 0 * columns)
+        ]
+        left, right = (np.clip(eye + rng.normal(0, 1.5, eye.shape), 0, 255).astype(np.uint8) for eye in seen)
+        result = pipeline.process(StereoFrame(number, stamp, stamp, left, right), StepBudget(1))
+    view = result.views["left"]
+    assert view.confidence is not None
+    sure = (view.depth > 0) & (view.confidence >= SURE)
+    assert np.mean(sure & (view.depth > 1.3 * truth)) < 0.01
+    assert np.mean(sure[truth[:, 0] > NEAREST]) > 0.5 or max(depths) < 10
+    assert ("tissue_too_near" in by_code(pipeline.warnings)) == (min(depths) < 10)
 
 
 @pytest.mark.usefixtures("data_folder")
