@@ -99,12 +99,8 @@ class Receiver:
         self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
         self._connect(self._found(self._patience if patience is None else patience))
-        self._thread = threading.Thread(
-            target=go_on,
-            args=(self._receive_next, self._stopping, "sags-subscriber"),
-            name="sags-subscriber",
-            daemon=True,
-        )
+        turn = self._receive_next, self._stopping, "sags-subscriber"
+        self._thread = threading.Thread(target=go_on, args=turn, name="sags-subscriber", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # the thread must not outlive the interpreter
 

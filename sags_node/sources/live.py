@@ -204,7 +204,8 @@ class DeviceReader:
         self._put = put
         self._stopped = stopped
         self._pause = FIRST_PAUSE_S  # before the next attempt to open it
-        self._thread = threading.Thread(target=self._run, name=f"read {one.name}", daemon=True)
+        turn = self._read, stopped, one.name
+        self._thread = threading.Thread(target=go_on, args=turn, name=f"read {one.name}", daemon=True)
         self.rate = device.rate
 
     def start(self) -> None:
@@ -225,9 +226,6 @@ class DeviceReader:
         device, self._device = self._device, None
         if device is not None:
             device.close()
-
-    def _run(self) -> None:
-        go_on(self._read, self._stopped, self._input.name)
 
     def _read(self) -> bool:
         """Open the device if it was lost, and read it until it is; False: there is nothing more to come."""

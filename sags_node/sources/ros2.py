@@ -56,8 +56,9 @@ class RosCameras:
         self._readers: dict[Side, Reader] = {}
         self._left_out: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
         self._silent: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
-        self._heard = dict.fromkeys(self._names, 0.0)
-        self._thread = threading.Thread(target=self._run, name="ros2", daemon=True)
+        self._heard: dict[Side, float] = {}
+        turn = self._read, self._sent.pairs.stopped, "ros2"
+        self._thread = threading.Thread(target=go_on, args=turn, name="ros2", daemon=True)
 
     @property
     def dropped(self) -> int:
@@ -65,6 +66,7 @@ class RosCameras:
         return self._sent.dropped
 
     def __enter__(self) -> Self:
+        self._heard = dict.fromkeys(self._names, time.monotonic())
         self._thread.start()
         return self
 
@@ -84,10 +86,6 @@ class RosCameras:
         return iter(self._sent.pairs)
 
     # ---- the reading thread ----------------------------------------------------------------------------
-
-    def _run(self) -> None:
-        self._heard = dict.fromkeys(self._names, time.monotonic())
-        go_on(self._read, self._sent.pairs.stopped, "ros2")
 
     def _read(self) -> None:
         self._subscribe()

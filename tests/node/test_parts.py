@@ -182,7 +182,7 @@ def test_frames_that_are_missed_are_blamed_on_who_takes_part(consumers: int, run
 @pytest.mark.fault("depth: none is found")
 @pytest.mark.parametrize(
     ("skipped", "tissue", "said"),
-    [({}, True, "nearer than 10 mm or farther than"), ({"depth": "an eye is black"}, True, "an eye is black"),
+    [({}, True, "no depth is known"), ({"depth": "an eye is black"}, True, "an eye is black"),
      ({}, False, "no tissue is seen")],
 )  # fmt: skip
 def test_a_node_that_shows_nothing_is_not_well(

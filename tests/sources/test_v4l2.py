@@ -215,28 +215,22 @@ def taken_at(monkeypatch: pytest.MonkeyPatch, ages: list[float]) -> list[float]:
     wall_ns, monotonic_ns = 10**18, 10**14
 
     class Capture:
-        read_so_far = 0
+        waitAny = staticmethod(lambda captures, timeout: (True, [0]))
+        isOpened = set = release = lambda self, *_: True
+
+        def __init__(self, *_: object) -> None:
+            self.count = 0
 
         def read(self) -> tuple[bool, np.ndarray]:
-            self.read_so_far += 1
+            self.count += 1
             return True, np.zeros((4, 8, 3), np.uint8)
 
         def get(self, what: int) -> float:
-            if what == cv2.CAP_PROP_POS_MSEC:
-                age = ages[self.read_so_far - 1]
-                return 1e-6 * (monotonic_ns + self.read_so_far - round(age * 1e9))  # each is another one
+            if what == cv2.CAP_PROP_POS_MSEC:  # each is another one
+                return 1e-6 * (monotonic_ns + self.count - round(ages[self.count - 1] * 1e9))
             return {cv2.CAP_PROP_FRAME_WIDTH: 8.0, cv2.CAP_PROP_FRAME_HEIGHT: 4.0}.get(what, 0.0)
 
-        isOpened = set = release = lambda self, *_: True
-
-    class Opening:
-        waitAny = staticmethod(lambda captures, timeout: (True, [0]))
-        fourcc = staticmethod(lambda *letters: 0)
-
-        def __new__(cls, *_: object) -> Capture:  # type: ignore[misc]
-            return Capture()
-
-    monkeypatch.setattr(cv2, "VideoCapture", Opening)
+    monkeypatch.setattr(cv2, "VideoCapture", Capture)
     monkeypatch.setattr(time, "time_ns", lambda: wall_ns)
     monkeypatch.setattr(time, "monotonic_ns", lambda: monotonic_ns)
     camera = Device("/dev/null", CONFIG)
