@@ -202,9 +202,8 @@ def record(
         try:
             summary = recorder.run(tell, progress)
         except KeyboardInterrupt:
-            warn(
-                f"broken off: save what is there with: sags bag recover {shlex.quote(str(options.folder))} -o OUT"
-            )
+            saved = f"sags bag recover {shlex.quote(str(options.folder))} -o OUT"
+            warn(f"broken off: save what is there with: {saved}")
             raise
     show(summary if json_out else say.recorded_table(summary))
 

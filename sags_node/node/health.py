@@ -113,6 +113,7 @@ class Statistics:
         with self._lock:
             self._published.clear()
             self._resumed = self._taken_in = time.monotonic()
+            self._drawn = max(self._drawn, self._resumed)
 
     def health(
         self,
