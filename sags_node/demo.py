@@ -19,7 +19,7 @@ from sags_node.evaluation.report import write_report
 from sags_node.evaluation.session import measure
 from sags_node.evaluation.spool import Spool
 from sags_node.files import whole
-from sags_node.media.h264_file import H264File
+from sags_node.media.video_file import VideoFile
 from sags_node.messaging.rundir import connection_path, default_run_dir
 from sags_node.node.node import Node
 from sags_node.overlay.draw import over
@@ -81,7 +81,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
                 node.stop()
         consumed = _finish_overlay(overlay)
         with whole(out / VIDEO) as partial:
-            video = H264File(partial, session.source.rate, session.published_size)
+            video = VideoFile(partial, session.source.rate, session.published_size)
             shown = Shown(video, read_layers(spool.folder / LAYERS))
             outcome = measure(
                 session, spool, _OPTIONS, (), lambda what, done: progress(done, frames, what), shown.add
@@ -96,7 +96,7 @@ class Shown:
     """What a display showed: the camera's picture, and what the overlay drew over it. For a missed frame,
     what was there before."""
 
-    def __init__(self, file: H264File, layers: Mapping[int, Layer]) -> None:
+    def __init__(self, file: VideoFile, layers: Mapping[int, Layer]) -> None:
         self._file = file
         self._layers = layers
         self._shown: U8 | None = None

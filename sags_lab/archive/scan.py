@@ -13,11 +13,11 @@ from sags_node.config.launch_file import BAG_SUFFIXES, is_sidecar, known_recordi
 from sags_node.config.schema import LiveSource, PhantomSource, Source
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
+from sags_node.media.video import Video
 from sags_node.pipeline.session import open_session
 from sags_node.sources.dvrk import read_sidecar
 from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source, recorded_rig
-from sags_node.sources.videos import Video
 
 WIDE = 2.2  # times as wide as high: two pictures beside each other; one alone is at most 1.9 (16:9, 17:9)
 PHANTOM_RATE = 30.0  # frames per second, unless it says another

@@ -16,9 +16,9 @@ from sags_lab.protocols.arithmetic import stereo_points_mm
 from sags_node import geometry
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
+from sags_node.media.video import Video
 from sags_node.rig import fit_distortion, rectify_eyes
 from sags_node.sources.pictures import read_picture
-from sags_node.sources.videos import Video
 from sags_node.types import F64, I64, Bool, StereoRig
 
 LARGEST_TEXT = 64 << 20  # bytes

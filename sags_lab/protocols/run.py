@@ -31,10 +31,10 @@ from sags_node.evaluation.metrics import resample_nearest
 from sags_node.evaluation.point_tracks import shares_within
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
+from sags_node.media.video import Video
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_posed, rig_of
 from sags_node.pipeline.warm_up import warm_up
-from sags_node.sources.videos import Video
 from sags_node.types import F64, StereoRig
 
 LEAST_POSES = 3  # to align

@@ -27,9 +27,9 @@ from sags_node.config.schema import RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.kernels.threads import configure_threads
+from sags_node.media.video import Video
 from sags_node.pipeline.session import open_posed
 from sags_node.pipeline.warm_up import warm_up
-from sags_node.sources.videos import Video
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
 
 QUERIES, TRUTH = "queries.json", "annotations.json"

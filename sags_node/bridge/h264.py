@@ -1,4 +1,4 @@
-"""Pictures as H.264 for thin links, by PyAV (extra `bridges`): each message is one picture (Annex B)."""
+"""Pictures as H.264 for thin links, by PyAV: each message is one picture (Annex B)."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def rectified_before(config: LaunchConfig) -> bool:
         rig = _rig_of(config, None, None)
         if config.rectified is not None or not rectifies(rig):
             return False
-        matches = [match_eyes(*pair) for pair in first_pairs(config.source, FIRST_PAIRS)[1]]
+        matches = [match_eyes(*pair) for pair in first_pairs(config.source, FIRST_PAIRS)[2]]
     except SagsError:  # whoever plays it says so
         return False
     return bool(matches) and bool(judge_rectified(rig, np.concatenate(matches)))

@@ -14,6 +14,7 @@ from sags_node.calibration.rows import FEWEST_MATCHES, rectified_rows
 from sags_node.config.schema import RecordedSource, Source
 from sags_node.errors import SagsError
 from sags_node.rig import guessed_rig
+from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source
 from sags_node.types import F64, Eye, StereoRig
 
@@ -28,8 +29,8 @@ def guess_rig(source: Source) -> StereoRig:
     Raises:
         SagsError: it gives no frame.
     """
-    size, pairs = first_pairs(source)
-    return with_equal_rows(guessed_rig(*size), pairs)
+    (width, height), pixel_aspect, pairs = first_pairs(source)
+    return with_equal_rows(guessed_rig(width, height, pixel_aspect), pairs)
 
 
 def with_equal_rows(rig: StereoRig, pairs: Sequence[Pair]) -> StereoRig:
@@ -54,8 +55,9 @@ def _turned(eye: Eye, pitch: float, roll: float, scale: float) -> Eye:
     return replace(eye, K=K, R=turn @ eye.R)
 
 
-def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int], list[Pair]]:
-    """Width and height of an eye's picture, px, and some pairs; none where there is one eye.
+def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int], float, list[Pair]]:
+    """Width and height of an eye's picture, px, those of its pixels as a ratio, and some pairs; none where
+    there is one eye.
 
     Raises:
         SagsError: it gives no frame.
@@ -64,6 +66,7 @@ def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int]
         source = source.model_copy(update={"pace": "step", "loop": False, "warm_up": 0})
     size, pairs = None, list[Pair]()
     with open_source(source, references=False) as opened:
+        pixel_aspect = opened.pixel_aspect if isinstance(opened, Replay) else 1.0
         for index, frame in enumerate(opened):
             size = size or (frame.left.shape[1], frame.left.shape[0])
             if frame.right is not None and index % EVERY == 0:
@@ -72,4 +75,4 @@ def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int]
                 break
     if size is None:
         raise SagsError("no calibration, and not one frame came that could tell a size; set rig")
-    return size, pairs
+    return size, pixel_aspect, pairs

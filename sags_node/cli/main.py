@@ -191,13 +191,11 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, verbose: bool, json
     """
     from sags_node.demo import VIDEO, run_demo
     from sags_node.evaluation.report import check_report
-    from sags_node.media.h264_file import check_h264
     from sags_node.pipeline.session import open_session
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
     check_plots()
-    check_h264()
     check_report(out, VIDEO)
     live = ["source.loop:=true", "source.pace:=realtime"]
     opened = open_launched(path, [*live, *overrides])  # says what it plays, and at what size

@@ -21,7 +21,6 @@ from sags_node.config.schema import (
     LiveSource,
     PhantomSource,
     RecordedSource,
-    VideosSource,
 )
 from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures, videos
@@ -34,6 +33,7 @@ from sags_node.sources.pictures import size_text
 from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source, recorded_rig
+from sags_node.sources.videos import VideoPairs
 from sags_node.vision.rectify import Rectifier
 
 MOST_SAID = 1 << 16  # lines in the log
@@ -187,14 +187,17 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
     """The first frame, and those in the middle: do masks mark something, are the eyes of one time?"""
     with open_source(source, references=False) as opened:
         count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
-        stamped = list(opened.findings) if isinstance(opened, Replay) else []
+        stamped, said, ends = [], [], []
+        if isinstance(opened, Replay):
+            stamped = list(opened.findings)
+            said = [*videos.said_of(opened.oddities), *videos.check_pixels(opened.pixel_aspect)]
+            if isinstance(opened.pairs, VideoPairs):
+                ends = videos.check_ends(opened.pairs, (opened.first + count) * source.stride)
     if first is None:
         return [Finding("error", "not one frame can be read", "check the files")]
     found = [Finding("ok", f"{count} frames of {size_text(*first.left.shape[1::-1])} px at {rate:g} Hz")]
-    if isinstance(source, VideosSource) and source.right is not None:
-        frames = round(source.start * rate) + count
-        found += videos.check_ends(source.left, source.right, frames * source.stride)
-    if found[-1].level == "error":
+    found += [*said, *ends]
+    if _refused(found):
         return found
     timing, shares = Timing(), []
     middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from sags_node.calibration.matches import match_eyes
+from sags_node.calibration.pictures import Pair
+from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.importing import pictures
 from sags_node.importing.folder import override
+from sags_node.media.video import LostPictureError, Video
 from sags_node.rig import Finding
+from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import size_text
-from sags_node.sources.videos import Video
+from sags_node.sources.videos import VideoPairs
 from sags_node.types import U8
 
 LOOKED_AT = 4  # pictures, spread over the video
 LEAST_ALONG = 0.8  # share of the matches whose rows agree, of two eyes
 ROWS = 1 / 40  # of the width: as far as rows of eyes that are not rectified differ
 ONE_EYE = "one eye is shown, or both in a way that was not recognised"
+NOT_SQUARE = 0.01
 APART = 1.0  # px: eyes see the tissue in different columns; fields of one picture do not
 
 
@@ -65,15 +70,16 @@ def look(files: tuple[Path, ...]) -> list[Finding]:
     """What some pictures show, of the videos of the left and the right eye, or of one of both. They are
     played as `launch_of` says."""
     try:
-        found = [_length(file) for file in files]
-        shown = [_some(file) for file in files]
+        found = [finding for file in files for finding in _file(file)]
+        if len(files) == 1:
+            return found + _one(files[0], _some(files[0]))
+        with closing(VideoPairs(files[0], files[1], Layout(GeometryConfig()))) as pairs:
+            looked = _some_pairs(pairs)
     except SagsError as error:
-        return [pictures.refused("video", error)]
-    if len(files) == 1:
-        return found + _one(files[0], shown[0])
-    left, right = shown
-    found += pictures.check_eye("left", left) + pictures.check_eye("right", right)
-    return found + pictures.check_eyes(left, right)
+        return [pictures.refused("videos", error)]
+    left, right = ([(file, pair[eye]) for pair in looked] for eye, file in enumerate(files))
+    eyes = pictures.check_eye("left", left) + pictures.check_eye("right", right)
+    return [*found, *eyes, *pictures.check_eyes(left, right)]
 
 
 def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
@@ -114,23 +120,50 @@ def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
     return f"{LAYOUT}{way.layout}", *fixes
 
 
-def _length(file: Path) -> Finding:
+def _file(file: Path) -> list[Finding]:
     with closing(Video(file)) as video:
         rate = "" if video.rate is None else f" at {video.rate:g} Hz, {video.count / video.rate:.1f} s"
-        return Finding("ok", f"{file.name}: {video.count} frames of {size_text(*video.size)} px{rate}")
+        what = f"{file.name}: {video.count} frames of {size_text(*video.size)} px{rate}"
+        found = [Finding("ok", what), *said_of(video.oddities)]
+        if video.cut_off:
+            found.append(Finding("error", f"{file.name}: {video.cut_off}", "copy it again"))
+        if video.gaps:
+            before, missing = video.gaps[0]
+            at = "" if video.stamps is None else f", {(video.stamps[before] - video.stamps[0]) * 1e-9:.2f} s"
+            what = (
+                f"{file.name}: {len(video.gaps)} gap{'s' * (len(video.gaps) > 1)} in its stamps, the first "
+                f"behind picture {before}{at}: so long as {missing} pictures"
+            )
+            fix = "paired and played by the stamps: were they lost, or was the recording paused?"
+            found.append(Finding("warning", what, fix))
+        return found
 
 
-def check_ends(left: Path, right: Path, needed: int) -> list[Finding]:
+def said_of(oddities: Sequence[str]) -> list[Finding]:
+    """What is said of a file, with its remedy after a semicolon."""
+    return [Finding("warning", what, fix) for what, _, fix in (each.partition("; ") for each in oddities)]
+
+
+def check_pixels(aspect: float) -> list[Finding]:
+    """Whether they are square; `aspect` is their width over their height."""
+    if abs(aspect - 1) < NOT_SQUARE:
+        return []
+    what = f"pixels are {aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
+    fix = "calibrate pictures as they are played; a camera that is guessed has such pixels"
+    return [Finding("warning", what, fix, {"pixel_aspect": aspect})]
+
+
+def check_ends(pairs: VideoPairs, needed: int) -> list[Finding]:
     """Whether the right video reaches as far as the left one is played, so many frames."""
-    with closing(Video(right)) as video:
-        count = video.count
+    if pairs.right is None or not pairs.by_number:
+        return []
+    left, right, count = pairs.left.path.name, pairs.right.path.name, pairs.right.count
     if count < needed:
-        what = f"{right.name} ends after {count} frames but {left.name} goes on: there playing fails"
+        what = f"{right} ends after {count} frames but {left} goes on: there playing fails"
         return [Finding("error", what, f"set source.frames:={count} to stop there, or give both one length")]
-    with closing(Video(left)) as video:
-        if count == video.count:
-            return []
-        what = f"{right.name} has {count} frames, {left.name} {video.count}"
+    if count == pairs.left.count:
+        return []
+    what = f"{right} has {count} frames, {left} {pairs.left.count}"
     fix = "were both begun at the same moment? What the left one has is played"
     return [Finding("warning", what, fix)]
 
@@ -141,18 +174,33 @@ def _some(file: Path) -> list[tuple[Path, U8]]:
     Raises:
         SagsError: it cannot be read to its end.
     """
-    video = Video(file)
-    try:
+    with closing(Video(file)) as video:
         found = []
-        for number in sorted({round(at) for at in np.linspace(0, video.count - 1, LOOKED_AT)}):
-            video.seek(number)
-            picture = video.read()
-            if picture is None:
-                raise SagsError(f"{file} ends before picture {number} of {video.count}; copy it again")
-            found.append((file, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.uint8)))
+        for number in _spread(video.count):
+            with suppress(LostPictureError):  # it is left out while playing, too
+                picture = video.read(number)
+                if picture is None:
+                    raise SagsError(f"{file} ends before picture {number} of {video.count}; copy it again")
+                found.append((file, picture))
         return found
-    finally:
-        video.close()
+
+
+def _some_pairs(pairs: VideoPairs) -> list[Pair]:
+    """Spread over two videos, as far as both reach."""
+    found = []
+    both = min(pairs.count, pairs.right.count) if pairs.right is not None and pairs.by_number else pairs.count
+    for index in _spread(both):
+        pairs.seek(index)
+        with suppress(LostPictureError):
+            pair = pairs.read()
+            if pair is None or pair.right is None:
+                raise SagsError(f"{pairs.left.path} ends before picture {index}; copy it again")
+            found.append((pair.left, pair.right))
+    return found
+
+
+def _spread(count: int) -> list[int]:
+    return sorted({round(at) for at in np.linspace(0, count - 1, LOOKED_AT)})
 
 
 def _one(file: Path, shown: list[tuple[Path, U8]]) -> list[Finding]:
@@ -167,14 +215,18 @@ def _one(file: Path, shown: list[tuple[Path, U8]]) -> list[Finding]:
     looked = pictures.check_eye("left", left) + pictures.check_eye("right", right)
     if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
+    layout = Layout(GeometryConfig(layout="separate" if way.layout == "panes" else way.layout))
+    with closing(Video(file)) as video:
+        aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
     found = Finding("ok", f"{size} px show both eyes: {way.what}")
-    return [found, *looked, *pictures.check_eyes(left, right)]
+    return [found, *check_pixels(aspect), *looked, *pictures.check_eyes(left, right)]
 
 
 def _both_needed(file: Path) -> str:
     return (
-        f"two videos or one of both eyes are needed; sags calib live {override('source.left', file)} "
-        f"source.kind:=videos {LAYOUT}side_by_side shows what is in it; one camera alone needs a network "
+        "two videos or one of both eyes are needed; sags calib live "
+        f"{shlex.quote(override('source.left', file))} source.kind:=videos {LAYOUT}side_by_side shows what "
+        "is in it; one camera alone needs a network "
         "(docs/networks.md)"
     )
 

@@ -1,49 +1,70 @@
-"""A video that is written picture by picture."""
+"""A video that is written picture by picture: H.264 in MP4, which every browser plays."""
 
 from __future__ import annotations
 
 import errno
-import os
-import shutil
+from fractions import Fraction
 from pathlib import Path
 
-import cv2
+import av
+import numpy as np
 
-from sags_node.media.native_output import native_output
 from sags_node.types import U8
 
-RATES = (1.0, 240.0)  # Hz that MPEG-4 and players can do
-
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)  # it would say a line for each lost picture
+TICKS = 90_000  # a second: usual rates are whole multiples of one
+LONGEST_STEP = 60 * TICKS  # between two pictures; a longer one is another recording
+RATES = (1.0, 240.0)  # Hz that players can do
 
 
 class VideoFile:
-    """An MP4 file. Write it where `files.whole` says: only after `finish` all of it is there.
+    """Write it where `files.whole` says: only after `finish` all of it is there.
 
     Args:
-        rate: pictures per second.
-        size: width and height of the pictures, px.
+        rate: pictures per second, where they come without a stamp.
+        size: width and height of the pictures, px; odd ones lose a column or row.
 
     Raises:
         OSError: it cannot be written.
     """
 
     def __init__(self, path: Path, rate: float, size: tuple[int, int]) -> None:
-        self._path = path
-        self._count = 0
-        code = cv2.VideoWriter.fourcc(*"mp4v")
-        rate = round(min(max(rate, RATES[0]), RATES[1]), 2)  # MPEG-4 knows no finer fractions
-        with native_output():
-            self._writer = cv2.VideoWriter(str(path), code, rate, size)
-        if not self._writer.isOpened():
-            if shutil.disk_usage(path.parent).free == 0:
-                raise _no_space()
-            raise OSError(errno.EINVAL, f"{size[0]}x{size[1]} px cannot be encoded as a video")
+        rate = min(max(rate, RATES[0]), RATES[1])
+        self._file = av.open(f"file:{path}", "w", format="mp4", options={"movflags": "faststart"})
+        self._stream = self._file.add_stream("libx264", Fraction(rate).limit_denominator(1000))
+        self._stream.width, self._stream.height = (side - side % 2 for side in size)
+        self._stream.pix_fmt = "yuv420p"
+        codec = self._stream.codec_context
+        codec.time_base, codec.thread_count = Fraction(1, TICKS), 1
+        self._stream.options = {"preset": "ultrafast", "crf": "22"}  # beside a node that needs the cores
+        self._period = TICKS / rate
+        self._first_ns: int | None = None
+        self._shift = 0.0  # ticks that stamps are late, where they began anew
+        self._at = -self._period  # ticks, of the newest picture
 
-    def add(self, picture: U8) -> None:
-        """One more picture, RGB [H, W, 3]."""
-        self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-        self._count += 1
+    def add(self, picture: U8, stamp_ns: int | None = None) -> None:
+        """One more picture, RGB [H, W, 3].
+
+        Args:
+            stamp_ns: when it was captured: as long after the one before it is shown. Where stamps begin anew
+                it follows the one before. None: at the rate.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        after = self._at + self._period
+        if stamp_ns is not None:
+            if self._first_ns is None:
+                self._first_ns = stamp_ns
+            at = (stamp_ns - self._first_ns) * 1e-9 * TICKS + self._shift
+            if not self._at < at < self._at + LONGEST_STEP:
+                self._shift += after - at
+                at = after
+            after = at
+        self._at = max(after, self._at + 1)
+        even = np.ascontiguousarray(picture[: self._stream.height, : self._stream.width])
+        frame = av.VideoFrame.from_ndarray(even, "rgb24").reformat(format="yuv420p", threads=1)
+        frame.pts, frame.time_base = round(self._at), Fraction(1, TICKS)
+        self._write(frame)
 
     def finish(self) -> None:
         """Write the rest.
@@ -51,13 +72,14 @@ class VideoFile:
         Raises:
             OSError: not all of it is there.
         """
-        self._writer.release()
-        # OpenCV says nothing of a full disk. The index comes last: a file that was cut off has none.
-        with native_output():
-            written = cv2.VideoCapture(str(self._path)).get(cv2.CAP_PROP_FRAME_COUNT)
-        if written != self._count:
-            raise _no_space()
+        self._write(None)
+        self._file.close()
 
-
-def _no_space() -> OSError:
-    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    def _write(self, frame: av.VideoFrame | None) -> None:
+        try:
+            self._file.mux(self._stream.encode(frame))
+        except av.FFmpegError as error:
+            if isinstance(error, OSError):
+                raise
+            size = f"{self._stream.width}x{self._stream.height} px"
+            raise OSError(errno.EINVAL, f"{size} cannot be encoded as a video") from None

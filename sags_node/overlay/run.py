@@ -266,7 +266,7 @@ class _Overlay:
             if rgba is None and self._stream.reason is not None:
                 rgba = self._stream.notice((picture.shape[0], picture.shape[1]))
             shown = picture if rgba is None else overlay_draw.over(picture, rgba)
-            self._output.add(shown, reason is None, self._node.period(PICTURE))
+            self._output.add(shown, reason is None, leading.stamp_ns)
 
     def _overlay(self, stamp_ns: int) -> tuple[U8 | None, str | None]:
         """The left eye's overlay, published, where there is one; and why nothing is to be seen of it."""

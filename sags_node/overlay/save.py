@@ -15,7 +15,7 @@ from sags_node.files import check_file, whole, writing
 from sags_node.media.video_file import VideoFile
 from sags_node.types import U8
 
-PICTURES_BEFORE_VIDEO = 5  # the frame rate must be known before a video file is opened
+RATE = 30.0  # Hz that the video's header begins with; its pictures have their own stamps
 
 _LAYER = struct.Struct("<5i")  # frame, first row and column, height and width of what follows: RGBA
 
@@ -96,29 +96,30 @@ class Output:
         self._still: U8 | None = None
         self._video: VideoFile | None = None
         self._whole = ExitStack()  # of the video
-        self._shown = 0
+        self._failed: OSError | None = None
         self.saved: str | None = None  # what has been written
 
-    def add(self, picture: U8, with_overlay: bool, period: float) -> None:
-        """One picture [H, W, 3] RGB, `period` s after the one before.
+    def add(self, picture: U8, with_overlay: bool, stamp_ns: int) -> None:
+        """One picture [H, W, 3] RGB, by when it was captured. What a video then lacks is said by `close`.
 
         Raises:
-            SagsError: the video cannot be written.
+            SagsError: the video cannot be begun.
         """
-        self._shown += 1
         if self._file is None:
             return
         if self._file.suffix == ".png":
             if with_overlay or self._still is None:
                 self._still = picture
             return
-        if self._shown < PICTURES_BEFORE_VIDEO:
-            return
         if self._video is None:
             size = picture.shape[1], picture.shape[0]
             with writing(self._file):
-                self._video = VideoFile(self._whole.enter_context(whole(self._file)), 1 / period, size)
-        self._video.add(picture)
+                self._video = VideoFile(self._whole.enter_context(whole(self._file)), RATE, size)
+        if self._failed is None:
+            try:
+                self._video.add(picture, stamp_ns)
+            except OSError as error:
+                self._failed = error  # the overlay itself goes on
 
     def close(self) -> None:
         """Finish the file.
@@ -128,6 +129,8 @@ class Output:
         """
         if self._video is not None:
             with self._whole:
+                if self._failed is not None:
+                    raise self._failed
                 self._video.finish()
             self.saved = str(self._file)
         if self._still is not None and self._file is not None:

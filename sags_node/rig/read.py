@@ -48,10 +48,14 @@ def load_camera(file: Path) -> StereoRig:
     return accept_rig(ros.read_one(Path(file), NOMINAL_BASELINE), file)
 
 
-def guessed_rig(width: int, height: int) -> StereoRig:
-    """Eyes of usual optics for pictures of this size (px) that nobody has calibrated; not `metric`."""
-    focal = 0.5 * width / np.tan(np.radians(0.5 * GUESSED_FOV))
-    K = np.array([[focal, 0, 0.5 * (width - 1)], [0, focal, 0.5 * (height - 1)], [0, 0, 1]])
+def guessed_rig(width: int, height: int, pixel_aspect: float = 1.0) -> StereoRig:
+    """Eyes of usual optics for pictures of this size (px) that nobody has calibrated; not `metric`.
+
+    Args:
+        pixel_aspect: width of a pixel over its height.
+    """
+    fx = 0.5 * width / np.tan(np.radians(0.5 * GUESSED_FOV))
+    K = np.array([[fx, 0, 0.5 * (width - 1)], [0, pixel_aspect * fx, 0.5 * (height - 1)], [0, 0, 1]])
     return replace(rectified_rig("guessed", width, height, K, NOMINAL_BASELINE), metric=False)
 
 

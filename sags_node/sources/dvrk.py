@@ -17,10 +17,11 @@ from sags_node.config.launch_file import SIDECAR_TYPE
 from sags_node.config.schema import DvrkSource
 from sags_node.errors import UsageError
 from sags_node.files import read_file
+from sags_node.media.video import Video
 from sags_node.sources.layout import side_by_side
 from sags_node.sources.pictures import RawPair
 from sags_node.sources.stamps import nearest
-from sags_node.sources.videos import OneVideoPairs, Video
+from sags_node.sources.videos import OneVideoPairs
 from sags_node.types import I64
 
 ALONE = "alone with source.kind:=videos source.geometry.layout:=side_by_side"
@@ -173,10 +174,9 @@ def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> I64:
     """For each frame of the video the one of the sidecar at the same presentation time."""
     pts = [frame.gst.pts_ns for frame in sidecar.frames]
     known = np.array([-1 if at is None else at for at in pts], np.int64)
-    if (known < 0).any() or video.rate is None or (np.diff(known) < 0).any():
+    if (known < 0).any() or video.stamps is None or (np.diff(known) < 0).any():
         raise UsageError(
             f"{file} lists {len(known)} frames but {video.path} holds {video.count}, and there are no rising "
             f"presentation times to join them by; play the MP4 {ALONE}"
         )
-    at = np.round(np.arange(video.count) * 1e9 / video.rate).astype(np.int64)
-    return nearest(at, known - known[0])
+    return nearest(video.stamps - video.stamps[0], known - known[0])

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}  # OpenCV's codes
 FIELD_ROWS = {"top": 0, "bottom": 1}
+WIDEST = 2.2  # times as wide as high: one eye is at most 1.9 (17:9)
 
 
 class Layout:
@@ -63,6 +64,26 @@ class Layout:
                 f"{sizes[0][0]}x{sizes[0][1]}; all panes need one size"
             )
         return sizes[0]
+
+    def pixel_aspect(self, width: int, height: int, told: float) -> float:
+        """Width of an eye's pixel over its height.
+
+        Where a file says that its pixels are square, eyes that are narrower than high, or more than twice as
+        wide, were squeezed to fit beside or above each other.
+
+        Args:
+            width, height: of what is delivered, px.
+            told: what the file says of its pixels.
+        """
+        match self._config.layout:
+            case "row_interleaved":
+                return 0.5 * told
+            case "side_by_side" if told == 1 and width // 2 < height:
+                return 2.0
+            case "over_under" if told == 1 and width > WIDEST * (height // 2):
+                return 0.5
+            case _:
+                return told
 
     def eye(self, picture: Samples, side: Side) -> U8:
         """The picture [H, W, 3] of one eye; the argument itself where there is nothing to do."""

@@ -19,8 +19,8 @@ def unpainted(pane: U8, left: U8) -> Bool:
     """True where `pane` shows `left` without green paint.
 
     Args:
-        pane: [H, W, 3] BGR, the left picture with semi-transparent green instruments.
-        left: [H, W, 3] BGR, the same picture without paint.
+        pane: [H, W, 3] RGB, the left picture with semi-transparent green instruments.
+        left: [H, W, 3] RGB, the same picture without paint.
     """
     painted = np.empty(pane.shape[:2], np.uint8)
     _find_paint(pane, left, painted)
@@ -35,7 +35,7 @@ def _find_paint(pane: U8, left: U8, painted: U8) -> None:
     """Write 1 where green was gained, else 0; in one pass, since pictures in between cost four times that."""
     for y in range(painted.shape[0]):
         for x in range(painted.shape[1]):
-            blue, green, red = (
+            red, green, blue = (
                 np.int32(pane[y, x, 0]) - left[y, x, 0],
                 np.int32(pane[y, x, 1]) - left[y, x, 1],
                 np.int32(pane[y, x, 2]) - left[y, x, 2],

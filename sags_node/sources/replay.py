@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -12,6 +14,7 @@ import numpy as np
 
 from sags_node.config import schema as cfg
 from sags_node.errors import UsageError
+from sags_node.media.video import LostPictureError, Video
 from sags_node.sources.bags import BagPairs
 from sags_node.sources.dvrk import DvrkPairs
 from sags_node.sources.endonerf import EndoNerfPairs
@@ -20,8 +23,10 @@ from sags_node.sources.one_eye import refuse_one_eye_twice
 from sags_node.sources.pictures import FolderPairs, RawPair
 from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
-from sags_node.sources.videos import OneVideoPairs, Video, VideoPairs
+from sags_node.sources.videos import OneVideoPairs, VideoPairs
 from sags_node.types import I64, StereoFrame
+
+log = logging.getLogger(__name__)
 
 Recording = (
     cfg.FoldersSource
@@ -47,7 +52,11 @@ class Pairs(Protocol):
         """Pass over one pair as cheaply as possible; False at the end."""
 
     def read(self) -> RawPair | None:
-        """The next pair, None at the end."""
+        """The next pair, None at the end.
+
+        Raises:
+            LostPictureError: it cannot be read; those behind it may be.
+        """
 
     def close(self) -> None: ...
 
@@ -65,6 +74,9 @@ class Replay:
     Attributes:
         first: number of the first frame.
         findings: what is odd about its stamps or poses.
+        pairs: what is read.
+        pixel_aspect: width of a pixel over its height, as far as the recording says it.
+        oddities: what is to be said of its files, each with a remedy after a semicolon.
 
     Args:
         config: which recording, and how to play it.
@@ -93,23 +105,27 @@ class Replay:
         self._sleep = sleep or self._stopped.wait
         self._poses = None if config.poses is None else Poses(config.poses)
         self._references = References(config.reference) if references else None
-        self._pairs = open_pairs(config, references)
-        self._count = -(-self._pairs.count // config.stride)  # rounded up
-        self.rate = (config.rate or self._pairs.rate or DEFAULT_RATE) / config.stride
+        self.pairs = open_pairs(config, references)
+        self._count = -(-self.pairs.count // config.stride)  # rounded up
+        self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
         self._stamps: I64 | None = None  # [turns, 2] ns, of the left and the right picture
-        if isinstance(self._pairs, BagPairs | DvrkPairs) and config.rate is None:
-            self._stamps = self._pairs.stamps[:: config.stride]
+        self.pixel_aspect, self.oddities = 1.0, list[str]()
+        if isinstance(self.pairs, VideoPairs | OneVideoPairs):
+            self.pixel_aspect, self.oddities = self.pairs.pixel_aspect, self.pairs.oddities
+        for oddity in self.oddities:
+            _say(oddity)
+        if isinstance(self.pairs, BagPairs | DvrkPairs | VideoPairs | OneVideoPairs) and config.rate is None:
+            stamps = self.pairs.stamps
+            self._stamps = None if stamps is None else stamps[:: config.stride]
         # The recording's own stamps of the left pictures, ns: by them poses of the same recording are found.
-        self._recorded = (
-            self._pairs.stamps[:: config.stride, 0] if isinstance(self._pairs, BagPairs) else None
-        )
-        self.findings = self._pairs.findings if isinstance(self._pairs, BagPairs | EndoNerfPairs) else ()
+        self._recorded = self.pairs.stamps[:: config.stride, 0] if isinstance(self.pairs, BagPairs) else None
+        self.findings = self.pairs.findings if isinstance(self.pairs, BagPairs | EndoNerfPairs) else ()
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0
         self.first = self.frame_at(config.start)
         if self.first >= self._count:
-            self._pairs.close()
+            self.pairs.close()
             seconds = self._count / self.rate
             raise UsageError(
                 f"source.start {config.start} s lies behind the recording's end at {seconds:.2f} s"
@@ -143,7 +159,7 @@ class Replay:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
-        self._pairs.close()
+        self.pairs.close()
 
     def stop(self) -> None:
         """End the iteration; any thread may call this."""
@@ -157,7 +173,7 @@ class Replay:
             SagsError: a picture is damaged, or the right eye ends before the left one.
         """
         stride = self._config.stride
-        self._pairs.seek(self.first * stride)
+        self.pairs.seek(self.first * stride)
         self._began = None
         self._dropped_in_a_row = 0
         epoch, index, frame_id = 0, self.first, self.first
@@ -165,14 +181,18 @@ class Replay:
         while not self._stopped.is_set() and frame_id != limit:
             pair = None
             if self._is_too_late(frame_id):
-                ended = not self._pairs.skip()
+                ended = not self.pairs.skip()
             else:
-                pair = self._pairs.read()
-                ended = pair is None
+                try:
+                    pair = self.pairs.read()
+                    ended = pair is None
+                except LostPictureError as lost:
+                    _say(str(lost))
+                    ended = False
             if ended:
                 if not self._config.loop or index == self.first:
                     return
-                self._pairs.seek(self.first * stride)
+                self.pairs.seek(self.first * stride)
                 epoch, index = epoch + 1, self.first
                 continue
             if pair is None:
@@ -205,7 +225,7 @@ class Replay:
                     recorded_s=self.seconds_of(index),
                 )
             for _ in range(stride - 1):
-                self._pairs.skip()
+                self.pairs.skip()
             index += 1
             frame_id += 1
 
@@ -251,6 +271,12 @@ class Replay:
             self._sleep(wait)
         assert self._began is not None
         return self._began[1] + self._elapsed(frame_id)
+
+
+@lru_cache(maxsize=256)
+def _say(oddity: str) -> None:
+    """Once, however often a recording is opened."""
+    log.warning(oddity)
 
 
 def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, one return per kind

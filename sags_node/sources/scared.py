@@ -19,12 +19,13 @@ from sags_node import geometry
 from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.media.picture_file import decode
+from sags_node.media.video import Video
 from sags_node.rig import check_intrinsics, rectified_rig, refuse_errors
 from sags_node.rig.opencv import numbers_in, open_storage
 from sags_node.sources.layout import Layout
 from sags_node.sources.numbered import NumberedFiles, open_numbered
 from sags_node.sources.pictures import FolderPairs, RawPair
-from sags_node.sources.videos import OneVideoPairs, Video
+from sags_node.sources.videos import OneVideoPairs
 from sags_node.types import F32, F64, Eye, Reference, StereoRig
 
 log = logging.getLogger(__name__)
@@ -94,11 +95,10 @@ class ScaredPairs:
         Raises:
             SagsError: a file of this frame is damaged or not of the stated form.
         """
-        index = self._next
+        index, self._next = self._next, self._next + 1
         pair = self._pictures.read() if index < self.count else None
         if pair is None:
             return None
-        self._next += 1
         return pair._replace(
             T_world_cam=None if self._poses is None else self._poses[index],
             reference=self._reference(index),

@@ -3,88 +3,51 @@
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 
-import cv2
+import numpy as np
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.media.video import Video
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import RawPair, size_text
-from sags_node.types import U8, Bool
+from sags_node.sources.stamps import pair
+from sags_node.types import I64, U8, Bool
 
 log = logging.getLogger(__name__)
 
-# FFmpeg and OpenCV would print their own lines about broken files beside our message. FFmpeg's level is read
-# when the first video is opened.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_FATAL)
+NEAR = 0.6  # of a period, from a picture to its partner: free-running eyes are up to half of one apart
+PARTNERED = 0.5  # share of the pictures that have a partner, where stamps of two files tell it
+UNEVEN_RATES = 0.1  # that the usual rates of two files with gaps or jitter may differ
 
 
-class Video:
-    """One video file, decoded forward.
+class _InOrder:
+    """Pairs that are read by their number."""
 
-    Raises:
-        UsageError: the file is missing or is not a video.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._open()
-        self.rate = self._capture.get(cv2.CAP_PROP_FPS) or None
-        self.count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        width, height = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT
-        self.size = int(self._capture.get(width)), int(self._capture.get(height))
-        if self.count <= 0:
-            raise UsageError(f"video {path} does not say how many frames it holds; remux it (ffmpeg -c copy)")
-        if not self._capture.grab():
-            raise UsageError(f"video {path} holds no picture that can be decoded")
-        self.seek(0)
-
-    def _open(self) -> None:
-        if not self.path.is_file():
-            raise UsageError(f"video {self.path} does not exist; check the path, or SAGS_DATA if it is used")
-        self._capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-        if not self._capture.isOpened():
-            raise UsageError(f"{self.path} cannot be read as a video; is it complete?")
+    count: int
+    _next = 0
 
     def seek(self, index: int) -> None:
-        """Make `index` the next frame, by counting where the file cannot seek to it exactly."""
-        self._capture.release()
-        self._open()
-        if index and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
-            if round(self._capture.get(cv2.CAP_PROP_POS_FRAMES)) == index:
-                self._next = index
-                return
-            self._capture.release()
-            self._open()
-        self._next = 0
-        while self._next < index and self.skip():
-            pass
+        self._next = index
 
     def skip(self) -> bool:
-        """Pass over one frame without converting it; False at the end."""
-        found: bool = self._capture.grab()
-        self._next += found
-        return found
-
-    def read(self) -> U8 | None:
-        """The next frame, BGR [H, W, 3], None at the end."""
-        picture: U8
-        found, picture = self._capture.read()
-        if not found:
-            if self._next < self.count:
-                log.warning("%s ends at frame %d, it announces %d", self.path, self._next, self.count)
-            return None
+        if self._next >= self.count:
+            return False
         self._next += 1
-        return picture
-
-    def close(self) -> None:
-        self._capture.release()
+        return True
 
 
-class VideoPairs:
-    """Two videos, paired by frame number, or the left one alone, which says how long it is.
+class VideoPairs(_InOrder):
+    """Two videos, or the left one alone, which says how long it is.
+
+    Pictures of one number are a pair. Where stamps say that some are missing, those nearest in time are.
+
+    Attributes:
+        left, right: the videos; right None: there is one eye.
+        by_number: not by stamps.
+        stamps: [count, 2] ns, of the left and the right picture; None: they are even.
+        pixel_aspect: width of a pixel over its height.
+        oddities: see `Video`; also how many pictures have no partner.
 
     Args:
         layout: what is used of each eye's picture.
@@ -94,58 +57,46 @@ class VideoPairs:
     """
 
     def __init__(self, left: Path, right: Path | None, layout: Layout) -> None:
-        self._left = Video(left)
-        self._right = None if right is None else Video(right)
+        self.left = Video(left)
+        self.right = None if right is None else Video(right)
         self._layout = layout
-        self.rate, self.count = self._left.rate, self._left.count
-        self._next = 0
-        if self._right is not None:
-            self._check(self._left, self._right)
+        self.rate = self.left.rate
+        self.oddities = [said for video in self._videos for said in video.oddities]
+        self._late = 0  # ns, of the right file's stamps
         try:
-            layout.size(*self._left.size, str(left))
+            numbers = None if self.right is None else self._joined(self.left, self.right)
+            layout.size(*self.left.size, str(left))
         except UsageError:
             self.close()
             raise
-
-    def _check(self, one: Video, other: Video) -> None:
-        for what, fits, values in (
-            ("px", one.size == other.size, (size_text(*one.size), size_text(*other.size))),
-            ("frames/s", _is_same_rate(one.rate, other.rate), (one.rate, other.rate)),
-        ):
-            if not fits:
-                self.close()
-                raise UsageError(
-                    f"{one.path} has {values[0]} {what} but {other.path} has {values[1]}; they are not one "
-                    "stereo pair"
-                )
-
-    def seek(self, index: int) -> None:
-        for video in self._videos:
-            video.seek(index)
-        self._next = index
-
-    def skip(self) -> bool:
-        found = self._left.skip()
-        if found and self._right is not None and not self._right.skip():
-            raise self._right_ended(self._right)
-        self._next += found
-        return found
+        self.by_number = numbers is None
+        self._numbers = np.arange(self.left.count)[:, None].repeat(2, axis=1) if numbers is None else numbers
+        self.count = len(self._numbers)
+        self.stamps = self._find_stamps()
+        self.pixel_aspect = layout.pixel_aspect(*self.left.size, self.left.pixel_aspect)
 
     def read(self) -> RawPair | None:
-        """The next pair, None at the end of the left video.
+        """The next pair, None at the end.
 
         Raises:
+            LostPictureError: one of the two cannot be decoded.
             SagsError: the right video is shorter than the left one.
         """
-        left = self._left.read()
+        if self._next >= self.count:
+            return None
+        index, self._next = self._next, self._next + 1
+        of_left, of_right = (int(number) for number in self._numbers[index])
+        left = self.left.read(of_left)
         if left is None:
             return None
-        right = None if self._right is None else self._right.read()
-        if self._right is not None and right is None:
-            raise self._right_ended(self._right)
-        self._next += 1
-        left = _rgb(self._layout.eye(left, "left"))
-        return RawPair(left, None if right is None else _rgb(self._layout.eye(right, "right")), None)
+        right = None if self.right is None else self.right.read(of_right)
+        if self.right is not None and right is None:
+            raise SagsError(
+                f"{self.right.path} ends at frame {index} but {self.left.path} goes on; set source.frames "
+                "to stop there"
+            )
+        seen = None if right is None else self._layout.eye(right, "right")
+        return RawPair(self._layout.eye(left, "left"), seen, None)
 
     def close(self) -> None:
         for video in self._videos:
@@ -153,20 +104,75 @@ class VideoPairs:
 
     @property
     def _videos(self) -> list[Video]:
-        return [self._left] if self._right is None else [self._left, self._right]
+        return [self.left] if self.right is None else [self.left, self.right]
 
-    def _right_ended(self, right: Video) -> SagsError:
-        return SagsError(
-            f"{right.path} ends at frame {self._next} but {self._left.path} goes on; "
-            f"set source.frames to stop there"
+    def _joined(self, left: Video, right: Video) -> I64 | None:
+        """Numbers of pictures that belong together [N, 2]; None: those of one number do."""
+        if left.size != right.size:
+            sizes = (
+                f"{left.path} has {size_text(*left.size)} px but {right.path} has {size_text(*right.size)}"
+            )
+            raise UsageError(f"{sizes}; they are not one stereo pair")
+        is_even = left.is_even and right.is_even
+        if left.rate is not None and right.rate is not None:
+            apart = abs(left.rate - right.rate) / left.rate
+            if apart > (0.01 if is_even else UNEVEN_RATES):
+                raise UsageError(
+                    f"{left.path} has {left.rate} frames/s but {right.path} has {right.rate}; they are not "
+                    f"one stereo pair: record both at one rate, or bring one to it (ffmpeg -i OLD -r "
+                    f"{left.rate:g} NEW)"
+                )
+        if left.stamps is None or right.stamps is None or left.rate is None:
+            return None
+        period = 1e9 / left.rate
+        late, ends_late = (int(right.stamps[at] - left.stamps[at]) for at in (0, -1))
+        of_one_clock = min(abs(late), abs(ends_late)) <= NEAR * period
+        if is_even and (not of_one_clock or abs(late) <= NEAR * period):
+            if not of_one_clock:
+                self._tell_late(late)
+            return None
+        if not of_one_clock:  # two recorders, each with its own zero
+            self._tell_late(late)
+        self._late = 0 if of_one_clock else late
+        found = pair(left.stamps, right.stamps - self._late, NEAR * period * 1e-9)
+        alone = left.count - len(found), right.count - len(found)
+        if len(found) < PARTNERED * min(left.count, right.count):
+            self.oddities.append(
+                f"{left.path}, {right.path}: the stamps of {alone[0]} pictures have no partner; both "
+                "are paired by number: is that what they show?"
+            )
+            return None
+        if any(alone):
+            self.oddities.append(
+                f"{left.path}, {right.path}: {alone[0]} and {alone[1]} pictures have no partner at "
+                "their time, and are left out; were they lost while recording?"
+            )
+        return found
+
+    def _tell_late(self, late_ns: int) -> None:
+        self.oddities.append(
+            f"the stamps of the right video begin {abs(late_ns) * 1e-9:.3f} s "
+            f"{'after' if late_ns > 0 else 'before'} those of the left one; their first pictures are taken "
+            "for one moment: is an eye late, cut its beginning off"
         )
 
+    def _find_stamps(self) -> I64 | None:
+        left, right = self.left, self.right
+        if left.stamps is None or (left.is_even and self.by_number):
+            return None
+        of_left = left.stamps[self._numbers[:, 0]]
+        if right is None or self.by_number:
+            return np.stack([of_left, of_left], axis=1)
+        assert right.stamps is not None
+        return np.stack([of_left, right.stamps[self._numbers[:, 1]] - self._late], axis=1)
 
-class OneVideoPairs:
+
+class OneVideoPairs(_InOrder):
     """One video of both eyes: in halves or boxes of a picture, in rows, or one after the other.
 
     Attributes:
         size: width and height of an eye's picture, px.
+        stamps, pixel_aspect, oddities: as of `VideoPairs`.
 
     Raises:
         UsageError: its pictures cannot be split as asked.
@@ -175,24 +181,33 @@ class OneVideoPairs:
     def __init__(self, video: Video, layout: Layout) -> None:
         self._video = video
         self._layout = layout
-        self._pictures = 2 if layout.is_sequential else 1  # that make a pair
-        self.rate = None if video.rate is None else video.rate / self._pictures
-        self.count = video.count // self._pictures
         try:
             self.size = layout.size(*video.size, str(video.path))
         except UsageError:
             self.close()
             raise
-
-    def seek(self, index: int) -> None:
-        self._video.seek(index * self._pictures)
-
-    def skip(self) -> bool:
-        return all(self._video.skip() for _ in range(self._pictures))
+        in_turn = 2 if layout.is_sequential else 1
+        self.rate = None if video.rate is None else video.rate / in_turn
+        self._numbers = _turns(video) if layout.is_sequential else np.arange(video.count)[:, None]
+        self.count = len(self._numbers)
+        self.stamps: I64 | None = None
+        if video.stamps is not None and not video.is_even:
+            of_eyes = video.stamps[self._numbers]
+            left = layout.order.index("left") if layout.is_sequential else 0
+            self.stamps = np.stack([of_eyes[:, left], of_eyes[:, -1 - left]], axis=1)
+        self.pixel_aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
+        self.oddities = video.oddities
 
     def read(self) -> RawPair | None:
-        """The next pair, None at the end."""
-        pictures = [self._video.read() for _ in range(self._pictures)]
+        """The next pair, None at the end.
+
+        Raises:
+            LostPictureError: it cannot be decoded.
+        """
+        if self._next >= self.count:
+            return None
+        index, self._next = self._next, self._next + 1
+        pictures = [self._video.read(int(number)) for number in self._numbers[index]]
         first, last = pictures[0], pictures[-1]
         if first is None or last is None:
             return None
@@ -202,24 +217,24 @@ class OneVideoPairs:
         else:
             left, right = self._layout.eyes(first)
         painted = self._layout.tools(first)
-        return RawPair(_rgb(left), _rgb(right), None if painted is None else _unpainted(painted, left))
+        return RawPair(left, right, None if painted is None else _unpainted(painted, left))
 
     def close(self) -> None:
         self._video.close()
 
 
-def _rgb(bgr: U8) -> U8:
-    """A new RGB picture, so that nothing the decoder owns leaves this file."""
-    rgb: U8 = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-    return rgb
+def _turns(video: Video) -> I64:
+    """Numbers of first and second pictures [N, 2], where the eyes come in turn. The time between two pictures
+    says how many were lost, so the eyes are not exchanged by one."""
+    turns = np.arange(video.count)
+    if video.stamps is not None and video.rate is not None:
+        steps = np.maximum(1, np.rint(np.diff(video.stamps) * (video.rate * 1e-9))).astype(np.int64)
+        turns = np.concatenate([[0], np.cumsum(steps)])
+    seconds = 1 + np.flatnonzero((turns[1:] % 2 == 1) & (np.diff(turns) == 1))
+    return np.stack([seconds - 1, seconds], axis=1)
 
 
 def _unpainted(painted: U8, left: U8) -> Bool:
     from sags_node.sources.painted import unpainted  # a kernel: other videos need no place for one
 
     return unpainted(painted, left)
-
-
-def _is_same_rate(one: float | None, other: float | None) -> bool:
-    """LearningRates measured from a file's stamps differ a little."""
-    return one is None or other is None or abs(one - other) <= 0.01 * one

@@ -8,7 +8,7 @@ import av
 import numpy as np
 
 from sags_node.demo import Shown
-from sags_node.media.h264_file import H264File
+from sags_node.media.video_file import VideoFile
 from sags_node.overlay.draw import over
 from sags_node.overlay.save import Layers, read_layers
 from sags_node.types import U8
@@ -67,7 +67,7 @@ def test_an_overlay_that_was_killed_leaves_what_it_had_written(tmp_path: Path) -
 
 def test_its_file_is_what_browsers_play(tmp_path: Path) -> None:
     """H.264 in yuv420p, whose sides are even; its index stands first."""
-    file = H264File(tmp_path / "video.mp4", RATE, (WIDTH, HEIGHT))
+    file = VideoFile(tmp_path / "video.mp4", RATE, (WIDTH, HEIGHT))
     for level in range(0, 200, 10):
         file.add(np.full((HEIGHT, WIDTH, 3), level, np.uint8))
     file.finish()

@@ -1,0 +1,334 @@
+"""A video file: its pictures by number, and the stamps that the file gives them. Read by FFmpeg (PyAV).
+
+Headers are not believed: how many pictures there are, when they are shown, and where decoding can begin is
+read from the packets, once for each file. What an edit list hides is no picture.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import av
+import cv2
+import numpy as np
+from av.stream import Discard, Disposition
+from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+
+from sags_node.errors import SagsError, UsageError
+from sags_node.types import I64, U8
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
+log = logging.getLogger(__name__)
+
+MAX_PIXELS = 64 << 20
+THREADS = min(4, os.cpu_count() or 1)
+REORDERED = 32  # pictures that a codec may hold back to show others first
+LONGEST_PAUSE = 600.0  # s between two pictures; beyond, the stamps are of different clocks
+SAME = 1_000_000  # ns: stamps of most containers are whole milliseconds
+FAR = 8  # pictures; what is nearer is decoded, not sought
+SHORT = 1.0  # s that a file may end before its header says so
+# Sizes of HD television, which is BT.709. Untagged pictures of any other size are BT.601: old television, and
+# what FFmpeg and OpenCV make of RGB pictures whatever their size.
+HD = {(1280, 720), (1440, 1080), (1920, 1080), (2048, 1080), (3840, 2160), (4096, 2160)}
+_UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
+_MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
+_TURNS = {
+    90: cv2.ROTATE_90_COUNTERCLOCKWISE,
+    -90: cv2.ROTATE_90_CLOCKWISE,
+    180: cv2.ROTATE_180,
+    -180: cv2.ROTATE_180,
+}
+
+
+class LostPictureError(SagsError):
+    """One picture cannot be decoded; those behind it may be."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Index:
+    """What the packets of a file say, in ticks."""
+
+    count: int
+    pts: I64 | None  # [count] rising; None: they do not say when pictures are shown
+    keys: I64  # [K, 3] pts, dts and size (bytes), rising, of the packets at which decoding can begin
+    unused: str = ""  # why the stamps are not used
+    cut_off: str = ""  # why the file must have been longer
+
+
+class Video:
+    """One video file. Pictures are numbered as they are shown.
+
+    Attributes:
+        size: width and height of a picture, px.
+        count: how many there are.
+        stamps: [count] when each is shown, ns, rising; None where the file does not say it.
+        rate: Hz, while none is missing; None: not known.
+        is_even: stamps say no more than the rate.
+        pixel_aspect: width of a pixel over its height.
+        cut_off: why the file must have been longer; "": it is whole.
+        oddities: what is to be said of the file, each with a remedy after a semicolon.
+
+    Raises:
+        UsageError: the file is missing or is not a video.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_file():
+            raise UsageError(f"video {path} does not exist; check the path, or SAGS_DATA if it is used")
+        seen = path.stat()
+        index = _read_index(path, seen.st_size, seen.st_mtime_ns)
+        self._keys, self._pts = index.keys, index.pts
+        # After a seek some containers give stamps that are one off.
+        self._begins = {(pts, size) for pts, _, size in index.keys.tolist()}
+        self._reformatter = VideoReformatter()
+        self._frame: av.VideoFrame | None = None  # the newest that is decoded
+        first = self._restart()
+        if first is None and self._pts is not None:  # pictures have other stamps than their packets
+            self._pts, first = None, self._restart()
+        if first is None:
+            raise UsageError(f"video {path} holds no picture that can be decoded")
+        self._coded = first.width, first.height
+        self._turn = _TURNS.get(first.rotation)
+        self.size = self._coded if first.rotation % 180 == 0 else self._coded[::-1]
+        aspect = float(self._stream.sample_aspect_ratio or 1)
+        self.pixel_aspect = aspect if first.rotation % 180 == 0 else 1 / aspect
+        self._untagged = Colorspace.ITU709 if _is_hd(*self.size) else Colorspace.ITU601
+        self.stamps: I64 | None = None
+        if self._pts is not None and first.pts is not None:
+            # What comes before the first picture that can be decoded began before the file did.
+            self._pts = self._pts[self._pts >= first.pts]
+            base = self._stream.time_base or Fraction(1, 1)
+            self.stamps = np.array([round(int(ticks) * base * 10**9) for ticks in self._pts], np.int64)
+        self.count = index.count if self.stamps is None else len(self.stamps)
+        self.rate, self.is_even = self._find_rate()
+        self.cut_off = index.cut_off
+        self.oddities = [f"{path}: {index.unused}"] if index.unused else []
+
+    @property
+    def gaps(self) -> list[tuple[int, int]]:
+        """Number of the picture before each gap in the stamps, and how many are missing there."""
+        if self.stamps is None or self.rate is None or self.is_even:
+            return []
+        steps = np.rint(np.diff(self.stamps) * self.rate * 1e-9).astype(int)
+        return [(int(number), int(steps[number]) - 1) for number in np.flatnonzero(steps > 1)]
+
+    def read(self, number: int) -> U8 | None:
+        """A picture, RGB [H, W, 3], None behind the end. One after the other is fastest.
+
+        Raises:
+            LostPictureError: this one cannot be decoded.
+            SagsError: it is of another size than the first one.
+        """
+        if number >= self.count:
+            if self.cut_off:
+                log.warning("%s %s; copy it again", self.path, self.cut_off)
+            return None
+        if number < self._at or self._key_of(number) > self._at + FAR:
+            self._jump(number)
+        while self._at < number:
+            if self._decode() is None:
+                log.warning(
+                    "%s ends at picture %d, not at %d; copy it again", self.path, self._at + 1, self.count
+                )
+                return None
+        if self._at > number:
+            raise LostPictureError(f"{self.path}: picture {number} cannot be decoded; copy the file again")
+        assert self._frame is not None
+        return self._converted(self._frame)
+
+    def close(self) -> None:
+        self._frame = None
+        self._container.close()
+
+    def _find_rate(self) -> tuple[float | None, bool]:
+        """The rate, and whether every picture comes when it says."""
+        told = [float(rate) for rate in (self._stream.average_rate, self._stream.guessed_rate) if rate]
+        if self.stamps is None or len(self.stamps) < 2:
+            return (told[0] if told else None), True
+        steps = np.diff(self.stamps)
+        for rate in (*told, 1e9 / float(np.mean(steps))):
+            late = self.stamps - self.stamps[0] - np.arange(self.count) * (1e9 / rate)
+            if np.abs(late).max() <= min(SAME, 0.25e9 / rate):
+                return rate, True
+        usual = 1e9 / float(
+            np.mean(steps[steps < 1.5 * np.median(steps)])
+        )  # stamps may be whole milliseconds
+        return next((rate for rate in told if abs(rate - usual) < 0.01 * usual), usual), False
+
+    def _restart(self) -> av.VideoFrame | None:
+        """From the beginning; the first picture, decoded."""
+        self._container, self._stream = _opened(self.path)
+        self._stream.thread_type = "AUTO"
+        self._stream.thread_count = THREADS
+        return self._begin(is_sought=False)
+
+    def _begin(self, is_sought: bool) -> av.VideoFrame | None:
+        """The first picture from where the container is."""
+        self._frames = self._pictures(is_sought)
+        self._at = -1
+        return self._decode()
+
+    def _jump(self, number: int) -> None:
+        """To where this picture is decoded next, or one before it."""
+        if self._pts is not None and len(self._keys):
+            at = int(np.searchsorted(self._keys[:, 0], self._pts[number], "right")) - 1
+            with suppress(av.FFmpegError):  # from containers that cannot seek
+                self._container.seek(int(self._keys[max(at, 0), 1]), stream=self._stream)
+                if self._begin(is_sought=True) is not None and self._at <= number:
+                    return
+        self._restart()
+
+    def _key_of(self, number: int) -> int:
+        """Number of the last picture not behind this one at which decoding can begin."""
+        if self._pts is None or not len(self._keys):
+            return 0
+        at = int(np.searchsorted(self._keys[:, 0], self._pts[number], "right")) - 1
+        return int(np.searchsorted(self._pts, self._keys[max(at, 0), 0]))
+
+    def _decode(self) -> av.VideoFrame | None:
+        """The next picture, None at the end."""
+        self._frame = None  # its memory is used again
+        for frame in self._frames:
+            number = self._number_of(frame)
+            if number > self._at:
+                self._at, self._frame = number, frame
+                return frame
+        return None
+
+    def _number_of(self, frame: av.VideoFrame) -> int:
+        """-1: it is none of those that are shown."""
+        if self._pts is None:
+            return self._at + 1
+        if frame.pts is None:
+            return -1
+        number = int(np.searchsorted(self._pts, frame.pts))
+        return number if number < len(self._pts) and self._pts[number] == frame.pts else -1
+
+    def _pictures(self, is_sought: bool) -> Iterator[av.VideoFrame]:
+        """Decode forward. What is damaged is passed over, and where a seek leads what lacks its beginning."""
+        packets = self._container.demux(self._stream)
+        begun = not is_sought
+        while True:
+            packet: av.Packet[av.VideoStream] | None = None  # the end
+            with suppress(av.FFmpegError):
+                packet = next(packets, None)
+            if packet is not None and packet.size == 0:
+                continue  # a picture that a capture card dropped; or the end
+            begun = begun or packet is None or (packet.pts, packet.size) in self._begins
+            if not begun:
+                continue
+            with suppress(av.FFmpegError):
+                yield from self._stream.decode(packet)
+            if packet is None:
+                return
+
+    def _converted(self, frame: av.VideoFrame) -> U8:
+        if (frame.width, frame.height) != self._coded:
+            raise SagsError(
+                f"{self.path}: picture {self._at} is {frame.width}x{frame.height} px, the first one "
+                f"{self._coded[0]}x{self._coded[1]}; cut the file there, e.g. with ffmpeg -ss and -t"
+            )
+        if frame.colorspace in _UNTAGGED:
+            frame.colorspace = self._untagged
+        elif frame.colorspace not in _MATRICES:
+            raise SagsError(f"{self.path}: colour matrix {frame.colorspace} is not read; encode it as BT.709")
+        rgb = self._reformatter.reformat(
+            frame, format="rgb24", interpolation=Interpolation.BICUBIC, threads=1
+        )
+        picture = rgb.to_ndarray()
+        if self._turn is not None:
+            picture = cv2.rotate(picture, self._turn)
+        return picture.astype(np.uint8, copy=False)
+
+
+def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
+    """A file and its pictures; nothing else of it is read.
+
+    Raises:
+        UsageError: it is no video.
+    """
+    try:
+        # `file:` for names that look like an address; what a playlist names is not fetched from elsewhere.
+        container = av.open(f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="ignore")
+    except (av.FFmpegError, ValueError):
+        raise UsageError(f"{path} cannot be read as a video; is it complete?") from None
+    streams = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+    if not streams:
+        container.close()
+        raise UsageError(f"{path} cannot be read as a video: it holds no pictures; is it the right file?")
+    for stream in container.streams:
+        if stream is not streams[0]:
+            stream.discard = Discard.all
+    streams[0].codec_context.options = {"max_pixels": str(MAX_PIXELS)}
+    return container, streams[0]
+
+
+@lru_cache(maxsize=16)
+def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
+    """One pass over the packets of a file, which is told from an older one by its size (bytes) and time."""
+    container, stream = _opened(path)
+    with container:
+        base = stream.time_base or Fraction(1, 1)
+        named = len(stream.index_entries)
+        shown: list[int | None] = []
+        keys: list[tuple[int, int, int]] = []
+        ticks: list[int] = []  # when packets are decoded
+        total = 0
+        with suppress(av.FFmpegError):  # where it is cut off
+            for packet in container.demux(stream):
+                total += packet.size > 0
+                ticks += [] if packet.dts is None else [packet.dts]
+                if packet.size and not packet.is_discard:
+                    shown.append(packet.pts)
+                if packet.is_keyframe and packet.pts is not None:
+                    keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
+        known = np.array([pts for pts in shown if pts is not None], np.int64)
+        # AVI knows no order but that of decoding: FFmpeg guesses, and some codecs hold pictures back.
+        is_guessed = container.format.name == "avi" and stream.codec_context.has_b_frames
+        lacks = 2 * len(known) <= len(shown) or (is_guessed and (np.diff(known) > 0).all())
+        unused = "" if lacks else _why_unused(known, base)
+        is_used = not lacks and not unused
+        pts = np.unique(known) if is_used else None
+        ends = 0.0 if not ticks else float((max(ticks) + np.diff(ticks).max(initial=0)) * base)
+        missing = 0.0  # s
+        if container.format.name == "avi":  # counts its beats, and writes one for each
+            missing = float(stream.frames * base) - ends
+        elif len(container.streams) == 1 and container.duration is not None:
+            missing = container.duration * 1e-6 - ends - SHORT
+        cut_off = ""
+        if named > total:
+            cut_off = f"is cut off: of {named} pictures it holds {total}"
+        elif missing > float(0.5 * base):
+            cut_off = "is cut off: it ends before it says so"
+        return _Index(len(shown), pts, np.array(sorted(keys), np.int64).reshape(-1, 3), unused, cut_off)
+
+
+def _why_unused(pts: I64, base: Fraction) -> str:
+    """What is wrong with the stamps of pictures in the order in which they are decoded; nothing: ""."""
+    order = np.argsort(pts, kind="stable")
+    moved = np.abs(order - np.arange(len(pts)))
+    steps = np.diff(pts[order]) * float(base)
+    remedy = "it is played by number, at its rate; ffmpeg -fflags +genpts -i OLD NEW writes new stamps"
+    if len(pts) and moved.max() > REORDERED:
+        return f"its stamps begin anew near picture {int(np.argmax(moved > REORDERED))}; {remedy}"
+    if np.count_nonzero(steps == 0) > 0.1 * len(pts):
+        return f"several pictures have one stamp; {remedy}"
+    if steps.max(initial=0) > LONGEST_PAUSE:
+        return f"its stamps jump by {steps.max():.0f} s after picture {int(np.argmax(steps))}; {remedy}"
+    return ""
+
+
+def _is_hd(width: int, height: int) -> bool:
+    """Whether this is the size of one or two pictures of HD television."""
+    return not HD.isdisjoint({(width, height), (width // 2, height), (width, height // 2)})

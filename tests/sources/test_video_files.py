@@ -1,0 +1,285 @@
+"""Video files by their own stamps and counts: pictures tell their number, so what comes is known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from stamped_videos import number_in, numbered, write
+from test_sources import Clock, replay
+
+from sags_node.calibration.guess import guess_rig
+from sags_node.config import schema as cfg
+from sags_node.errors import SagsError, UsageError
+from sags_node.media.video import Video
+from sags_node.sources.source import open_source
+from sags_node.types import U8, StereoFrame
+
+COUNT = 50
+RATE = 30
+TS = {"format": "mpegts"}
+MPEG2 = {"codec": "mpeg2video", "options": {"bf": "2"}}
+OPEN_GOP = {"options": {"x264-params": "keyint=10:open-gop=1:bframes=3"}}
+REFRESH = {"options": {"x264-params": "intra-refresh=1:keyint=10:bframes=0"}}
+CONTAINERS = {
+    "a.mp4": {}, "a.m4v": {"format": "mp4"}, "a.mov": {"codec": "prores_ks", "pixels": "yuv422p10le"},
+    "a.3gp": {}, "a.mkv": {}, "a.webm": {"codec": "libvpx", "options": {"auto-alt-ref": "1"}}, "a.flv": {},
+    "a.asf": {"codec": "msmpeg4"}, "a.wmv": {"codec": "wmv2", "format": "asf"},
+    "b-frames.avi": {}, "mpeg4.avi": {"codec": "mpeg4", "options": {"bf": "2"}},
+    "mjpeg.avi": {"codec": "mjpeg", "pixels": "yuvj420p"},
+    "a.ts": TS, "A.MTS": TS, "a.m2ts": MPEG2 | TS, "a.vob": MPEG2 | {"format": "vob"},
+    "a.mpg": MPEG2 | {"format": "mpeg"}, "a.mxf": MPEG2 | {"rate": 25},
+    "rgb.mkv": {"codec": "ffv1", "pixels": "bgr0"}, "hevc.mp4": {"codec": "libx265"},
+    "open.mp4": OPEN_GOP, "open.ts": OPEN_GOP | TS, "refresh.ts": REFRESH | TS,
+    "pieces.mp4": {"muxer": {"movflags": "frag_keyframe+empty_moov"}}, "live.mkv": {"muxer": {"live": "1"}},
+    "h.h264": {"format": "h264"},  # no stamps, no header
+}  # fmt: skip
+
+
+def pictures(numbers: range | list[int], eye: int = 0) -> list[U8]:
+    return [numbered(number, eye=eye) for number in numbers]
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_pictures_are_counted_and_found_in_every_container(tmp_path: Path, name: str) -> None:
+    video = Video(write(tmp_path / name, pictures(range(COUNT)), **CONTAINERS[name]))
+    assert video.count == COUNT and video.is_even and video.gaps == [] and not video.cut_off
+    assert video.oddities == [] and video.rate == (25 if name in ("a.mxf", "h.h264") else RATE)
+    shown = [video.read(number) for number in range(COUNT)]
+    assert [number_in(picture) for picture in shown if picture is not None] == list(range(COUNT))
+    assert video.read(COUNT) is None
+    for number in np.random.default_rng(0).permutation(COUNT)[:12].tolist():
+        np.testing.assert_array_equal(video.read(number), shown[number])  # to the bit
+
+
+def pair_of(folder: Path, left: Path, right: Path | None, **geometry: object) -> cfg.VideosSource:
+    return cfg.VideosSource(
+        left=left, right=right, pace="step", geometry=cfg.GeometryConfig.model_validate(geometry)
+    )
+
+
+def played(config: cfg.VideosSource) -> list[StereoFrame]:
+    with open_source(config) as source:
+        return list(source)
+
+
+def numbers_of(frames: list[StereoFrame]) -> list[tuple[int, int]]:
+    return [(number_in(frame.left), number_in(frame.right)) for frame in frames if frame.right is not None]
+
+
+def same(numbers: list[int]) -> list[tuple[int, int]]:
+    return [(number, number) for number in numbers]
+
+
+def eye(file: Path, numbers: list[int], begin: float = 0.0, rate: float = RATE, **how: object) -> Path:
+    """What one eye's recorder kept; every picture has the stamp of its number."""
+    return write(
+        file, pictures(numbers, file.stem == "r"), [begin + number / rate for number in numbers], **how
+    )  # type: ignore[arg-type]
+
+
+ALL = list(range(COUNT))
+
+
+def without(*lost: int) -> list[int]:
+    return [number for number in ALL if number not in lost]
+
+
+def jittered(file: Path, numbers: list[int], seed: int) -> Path:
+    """Stamps of a webcam: up to 6 ms off."""
+    noise = np.random.default_rng(seed).uniform(-0.006, 0.006, COUNT)
+    return write(file, pictures(numbers, file.stem == "r"), [0.1 + n / RATE + noise[n] for n in numbers])
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
+@pytest.mark.parametrize(
+    ("make_left", "make_right", "expected"),
+    [
+        (lambda f: eye(f, without(9, 10, 11)), lambda f: eye(f, without(30, 31)), without(9, 10, 11, 30, 31)),
+        (lambda f: eye(f, without(20)), lambda f: eye(f, without(20)), without(20)),
+        (lambda f: eye(f, without(20)), lambda f: eye(f, ALL, begin=8.0), without(20)),  # two machines
+        (lambda f: eye(f, ALL, begin=3.0), lambda f: eye(f, ALL), ALL),
+        (lambda f: eye(f, ALL, 1.0), lambda f: eye(f, ALL[21:], 1.0), ALL[21:]),  # begun later
+        (lambda f: jittered(f, without(4), 0), lambda f: jittered(f, without(30), 1), without(4, 30)),
+        (lambda f: eye(f, without(5)), lambda f: eye(f, ALL, begin=0.012), without(5)),  # two free clocks
+    ],
+    ids=["lost in both", "lost together", "own zeros, lost", "own zeros", "late", "jitter", "skewed"],
+)  # fmt: skip
+def test_pictures_of_one_moment_are_a_pair(
+    tmp_path: Path,
+    suffix: str,
+    make_left: Callable[[Path], Path],
+    make_right: Callable[[Path], Path],
+    expected: list[int],
+) -> None:
+    left, right = make_left(tmp_path / f"l.{suffix}"), make_right(tmp_path / f"r.{suffix}")
+    frames = played(pair_of(tmp_path, left, right))
+    assert numbers_of(frames) == same(expected)
+    since = np.array([frame.t_capture_ns - frames[0].t_capture_ns for frame in frames]) * 1e-9
+    true = (np.array(expected) - expected[0]) / RATE
+    assert np.abs(since - true).max() < 0.0131  # jitter of two pictures, and whole milliseconds
+
+
+def test_files_of_other_rates_are_refused_also_with_gaps(tmp_path: Path) -> None:
+    left, right = eye(tmp_path / "l.mp4", without(9)), eye(tmp_path / "r.mp4", ALL, rate=25)
+    with pytest.raises(UsageError, match=r"30.0 frames/s but .*25.0; .*ffmpeg -i OLD -r 30 NEW"):
+        open_source(pair_of(tmp_path, left, right))
+
+
+@pytest.mark.parametrize("first", ["left", "right"])
+def test_a_lost_picture_exchanges_no_eyes(tmp_path: Path, first: str) -> None:
+    scope = eye(tmp_path / "scope.mkv", without(17, 30, 31, 32))
+    frames = played(pair_of(tmp_path, scope, None, layout="frame_sequential", first=first))
+    pairs = [(n, n + 1) for n in range(0, COUNT, 2) if n not in (16, 30, 32)]
+    assert numbers_of(frames) == [pair if first == "left" else pair[::-1] for pair in pairs]
+
+
+def test_playing_begins_where_it_is_told_and_keeps_the_files_pace(tmp_path: Path) -> None:
+    """A pause of 20 s: no picture is early, and `source.start` is a time of the file."""
+    seconds = [n / RATE + (20 if n >= 15 else 0) for n in ALL]
+    left, right = (write(tmp_path / f"{s}.mp4", pictures(ALL, s == "r"), seconds) for s in "lr")
+    config = pair_of(tmp_path, left, right)
+    clock = Clock()
+    with replay(config.model_copy(update={"pace": "realtime"}), clock) as source:
+        assert source.rate == RATE and source.frame_count == COUNT
+        began, came = clock.now, []
+        for frame in source:
+            came.append((number_in(frame.left), clock.now - began))
+    assert [number for number, _ in came] == ALL
+    np.testing.assert_allclose([at for _, at in came], seconds, atol=1e-4)
+    for number in (0, 14, 15, 40):
+        (frame,) = played(config.model_copy(update={"start": seconds[number], "frames": 1}))
+        assert (frame.frame_id, number_in(frame.left), number_in(frame.right)) == (number,) * 3
+
+
+def hidden(file: Path) -> Path:
+    """Cut without encoding: an edit list hides the first twelve pictures."""
+    return write(file, pictures(ALL), [(n - 12) / RATE for n in ALL], muxer={"avoid_negative_ts": "disabled"})
+
+
+@pytest.mark.parametrize(
+    ("make", "first"), [(hidden, 12), (lambda file: eye(file, ALL, begin=0.7), 0)], ids=["edit list", "late"]
+)
+@pytest.mark.parametrize("suffix", ["mp4", "mov"])
+def test_what_a_header_says_is_not_believed(
+    tmp_path: Path, make: Callable[[Path], Path], first: int, suffix: str
+) -> None:
+    video = Video(make(tmp_path / f"cut.{suffix}"))
+    assert video.count == COUNT - first and video.is_even and not video.cut_off
+    for number in (0, video.count - 1, 7):
+        picture = video.read(number)
+        assert picture is not None and number_in(picture) == number + first
+
+
+def test_stamps_that_begin_anew_are_passed_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    parts = [write(tmp_path / f"{n}.ts", pictures(ALL[:40])).read_bytes() for n in range(2)]
+    for side in "lr":
+        (tmp_path / f"{side}.ts").write_bytes(b"".join(parts))
+    frames = played(pair_of(tmp_path, tmp_path / "l.ts", tmp_path / "r.ts"))
+    assert numbers_of(frames) == same([*range(40), *range(40)])
+    assert "begin anew near picture" in caplog.text and "by number" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        ("a.mp4", {"muxer": {"movflags": "faststart"}}), ("a.mkv", {}),
+        ("a.avi", {"codec": "mjpeg", "pixels": "yuvj420p"}),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_cut_off_is_told_from_a_whole_one(
+    tmp_path: Path, name: str, how: dict[str, object]
+) -> None:
+    whole = write(tmp_path / name, pictures(range(120)), **how)  # type: ignore[arg-type]
+    assert not Video(whole).cut_off
+    (tmp_path / f"cut-{name}").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    video = Video(tmp_path / f"cut-{name}")
+    assert 0 < video.count < 120 and "cut off" in video.cut_off
+
+
+def test_a_file_whose_pictures_change_size_says_where(tmp_path: Path) -> None:
+    parts = [
+        write(tmp_path / f"{n}.ts", [numbered(n, size)] * 20) for n, size in enumerate([(128, 96), (64, 48)])
+    ]
+    (tmp_path / "both.ts").write_bytes(b"".join(part.read_bytes() for part in parts))
+    video = Video(tmp_path / "both.ts")
+    with pytest.raises(SagsError, match=r"is 64x48 px, the first one 128x96"):
+        for number in range(video.count):
+            video.read(number)
+
+
+RED = (200, 40, 30)
+BT601, BT709, BT2020, LIMITED, FULL = 5, 1, 9, 1, 2
+
+
+@pytest.mark.parametrize(
+    ("size", "matrix", "told", "how"),
+    [
+        ((640, 480), BT601, None, {}), ((1280, 720), BT709, None, {}), ((1350, 1080), BT601, None, {}),
+        ((2560, 720), BT709, None, {}), ((1920, 2160), BT709, None, {}),  # two eyes
+        ((640, 480), BT709, (BT709, LIMITED), {}), ((1280, 720), BT601, (6, LIMITED), {}),
+        ((640, 480), BT709, (BT709, FULL), {}), ((640, 480), BT601, (3, LIMITED), {}),
+        ((640, 480), BT2020, (BT2020, LIMITED), {"codec": "libx265", "pixels": "yuv420p10le"}),
+        ((1280, 720), BT601, None, {"codec": "mjpeg", "pixels": "yuvj420p"}),  # as JPEG says
+        ((1280, 720), None, None, {"codec": "ffv1", "pixels": "bgr0"}),
+    ],
+)  # fmt: skip
+def test_colours_are_those_that_were_encoded(
+    tmp_path: Path,
+    size: tuple[int, int],
+    matrix: int | None,
+    told: tuple[int, int] | None,
+    how: dict[str, str],
+) -> None:
+    """Within 3 of 255: YUV of eight bits, and its compression."""
+    red = np.full((size[1], size[0], 3), RED, np.uint8)
+    picture = Video(write(tmp_path / "a.mkv", [red] * 2, matrix=matrix, told=told, **how)).read(1)  # type: ignore[arg-type]
+    assert picture is not None
+    assert np.abs(picture.reshape(-1, 3).mean(0) - RED).max() < 3
+
+
+@pytest.mark.parametrize(
+    ("size", "layout", "told", "aspect"),
+    [
+        ((320, 180), "side_by_side", None, 2.0),  # eyes of 160x180: half as wide as they were
+        ((320, 180), "side_by_side", Fraction(2), 2.0), ((640, 180), "side_by_side", None, 1.0),
+        ((320, 180), "over_under", None, 0.5), ((320, 256), "over_under", None, 0.5),
+        ((180, 320), "over_under", None, 1.0),
+        ((320, 256), "row_interleaved", None, 0.5), ((320, 256), "side_by_side", Fraction(16, 15), 16 / 15),
+    ],
+)  # fmt: skip
+def test_a_guessed_camera_has_the_pixels_of_the_file(
+    tmp_path: Path, size: tuple[int, int], layout: str, told: Fraction | None, aspect: float
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
+    file = write(tmp_path / "a.mp4", [noise] * 3, aspect=told)
+    K = guess_rig(pair_of(tmp_path, file, None, layout=layout)).left.K
+    assert K[1, 1] / K[0, 0] == pytest.approx(aspect, rel=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_a_picture_that_is_turned_by_the_file_comes_upright(tmp_path: Path, degrees: int) -> None:
+    upright = numbered(11)
+    turned = np.ascontiguousarray(np.rot90(upright, -degrees // 90))
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", RATE)
+        stream.height, stream.width = turned.shape[:2]
+        stream.set_display_rotation(degrees)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(turned, "rgb24")))
+        container.mux(stream.encode())
+    video = Video(tmp_path / "a.mp4")
+    picture = video.read(0)
+    assert picture is not None and video.size == (upright.shape[1], upright.shape[0])
+    assert np.abs(picture.astype(int) - upright).mean() < 3
+
+
+def test_a_name_that_looks_like_an_address_or_a_pattern_is_a_name(tmp_path: Path) -> None:
+    for name in ("http:a.mp4", "a%03d.mp4", "pipe:1.mkv", "a b#é.mp4"):
+        assert Video(write(tmp_path / "x.mp4", pictures([7])).rename(tmp_path / name)).count == 1
+    (tmp_path / "list.mp4").write_text(f"#EXTM3U\n#EXTINF:1,\n{tmp_path / 'http:a.mp4'}\n#EXT-X-ENDLIST\n")
+    with pytest.raises(UsageError, match="cannot be read as a video"):
+        Video(tmp_path / "list.mp4")
