@@ -60,7 +60,7 @@ mapping:
 - A missing key has its default.
 - Paths in a file are relative to the file. Paths on the command line are relative to the folder that you are
   in.
-- `$NAME` in a file is an environment variable. `$SAGS_DATA` need not be set. It is then
+- `$NAME` in a file is an environment variable, `$$` is a dollar. `$SAGS_DATA` need not be set. It is then
   `../shared/data`, seen from the folder above the launch file's.
 - The topic `parameters` shows the configuration of a running node.
 """

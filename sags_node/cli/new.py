@@ -45,7 +45,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
     sags new left.mp4 right.mp4 rig:=calib/mine
     sags new /dev/video0 source.width:=1920 source.height:=1080
     """
-    from sags_node.config.launch_file import load_launch, tree_of
+    from sags_node.config.launch_file import load_launch, tree_of, written_in
     from sags_node.doctor import examine
     from sags_node.importing.proposal import propose
 
@@ -69,14 +69,15 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
     people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
     wrong = any(finding.level == "error" for finding in found.findings)
     if not wrong:
-        tree = _beside(tree_of(found.launch), file)
+        tree = written_in(file.parent, tree_of(found.launch))
         with whole(file, new=is_new) as partial:
             partial.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        load_launch(file)  # it is said to play: this says why not, if it does not
     show({"launch": None if wrong else str(file), "found": rows} if json_out else text.rows_table(people))
     if wrong:
         raise SagsError(f"{named[0]} cannot be played as it is; see the fixes above")
-    where, quoted = escape(str(file)), escape(shlex.quote(str(file)))
-    console.print(f"launch file: [bold]{where}[/]; play it: sags run {quoted}", soft_wrap=True)
+    where = escape(shlex.quote(str(file)))
+    console.print(f"launch file: [bold]{where}[/]; play it: sags run {where}", soft_wrap=True)
 
 
 def _asked(out: Path | None) -> tuple[list[Path], Path | None]:
@@ -97,18 +98,3 @@ def _paths(said: str) -> list[Path]:
     except ValueError as error:
         raise UsageError(f"{said}: {error}; close the quotes") from None
     return [Path(word) for word in words]
-
-
-def _beside(tree: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Paths as a launch file there reads them: from its folder if they lie below it, else from the root."""
-    folder = file.resolve().parent
-
-    def moved(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: moved(each) for key, each in value.items()}
-        if not isinstance(value, str) or not os.path.exists(value):
-            return value
-        path = Path(value).resolve() if not value.startswith("/dev/") else Path(value)
-        return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
-
-    return {section: moved(value) for section, value in tree.items()}

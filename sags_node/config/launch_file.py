@@ -31,7 +31,10 @@ COMMAND_LINE = "command line"
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 UNFINISHED = ".bag.active"  # of ROS 1, while it is recorded
-VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".wmv")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".m4v", ".mov", ".3gp", ".avi", ".mkv", ".webm", ".wmv", ".asf", ".flv", ".ogv", ".mxf", ".dv"),
+    *(".mpg", ".mpeg", ".vob", ".ts", ".mts", ".m2ts"),
+)
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
 SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
 
@@ -123,6 +126,28 @@ def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
     for override in overrides:
         _apply_override(tree, override)
     return tree
+
+
+def written_in(
+    folder: Path, tree: Mapping[str, Any], path_keys: frozenset[str] = _PATH_KEYS
+) -> dict[str, Any]:
+    """What a launch file in this folder must say to be read as this tree: paths from there if they lie below
+    it, else from the root, and $$ for each $."""
+
+    def said(key: str, value: Any) -> Any:
+        if isinstance(value, dict):
+            is_live = key == "source" and value.get("kind") in _LIVE_PATHS
+            return written_in(folder, value, _LIVE_PATHS[value["kind"]] if is_live else path_keys)
+        if isinstance(value, list):
+            return [said(key, item) for item in value]
+        if not isinstance(value, str):
+            return value
+        if key in path_keys:
+            path, here = Path(value).resolve(), folder.resolve()
+            value = str(path.relative_to(here) if path.is_relative_to(here) else path)
+        return value.replace("$", "$$")
+
+    return {key: said(key, value) for key, value in tree.items()}
 
 
 def section_of(kind: type[S], overrides: Sequence[str]) -> S:
@@ -225,9 +250,14 @@ def _resolve_paths(tree: dict[str, Any], folder: Path, path_keys: frozenset[str]
 def _resolve(
     key: str, value: str, folder: Path, variables: Mapping[str, str], path_keys: frozenset[str]
 ) -> str:
-    expanded = Template(value).safe_substitute(variables)
-    if "$" in expanded and key in path_keys:
-        raise UsageError(f"{key}: {value} uses a variable that is not set; export it first")
+    template = Template(value)
+    unset = [name for name in template.get_identifiers() if name not in variables]
+    if unset and key in path_keys:
+        raise UsageError(
+            f"{key}: {value} uses a variable that is not set; export {unset[0]} first, or write $$ where a "
+            "name has a $"
+        )
+    expanded = template.safe_substitute(variables)
     return str(folder / expanded) if key in path_keys else expanded
 
 

@@ -129,12 +129,11 @@ def _file(file: Path) -> list[Finding]:
             found.append(Finding("error", f"{file.name}: {video.cut_off}", "copy it again"))
         if video.gaps:
             before, missing = video.gaps[0]
-            at = "" if video.stamps is None else f", {(video.stamps[before] - video.stamps[0]) * 1e-9:.2f} s"
+            many = "a gap" if len(video.gaps) == 1 else f"{len(video.gaps)} gaps, the first"
             what = (
-                f"{file.name}: {len(video.gaps)} gap{'s' * (len(video.gaps) > 1)} in its stamps, the first "
-                f"behind picture {before}{at}: so long as {missing} pictures"
+                f"{file.name}: its stamps have {many} behind picture {before}, as long as {missing} pictures"
             )
-            fix = "paired and played by the stamps: were they lost, or was the recording paused?"
+            fix = "it is played by its stamps: were pictures lost, or was the recording paused?"
             found.append(Finding("warning", what, fix))
         return found
 

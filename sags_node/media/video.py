@@ -31,9 +31,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_PIXELS = 64 << 20
+ONE_THREAD = 2_500_000  # px: full HD takes one thread a quarter of its time; more threads cost more in all
 THREADS = min(4, os.cpu_count() or 1)
 REORDERED = 32  # pictures that a codec may hold back to show others first
 LONGEST_PAUSE = 600.0  # s between two pictures; beyond, the stamps are of different clocks
+LARGE = 1 << 22  # bytes of a picture from which on NumPy's pages cost more than FFmpeg's
 SAME = 1_000_000  # ns: stamps of most containers are whole milliseconds
 FAR = 8  # pictures; what is nearer is decoded, not sought
 SHORT = 1.0  # s that a file may end before its header says so
@@ -164,13 +166,14 @@ class Video:
         usual = 1e9 / float(
             np.mean(steps[steps < 1.5 * np.median(steps)])
         )  # stamps may be whole milliseconds
-        return next((rate for rate in told if abs(rate - usual) < 0.01 * usual), usual), False
+        return next((rate for rate in reversed(told) if abs(rate - usual) < 0.01 * usual), usual), False
 
     def _restart(self) -> av.VideoFrame | None:
         """From the beginning; the first picture, decoded."""
         self._container, self._stream = _opened(self.path)
         self._stream.thread_type = "AUTO"
-        self._stream.thread_count = THREADS
+        small = self._stream.width * self._stream.height <= ONE_THREAD
+        self._stream.thread_count = 1 if small else THREADS
         return self._begin(is_sought=False)
 
     def _begin(self, is_sought: bool) -> av.VideoFrame | None:
@@ -249,7 +252,8 @@ class Video:
         picture = rgb.to_ndarray()
         if self._turn is not None:
             picture = cv2.rotate(picture, self._turn)
-        return picture.astype(np.uint8, copy=False)
+        # FFmpeg's memory goes back at once, to be used again: new pages cost more than a small copy.
+        return picture.astype(np.uint8, copy=picture.nbytes < LARGE)
 
 
 def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,7 +95,8 @@ class NodeAddress:
         if connection.recording is not None:
             raise SagsError(
                 f"a recording is played as '{self.ns}': it takes no requests, so it holds no anchors and no "
-                f"views; a node does, with the recording's pictures: sags run {connection.recording}"
+                f"views; a node does, with the recording's pictures: sags run "
+                f"{shlex.quote(str(connection.recording))}"
             )
         if connection.control is None:
             raise SagsError(f"the node '{self.ns}' has no control socket; start it with publish.control set")

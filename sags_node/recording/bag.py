@@ -6,6 +6,7 @@ false length nor an index that lies can take memory; db3 and ROS 1 files are rea
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -129,7 +130,7 @@ def _explained(file: Path) -> Iterator[None]:
     except OSError as error:
         raise SagsError(f"cannot read {file}: {error.strerror}") from None
     except DamagedError as error:
-        fix = f"save what is whole with: sags bag recover {file} -o OUT"
+        fix = f"save what is whole with: sags bag recover {shlex.quote(str(file))} -o OUT"
         if file.suffix != ".mcap":
             fix = "copy it again, or fix it with its own tools (rosbag reindex, sqlite3 .recover)"
         raise SagsError(f"{file} is {error}; {fix}") from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -174,7 +175,7 @@ class RecorderProcess:
             child.kill()
             raise SagsError(
                 f"the recorder did not finish in {FINISH_SECONDS:g} s and was ended; save what it wrote "
-                f"with: sags bag recover {child.folder} -o OUT"
+                f"with: sags bag recover {shlex.quote(str(child.folder))} -o OUT"
             ) from None
 
     def _stop_if_running(self) -> None:

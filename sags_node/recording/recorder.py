@@ -7,6 +7,7 @@ counted, and so is what never arrived (gaps in `seq`).
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import threading
 import time
@@ -270,5 +271,6 @@ def _told(folder: Path, error: Exception) -> SagsError:
         log.error("writing %s failed", folder, exc_info=error)
         what = f"{type(error).__name__}: {error}"
     return SagsError(
-        f"cannot write {folder}: {what}; save what is there with: sags bag recover {folder} -o OUT"
+        f"cannot write {folder}: {what}; save what is there with: sags bag recover "
+        f"{shlex.quote(str(folder))} -o OUT"
     )

@@ -14,6 +14,7 @@ from places import SESSION
 from user_files import write_video
 
 from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import VideosSource
 from sags_node.errors import UsageError
 from sags_node.importing.proposal import propose
 from sags_node.sources.source import open_source
@@ -93,3 +94,30 @@ def test_what_cannot_be_played_gets_no_file(tmp_path: Path) -> None:
     refused(1, "new", "/dev/no-camera", "-o", file, said=("/dev/no-camera", "does not exist"))
     with pytest.raises(UsageError, match="two of one kind"):
         propose([left, right, left])
+
+
+@pytest.mark.parametrize("name", ["data$", "a $SAGS_DATA b", "${HOME}", "$$", "videos", "bag"])
+def test_a_path_is_a_path_and_a_word_a_word(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Names with a dollar, and folders that are called as values of keys are."""
+    left, right = videos(tmp_path / name, LEFT, RIGHT)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "step").mkdir()
+    code, _, said = ran("new", f"{name}/a.mp4", f"{name}/b.mp4", "source.pace:=step", "-o", "my own.yaml")
+    assert code == 0 and "sags run 'my own.yaml'" in said
+    for place in (tmp_path, Path("/")):
+        monkeypatch.chdir(place)
+        source = load_launch(tmp_path / "my own.yaml").source
+        assert isinstance(source, VideosSource) and source.pace == "step"
+        assert (source.left, source.right) == (left, right)
+
+
+def test_a_variable_that_is_not_set_says_how_a_dollar_is_written(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("source: {kind: videos, left: $gone/a.mp4, right: b.mp4}\n")
+    with pytest.raises(UsageError, match=r"export gone first, or write \$\$"):
+        load_launch(tmp_path / "a.yaml")
+    (tmp_path / "a.yaml").write_text("source: {kind: videos, left: $$gone/a.mp4, right: c$.mp4}\n")
+    source = load_launch(tmp_path / "a.yaml").source
+    assert isinstance(source, VideosSource)
+    assert (source.left, source.right) == (tmp_path / "$gone/a.mp4", tmp_path / "c$.mp4")

@@ -15,6 +15,7 @@ from test_sources import Clock, replay
 from sags_node.calibration.guess import guess_rig
 from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
+from sags_node.importing.check import check_folder
 from sags_node.media.video import Video
 from sags_node.sources.source import open_source
 from sags_node.types import U8, StereoFrame
@@ -283,3 +284,21 @@ def test_a_name_that_looks_like_an_address_or_a_pattern_is_a_name(tmp_path: Path
     (tmp_path / "list.mp4").write_text(f"#EXTM3U\n#EXTINF:1,\n{tmp_path / 'http:a.mp4'}\n#EXT-X-ENDLIST\n")
     with pytest.raises(UsageError, match="cannot be read as a video"):
         Video(tmp_path / "list.mp4")
+
+
+def test_the_check_says_what_stamps_and_pixels_say(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    scene = rng.integers(0, 255, (96, 148, 3), np.uint8)
+    moving = [np.roll(scene, number, axis=0) for number in range(COUNT)]
+    for name, shift, lost in (("left.MTS", 0, 9), ("right.MTS", 8, 30)):
+        shown = [(n, np.ascontiguousarray(moving[n][:, shift : shift + 128])) for n in without(lost)]
+        write(
+            tmp_path / name, [picture for _, picture in shown], [n / RATE for n, _ in shown],
+            format="mpegts", aspect=Fraction(4, 3),
+        )  # fmt: skip
+    found = check_folder(tmp_path)
+    said = "\n".join(each.what for each in found)
+    assert "error" not in {each.level for each in found} and " late" not in said
+    assert "left.MTS: its stamps have a gap behind picture 8, as long as 1 pictures" in said
+    assert "1 and 1 pictures have no partner at their time" in said
+    assert "pixels are 1.33 times as wide as high" in said
