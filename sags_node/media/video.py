@@ -42,6 +42,7 @@ SHORT = 1.0  # s that a file may end before its header says so
 # Sizes of HD television, which is BT.709. Untagged pictures of any other size are BT.601: old television, and
 # what FFmpeg and OpenCV make of RGB pictures whatever their size.
 HD = {(1280, 720), (1440, 1080), (1920, 1080), (2048, 1080), (3840, 2160), (4096, 2160)}
+BROKEN = (av.FFmpegError, IndexError)  # where a file breaks off; where another stream begins in it: PyAV
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
 _MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
 _TURNS = {
@@ -136,7 +137,8 @@ class Video:
             if self.cut_off:
                 log.warning("%s %s; copy it again", self.path, self.cut_off)
             return None
-        if number < self._at or self._key_of(number) > self._at + FAR:
+        is_past = number < self._at or (number == self._at and self._frame is None)
+        if is_past or self._key_of(number) > self._at + FAR:
             self._jump(number)
         while self._at < number:
             if self._decode() is None:
@@ -224,7 +226,7 @@ class Video:
         begun = not is_sought
         while True:
             packet: av.Packet[av.VideoStream] | None = None  # the end
-            with suppress(av.FFmpegError):
+            with suppress(*BROKEN):
                 packet = next(packets, None)
             if packet is not None and packet.size == 0:
                 continue  # a picture that a capture card dropped; or the end
@@ -271,6 +273,9 @@ def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
     if not streams:
         container.close()
         raise UsageError(f"{path} cannot be read as a video: it holds no pictures; is it the right file?")
+    if streams[0].codec_context is None:
+        container.close()
+        raise UsageError(f"{path} cannot be read as a video: its codec is not known; convert it to H.264")
     for stream in container.streams:
         if stream is not streams[0]:
             stream.discard = Discard.all
@@ -289,7 +294,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         keys: list[tuple[int, int, int]] = []
         ticks: list[int] = []  # when packets are decoded
         total = 0
-        with suppress(av.FFmpegError):  # where it is cut off
+        with suppress(*BROKEN):
             for packet in container.demux(stream):
                 total += packet.size > 0
                 ticks += [] if packet.dts is None else [packet.dts]
