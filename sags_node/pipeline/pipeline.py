@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
     from sags_node.mapping.sags_mapper import SagsMapper
 
 UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
+GAP = 3.0  # usual steps between two frames: beyond, frames have failed to come
 NOTICED_LATE = HALVING  # m: what was measured before matches are found to be wrong may be wrong by so much
 
 
@@ -134,7 +137,9 @@ class Pipeline:
         self.newest: FrameResult | None = None
         self.held = ""
         self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
-        self._unwatched = 0.0  # m: how far tissue may have moved in frames that were held since
+        self._unwatched = 0.0  # m: how far tissue may have moved while no frame was taken in
+        self._came_ns: int | None = None  # when the last frame was captured
+        self._steps: deque[float] = deque(maxlen=15)  # s between the last ones
 
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch.
@@ -151,6 +156,7 @@ class Pipeline:
         self._scene.forget()
         self._still.forget()
         self.newest = self._last = None
+        self._came_ns = None
         self._unwatched = 0.0
 
     def anchor_confidence(self, anchor_id: int) -> float:
@@ -204,6 +210,7 @@ class Pipeline:
 
     def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:
         plan, clock = budget.start(request.waited), Stopwatch()
+        self._note_gap(frame.t_capture_ns)
         with clock("rectify"):
             pair = self._rectified(frame)
         self._on_rectified(pair, self._epoch(frame))
@@ -293,6 +300,15 @@ class Pipeline:
         last = repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, anchors)
         held = doubted(last, self._unwatched)
         return replace(held, observation=observation, skipped={what: why}, held=why, hurried=False)
+
+    def _note_gap(self, t_capture_ns: int) -> None:
+        """Where no frame has come for longer than is usual, nobody watched the tissue."""
+        before, self._came_ns = self._came_ns, t_capture_ns
+        seconds = 1e-9 * (t_capture_ns - before) if before is not None else 0.0
+        if self._steps and seconds > GAP * median(self._steps):
+            self._unwatched = max(self._unwatched, UNWATCHED * seconds)
+        elif seconds > 0:
+            self._steps.append(seconds)
 
     def _in_usual_light(self, pair: RectifiedPair, judged: Judgement) -> RectifiedPair:
         """The pair in the exposure that the model has."""

@@ -15,6 +15,7 @@ from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import as_float
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
+from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.messaging.content import OF_THE_MODEL, tells_of
 from sags_node.node.operations import NodeState, Operations
 from sags_node.pipeline.pipeline import NOTICED_LATE, Pipeline
@@ -286,3 +287,15 @@ def test_a_frame_without_its_pose_is_shown_by_no_new_model(
         assert result.views["left"].rgb is first.views["left"].rgb
     again = pipeline.process(frames[3], StepBudget(2))
     assert not again.held and again.epoch == first.epoch + 1
+
+
+def test_where_no_frame_comes_depth_is_doubted_as_where_none_is_taken_in(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    """A camera that is away for 0.8 s, and then one eye alone: nothing was measured since."""
+    last = replace(frames[FIRST + COUNT], right=black(frames[FIRST + COUNT].right))
+    for gone, doubted in ((0, False), (COUNT, True)):
+        there = frames[: FIRST + COUNT - gone]
+        results, _, _ = play(session, [*there, last])
+        before, after = (np.median(each.snapshot.gaussians.depth_errors) for each in results[-2:])
+        assert (after > before + 0.9 * UNWATCHED * 0.1 * COUNT) == doubted
