@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
 log = logging.getLogger(__name__)
-OF_THE_NODE = frozenset({"torch", "cv2", "open3d", "onnxruntime", "numba", "PIL", "mcap", "lz4", "zstandard"})
+OF_THE_NODE = frozenset("torch cv2 open3d onnxruntime numba PIL mcap lz4 zstandard av".split())
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
 
 

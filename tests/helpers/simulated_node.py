@@ -282,9 +282,8 @@ class Run:
         patch.setattr(node, "configure_threads", lambda _: None)
         patch.setattr(publisher, "zmq", self._network)
         patch.setattr(publisher, "Peers", _Peers)
-        patch.setattr(
-            views.Views.__init__, "__defaults__", (self.world.monotonic, self.world.monotonic, lambda: 0.0)
-        )
+        defaults = self.world.monotonic, self.world.monotonic, lambda: 0.0, "numba"
+        patch.setattr(views.Views.__init__, "__defaults__", defaults)
         patch.setattr(sys.modules["sags_node.messaging.node_clock"], "time", self.world)
 
     def _note(self, result: FrameResult, latency_ms: float) -> None:

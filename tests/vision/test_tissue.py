@@ -47,7 +47,7 @@ def test_no_method_uses_every_pixel_but_the_boxes() -> None:
     assert (~mask).sum() == 25
 
 
-@pytest.mark.parametrize("box", [(-1, 0, 5, 5), (670, 0, 6, 5), (0, 0, 0, 5), (0, 539, 5, 2)])
+@pytest.mark.parametrize("box", [(670, 0, 6, 5), (0, 0, 0, 5), (0, 539, 5, 2)])
 def test_a_box_outside_the_picture_is_refused(box: tuple[int, int, int, int]) -> None:
     with pytest.raises(UsageError, match="675x540"):
         TissueMask(TissueConfig(exclude=(box,)), Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512))
