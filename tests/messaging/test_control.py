@@ -138,7 +138,7 @@ def test_what_has_failed_is_not_done_later(tmp_path: Path) -> None:
                 asker.request("pause", timeout=0.2)
             with repeating(lambda _: running.poll(20)):
                 assert asker.request("ping", timeout=60) == "pong"
-                with pytest.raises(SagsError, match="no answer"):
+                with pytest.raises(SagsError, match=r"no answer|not begun in the time"):  # whoever is first
                     asker.request("reset_model", timeout=0.2)
                 until(posted[0].cancelled)
                 waiting.serve()

@@ -234,7 +234,7 @@ def test_a_flood_of_requests_does_not_slow_others(tmp_path: Path) -> None:
             with ControlClient(running.connection.control) as asker:
                 for _ in range(100):
                     assert asker.request("pause", timeout=60) == "done"
-                with pytest.raises(SagsError, match="no answer"):  # it waits, and is not refused
+                with pytest.raises(SagsError, match=r"no answer|not begun in the time"):  # not refused
                     asker.request("wait", timeout=0.2)
         served = sum(one["ok"] for one in answers)
         assert served <= BURST + RATE * (time.monotonic() - began)
