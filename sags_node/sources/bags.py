@@ -117,7 +117,7 @@ class BagPairs:
         self.rate: float | None = (
             float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else None
         )
-        self.findings = judge_stamps(self._keys, self.stamps, self.rate, (len(left), len(right)))
+        self.judged = judge_stamps(self._keys, self.stamps, self.rate, (len(left), len(right)))
         self._layout = Layout(config.geometry)
         self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
         self._size: tuple[int, int] | None = None

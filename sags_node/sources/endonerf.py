@@ -59,7 +59,7 @@ class EndoNerfPairs:
         self.count = self._pictures.count
         self._next = 0
         self._T_world_cam = self._llff.T_world_cam
-        self.findings: tuple[Finding, ...] = ()
+        self.judged: tuple[Finding, ...] = ()
         self._check_camera(folder)
         if (folder / "depth").is_dir():
             pairs = pair_files((folder / "images", folder / "depth"), numbered=True)
@@ -84,7 +84,7 @@ class EndoNerfPairs:
         if said == "auto" and axes != "opencv":
             what = f"poses_bounds.npy: of two frames with depth the poses fit as {axes}, and are read so"
             fix = f"set source.pose_axes:={axes} if that is right, or opencv"
-            self.findings = (Finding("warning", what, fix),)
+            self.judged = (Finding("warning", what, fix),)
 
     def _look(self, index: int) -> Seen:
         self.seek(index)

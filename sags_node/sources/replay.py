@@ -73,7 +73,7 @@ class Replay:
 
     Attributes:
         first: number of the first frame.
-        findings: what is odd about its stamps or poses.
+        judged: what is odd about its stamps or poses, as `sags import --check` says it.
         pairs: what is read.
         pixel_aspect: width of a pixel over its height, as far as the recording says it.
         oddities: what is to be said of its files, each with a remedy after a semicolon.
@@ -119,7 +119,7 @@ class Replay:
             self._stamps = None if stamps is None else stamps[:: config.stride]
         # The recording's own stamps of the left pictures, ns: by them poses of the same recording are found.
         self._recorded = self.pairs.stamps[:: config.stride, 0] if isinstance(self.pairs, BagPairs) else None
-        self.findings = self.pairs.findings if isinstance(self.pairs, BagPairs | EndoNerfPairs) else ()
+        self.judged = self.pairs.judged if isinstance(self.pairs, BagPairs | EndoNerfPairs) else ()
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0

@@ -22,7 +22,7 @@ from sags_node.importing.check import check_folder
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
-from sags_node.sources.source import open_source
+from sags_node.sources.source import findings_of, open_source
 from sags_node.types import U8, StereoFrame
 
 WIDTH, HEIGHT, FOCAL = 160, 128, 150.0
@@ -149,6 +149,7 @@ def test_poses_are_read_as_they_explain_the_pictures(
     assert (f"fit as {tool}" in caplog.text) is (tool != "opencv")
     with session.source as source:
         poses = [frame.T_world_cam for frame in source]
+        assert findings_of(source) == ()  # it was said; a node warns of what goes on
     for number, T in enumerate(poses):
         assert T is not None
         moved = np.linalg.inv(poses[0]) @ T

@@ -40,7 +40,7 @@ class Long(BagPairs):
     """The pairs of a recording that nobody has to write."""
 
     def __init__(self, count: int, rate: float, stamps: Any = None) -> None:
-        self.count, self.rate, self.findings = count, rate, ()
+        self.count, self.rate, self.judged = count, rate, ()
         if stamps is not None:
             self.stamps = stamps
 
