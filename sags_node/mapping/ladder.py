@@ -78,7 +78,8 @@ class Prices:
 USED = 0.82  # of the Gaussians that a rung allows: so many a model has, the rest is room for what appears
 # Two cores of one machine, by 18 runs at three working sizes (`benchmarks/ladder.md`).
 ON_CPU = Prices(every_frame=8.5, depth=3.0, worked=0.8, drawn=3.6, stepped=2.4, per_thousand=0.33)
-# One H200 beside 16 cores, by five runs (`benchmarks/gpu.md`); they took 1.1 to 1.3 times as long.
+# One H200 beside 16 cores, by five runs (`benchmarks/gpu.md`), which took 1.07 to 1.12 times as long. Not run
+# on a card since.
 ON_GPU = Prices(every_frame=8.5, depth=5.0, worked=0.8, drawn=3.6, stepped=1.2, per_thousand=0.08)
 FULL = 640 * 512  # px
 

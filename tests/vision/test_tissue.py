@@ -53,6 +53,11 @@ def test_a_box_outside_the_picture_is_refused(box: tuple[int, int, int, int]) ->
         TissueMask(TissueConfig(exclude=(box,)), Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512))
 
 
+def test_a_box_that_begins_outside_is_refused_by_the_configuration() -> None:
+    with pytest.raises(UsageError, match=r"vision\.tissue\.exclude.*greater than or equal to 0"):
+        load_launch(None, ["vision.tissue.exclude:=[[-1,0,5,5]]"])
+
+
 def test_masks_upside_down_are_refused_with_a_hint() -> None:
     tissue = np.zeros((540, 675), np.bool_)
     tissue[200:300, 400:] = True
