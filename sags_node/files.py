@@ -18,6 +18,7 @@ from typing import BinaryIO
 from sags_node.errors import SagsError, UsageError
 
 LARGEST_RESULT = 64 << 20  # bytes of figures as JSON
+_checked: set[Path] = set()  # asked for without --force: what comes there before `whole` has ended stays
 _KINDS = (
     (stat.S_ISDIR, "it is a folder"),
     (stat.S_ISFIFO, "it is a pipe, no file"),
@@ -84,10 +85,11 @@ def whole(path: Path, new: bool = False) -> Iterator[Path]:
     nothing of it is left, and what stood at `path` stays.
 
     Args:
-        new: it takes the place of no other file, also of none that comes while it is written.
+        new: it takes the place of no other file. After `check_file` or `check_results` it takes none's but
+            of what they allow. Both hold for a file that comes while it is written, too.
 
     Raises:
-        SagsError: it cannot be written, or is there already.
+        SagsError: it cannot be written, or another file is there.
     """
     target = path.resolve()  # through a link, not over it
     if new and target.exists():
@@ -95,9 +97,15 @@ def whole(path: Path, new: bool = False) -> Iterator[Path]:
     with writing(path), tempfile.TemporaryDirectory(prefix=".sags-", dir=target.parent) as passing:
         partial = Path(passing) / path.name
         yield partial
-        if new:
-            target.open("xb").close()  # only one can make it
+        if (new or target in _checked) and not partial.is_dir():  # which replaces nothing but an empty folder
+            try:
+                target.open("xb").close()  # only one can make it
+            except FileExistsError:
+                if new or not is_result(target):
+                    said = "exists now: another program wrote it meanwhile, and it was left as it is"
+                    raise SagsError(f"{path} {said}; choose another name, or remove it") from None
         partial.replace(target)
+        _checked.discard(target)  # from now on it is ours
 
 
 def check_folder(folder: Path) -> None:
@@ -123,6 +131,9 @@ def check_file(file: Path, force: bool | None = None) -> None:
         SagsError: it cannot be written.
     """
     check_folder(file.parent)
+    _checked.discard(file.resolve())
+    if not force:
+        _checked.add(file.resolve())
     with writing(file):
         if not file.exists():
             return
@@ -150,6 +161,7 @@ def check_results(folder: Path, names: Sequence[str], ours: bool) -> None:
         raise UsageError(
             f"{folder / there[0]} exists already and is no earlier result; choose another folder"
         )
+    _checked.update((folder / name).resolve() for name in names if name not in there)
 
 
 def is_result(file: Path) -> bool:

@@ -21,7 +21,7 @@ from typing import Any
 from fsspec.core import url_to_fs
 
 from sags_node.errors import SagsError, UsageError, brief
-from sags_node.files import whole
+from sags_node.files import check_file, whole
 
 COLUMNS = ("recording", "rig", "overrides", "weight", "segment")
 PARQUET = ".parquet"
@@ -166,6 +166,9 @@ def check_manifest(url: str, force: bool) -> None:
     """
     if not url.endswith(SUFFIXES):
         raise UsageError(f"{url}: a manifest is a {' or '.join(SUFFIXES)} file")
+    if not is_url(url):
+        check_file(Path(url), force)
+        return
     try:
         fs, path = url_to_fs(url)
         there = fs.exists(path)

@@ -55,7 +55,6 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
         named, out = _asked(out)
     file = out or Path(f"{named[0].resolve().stem}.yaml")
     check_file(file, force)
-    is_new = not file.exists()
     with console.status("looking at the pictures"):
         found = propose(named, [word for word in words if ":=" in word])
     rows: list[dict[str, Any]] = [asdict(finding) for finding in found.findings]
@@ -70,7 +69,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
     wrong = any(finding.level == "error" for finding in found.findings)
     if not wrong:
         tree = written_in(file.parent, tree_of(found.launch))
-        with whole(file, new=is_new) as partial:
+        with whole(file) as partial:
             partial.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
         load_launch(file)  # it is said to play: this says why not, if it does not
     show({"launch": None if wrong else str(file), "found": rows} if json_out else text.rows_table(people))

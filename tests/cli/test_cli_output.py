@@ -8,6 +8,7 @@ import re
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from ctypes.util import find_library
 from datetime import datetime
@@ -21,7 +22,9 @@ from places import ROOT
 from user_files import videos
 
 from sags_node.cli.main import main
+from sags_node.errors import SagsError
 from sags_node.evaluation.report import check_report
+from sags_node.files import check_file, check_results, whole
 from sags_node.terminal import console as terminal
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
@@ -105,6 +108,55 @@ def test_no_command_overwrites_in_a_folder_what_it_did_not_make(
     (tmp_path / name).write_text("mine")
     refused(2, *command, option, tmp_path, said=(str(tmp_path / name), "exists already", "choose another"))
     assert (tmp_path / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (("calib", "convert", ROOT / "calib/d4d", "--out", "."), "right.yaml"),
+        (("archive", "scan", "SESSION", "--out", "list.csv"), "list.csv"),
+        (("export", "--session", "SESSION", "source.frames:=1", "--splats", "splats.ply"), "splats.ply"),
+        (("export", "--session", "SESSION", "source.frames:=1", "--tracks", "t.npz"), "t.npz"),
+    ],
+)
+def test_no_command_overwrites_what_comes_while_it_works(
+    tmp_path: Path,
+    phantom_session: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: tuple[Any, ...],
+    name: str,
+) -> None:
+    class Meanwhile(tempfile.TemporaryDirectory[str]):
+        def __enter__(self) -> str:
+            Path(name).write_text("theirs")
+            return super().__enter__()
+
+    monkeypatch.chdir(tmp_path)
+    said = [phantom_session if word == "SESSION" else word for word in command]
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "TemporaryDirectory", Meanwhile)
+        refused(1, *said, said=(name, "another program wrote it meanwhile", "choose another name"))
+    assert [file.name for file in tmp_path.iterdir()] == [name] and Path(name).read_text() == "theirs"
+    Path(name).unlink()
+    assert sags(*said).exit_code == 0 and Path(name).read_bytes() != b"theirs"
+
+
+def test_figures_and_results_of_before_are_replaced_also_when_they_come_late(tmp_path: Path) -> None:
+    file, result = tmp_path / "out.json", '{"provenance": "another run beside this one"}'
+    check_file(file)
+    with whole(file) as partial:
+        file.write_text(result)
+        partial.write_text("new")
+    assert file.read_text() == "new"
+    check_results(tmp_path, ("figures.json",), ours=False)
+    with pytest.raises(SagsError, match="meanwhile"), whole(tmp_path / "figures.json") as partial:
+        partial.write_text("new")
+        (tmp_path / "figures.json").write_text("theirs")
+    check_file(file, force=True)
+    with whole(file) as partial:
+        file.write_text("theirs")
+        partial.write_text("told to")
+    assert file.read_text() == "told to"
 
 
 def test_every_command_spells_its_options_alike() -> None:
