@@ -215,6 +215,8 @@ class Publisher:
             self._seq[topic] = self._seq.get(topic, self._view_seq) + 1
             if drawn.still or body.type == topics.CAMERA_INFO:
                 self._kept[topic] = _Kept(body, shown.t_capture_ns, shown.frame_id, drawn.epoch, ahead_ns)
+            else:
+                self._kept.pop(topic, None)  # of when it was drawn once
             if self.wanted(topic):
                 self._send(topic, body, shown.frame_id, shown.t_capture_ns, drawn.epoch, ahead_ns)
 

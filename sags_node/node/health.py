@@ -108,6 +108,12 @@ class Statistics:
         last = self._published[-1] if self._published else self._resumed
         return now - last > WAITING_AFTER
 
+    @property
+    def flowing(self) -> bool:
+        """Whether frames come, since the last pause."""
+        with self._lock:
+            return bool(self._published) and not self._is_waiting(time.monotonic())
+
     def resume(self) -> None:
         """After a pause the time without frames says nothing."""
         with self._lock:

@@ -278,7 +278,6 @@ class Node:
             if scene is not None:
                 for name, drawn in self._state.views.draw_due(scene, self._watched):
                     self._hand_over_view(name, drawn)
-                self._state.scene = scene
             self._operations.for_drawing.serve()
         self._operations.for_drawing.serve()
 

@@ -34,7 +34,6 @@ class NodeState:
     pipeline: Pipeline  # of the mapping thread
     budget: Budget  # of the mapping thread
     views: Views  # of the drawing thread
-    scene: FrameResult | None = None  # drawn last; of the drawing thread
     statistics: Statistics = field(default_factory=Statistics)
     paused: threading.Event = field(default_factory=threading.Event)
     parameters_changed: threading.Event = field(default_factory=threading.Event)
@@ -92,7 +91,6 @@ class Operations:
 
     def _reset_model(self) -> dict[str, Any]:
         self._state.pipeline.reset()
-        self._state.scene = None  # a view that is opened now waits for the new model
         return {}
 
     def _pause(self) -> dict[str, Any]:
@@ -136,11 +134,18 @@ class Operations:
         request = parse(ViewRequest, args)
         if request.ahead_ms:
             self._state.pipeline.predict_motion()
-        drawn = self._state.views.open(request, self._state.scene)
-        if drawn is not None:
-            self._show_view(request.name, drawn)
+        drawn = self._state.views.open(request, self._scene())
         status = self._state.views.status[request.name]
+        if drawn is not None or status.draw_ms == 0:  # None: what was kept of it shows another viewpoint
+            self._show_view(request.name, drawn)
         return {"topics": content.view_topics(request.name, request.stereo, request.depth), **asdict(status)}
+
+    def _scene(self) -> FrameResult | None:
+        """What shows the tissue as it is now; None: the next frame that is taken in will."""
+        state, newest = self._state, self._state.pipeline.newest
+        if newest is None or state.pipeline.held or state.paused.is_set() or not state.statistics.flowing:
+            return None
+        return newest if state.pipeline.metric else unsure(newest)
 
     def _close_view(self, args: dict[str, Any]) -> dict[str, Any]:
         name = parse(ViewName, args).name

@@ -85,7 +85,8 @@ class Views:
         self._watched: Collection[str] = ()
 
     def open(self, request: ViewRequest, scene: FrameResult | None) -> DrawnView | None:
-        """Open a view, or change one of that name; returns its first picture where there is a scene.
+        """Open a view, or change one of that name; returns its first picture where there is a scene. Else
+        it is drawn with the next one.
 
         Raises:
             SagsError: there are too many views.
@@ -96,12 +97,14 @@ class Views:
             names = ", ".join(sorted(self._views))
             raise SagsError(f"{MAX_VIEWS} views are open, the most there can be ({names}); close one first")
         view = _View(request, self._clock()) if known is None else known
+        if request.static or view.request.static:
+            view.cost = 0.0  # it was not drawn as it is asked for now
         view.request = request
         self._views[request.name] = view
         self._forget_sizes()
         self._watched = {*self._watched, request.name}  # until it is known better
         drawn = None
-        if scene is not None and (known is None or request.static):
+        if scene is not None and view.cost == 0:
             try:
                 drawn = self._draw(view, scene)
             except Exception:
@@ -217,7 +220,7 @@ class Views:
         short = live and granted < 0.95 * view.request.rate_hz
         reasons = (
             (bool(view.failure), view.failure),
-            (view.cost == 0, "no frame has come yet"),
+            (view.cost == 0, "it waits for a frame that is taken in"),
             (live and name not in self._watched, "nobody subscribes"),
             (short and self._allowance.is_behind, "the mapping is late and goes first"),
             (short, f"all views together get {SHARE:g} of a core"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -17,10 +18,13 @@ from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.messaging.content import OF_THE_MODEL, tells_of
+from sags_node.node.allowance import Allowance
+from sags_node.node.health import WAITING_AFTER
 from sags_node.node.operations import NodeState, Operations
+from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import NOTICED_LATE, Pipeline
 from sags_node.pipeline.session import Session, open_session
-from sags_node.types import U8, Finding, FrameResult, StereoFrame
+from sags_node.types import U8, DrawnView, Finding, FrameResult, StereoFrame
 from sags_node.vision.match_watch import MatchWatch
 
 FIRST, COUNT, AFTER = 8, 8, 11  # frames, at 10 Hz: before, with the fault, and until the tenth after it
@@ -169,6 +173,54 @@ def test_a_pixel_of_a_picture_that_is_held_is_not_pinned(session: Session, frame
         pin(u=160, v=128)
     x, y, z = result.snapshot.gaussians.means[0].tolist()
     assert pin(x=x, y=y, z=z)["depth_confidence"] < 0.05  # 0.8 s at 20 mm/s: five times what halves it
+
+
+@pytest.mark.fault("picture: both eyes of a live feed are frozen, and a view is opened")
+@pytest.mark.parametrize("why", ["held", "paused", "no frame comes"])
+def test_a_view_that_is_opened_while_nothing_new_is_seen_waits(
+    session: Session, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch, why: str
+) -> None:
+    pipeline, shown = Pipeline(session.config, session.rig), list[tuple[str, DrawnView | None]]()
+    state = NodeState(session.config, pipeline, None, Views(Allowance()))  # type: ignore[arg-type]
+    operations = Operations(state, lambda name, drawn: shown.append((name, drawn)))
+
+    def ask(operation: str, **args: Any) -> dict[str, Any]:
+        asked = operations.handlers()[operation](args)
+        operations.for_mapping.serve()
+        operations.for_drawing.serve()
+        return dict(asked.result(0))
+
+    def process(frame: StereoFrame) -> FrameResult:
+        result = pipeline.process(frame, StepBudget(2))
+        state.statistics.add(result, 40.0, {})
+        return result
+
+    *given, later = frozen(frames[: FIRST + COUNT + 1], range(FIRST, FIRST + COUNT))
+    for frame in given[: FIRST + COUNT if why == "held" else FIRST]:
+        process(frame)
+        if frame is given[1]:
+            assert ask("open_view", name="once", static=True)["draw_ms"] > 0
+            (name, drawn), *more = shown
+            assert drawn is not None and drawn.eyes[""].t_capture_ns == frame.t_capture_ns
+            assert (name, more) == ("once", [])
+    shown.clear()
+    if why == "paused":
+        ask("pause")
+    if why == "no frame comes":
+        now = time.monotonic()
+        monkeypatch.setattr(time, "monotonic", lambda: now + WAITING_AFTER + 1)
+    assert "waits for a frame" in ask("open_view", name="once", static=True, fov=40)["limited_by"]
+    assert "waits for a frame" in ask("open_view", name="often")["limited_by"]
+    assert shown == [("once", None), ("often", None)], "what was drawn before is not sent again"
+    if why == "paused":
+        ask("resume")
+        ask("open_view", name="early", static=True)  # before a frame has come
+        assert shown[2:] == [("early", None)]
+    result = process(later)
+    assert not result.held
+    drawn_now = dict(state.views.draw_due(result, set()))
+    assert drawn_now.keys() == {"once", "often", *(["early"] if why == "paused" else [])}
+    assert {one.eyes[""].t_capture_ns for one in drawn_now.values()} == {later.t_capture_ns}
 
 
 def test_what_a_recording_repeats_is_no_frozen_feed(session: Session, frames: list[StereoFrame]) -> None:

@@ -199,6 +199,11 @@ def test_a_static_view_is_sent_again_to_who_comes_later(node: RunningNode, contr
     first, again = (collect(node, ["view/still/image"])["view/still/image"][0] for _ in range(2))
     assert first.meta["stamp_ns"] == again.meta["stamp_ns"] and first.parts == again.parts
     assert collect(node, ["view/still/image"], count=2, timeout=0.5)["view/still/image"][1:] == []
+    control.request("open_view", {"name": "still", "width": 64, "height": 48})
+    later = collect(node, ["view/still/image"])["view/still/image"][0]
+    assert later.meta["stamp_ns"] > first.meta["stamp_ns"], (
+        "drawn again and again, it is not the one of before"
+    )
     control.request("close_view", {"name": "still"})
     assert collect(node, ["view/still/image"], timeout=0.5)["view/still/image"] == []
 
@@ -413,7 +418,7 @@ def test_a_view_opened_before_the_first_frame_is_drawn_with_it() -> None:
     clocks = Clocks(0.005)
     views = Views(clocks.allowance, clocks.wall, clocks.processor)
     assert views.open(parse(ViewRequest, {"name": "a", "width": 32, "height": 32}), None) is None
-    assert views.status["a"].limited_by == "no frame has come yet"
+    assert views.status["a"].limited_by == "it waits for a frame that is taken in"
     assert run(views, clocks, 0.1, set()) == ["a"]
 
 
