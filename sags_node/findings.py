@@ -25,6 +25,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "eyes_knocked": "eyes",
     "rows_differ": "calibration",
     "uncalibrated": "calibration",
+    "calibration_changed": "calibration",
     "tissue_too_near": "depth",
     "no_model": "depth",
     "picture_frozen": "picture",

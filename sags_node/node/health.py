@@ -170,7 +170,10 @@ class Statistics:
                 skipped=dict(self._skipped),
                 last_error=str(error) if error else None,
                 warnings=by_stage(
-                    [*chain(*warnings.values()), *self._findings(state, now, missed, working, consumers)]
+                    [
+                        *chain(*warnings.values()),
+                        *self._findings(state, now, missed, working, consumers, warnings),
+                    ]
                 ),
                 connections=connections,
                 views=views,
@@ -180,13 +183,15 @@ class Statistics:
                 recording=recording,
             )
 
-    def _findings(self, state: str, now: float, missed: str, working: float, consumers: int) -> list[Finding]:
+    def _findings(
+        self, state: str, now: float, missed: str, working: float, consumers: int, known: Findings
+    ) -> list[Finding]:
         """What the flow of frames says; asked with the lock held."""
         found = []
         if state == "waiting" and working > WAITING_AFTER:
             said = f"one frame has been worked on for {working:.0f} s, as {missed}"
             found.append(Finding("mapping_hangs", f"{said}; if it stays, restart the node"))
-        elif state == "waiting":
+        elif state == "waiting" and "calibration_changed" not in by_code(known):  # which is why
             said = f"no frame for {now - self._published[-1]:.0f} s" if self._published else "no frame comes"
             found.append(Finding("no_frames", f"{said}: {self._nothing_comes}"))
         if state == "running" and now - self._drawn > WAITING_AFTER:

@@ -56,7 +56,7 @@ def changes(said: Sequence[Said]) -> list[Said]:
     """What is said, in order of time, without what says the same again."""
     kept: list[Said] = []
     for each in sorted(said, key=lambda one: one.since_ns):
-        if not kept or not _same(kept[-1].eye, each.eye):
+        if not kept or not same(kept[-1].eye, each.eye):
             kept.append(each)
     return kept
 
@@ -67,7 +67,8 @@ def in_force(said: Sequence[Said], stamps: I64) -> I64:
     return np.maximum(np.searchsorted(since, stamps, "right") - 1, 0)
 
 
-def _same(one: Eye, other: Eye) -> bool:
+def same(one: Eye, other: Eye) -> bool:
+    """Whether two calibrations are equal but for rounding."""
     a, b = (
         np.concatenate([[eye.width, eye.height], *map(np.ravel, (eye.K, eye.R, eye.P, eye.distortion))])
         for eye in (one, other)

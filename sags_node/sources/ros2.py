@@ -14,14 +14,14 @@ from sags_node.config.schema import Ros2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import CAMERA_INFO
-from sags_node.recording.camera_info import read_eye
+from sags_node.recording.camera_info import read_eye, same
 from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp
-from sags_node.rig import accept_rig
+from sags_node.rig import accept_rig, already_rectified
 from sags_node.ros.endpoints import Reader
 from sags_node.ros.graph import Graph, receive_buffer
 from sags_node.sources.sent import SentPictures
 from sags_node.types import Eye as Calibrated
-from sags_node.types import Side, StereoFrame, StereoRig
+from sags_node.types import Finding, Side, StereoFrame, StereoRig
 from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
@@ -37,10 +37,12 @@ ZEROS_S = 2.0  # longest wait where they say that they have none: drivers start 
 class RosCameras:
     """A `Source` of live stereo frames; see `LivePairs` for their numbers and epochs.
 
-    Pictures come raw or compressed, as their sender publishes them. Its process may end and come again.
+    Pictures come raw or compressed, as their sender publishes them. Its process may end and come again. While
+    the cameras say another calibration than `rig` none is given: its depth would be wrong.
 
     Args:
         size: width and height that pictures must have, px; None: those of the first.
+        rig: what the cameras said at the start, see `read_rig`; None: the calibration is not theirs.
 
     Raises:
         UsageError, SagsError: see `Graph`.
@@ -48,10 +50,16 @@ class RosCameras:
 
     frame_count: int | None = None
 
-    def __init__(self, config: Ros2Source, size: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self, config: Ros2Source, size: tuple[int, int] | None = None, rig: StereoRig | None = None
+    ) -> None:
         self.rate = config.rate
         self._sent = SentPictures(config, size)
         self._graph = Graph(config)
+        self._rig = rig
+        self._infos = None if rig is None else _CameraInfos(self._graph, config)
+        self._damaged = RateLimitedLog()
+        self._changed: dict[Side, str] = {}
         self._names = picture_topics(config)
         self._readers: dict[Side, Reader] = {}
         self._left_out: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
@@ -64,6 +72,15 @@ class RosCameras:
     def dropped(self) -> int:
         """Pairs that are missing: lost on the way, or without the other eye's picture."""
         return self._sent.dropped
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the cameras, and how to fix it. May be read from any thread."""
+        changed = ", ".join(self._changed.copy().values())
+        if not changed:
+            return ()
+        said = f"{changed}: zoom, focus or picture size was changed, and nothing is shown"
+        return (Finding("calibration_changed", f"{said}; set it back, or restart the node to take it over"),)
 
     def __enter__(self) -> Self:
         self._heard = dict.fromkeys(self._names, time.monotonic())
@@ -90,10 +107,12 @@ class RosCameras:
     def _read(self) -> None:
         self._subscribe()
         self._graph.wait(POLL_S)
+        self._follow_calibration()
         for eye, reader in self._readers.items():
             for data in reader.take():
                 self._heard[eye] = time.monotonic()
-                self._put(eye, reader.kind, data)
+                if not self._changed:
+                    self._put(eye, reader.kind, data)
         for eye, last in self._heard.items():
             if time.monotonic() - last > QUIET_S and self._silent[eye].due():
                 log.warning("%s", self._silence(eye))
@@ -107,6 +126,27 @@ class RosCameras:
             kinds = there.get(name, set()) & set(IMAGE_TYPES)
             if eye not in self._readers and kinds:
                 self._readers[eye] = self._graph.reader(name, min(kinds))
+
+    def _follow_calibration(self) -> None:
+        if self._infos is None or self._rig is None:
+            return
+        try:
+            for eye, said in self._infos.take():
+                if said is not None:
+                    self._compare(eye, said)
+        except SagsError as error:
+            if self._damaged.due():
+                log.warning("%s", error)
+
+    def _compare(self, eye: Side, said: Calibrated) -> None:
+        assert self._infos is not None and self._rig is not None
+        taken = self._rig.left if eye == "left" else self._rig.right
+        rectified = already_rectified(StereoRig("ros2", said, said)).left  # which of them was taken is alike
+        if same(taken, said) or same(taken, rectified):
+            self._changed.pop(eye, None)
+            return
+        before, after = taken.P[0, 0], said.P[0, 0]
+        self._changed[eye] = f"{self._infos.names[eye]} has changed (f {before:.1f} to {after:.1f} px)"
 
     def _put(self, eye: Side, kind: str, data: bytes) -> None:
         name, arrival_ns = self._names[eye], time.time_ns()
@@ -166,38 +206,57 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
         SagsError: a message is damaged.
     """
     graph = Graph(config)
-    named: Mapping[Side, str] = {
-        "left": absolute(config.left_info or _beside(config.left)),
-        "right": absolute(config.right_info or _beside(config.right)),
-    }
-    readers = {eye: graph.reader(name, CAMERA_INFO) for eye, name in named.items()}
+    infos = _CameraInfos(graph, config)
     found: dict[Side, Calibrated] = {}
     zeros: set[Side] = set()
     deadline = time.monotonic() + seconds
-    while len(found) < len(named):
-        if zeros | found.keys() == named.keys():
+    while len(found) < len(infos.names):
+        if zeros | found.keys() == infos.names.keys():
             deadline = min(deadline, time.monotonic() + ZEROS_S)
         if time.monotonic() > deadline:
-            if zeros | found.keys() == named.keys():
+            if zeros | found.keys() == infos.names.keys():
                 break
-            missing = " and ".join(name for eye, name in named.items() if eye not in found)
+            missing = " and ".join(name for eye, name in infos.names.items() if eye not in found)
             raise UsageError(
                 f"no camera_info on {missing} in {seconds:g} s ({graph.where()}): start the cameras first, "
                 "name the topics in source.left_info and source.right_info, or set rig"
             )
         graph.wait(POLL_S)
-        for eye, reader in readers.items():
-            for data in reader.take():
-                said = read_eye(data, named[eye])
-                if said is None:
-                    zeros.add(eye)
-                else:
-                    found[eye] = said
+        for eye, said in infos.take():
+            if said is None:
+                zeros.add(eye)
+            else:
+                found[eye] = said
     if not found:
         return None
-    for eye in named.keys() - found.keys():
-        raise UsageError(f"{named[eye]} says that its eye is not calibrated; set rig")
+    for eye in infos.names.keys() - found.keys():
+        raise UsageError(f"{infos.names[eye]} says that its eye is not calibrated; set rig")
     return accept_rig(StereoRig("ros2", found["left"], found["right"]), graph.where())
+
+
+class _CameraInfos:
+    """What both eyes' cameras say of their calibration.
+
+    Attributes:
+        names: the topic of each eye.
+    """
+
+    def __init__(self, graph: Graph, config: Ros2Source) -> None:
+        self.names: Mapping[Side, str] = {
+            "left": absolute(config.left_info or _beside(config.left)),
+            "right": absolute(config.right_info or _beside(config.right)),
+        }
+        self._readers = {eye: graph.reader(name, CAMERA_INFO) for eye, name in self.names.items()}
+
+    def take(self) -> Iterator[tuple[Side, Calibrated | None]]:
+        """What has come since; None: not calibrated.
+
+        Raises:
+            SagsError: see `read_eye`.
+        """
+        for eye, reader in self._readers.items():
+            for data in reader.take():
+                yield eye, read_eye(data, self.names[eye])
 
 
 def _beside(topic: str) -> str:

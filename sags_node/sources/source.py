@@ -62,6 +62,7 @@ def open_source(
     references: bool = True,
     progress: Callable[[int, int], None] | None = None,
     size: tuple[int, int] | None = None,
+    rig: StereoRig | None = None,
 ) -> Source:
     """Open the source a launch file describes.
 
@@ -70,6 +71,7 @@ def open_source(
         references: read the recording's truth with each frame. Only measuring needs it.
         progress: called with (done, total) while a phantom session is rendered.
         size: width and height that an eye's live pictures must have, px; None: those of the first.
+        rig: the calibration that live cameras gave, if they did: it must stay the same.
 
     Raises:
         UsageError: a file, folder or device is missing or does not fit the rest.
@@ -86,7 +88,7 @@ def open_source(
     if isinstance(config, cfg.Ros2Source):
         from sags_node.sources.ros2 import RosCameras
 
-        return RosCameras(config, size)
+        return RosCameras(config, size, rig)
     if isinstance(config, cfg.PushSource):
         from sags_node.sources.push import PushedPictures
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import re
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +21,13 @@ from waiting import until
 from sags_node.config.schema import GeometryConfig, LaunchConfig, Ros2Robot, Ros2Source, RosGraph
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
-from sags_node.messaging.topics import IMAGE, TF
+from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
+from sags_node.rig import already_rectified, load_rig, rectified_rig, resized_rig
 from sags_node.ros.graph import Graph, domain_of
 from sags_node.sources import ros2
 from sags_node.sources.robot import open_robot
 from sags_node.sources.ros2 import RosCameras, read_rig
+from sags_node.types import Eye, StereoRig
 
 pytestmark = pytest.mark.live
 
@@ -39,8 +43,6 @@ def config() -> Ros2Source:
 
 
 def test_the_cameras_calibration_is_taken(phantom_session: Path) -> None:
-    from sags_node.rig import load_rig, resized_rig
-
     with sending(dds(phantom_session, 30, "size=640x512")):
         rig = read_rig(config(), seconds=60)
     want = resized_rig(load_rig(phantom_session / "calib"), 2)
@@ -122,6 +124,42 @@ def test_one_topic_may_show_both_eyes() -> None:
     with Taker(RosCameras(said, (160, 120))) as taker:
         until(sent_and_come)
     assert set(taker.numbers) == {(7, 7)}
+
+
+@pytest.mark.fault("calibration: a live camera's zoom is turned, and turned back")
+@pytest.mark.parametrize("taken", [lambda rig: rig, already_rectified])
+def test_pictures_of_another_calibration_are_not_given(taken: Callable[[StereoRig], StereoRig]) -> None:
+    K = np.array([[200.0, 0, 80], [0, 200, 60], [0, 0, 1]])
+    rig = rectified_rig("scope", 160, 120, K, 0.004)
+    rig = replace(rig, left=replace(rig.left, distortion=np.array([0.1, 0, 0, 0, 0])))
+    zoomed = replace(rig.right, P=np.diag([1.5, 1.5, 1]) @ rig.right.P)
+    graph = Graph(RosGraph(domain=DOMAIN))
+    infos = [graph.writer(f"/stereo/{eye}/camera_info", CAMERA_INFO) for eye in ("left", "right")]
+    pictures = [graph.writer(f"/stereo/{eye}/image_raw", IMAGE) for eye in ("left", "right")]
+
+    def send(right: Eye, number: int) -> None:
+        now, picture = time.time_ns(), np.zeros((120, 160, 3), np.uint8)
+        paint_number(picture, number)
+        for writer, eye in zip(infos, (rig.left, right), strict=True):
+            writer.write(cdr.eye_info(eye, now).cdr(), now)
+        for writer in pictures:
+            writer.write(cdr.image(picture, "rgb8", now).cdr(), now)
+
+    unknown = replace(rig.right, K=np.zeros((3, 3)))  # as drivers say that have not read it yet
+    source = RosCameras(config(), (160, 120), taken(rig))
+    with Taker(source) as taker:
+        until(lambda: send(rig.right, 1) or (1, 1) in taker.numbers)
+        until(lambda: send(unknown, 2) or (2, 2) in taker.numbers)
+        assert source.findings == ()
+        until(lambda: send(zoomed, 3) or source.findings)
+        (finding,) = source.findings
+        assert finding.code == "calibration_changed"
+        assert "/stereo/right/camera_info has changed (f 200.0 to 300.0 px): zoom" in finding.text
+        for _ in range(5):
+            send(zoomed, 4)
+            time.sleep(0.1)
+        until(lambda: send(rig.right, 5) or (5, 5) in taker.numbers)
+        assert source.findings == () and (4, 4) not in taker.numbers
 
 
 def test_the_domain_is_that_of_the_launch_file_or_of_ros(monkeypatch: pytest.MonkeyPatch) -> None:

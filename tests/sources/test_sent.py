@@ -22,12 +22,12 @@ from sags_node.config.schema import (
     V4l2Source,
 )
 from sags_node.errors import SagsError
-from sags_node.findings import by_code
+from sags_node.findings import by_code, by_stage
 from sags_node.messaging import cdr, content, topics
 from sags_node.node.health import Statistics
 from sags_node.sources.clock import KEPT, CaptureClock
 from sags_node.sources.sent import WINDOW, Arrivals, SentPictures
-from sags_node.types import U8, ClockStatus, Side, StereoFrame
+from sags_node.types import U8, ClockStatus, Finding, Side, StereoFrame
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD = 33 * MS
@@ -84,6 +84,8 @@ def test_what_helps_depends_on_where_pictures_come_from(
     now += 1.0
     warnings = by_code(statistics.health({}, False, False, None, {}, {}, {}).warnings)
     assert warnings["no_frames"] == f"no frame comes: {said}"
+    why = by_stage([Finding("calibration_changed", "the zoom was turned")])
+    assert statistics.health({}, False, False, None, why, {}, {}).warnings == why, "it says it already"
 
 
 @pytest.mark.fault("stamp: 3.2 s old, or 0.5 s ahead")
