@@ -211,6 +211,9 @@ def _check_rows(rig: StereoRig) -> list[Finding]:
         if abs(a - b) > tolerance:
             what = f"rectified {name} differs: {a:g} px in left.yaml, {b:g} px in right.yaml"
             fix = "the files are not from one stereo calibration; " + RECALIBRATE
+            if name == "cy" and not found:  # all but the rows is of one calibration
+                what += f": do the eyes' pictures begin {abs(a - b):g} rows apart (roi, y_offset, a crop)?"
+                fix = "read out the same rows of both eyes, or calibrate with these pictures and set rig"
             found.append(Finding("error", what, fix))
     return found or [Finding("ok", "rectified rows of both eyes agree")]
 

@@ -128,15 +128,19 @@ def test_a_calibration_that_was_made_with_rectified_pictures_stays_as_it_is(
 # ---- camera_info -----------------------------------------------------------------------------------------
 
 
-def said_bag(folder: Path, said: Sequence[tuple[Eye, Eye]], **options: object) -> Path:
+def said_bag(
+    folder: Path,
+    said: Sequence[tuple[Eye, Eye]],
+    rois: Sequence[tuple[int, int, int, int]] = 2 * [(0, 0, 0, 0)],
+    **options: object,
+) -> Path:
     """A bag whose camera_info says one after the other of these, each with a pair of pictures."""
     rows: list[Row] = []
     for number, eyes in enumerate(said):
         stamp = START + number * 40 * MS
         for eye, side in enumerate(("left", "right")):
-            rows.append(
-                (f"/rig/{side}/camera_info", files.camera_info(ROS2, stamp, eyes[eye], **options), stamp)
-            )
+            info = files.camera_info(ROS2, stamp, eyes[eye], roi=rois[eye], **options)
+            rows.append((f"/rig/{side}/camera_info", info, stamp))
             rows.append((f"/rig/{side}/image_raw", files.image(ROS2, picture(number, eye), stamp), stamp))
     return files.write_rosbag2(folder / "bag", rows)
 
@@ -174,7 +178,7 @@ def test_what_is_read_out_and_binned(tmp_path: Path) -> None:
     first binned pixel is the middle of 2 x 3 pixels of the sensor."""
     sensor = [replace(eye, width=160, height=200) for eye in eyes(80.0)]
     roi, binning = (20, 30, 2 * WIDTH, 3 * HEIGHT), (2, 3)
-    path = said_bag(tmp_path, [(sensor[0], sensor[1])], roi=roi, binning=binning)
+    path = said_bag(tmp_path, [(sensor[0], sensor[1])], [roi, roi], binning=binning)
     rig = open_session(path).rig
     assert (rig.left.width, rig.left.height) == (WIDTH, HEIGHT)
     ray = np.array([0.21, -0.13, 1.0])
@@ -183,9 +187,22 @@ def test_what_is_read_out_and_binned(tmp_path: Path) -> None:
     for matrix in (rig.left.K, rig.left.P[:, :3]):
         np.testing.assert_allclose((matrix @ ray)[:2], expected)
     assert rig.baseline == pytest.approx(BASELINE)
-    impossible = said_bag(tmp_path / "b", [(sensor[0], sensor[1])], roi=(150, 0, 20, 20))
+    impossible = said_bag(tmp_path / "b", [(sensor[0], sensor[1])], 2 * [(150, 0, 20, 20)])
     with pytest.raises(UsageError, match=r"roi 150,0 20x20 .* is no part of 160x200 px"):
         open_session(impossible)
+
+
+def test_eyes_that_read_out_other_rows_are_told_so_and_other_columns_are_applied(tmp_path: Path) -> None:
+    left, right = (replace(eye, width=2 * WIDTH, height=2 * HEIGHT) for eye in eyes(80.0))
+    size = WIDTH, HEIGHT
+    columns = said_bag(tmp_path / "a", [(left, right)], [(3, 9, *size), (5, 9, *size)])
+    rig = open_session(columns).rig
+    assert rig.left.P[0, 2] - rig.right.P[0, 2] == left.P[0, 2] - right.P[0, 2] + 2
+    rows = said_bag(tmp_path / "b", [(left, right)], [(3, 9, *size), (3, 4, *size)])
+    with pytest.raises(UsageError, match=r"begin 5 rows apart \(roi.*same rows.*or calibrate .*set rig"):
+        open_session(rows)
+    save_rig(rig, tmp_path / "told")
+    assert open_session(rows, [f"rig:={tmp_path / 'told'}"]).rig.right.P[1, 2] == rig.right.P[1, 2]
 
 
 @pytest.mark.parametrize("model", ["equidistant", "fisheye", "kannala_brandt4"])
