@@ -78,7 +78,7 @@ def check_calibration(
         rig = as_pictures_come(read_rig(path, size, metres), config.model_copy(update={"rig": path}))
     else:
         rig = as_named(read_rig(path, size, metres), *(file for pair in images for file in pair))
-    return judge(rig, pairs, depths)
+    return judge(rig, pairs, depths, metres)
 
 
 def read_calibration(path: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
@@ -87,12 +87,14 @@ def read_calibration(path: Path, size: tuple[int, int] | None, metres: float | N
     return read_rig(path, size, metres) if known else _rig_of(_launched(path, ()), size, metres)
 
 
-def judge(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
+def judge(
+    rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = (), metres: float | None = None
+) -> list[Finding]:
     """Look over a calibration, and compare it with raw pictures where there are some."""
     findings = check_eyes(rig)
     if _broken(findings):
         return findings
-    findings += check_pair(rig)
+    findings += check_pair(rig, metres)
     if rig.left.P[0, 3] == rig.right.P[0, 3]:  # without a baseline pictures tell nothing
         return findings
     return findings + (check_pictures(rig, pairs, depths) if pairs else [])

@@ -164,8 +164,9 @@ def convert(
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
-    rig = resized_rig(read_calibration(path, size, UNITS.get(unit or "")), scale)
-    refuse_errors(check_rig(rig), path)
+    metres = UNITS.get(unit or "")
+    rig = resized_rig(read_calibration(path, size, metres), scale)
+    refuse_errors(check_rig(rig, metres), path)
     check_files(*eye_files(out), force=force)
     save_rig(rig, out)
     console.print(

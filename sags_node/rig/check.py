@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from sags_node import geometry
-from sags_node.config.units import NAMES, fitting_units, in_metres
+from sags_node.config.units import NAMES, UNITS, fitting_units, in_metres
 from sags_node.errors import UsageError
 from sags_node.types import F64, Eye, StereoRig
 
@@ -63,12 +63,16 @@ def accept_rig(rig: StereoRig, where: Path | str) -> StereoRig:
     return rig
 
 
-def check_rig(rig: StereoRig) -> list[Finding]:
-    """What is right, odd or wrong with a calibration, each with a way to fix it."""
+def check_rig(rig: StereoRig, metres: float | None = None) -> list[Finding]:
+    """What is right, odd or wrong with a calibration, each with a way to fix it.
+
+    Args:
+        metres: the unit that its lengths were told to be in; None: nobody said it.
+    """
     findings = check_eyes(rig)
     if any(finding.level == "error" for finding in findings):
         return findings
-    return findings + check_pair(rig)
+    return findings + check_pair(rig, metres)
 
 
 def check_eyes(rig: StereoRig) -> list[Finding]:
@@ -79,9 +83,9 @@ def check_eyes(rig: StereoRig) -> list[Finding]:
     return _until_error(rig, (_check_numbers, _check_eyes, _check_rows))
 
 
-def check_pair(rig: StereoRig) -> list[Finding]:
+def check_pair(rig: StereoRig, metres: float | None = None) -> list[Finding]:
     """`check_rig`'s look at which eye is which, and how far apart they are."""
-    return _until_error(rig, (_check_order, _check_baseline))
+    return _check_unit(rig, metres) or _until_error(rig, (_check_order, _check_baseline))
 
 
 def _until_error(rig: StereoRig, checks: Sequence[Callable[[StereoRig], list[Finding]]]) -> list[Finding]:
@@ -249,3 +253,20 @@ def _check_baseline(rig: StereoRig) -> list[Finding]:
         fix = in_metres(units) if units else "check projection_matrix[3] in right.yaml: it is -fx * metres"
         return [Finding("warning", what, fix)]
     return [Finding("ok", f"baseline {baseline * 1e3:.3g} mm")]
+
+
+def _check_unit(rig: StereoRig, metres: float | None) -> list[Finding]:
+    """Whether lengths in the unit that was said are those of no endoscope, and in another one they are."""
+    said = next((unit for unit, each in UNITS.items() if each == metres), None)
+    least, most = ENDOSCOPE_BASELINE
+    baseline = rig.baseline
+    if said is None or least <= baseline <= most:
+        return []
+    in_other = {unit: baseline / UNITS[said] * each for unit, each in UNITS.items()}
+    fitting = [unit for unit, length in in_other.items() if least <= length <= most]
+    if not fitting:
+        return []
+    what = f"--unit {said} makes the baseline {baseline * 1e3:.3g} mm"
+    ways = " or ".join(f"--unit {unit} ({in_other[unit] * 1e3:.3g} mm)" for unit in fitting)
+    fix = f"say {ways}; if it is right, write the lengths in metres into the files and leave --unit out"
+    return [Finding("error", what, fix)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import re
 import tarfile
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import yaml
 from command_line import ran
 from test_calibration import make_rig
 
+from sags_node.config.units import UNITS
 from sags_node.errors import UsageError
 from sags_node.geometry import scale_intrinsics
 from sags_node.rig import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
@@ -244,6 +246,30 @@ def test_millimetres_must_be_said(tmp_path: Path) -> None:
     findings = check_rig(read_rig(folder, SIZE))
     assert findings[-1].level == "error"
     assert "looks like millimetres" in findings[-1].what and "--unit mm" in findings[-1].fix
+
+
+@pytest.mark.parametrize(
+    ("unit", "said"), [("cm", "mm"), ("cm", "um"), ("mm", "m"), ("inch", "mm"), ("um", "mm")]
+)
+def test_a_wrong_unit_is_refused_and_the_right_one_named(unit: str, said: str, tmp_path: Path) -> None:
+    folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T / UNITS[unit])
+    command = ("calib", "convert", folder, "-o", tmp_path / "out", "--size", "640x480", "--unit")
+    code, _, text = ran(*command, said)
+    assert code == 2 and f"--unit {said} makes the baseline" in text and not (tmp_path / "out").exists()
+    assert re.findall(r"say --unit (\w+) \(5.2 mm\)", text) == [unit]
+    code, text, _ = ran("calib", "check", folder, *command[-3:], said, "--json")
+    assert code == 1 and f"say --unit {unit} (5.2 mm)" in text
+    assert ran(*command, unit)[0] == 0
+    assert_same(load_rig(tmp_path / "out"), expected())
+
+
+def test_a_unit_that_no_other_one_betters_is_taken(tmp_path: Path) -> None:
+    """20 mm: of no endoscope in any unit."""
+    folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T * 20 / 5.2e-3)
+    code, _, text = ran(
+        "calib", "convert", folder, "-o", tmp_path / "out", "--size", "640x480", "--unit", "mm"
+    )
+    assert code == 0 and "baseline 20 mm" in text
 
 
 def test_the_size_must_be_said(tmp_path: Path) -> None:
