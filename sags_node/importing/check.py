@@ -56,7 +56,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
     if contents.left is not None:
         found += _pictures(contents, contents.left)
     if contents.videos:
-        found += videos.look(contents.videos)
+        found += _tried("videos", lambda: videos.look(contents.videos))
     if contents.level == "error":
         return found
     launch: list[str] = []

@@ -13,7 +13,7 @@ import numpy as np
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.pictures import Pair
 from sags_node.config.schema import GeometryConfig
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.importing import pictures
 from sags_node.importing.folder import override
 from sags_node.media.video import LostPictureError, Video
@@ -68,15 +68,16 @@ _WAYS = (  # a part before the whole: what is found in the one is found in the o
 
 def look(files: tuple[Path, ...]) -> list[Finding]:
     """What some pictures show, of the videos of the left and the right eye, or of one of both. They are
-    played as `launch_of` says."""
-    try:
-        found = [finding for file in files for finding in _file(file)]
-        if len(files) == 1:
-            return found + _one(files[0], _some(files[0]))
-        with closing(VideoPairs(files[0], files[1], Layout(GeometryConfig()))) as pairs:
-            looked = _some_pairs(pairs)
-    except SagsError as error:
-        return [pictures.refused("videos", error)]
+    played as `launch_of` says.
+
+    Raises:
+        SagsError: they cannot be read.
+    """
+    found = [finding for file in files for finding in _file(file)]
+    if len(files) == 1:
+        return found + _one(files[0], _some(files[0]))
+    with closing(VideoPairs(files[0], files[1], Layout(GeometryConfig()))) as pairs:
+        looked = _some_pairs(pairs)
     left, right = ([(file, pair[eye]) for pair in looked] for eye, file in enumerate(files))
     eyes = pictures.check_eye("left", left) + pictures.check_eye("right", right)
     return [*found, *eyes, *pictures.check_eyes(left, right)]
@@ -125,8 +126,6 @@ def _file(file: Path) -> list[Finding]:
         rate = "" if video.rate is None else f" at {video.rate:g} Hz, {video.count / video.rate:.1f} s"
         what = f"{file.name}: {video.count} frames of {size_text(*video.size)} px{rate}"
         found = [Finding("ok", what), *said_of(video.oddities)]
-        if video.cut_off:
-            found.append(Finding("error", f"{file.name}: {video.cut_off}", "copy it again"))
         if video.gaps:
             before, missing = video.gaps[0]
             many = "a gap" if len(video.gaps) == 1 else f"{len(video.gaps)} gaps, the first"
@@ -168,19 +167,14 @@ def check_ends(pairs: VideoPairs, needed: int) -> list[Finding]:
 
 
 def _some(file: Path) -> list[tuple[Path, U8]]:
-    """Pictures spread over a video, RGB; the last of them tells whether it is whole.
-
-    Raises:
-        SagsError: it cannot be read to its end.
-    """
+    """Pictures spread over a video, RGB."""
     with closing(Video(file)) as video:
         found = []
         for number in _spread(video.count):
             with suppress(LostPictureError):  # it is left out while playing, too
                 picture = video.read(number)
-                if picture is None:
-                    raise SagsError(f"{file} ends before picture {number} of {video.count}; copy it again")
-                found.append((file, picture))
+                if picture is not None:  # else it is said where the video ends, as while it is played
+                    found.append((file, picture))
         return found
 
 
@@ -192,9 +186,8 @@ def _some_pairs(pairs: VideoPairs) -> list[Pair]:
         pairs.seek(index)
         with suppress(LostPictureError):
             pair = pairs.read()
-            if pair is None or pair.right is None:
-                raise SagsError(f"{pairs.left.path} ends before picture {index}; copy it again")
-            found.append((pair.left, pair.right))
+            if pair is not None and pair.right is not None:
+                found.append((pair.left, pair.right))
     return found
 
 

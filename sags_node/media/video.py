@@ -293,15 +293,18 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         shown: list[int | None] = []
         keys: list[tuple[int, int, int]] = []
         ticks: list[int] = []  # when packets are decoded
-        total = 0
+        total, is_broken = 0, False
         with suppress(*BROKEN):
             for packet in container.demux(stream):
+                is_broken = packet.is_corrupt or (is_broken and not packet.size)
                 total += packet.size > 0
                 ticks += [] if packet.dts is None else [packet.dts]
                 if packet.size and not packet.is_discard:
                     shown.append(packet.pts)
                 if packet.is_keyframe and packet.pts is not None:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
+        if is_broken and shown:
+            shown.pop()  # a part of a picture
         known = np.array([pts for pts in shown if pts is not None], np.int64)
         # AVI knows no order but that of decoding: FFmpeg guesses, and some codecs hold pictures back.
         is_guessed = container.format.name == "avi" and stream.codec_context.has_b_frames
@@ -320,6 +323,8 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
             cut_off = f"is cut off: of {named} pictures it holds {total}"
         elif missing > float(0.5 * base):
             cut_off = "is cut off: it ends before it says so"
+        elif is_broken:
+            cut_off = "is cut off: of its last picture a part is there"
         return _Index(len(shown), pts, np.array(sorted(keys), np.int64).reshape(-1, 3), unused, cut_off)
 
 

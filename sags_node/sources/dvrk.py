@@ -71,6 +71,7 @@ class DvrkPairs:
 
     Attributes:
         stamps: [count, 2] ns, capture of the left and the right picture.
+        cut_off, reach: as of `VideoPairs`.
 
     Raises:
         UsageError: files are missing or damaged, or the video is not stereo.
@@ -92,6 +93,7 @@ class DvrkPairs:
             video.close()
             raise
         self.count = len(self.stamps)
+        self.cut_off, self.reach = self._pairs.cut_off, min(self.count, self._pairs.reach)
         steps = np.diff(self.stamps[:, 0])
         self.rate = float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else video.rate
         self._next = 0

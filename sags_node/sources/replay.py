@@ -86,7 +86,8 @@ class Replay:
         sleep: waits for seconds; the default is cut short by `stop`.
 
     Raises:
-        UsageError: files are missing or do not fit each other, or `start` lies behind the end.
+        UsageError: files are missing or do not fit each other, a video is cut off before `frames`, or `start`
+            lies behind the end.
     """
 
     def __init__(
@@ -130,6 +131,13 @@ class Replay:
             raise UsageError(
                 f"source.start {config.start} s lies behind the recording's end at {seconds:.2f} s"
             )
+        if isinstance(self.pairs, VideoPairs | OneVideoPairs | DvrkPairs) and self.pairs.cut_off:
+            there = -(-self.pairs.reach // config.stride) - self.first
+            if config.frames is None or config.frames > there:
+                self.pairs.close()
+                raise UsageError(
+                    f"{self.pairs.cut_off}; copy it again, or play what is there with source.frames:={there}"
+                )
 
     def frame_at(self, start: float) -> int:
         """Number of the frame that this `source.start` begins with."""

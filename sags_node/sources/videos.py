@@ -47,6 +47,8 @@ class VideoPairs(_InOrder):
         by_number: not by stamps.
         stamps: [count, 2] ns, of the left and the right picture; None: they are even.
         pixel_aspect: width of a pixel over its height.
+        cut_off: why a file must have been longer; "": both are whole.
+        reach: how many pairs are there, also of the right eye.
         oddities: see `Video`; also how many pictures have no partner.
 
     Args:
@@ -74,6 +76,8 @@ class VideoPairs(_InOrder):
         self.count = len(self._numbers)
         self.stamps = self._find_stamps()
         self.pixel_aspect = layout.pixel_aspect(*self.left.size, self.left.pixel_aspect)
+        self.cut_off = next((f"{each.path} {each.cut_off}" for each in self._videos if each.cut_off), "")
+        self.reach = min(self.count, *(each.count for each in self._videos))
 
     def read(self) -> RawPair | None:
         """The next pair, None at the end.
@@ -172,7 +176,7 @@ class OneVideoPairs(_InOrder):
 
     Attributes:
         size: width and height of an eye's picture, px.
-        stamps, pixel_aspect, oddities: as of `VideoPairs`.
+        stamps, pixel_aspect, cut_off, reach, oddities: as of `VideoPairs`.
 
     Raises:
         UsageError: its pictures cannot be split as asked.
@@ -196,6 +200,8 @@ class OneVideoPairs(_InOrder):
             left = layout.order.index("left") if layout.is_sequential else 0
             self.stamps = np.stack([of_eyes[:, left], of_eyes[:, -1 - left]], axis=1)
         self.pixel_aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
+        self.cut_off = f"{video.path} {video.cut_off}" if video.cut_off else ""
+        self.reach = self.count
         self.oddities = video.oddities
 
     def read(self) -> RawPair | None:

@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 from numbered_pictures import write_video
 from places import SESSION
+from stamped_videos import write
 
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
@@ -395,6 +396,40 @@ def test_videos_that_cannot_be_played_are_refused(
     assert result.exit_code == 1 and "cannot be played" in result.stderr
     for part in said:
         assert part in result.stdout
+
+
+@pytest.mark.fault("file: a video is cut off")
+@pytest.mark.parametrize("shown", ["both eyes", "left", "right"])
+@pytest.mark.parametrize(
+    ("suffix", "how"),
+    [
+        ("mp4", {"muxer": {"movflags": "faststart"}}),
+        ("mkv", {}),
+        ("avi", {"codec": "mjpeg", "pixels": "yuvj420p"}),
+    ],
+)
+def test_a_video_that_is_cut_off_is_refused_by_check_and_run_alike(
+    suffix: str, how: dict[str, object], shown: str, tmp_path: Path
+) -> None:
+    """As any damaged file; what is there can be played."""
+    pictures = [[cv2.resize(each, (256, 160)) for each in moving(150, shift)] for shift in (0, -DISPARITY)]
+    named = dict(zip(("left", "right"), pictures, strict=True))
+    if shown == "both eyes":
+        named = {shown: [np.hstack(pair) for pair in zip(*pictures, strict=True)]}
+    for name, each in named.items():
+        write(tmp_path / f"{name}.{suffix}", each, options={"g": "10"}, **how)  # type: ignore[arg-type]
+    file = tmp_path / f"{shown}.{suffix}"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    (error,) = [each for each in check_folder(tmp_path) if each.level == "error"]
+    assert file.name in error.what and "is cut off" in error.what
+    with pytest.raises(UsageError, match=r"is cut off.*copy it again"):
+        open_session(tmp_path, overrides_of(tmp_path), guess=True)
+    remedy = error.fix.split()[-1]
+    assert 50 < int(remedy.removeprefix("source.frames:=")) < 149
+    assert "error" not in {each.level for each in check_folder(tmp_path, [remedy])}
+    overrides = [*overrides_of(tmp_path), remedy, "source.pace:=step"]
+    with open_session(tmp_path, overrides, guess=True).source as source:
+        assert len(list(source)) == int(remedy.removeprefix("source.frames:="))
 
 
 def test_videos_say_rate_length_and_number(tmp_path: Path) -> None:
