@@ -5,6 +5,7 @@ Files that we make: each appears when all of it is there, and takes the place of
 
 from __future__ import annotations
 
+import difflib
 import errno
 import json
 import os
@@ -55,6 +56,16 @@ def read_file(path: Path, largest: int) -> bytes:
         if size > largest:
             raise OSError(errno.EFBIG, f"it has {size} bytes, {largest} at most are read", str(path))
         return opened.read(largest)
+
+
+def near(path: Path) -> str:
+    """The remedy for a path that cannot be read: what beside it is named alike."""
+    try:
+        beside = [each.name for each in path.absolute().parent.iterdir()]
+    except OSError:
+        return "check the path"
+    names = difflib.get_close_matches(path.name, [each for each in beside if each != path.name], n=1)
+    return f"did you mean {path.parent / names[0]}?" if names else "check the path"
 
 
 def _refuse_others(path: Path, mode: int) -> None:

@@ -17,7 +17,7 @@ from rich.markup import escape
 
 from sags_node.cli.launching import as_json, positive
 from sags_node.cli.node_options import endpoint_option, node_options, ns_option
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, on_stop_signals, show
 
@@ -77,6 +77,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     ) -> None:  # fmt: skip
         from sags_node.bridge.feed import Place
         from sags_node.messaging.node_clock import NodeClock
+        from sags_node.messaging.rundir import read_connection
 
         remote = node.endpoint is not None and node.control is not None
         clock = NodeClock.at(node) if remote else None
@@ -85,6 +86,11 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
         stop = threading.Event()
 
         def say(words: str, fields: Mapping[str, Any]) -> None:
+            if node.endpoint is None:
+                try:
+                    read_connection(node.ns, node.run_dir)
+                except SagsError as error:
+                    console.print(f"waiting: {error}", markup=False, soft_wrap=True)
             if json_out:
                 show(dict(fields))
             else:

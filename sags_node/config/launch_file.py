@@ -224,8 +224,8 @@ def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> Laun
 
 def _read_yaml(file: Path) -> dict[str, Any]:
     tree = read_yaml(file, "launch file")
-    if tree is None:
-        return {}
+    if not tree:
+        raise UsageError(f"{file} is empty; write source: into it, or leave it out to play the phantom")
     if not isinstance(tree, dict):
         raise UsageError(f"{file}: a launch file is a map of sections, this is a {type(tree).__name__}")
     return tree

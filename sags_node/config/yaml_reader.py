@@ -14,7 +14,7 @@ import yaml
 from yaml.constructor import ConstructorError
 
 from sags_node.errors import UsageError, brief
-from sags_node.files import read_file
+from sags_node.files import near, read_file
 
 LARGEST_FILE = 1 << 20  # bytes
 MOST_VALUES = 100_000  # with all aliases unfolded
@@ -34,7 +34,7 @@ def read_yaml(file: Path, what: str, largest: int = LARGEST_FILE) -> Any:
     try:
         content = read_file(file, largest)
     except OSError as error:
-        raise UsageError(f"cannot read {what} {file}: {error.strerror}; check the path") from None
+        raise UsageError(f"cannot read {what} {file}: {error.strerror}; {near(file)}") from None
     return parse_yaml(content, str(file))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.errors import UsageError
+from sags_node.files import near
 from sags_node.rig import opencv, ros, scikit_surgery
 from sags_node.rig.check import accept_rig
 from sags_node.rig.rig import rectified_rig
@@ -115,6 +116,7 @@ def find_form(path: Path) -> Form | None:
 def unknown_form(path: Path) -> str:
     """What to say where there is no calibration."""
     if not path.exists():
-        return f"no calibration: no {path / 'left.yaml'}; a rig is a folder with left.yaml and right.yaml"
+        what = f"no calibration: no {path / 'left.yaml'}; a rig is a folder with left.yaml and right.yaml"
+        return f"{what}; {near(path)}"
     looked_for = "; ".join(form.value for form in Form)
     return f"{path} is no calibration; looked for: {looked_for}"

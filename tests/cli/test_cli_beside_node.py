@@ -27,6 +27,16 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
 # ---- beside no node --------------------------------------------------------------------------------------
 
+
+@pytest.mark.parametrize("bridge", ["web", "foxglove", "openigtlink"])
+def test_a_bridge_says_that_it_waits_for_a_node(bridge: str, run_dir: Path) -> None:
+    process = start(["bridge", bridge, "--port", "0", "--ns", "other", "--json"])
+    assert process.stderr is not None
+    assert "waiting: no node runs as 'other'" in process.stderr.readline()
+    process.terminate()
+    assert process.wait(60) == 0
+
+
 LISTENERS = [
     ["topic", "list"],
     ["topic", "echo", "tf"],

@@ -24,6 +24,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
     [
         (["nowhere.yaml"], ("nowhere.yaml", "No such file", "check the path")),
         (["[/bold].yaml"], ("[/bold].yaml", "check the path")),  # is not taken for rich's markup
+        ([f"{ROOT}/launch/d4d_pul.yaml"], ("No such file", f"did you mean {ROOT}/launch/d4d_pull.yaml?")),
         (["a.yaml", "b.yaml"], ("one launch file", "a.yaml, b.yaml")),
         (["mapping.budgt_ms:=25"], ("mapping.budgt_ms", "did you mean 'budget_ms'")),
         (["budget_ms:=25"], ("'budget_ms'", "did you mean 'mapping.budget_ms'")),
@@ -40,6 +41,17 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 )
 def test_a_wrong_launch(command: str, arguments: list[str], said: tuple[str, ...]) -> None:
     refused(2, command, *arguments, said=said)
+
+
+@pytest.mark.parametrize("content", ["", "# source: {kind: videos}\n", "{}"])
+def test_a_launch_file_that_says_nothing_is_not_taken_for_the_phantom(tmp_path: Path, content: str) -> None:
+    (tmp_path / "mine.yaml").write_text(content)
+    refused(2, "run", tmp_path / "mine.yaml", said=("mine.yaml is empty", "write source:"))
+
+
+def test_a_calibration_that_is_spelled_wrongly_is_named(user_files: Path) -> None:
+    said = ("no calibration", f"did you mean {user_files / 'calib'}?")
+    refused(2, "run", *videos(user_files, rig="calb"), said=said)
 
 
 def test_a_folder_that_is_no_session(user_files: Path) -> None:
