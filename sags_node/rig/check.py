@@ -205,7 +205,7 @@ def _check_rows(rig: StereoRig) -> list[Finding]:
     if (left.width, left.height) != (right.width, right.height):
         what = f"left.yaml is {left.width}x{left.height}, right.yaml {right.width}x{right.height}"
         return [Finding("error", what, "both eyes need the same picture size")]
-    found = []
+    found: list[Finding] = []
     for name, row, column, tolerance in (
         ("fx", 0, 0, 1e-3 * left.P[0, 0]),
         ("fy", 1, 1, 1e-3 * left.P[1, 1]),
