@@ -24,9 +24,8 @@ from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, Bool, FrameResult, RectifiedPair, StereoFrame
-from sags_node.vision.mono_depth import MonoDepth
-from sags_node.vision.mono_scale import fit_scale_shift
-from sags_node.vision.onnx_network import DepthNetwork
+from sags_node.vision.mono_depth import MonoDepth, fit_scale_shift
+from sags_node.vision.onnx_depth import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.pair_watch import PairWatch
 from sags_node.vision.rectify import Rectifier
