@@ -91,17 +91,15 @@ def _passed(rows: Tensor, before: Tensor, after: Tensor) -> Tensor:
 class WindowModel(DeformableModel):
     """Gaussians and a field over a window of time that slides. There is no exposure."""
 
-    def __init__(self, rows: F32, field: Field, smooth: bool = True, slopes: F32 | None = None) -> None:
+    def __init__(self, rows: F32, field: Field) -> None:
         """
         Args:
             rows: [N, 14] of the first frame; where they are now become their places.
             field: its HexPlane has a window that slides.
-            smooth: whether the 3D filter is on.
-            slopes: [N, 3] as in `DeformableModel`.
         """
         neutral = Exposure(np.zeros(1, np.int64), np.ones((1, 3), np.float32))
         self._anchored = AnchoredField(field, rows[:, columns.MEAN])
-        super().__init__(rows, self._anchored, neutral, smooth, slopes)
+        super().__init__(rows, self._anchored, neutral)
 
     def advance(self, t_ns: int) -> int:
         """Let the window reach `t_ns`. Every slot that leaves it is folded into the canonical rows.
@@ -132,8 +130,8 @@ class WindowModel(DeformableModel):
         self._anchored.place(self._anchored.places[kept])
         super().keep(kept)
 
-    def insert(self, rows: F32, t_ns: int, slopes: F32 | None = None) -> None:
-        """Add Gaussians that are as `rows` [M, 14] and `slopes` [M, 3] say at `t_ns`.
+    def insert(self, rows: F32, t_ns: int) -> None:
+        """Add Gaussians that are as `rows` [M, 14] say at `t_ns`.
 
         They get places as if they had been there from the start, moved by what moved their neighbours.
         """
@@ -146,5 +144,3 @@ class WindowModel(DeformableModel):
         anchored.place(np.concatenate([anchored.places, means - moved]))
         new = torch.arange(count, count + len(rows))
         self.append(anchored.carry(rows, t_ns, anchored.anchor_ns, new), index[:, 0].astype(np.int64))
-        if self.slopes is not None and slopes is not None:
-            self.slopes.detach()[count:] = torch.from_numpy(slopes)

@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from engine_scenes import camera as facing_camera
 
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, FieldRates, NodeField, PointField
 from sags_node.field.hexplane import HexPlane
-from sags_node.field.model import Rates
 from sags_node.field.window import AnchoredField, WindowModel
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
@@ -169,27 +166,6 @@ def test_places_stay_with_their_gaussians() -> None:
     np.testing.assert_allclose(states(model, times), expected, atol=ROUNDING)
     model.advance(NEWEST_NS + SLOT_NS)
     np.testing.assert_allclose(states(model, times), expected, atol=ROUNDING)
-
-
-def test_slopes_are_learnt_and_stay_with_their_gaussians() -> None:
-    slopes = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
-    rows, deltas = some_rows(), moving_deltas("self")
-    model = WindowModel(rows, PointField(deltas), slopes=slopes)
-    camera = facing_camera(160, 128)
-    rasterizer = make_rasterizer("numba", 160, 128)
-    drawing = model.draw(rasterizer, NEWEST_NS, camera)
-    drawing.differentiate(drawing.planes[:3].square().sum(), np.ones((128, 160), np.float32))
-    model.descend([drawing], Rates(np.zeros(columns.COUNT, np.float32), FieldRates(0, 0, 0), slopes=0.01))
-    seen = drawing.contribution > 0
-    assert model.slopes is not None and seen.any()
-    learnt = model.slopes.detach().numpy()
-    assert (np.abs(learnt - slopes)[seen] > 1e-3).any() and np.array_equal(learnt[~seen], slopes[~seen])
-    kept = np.arange(300) % 2 == 0
-    model.keep(kept)
-    born = np.ones((4, 3), np.float32)
-    model.insert(some_rows(4, seed=5), NEWEST_NS, born)
-    found = model.at(NEWEST_NS, [camera]).slopes
-    np.testing.assert_array_equal(found, np.concatenate([learnt[kept], born]))
 
 
 # ---- gradients -------------------------------------------------------------------------------------------
