@@ -92,7 +92,8 @@ class _Loader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
         is_alias = self.check_event(yaml.AliasEvent)
-        node: yaml.Node = super().compose_node(parent, index)
+        node = super().compose_node(parent, index)
+        assert node is not None  # PyYAML's types say that it may be
         if is_alias:
             if node not in self._sizes:
                 raise _RefusedError(node, "it contains itself, through an alias")

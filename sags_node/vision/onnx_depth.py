@@ -102,7 +102,8 @@ class DepthNetwork:
             raise DepthNetworkError(
                 f"{self.name}: output {self._output} is not a map of the {sizes_of_maps(fit)}"
             )
-        return maps[0].astype(np.float32)
+        first: F32 = maps[0].astype(np.float32)
+        return first
 
     def _check_description(self) -> None:
         """
