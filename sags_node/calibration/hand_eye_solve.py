@@ -177,14 +177,11 @@ def _rotation(robot: F64, camera: F64) -> F64:
 def _linear(hands: F64, boards: F64) -> F64:
     """A first hand-eye transform [4, 4]: A X = X B for the motions A of the hand and B of the camera."""
     first, second = _pairs(len(hands))
+    A, B = np.linalg.inv(hands[first]) @ hands[second], boards[first] @ np.linalg.inv(boards[second])
     X = np.eye(4)
     X[:3, :3] = _rotation(*_turns(hands, boards))
-    rows, right = [], []
-    for i, j in zip(first, second, strict=True):
-        A, B = invert(hands[i]) @ hands[j], boards[i] @ invert(boards[j])
-        rows.append(A[:3, :3] - np.eye(3))
-        right.append(X[:3, :3] @ B[:3, 3] - A[:3, 3])
-    X[:3, 3] = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    right = B[:, :3, 3] @ X[:3, :3].T - A[:, :3, 3]
+    X[:3, 3] = np.linalg.lstsq((A[:, :3, :3] - np.eye(3)).reshape(-1, 3), right.ravel(), rcond=None)[0]
     return X
 
 
