@@ -14,7 +14,6 @@ from benchmarks.commands.engine import (
     bench_gpu,
     bench_kernels,
     bench_methods,
-    bench_stream,
 )
 from benchmarks.commands.masks import (
     bench_masks,
@@ -62,7 +61,6 @@ for command in (
     bench_kernels,
     bench_gpu,
     bench_alias,
-    bench_stream,
     bench_methods,
     bench_ablation,
 ):

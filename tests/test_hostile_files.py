@@ -20,8 +20,7 @@ from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.media import picture_file
-from sags_node.media.native_output import native_output
-from sags_node.media.picture_header import claimed_size, is_whole
+from sags_node.media.picture_file import claimed_size, is_whole, native_output
 from sags_node.overlay.mesh import mesh_of
 from sags_node.overlay.save import Output
 from sags_node.overlay.scene import ObjectSpec

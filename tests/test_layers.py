@@ -88,7 +88,6 @@ def test_the_package_imports_nothing_that_stands_beside_it() -> None:
 # Private names that tests use. The first is Numba's; the package has such a name, too.
 REACHED_INTO = {
     ("kernels/test_kernel_cache.py", "_cache"),
-    ("benchmarks/test_stream_fit.py", "_drawn_ns"),  # whose rows must stay those of the model it thins out
     ("model/test_model.py", "_LEAST_STIFFNESS"),  # without stiffness: the twin that it must be better than
 }
 PRIVATE = re.compile(r"\b_[a-zA-Z]\w*")

@@ -18,7 +18,6 @@ from sags_node.cli.launching import (
     launch_argument,
     lpips_option,
     open_launched,
-    positive,
     split_recording,
     write_json,
 )
@@ -201,56 +200,6 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool
     if picture is not None:
         with whole(picture) as partial:
             partial.write_bytes(alias_report.picture(measured.truth, measured.models))
-
-
-@click.command("stream")
-@launch_argument
-@click.option(
-    "--seconds",
-    type=positive,
-    default=8.0,
-    show_default=True,
-    help="Length of the stream, on the recording's clock; a shorter recording begins again.",
-)
-@click.option("--window", type=positive, default=2.0, show_default=True, help="Seconds the model looks back.")
-@click.option("--quick", is_flag=True, help="A tiny model: does it work, not how good is it.")
-@figures_option
-@as_json
-def bench_stream(
-    launch: tuple[str, ...], seconds: float, window: float, quick: bool, out: Path | None, json_out: bool
-) -> None:
-    """Whether the SAGS model lasts over a stream that never ends.
-
-    A session, by default the built-in phantom, is played frame by frame, however long each takes; --seconds
-    should be several times the --window that the deformation field remembers. What leaves the window is
-    folded into the Gaussians. Beside it: a model that forgets it instead, and one whose window covers all.
-    Second by second: PSNR on tissue of the newest frame before and after it was learnt from and of earlier
-    ones, the largest change of the picture as the window moves, sizes and times. Takes some five minutes.
-
-    \b
-    python -m benchmarks stream launch/phantom.yaml --seconds 6.5 --out benchmarks/results/stream.json
-    """
-    from dataclasses import replace
-
-    from benchmarks.node import stream
-    from sags_node.fitting.stream import QUICK, StreamSettings
-    from sags_node.pipeline.session import open_session
-
-    no_cameras = "benchmarks stream plays recordings; live cameras do not come twice alike"
-    path, overrides = split_recording(launch, no_cameras)
-    if seconds < window:
-        raise UsageError(f"--seconds {seconds:g} is shorter than --window {window:g}: nothing would leave it")
-    check_files(out)
-    forced = ["source.loop:=true", "source.pace:=step"]
-    with open_launched(path, [*overrides, *forced]).source as source:
-        frames = max(1, round(source.rate * seconds))
-    session = open_session(path, [*overrides, *forced, f"source.frames:={frames}"])
-    settings = replace(QUICK if quick else StreamSettings(), window=window)
-    with progress("measuring") as advance:
-        measured = stream.measure_stream(session, settings, advance)
-    for table in [measured] if json_out else stream.tables(measured):
-        show(table)
-    write_json(out, measured)
 
 
 @click.command("methods")

@@ -40,7 +40,6 @@ class HandEyeSolution:
     """The calibration, and what is known of its quality."""
 
     hand_eye: HandEye
-    T_base_board: F64  # [4, 4] m
     errors: F64  # [V] px, root mean square of each view, both eyes
     names: list[str]  # of the views used
     position_error: float  # m, standard deviation of the camera's place on the hand
@@ -72,7 +71,7 @@ def solve_hand_eye(
     Z = hands[0] @ X @ boards[0]
     residuals = _Residuals(views, stamps, points, rig, pose_at, X, Z, offset)
     parameters, covariance, spread = _least_squares(residuals)
-    X, Z, offset = residuals.unpacked(parameters)
+    X, _, offset = residuals.unpacked(parameters)
     corners = residuals(parameters).reshape(-1, 2)
     ends = np.cumsum([2 * len(view.ids) for view in views])
     errors = np.array([np.sqrt(np.mean(np.sum(part**2, 1))) for part in np.split(corners, ends[:-1])])
@@ -89,9 +88,7 @@ def solve_hand_eye(
             f"{np.degrees(turn):.2f} degrees): {_TURN}"
         )
     names = [view.name for view in views]
-    return HandEyeSolution(
-        HandEye(X, offset), Z, errors, names, float(place), float(turn), float(clock * 1e9)
-    )
+    return HandEyeSolution(HandEye(X, offset), errors, names, float(place), float(turn), float(clock * 1e9))
 
 
 def _enough(count: int, of: int) -> None:
@@ -180,14 +177,11 @@ def _rotation(robot: F64, camera: F64) -> F64:
 def _linear(hands: F64, boards: F64) -> F64:
     """A first hand-eye transform [4, 4]: A X = X B for the motions A of the hand and B of the camera."""
     first, second = _pairs(len(hands))
+    A, B = np.linalg.inv(hands[first]) @ hands[second], boards[first] @ np.linalg.inv(boards[second])
     X = np.eye(4)
     X[:3, :3] = _rotation(*_turns(hands, boards))
-    rows, right = [], []
-    for i, j in zip(first, second, strict=True):
-        A, B = invert(hands[i]) @ hands[j], boards[i] @ invert(boards[j])
-        rows.append(A[:3, :3] - np.eye(3))
-        right.append(X[:3, :3] @ B[:3, 3] - A[:3, 3])
-    X[:3, 3] = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    right = B[:, :3, 3] @ X[:3, :3].T - A[:, :3, 3]
+    X[:3, 3] = np.linalg.lstsq((A[:, :3, :3] - np.eye(3)).reshape(-1, 3), right.ravel(), rcond=None)[0]
     return X
 
 

@@ -1,4 +1,4 @@
-"""Reads launch files. An unknown key is an error that names the nearest known one, or what replaced it."""
+"""Reads launch files. An unknown key is an error that names the nearest known one."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from typing import Any, TypeVar, get_args
 from pydantic import ValidationError
 
 from sags_node.config.schema import (
-    REMOVED,
-    REMOVED_KINDS,
     LaunchConfig,
     LiveSource,
     PhantomSource,
@@ -281,7 +279,7 @@ def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
 def _explain(
     error: ValidationError, name: str, given: Sequence[str] = (), root: type[Section] = LaunchConfig
 ) -> str:
-    """One line per mistake: where, what, and for an unknown key what replaced it or the nearest known one.
+    """One line per mistake: where, what, and for an unknown key the nearest known one.
 
     Args:
         name: of what was read.
@@ -294,9 +292,7 @@ def _explain(
         path = [str(part) for part in item["loc"]]
         where = ".".join(part for part in path if part not in _SOURCES)
         said = COMMAND_LINE if any(f"{where}.".startswith(f"{key}.") for key in given) else name
-        if item["type"] == "extra_forbidden" and where in REMOVED:
-            lines.append(f"{said}: there is no {where} any more: {REMOVED[where]}")
-        elif item["type"] == "extra_forbidden":
+        if item["type"] == "extra_forbidden":
             lines.append(f"{said}: unknown key '{where}'; {_nearest(path, root)}")
         elif item["type"] == "missing":
             lines.append(f"{said}: {where} is missing; set it")
@@ -304,10 +300,7 @@ def _explain(
             kinds = ", ".join(repr(kind) for kind in _SOURCES)
             got = item["input"].get("kind")
             said = COMMAND_LINE if "source.kind" in given else name
-            if got in REMOVED_KINDS:
-                lines.append(f"{said}: there is no source.kind {got} any more: {REMOVED_KINDS[got]}")
-            else:
-                lines.append(f"{said}: source.kind: should be one of {kinds} (got {brief(got)})")
+            lines.append(f"{said}: source.kind: should be one of {kinds} (got {brief(got)})")
         else:
             what = _PLAIN.get(item["type"], item["msg"])
             lines.append(f"{said}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")

@@ -846,31 +846,3 @@ class LaunchConfig(Section):
 
 
 LIVE_PARAMETERS = ("mapping.budget_ms",)  # that `set_parameters` may change while the node runs
-
-# Keys of earlier versions, and what stands in their place: an error says it.
-ALWAYS_ON = "it is always on; `python -m benchmarks pareto --only skips` says what it brings"
-SCENE = "`sags phantom FOLDER key:=value` writes a session with it; play that folder"
-REMOVED = {
-    "seed": "`python -m benchmarks endurance` has --seed; source.seed is the phantom's",
-    "mapping.right_eye": "publish.right draws the right eye, and learns from what it sees",
-    "vision.stereo.method": "inverse search matches; SGBM is a baseline of `python -m benchmarks depth`",
-    "source.order": "source.geometry.first says whose the left half is",
-    "source.video": "source.left names the video",
-    "engine.backend": "device:=cuda draws and refines on a GPU, any other device on the CPU",
-    "mapping.smoothing": "it is always on; `python -m benchmarks alias` says what it brings",
-    "mapping.skip_duplicates": ALWAYS_ON,
-    "mapping.skip_depth": ALWAYS_ON,
-    "mapping.skip_fitted": "the first step is on the whole picture now: a part saved 0.2 ms and cost 0.26 dB",
-    "mapping.skip_still": ALWAYS_ON,
-    "source.smoke": SCENE,
-    "source.noise": SCENE,
-    "source.blur": SCENE,
-    "source.gloss": SCENE,
-    "source.still_tissue": SCENE,
-    "source.blackout": SCENE,
-}
-REMOVED_KINDS = {
-    "side_by_side": "source.kind:=videos source.left:=VIDEO source.geometry.layout:=side_by_side",
-    "panes": "source.kind:=videos source.left:=VIDEO source.geometry.layout:=panes, with the boxes of the "
-    "eyes in source.geometry.crop and crop_right",
-}

@@ -48,12 +48,8 @@ def parse_yaml(content: bytes | str, where: str) -> Any:
         UsageError: it is not UTF-8 or not YAML, or is one of the things that this module refuses.
     """
     try:
-        loader = yaml.SafeLoader(content if isinstance(content, str) else content.decode("utf-8"))
-        document = loader.get_single_node()
-        if document is None:
-            return None
-        _Check(loader).size(document)
-        return _unfolded(loader.construct_document(document))
+        text = content if isinstance(content, str) else content.decode("utf-8")
+        return _unfolded(_Loader(text).get_single_data())
     except UnicodeDecodeError:
         problem = "it is not UTF-8 text"
     except RecursionError:
@@ -73,13 +69,10 @@ def check_dialect(text: str, where: str) -> None:
         UsageError: a key is given twice, and so on.
     """
     try:
-        loader = yaml.SafeLoader(text)
-        document = loader.get_single_node()
-        if document is not None:
-            _Check(loader).size(document)
+        _Loader(text).get_single_node()
     except _RefusedError as error:
         raise UsageError(f"{where} is not valid YAML: {_in_words(error)}") from None
-    except (yaml.YAMLError, RecursionError):
+    except (yaml.YAMLError, RecursionError, ValueError):
         return  # its own reader says what it thinks of it
 
 
@@ -90,44 +83,43 @@ class _RefusedError(ConstructorError):
         super().__init__(None, None, problem, node.start_mark)
 
 
-class _Check:
-    """Walks through a document as it was written, before any value is made of it."""
+class _Loader(yaml.SafeLoader):
+    """Looks at each part of a document as it was written, before any value is made of it."""
 
-    def __init__(self, loader: yaml.SafeLoader) -> None:
-        self._loader = loader
-        self._sizes: dict[int, int] = {}  # by node; 0: this walk is inside it
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._sizes: dict[yaml.Node, int] = {}  # values in a part, with its aliases unfolded
 
-    def size(self, node: yaml.Node) -> int:
-        """How many values a node holds with its aliases unfolded."""
-        known = self._sizes.get(id(node))
-        if known == 0:
-            raise _RefusedError(node, "it contains itself, through an alias")
-        if known is not None:
-            return known
-        self._sizes[id(node)] = 0
-        size = 1
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        is_alias = self.check_event(yaml.AliasEvent)
+        node = super().compose_node(parent, index)
+        assert node is not None  # PyYAML's types say that it may be
+        if is_alias:
+            if node not in self._sizes:
+                raise _RefusedError(node, "it contains itself, through an alias")
+            return node
+        parts: list[yaml.Node] = []
         if isinstance(node, yaml.MappingNode):
             self._refuse_twins(node)
-            size += sum(self.size(key) + self.size(value) for key, value in node.value)
+            parts = [part for pair in node.value for part in pair]
         elif isinstance(node, yaml.SequenceNode):
-            size += sum(map(self.size, node.value))
+            parts = node.value
         elif "\0" in node.value:
             raise _RefusedError(node, "a text holds a zero character")
-        if size > MOST_VALUES:
+        self._sizes[node] = 1 + sum(self._sizes[part] for part in parts)
+        if self._sizes[node] > MOST_VALUES:
             raise _RefusedError(node, f"it holds more than {MOST_VALUES} values, with its aliases unfolded")
-        self._sizes[id(node)] = size
-        return size
+        return node
 
     def _refuse_twins(self, node: yaml.MappingNode) -> None:
         lines: dict[Any, int] = {}
         for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":
-                continue
-            name, line = self._loader.construct_object(key), key.start_mark.line + 1
-            if name in lines:
-                said = f"the key {brief(name)} is given twice, first in line {lines[name]}; keep one"
-                raise _RefusedError(key, said)
-            lines[name] = line
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                name, line = self.construct_object(key), key.start_mark.line + 1
+                if name in lines:
+                    said = f"the key {brief(name)} is given twice, first in line {lines[name]}; keep one"
+                    raise _RefusedError(key, said)
+                lines[name] = line
 
 
 def _unfolded(value: Any) -> Any:

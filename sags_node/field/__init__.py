@@ -8,18 +8,18 @@ A model is canonical Gaussians in raw rows [N, 14] (`model.columns`) and a field
     hexplane = HexPlane(box, t0_ns, slot_ns, slots)                  features of (x, y, z, t)
     decoder = Decoder(hexplane.features, tokens)                     features -> changes of a row
     field = NodeField(Deltas(hexplane, decoder), nodes)              or PointField(Deltas(...))
-    model = WindowModel(rows, field, slopes=slopes)                  or DeformableModel: of a clip
+    model = WindowModel(rows, field)                                 or DeformableModel: of a clip
     decoder.awaken(seed)                                             WindowModel: before it learns
 
     model.at(t_ns, cameras) -> Gaussians                             numpy, ready to draw; len(model)
-    model.advance(t_ns); model.keep(kept); model.insert(rows, t_ns, slopes)
+    model.advance(t_ns); model.keep(kept); model.insert(rows, t_ns)
 
 One step of learning, with any loss of the planes, or its gradient by them [5, H, W]:
 
     drawing = model.draw(rasterizer, t_ns, camera)                   .planes [5, H, W], a tensor with a graph
     found = compare(drawing.planes, image, tissue, depth, unseen, LossWeights())
     drawing.differentiate(found.loss, found.weight)                  then .contribution, .spread [N]
-    model.descend([drawing], Rates(rows, FieldRates(), slopes=rate)) Adam
+    model.descend([drawing], Rates(rows, FieldRates()))              Adam
 
 Importing it imports torch, which takes a second: only what fits imports it, and where it does.
 

@@ -7,9 +7,6 @@ HexPlane, Cao & Johnson, CVPR 2023; the product is that of K-Planes, Fridovich-K
 Six planes of feature vectors on each level are sampled bilinearly. The first and last node of an axis in
 space lie on the faces of the box; outside it, the border's value holds.
 
-Space: cells have a fixed size in metres. The box grows by whole cells of the coarsest level, and new cells
-take the value of the nearest old one, which is what sampling gave there before: growing changes no feature.
-
 Time: slot number k stands for t0_ns + k * slot_ns; the last `slots` of them are kept in a ring. Between slots
 features are blended, before the oldest and after the newest they are constant. A new slot starts as a copy of
 the newest.
@@ -32,7 +29,6 @@ from sags_node.types import F64, I64
 
 MAX_BYTES = 1 << 29  # of the cells; their optimiser's state takes twice as much again, their gradients once
 MAX_LEVELS = 8
-GROWTH_MARGIN = 4  # coarsest cells added beyond the need, so that the box does not grow every frame
 
 # First values of the planes in space, and of the lines in time. EndoGaussian takes 0.1 to 0.5: the
 # product of three planes is then about 0.03, the decoder sees next to nothing at first, and after 1300
@@ -98,8 +94,7 @@ class HexPlane:
             )
         self.t0_ns, self.slot_ns, self.slots, self.channels = int(t0_ns), int(slot_ns), slots, channels
         self.newest = 0
-        self._cell = (box[1] - box[0]) / counts  # m, [3], coarsest level
-        self._lay_out(box[0], counts, levels)
+        self._lay_out(box, counts, levels)
         rows = self._space_rows + slots * self._slot_rows
         values = np.full((rows, channels), FIRST_LINE, np.float32)
         values[: self._space_rows] = np.random.default_rng(seed).uniform(
@@ -108,8 +103,8 @@ class HexPlane:
         self.cells: Tensor = torch.from_numpy(values).to(device).requires_grad_()
         self.adam = RowAdam.of(self.cells)
 
-    def _lay_out(self, low: F64, counts: I64, levels: int) -> None:
-        """The grid of `counts` [3] cells on the coarsest level, from the corner `low` [3] m."""
+    def _lay_out(self, box: F64, counts: I64, levels: int) -> None:
+        """Place the grid of `counts` [3] cells on the coarsest level in the box [2, 3] m."""
         nodes = counts * 2.0 ** np.arange(levels)[:, None] + 1  # float: what is out of range must not wrap
         x, y, z = nodes.T
         size = (x * y + x * z + y * z + self.slots * (x + y + z)).sum() * self.channels * 4
@@ -119,9 +114,8 @@ class HexPlane:
                 f"{size / 1e6:.0f} MB, the limit is {MAX_BYTES / 1e6:.0f} MB: "
                 "use fewer cells, or leave points that lie far away out of its box"
             )
-        self.box: F64 = np.array([low, low + counts * self._cell])
+        self.box = box
         self.nodes = nodes.astype(np.int64)
-        self._counts = counts.astype(np.int64)
         planes = np.array([[level[a] * level[b] for a, b in PAIRS] for level in self.nodes])
         self._plane_rows = (planes.cumsum() - planes.ravel()).reshape(-1, 3)
         self._line_rows = (self.nodes.cumsum() - self.nodes.ravel()).reshape(-1, 3)  # within a slot
@@ -218,44 +212,6 @@ class HexPlane:
             for number in range(max(oldest, self.newest + 1), newest + 1):
                 rows[self.slot(number)] = last
         self.newest = newest
-
-    def grow(self, box: F64) -> bool:
-        """Make the box hold `box` [2, 3] m too. Features stay the same everywhere.
-
-        Returns:
-            Whether it grew; then `cells` and `adam` are new.
-
-        Raises:
-            UsageError: the box is not finite.
-            SagsError: the grown planes are larger than the memory they may take; all is as it was.
-        """
-        if not np.isfinite(box).all():
-            raise UsageError(f"cannot grow a HexPlane to a box that is not finite: {box.tolist()} m")
-        slack = 1e-6  # of a cell: the box as it is must not look too small for itself
-        before = np.maximum(0, np.ceil((self.box[0] - box[0]) / self._cell - slack))
-        after = np.maximum(0, np.ceil((box[1] - self.box[1]) / self._cell - slack))
-        before[before > 0] += GROWTH_MARGIN
-        after[after > 0] += GROWTH_MARGIN
-        if not (before.any() or after.any()):
-            return False
-        old_nodes, old_planes, old_lines = self.nodes, self._plane_rows, self._line_rows
-        old_slots = [self.slot(number).start for number in range(self.slots)]
-        low = self.box[0] - before * self._cell
-        self._lay_out(low, self._counts + before + after, len(old_nodes))
-        rows, lines = [], []  # for each new row, the nearest old one
-        for level, (new, old) in enumerate(zip(self.nodes, old_nodes, strict=True)):
-            near = [
-                np.clip(np.arange(new[axis]) - int(before[axis]) * 2**level, 0, old[axis] - 1)
-                for axis in range(3)
-            ]
-            for plane, (a, b) in enumerate(PAIRS):
-                rows.append(old_planes[level, plane] + (near[a][:, None] * old[b] + near[b]).ravel())
-            lines += [old_lines[level, axis] + near[axis] for axis in range(3)]
-        rows += [first + np.concatenate(lines) for first in old_slots]
-        source = torch.from_numpy(np.concatenate(rows))
-        self.cells = self.cells.detach()[source].requires_grad_()
-        self.adam = self.adam.rows(source)
-        return True
 
 
 def for_clip(box: F64, first_ns: int, last_ns: int, slots: int = 25, **options: object) -> HexPlane:

@@ -28,11 +28,6 @@ class Rates(NamedTuple):
 
     rows: F32  # [14] of the canonical rows
     field: FieldRates
-    slopes: float = 0.0
-
-    def scaled(self, factor: float) -> Rates:
-        rows = self.rows * np.float32(factor)
-        return Rates(rows, self.field.scaled(factor), factor * self.slopes)
 
 
 class DeformableModel:
@@ -62,7 +57,6 @@ class DeformableModel:
         self.next_id = len(rows)
         self.field, self.exposure, self.smooth = field, exposure, smooth
         self.adam = RowAdam.of(self.rows.detach())
-        self.slopes_adam = RowAdam.of(self.rows.detach()[:, :3])
         field.follow(self.means)
 
     def __len__(self) -> int:
@@ -141,10 +135,6 @@ class DeformableModel:
         row_rates = torch.from_numpy(rates.rows).to(self.device, non_blocking=True)
         self.adam.step(self.rows, self.rows.grad, row_rates, seen)
         self.rows.grad = None
-        if self.slopes is not None and self.slopes.grad is not None:
-            slope_rates = self.slopes.grad.new_full((3,), rates.slopes)
-            self.slopes_adam.step(self.slopes, self.slopes.grad, slope_rates, seen)
-            self.slopes.grad = None
         self.field.deltas.step(rates.field)
 
     def keep(self, kept: Bool) -> None:
@@ -157,14 +147,12 @@ class DeformableModel:
 
     def _take(self, kept: I64, rows: F32, parents: I64) -> None:
         """The Gaussians in `kept`, then new ones."""
+        assert self.slopes is None  # only an online start has them, whose Gaussians are the mapper's
         ids = np.arange(self.next_id, self.next_id + len(rows))
         self.ids, self.next_id = np.concatenate([self.ids[kept], ids]), self.next_id + len(rows)
-        if self.slopes is not None:
-            self.slopes = self._leaf(self.slopes.detach().cpu().numpy()[np.concatenate([kept, parents])])
         self.rows = self._leaf(np.concatenate([self.table[kept], rows]))
         known = torch.from_numpy(kept).to(self.device)
         self.adam = self.adam.rows(known).grown(len(rows))
-        self.slopes_adam = self.slopes_adam.rows(known).grown(len(rows))
         self.field.follow(self.means)
 
     def _leaf(self, values: F32) -> Tensor:

@@ -17,21 +17,17 @@ as those of the decoder and of the planes in space mostly do, would seem to help
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from sags_node.field.deformation import Deltas, Field, PointField, conjugate, product, unit
+from sags_node.field.deformation import Deltas, Field, conjugate, product, unit
 from sags_node.field.model import DeformableModel
 from sags_node.model import columns
 from sags_node.model.deformation import nearest_nodes
 from sags_node.model.exposure import Exposure
-from sags_node.types import F32, F64, Bool
-
-MOST_GROWTH = 0.5  # of the first box, on each side: places beyond take the field's value at the border
+from sags_node.types import F32, Bool
 
 
 class AnchoredField:
@@ -95,38 +91,18 @@ def _passed(rows: Tensor, before: Tensor, after: Tensor) -> Tensor:
 class WindowModel(DeformableModel):
     """Gaussians and a field over a window of time that slides. There is no exposure."""
 
-    def __init__(self, rows: F32, field: Field, smooth: bool = True, slopes: F32 | None = None) -> None:
+    def __init__(self, rows: F32, field: Field) -> None:
         """
         Args:
             rows: [N, 14] of the first frame; where they are now become their places.
             field: its HexPlane has a window that slides.
-            smooth: whether the 3D filter is on.
-            slopes: [N, 3] as in `DeformableModel`.
         """
         neutral = Exposure(np.zeros(1, np.int64), np.ones((1, 3), np.float32))
         self._anchored = AnchoredField(field, rows[:, columns.MEAN])
-        super().__init__(rows, self._anchored, neutral, smooth, slopes)
-        self._asks_at_places = isinstance(field, PointField)  # control nodes stay where they are
-        self._first_box: F64 = field.deltas.hexplane.box.copy()
+        super().__init__(rows, self._anchored, neutral)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of all that is learnt and of its optimisers."""
-        deltas = self.field.deltas
-        tables: list[NDArray[Any]] = [
-            self.table,
-            self._anchored.places,
-            self.ids,
-            deltas.hexplane.cells.detach().numpy(),
-        ]
-        for adam in (self.adam, deltas.hexplane.adam):
-            tables += [adam.moments.numpy(), adam.shares.numpy()]
-        parameters = sum(parameter.nbytes for parameter in deltas.decoder.parameters())
-        return sum(table.nbytes for table in tables) + 3 * parameters
-
-    def advance(self, t_ns: int, folds: bool = True) -> int:
-        """Let the window reach `t_ns`. Every slot that leaves it is folded into the canonical rows, or
-        forgotten, which only shows what folding is for.
+    def advance(self, t_ns: int) -> int:
+        """Let the window reach `t_ns`. Every slot that leaves it is folded into the canonical rows.
 
         Returns:
             How many left it.
@@ -135,8 +111,7 @@ class WindowModel(DeformableModel):
         retired: list[int] = []
 
         def fold(slot_ns: int) -> None:
-            if folds:
-                self.table[:] = self._anchored.carry(self.table, slot_ns, slot_ns + hexplane.slot_ns)
+            self.table[:] = self._anchored.carry(self.table, slot_ns, slot_ns + hexplane.slot_ns)
             retired.append(slot_ns)
 
         hexplane.advance(t_ns, fold)
@@ -155,8 +130,8 @@ class WindowModel(DeformableModel):
         self._anchored.place(self._anchored.places[kept])
         super().keep(kept)
 
-    def insert(self, rows: F32, t_ns: int, slopes: F32 | None = None) -> None:
-        """Add Gaussians that are as `rows` [M, 14] and `slopes` [M, 3] say at `t_ns`.
+    def insert(self, rows: F32, t_ns: int) -> None:
+        """Add Gaussians that are as `rows` [M, 14] say at `t_ns`.
 
         They get places as if they had been there from the start, moved by what moved their neighbours.
         """
@@ -166,18 +141,6 @@ class WindowModel(DeformableModel):
             others = self.rows_at(t_ns)[:, columns.MEAN].contiguous().numpy()
         index, weight, _ = nearest_nodes(means, others)
         moved = ((others - anchored.places)[index] * weight[..., None]).sum(axis=1)
-        places = means - moved
-        if self._asks_at_places:
-            self._grow(places)
-        anchored.place(np.concatenate([anchored.places, places]))
+        anchored.place(np.concatenate([anchored.places, means - moved]))
         new = torch.arange(count, count + len(rows))
         self.append(anchored.carry(rows, t_ns, anchored.anchor_ns, new), index[:, 0].astype(np.int64))
-        if self.slopes is not None and slopes is not None:
-            self.slopes.detach()[count:] = torch.from_numpy(slopes)
-
-    def _grow(self, places: F32) -> None:
-        """Let the field's box hold the places, but never more than memory may grow."""
-        first = self._first_box
-        reach = MOST_GROWTH * (first[1] - first[0])
-        box = np.array([places.min(axis=0), places.max(axis=0)], np.float64)
-        self.field.deltas.hexplane.grow(np.clip(box, first[0] - reach, first[1] + reach))

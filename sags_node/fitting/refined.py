@@ -13,7 +13,7 @@ from sags_node.field.model import DeformableModel
 from sags_node.fitting.residuals import COLOR_DAMPING, Residuals, Steps
 from sags_node.model import columns
 from sags_node.model.exposure import Exposure
-from sags_node.types import F32, I64, Bool, Camera
+from sags_node.types import F32, Camera
 
 
 class RefinedModel(DeformableModel):
@@ -63,11 +63,3 @@ class RefinedModel(DeformableModel):
         self.slopes.detach().numpy()[:] -= length.astype(np.float32)[:, None] * self.slopes.grad.numpy()
         self.slopes.grad = None
         self.field.deltas.step(field_rates)
-
-    def keep(self, kept: Bool) -> None:
-        self.residuals.keep(kept)
-        super().keep(kept)
-
-    def append(self, rows: F32, parents: I64) -> None:
-        self.residuals.append(parents)
-        super().append(rows, parents)

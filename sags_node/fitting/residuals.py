@@ -15,7 +15,7 @@ from sags_node.engine.adam import AdamState, adam_step
 from sags_node.errors import SagsError
 from sags_node.kernels.jit import aligned
 from sags_node.model import columns
-from sags_node.types import F32, I64, Bool
+from sags_node.types import F32, I64
 
 BETAS = (0.5, 0.99)  # low momentum: a slot is visited now and then, from other frames each time
 LEAST_CONTRIBUTION = 1e-3  # px: what was seen less is not touched
@@ -106,22 +106,3 @@ class Residuals:
             )  # fmt: skip
             # the smallest change of both slots whose blend is the step
             values[seen, columns.COLOR] -= np.float32(share / norm) * colors
-
-    def keep(self, kept: Bool) -> None:
-        """Forget the Gaussians where `kept` [N] is False."""
-        self._take(np.flatnonzero(kept), fresh=0)
-
-    def append(self, parents: I64) -> None:
-        """Add one Gaussian that does as its parent, for each of `parents` [M]."""
-        count = self.values.shape[1]
-        self._take(np.concatenate([np.arange(count), parents]), fresh=len(parents))
-
-    def _take(self, rows: I64, fresh: int) -> None:
-        values: F32 = aligned((len(self.times_ns), len(rows), columns.COUNT))
-        np.take(self.values, rows, axis=1, out=values)
-        self.values = values
-        known = len(rows) - fresh
-        for slot, old in enumerate(self.adam):
-            new = AdamState.new(len(rows), columns.COUNT)
-            new.moments[:known], new.shares[:known] = old.moments[rows[:known]], old.shares[rows[:known]]
-            self.adam[slot] = new

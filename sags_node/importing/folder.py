@@ -12,7 +12,7 @@ from sags_node.config.launch_file import VIDEO_SUFFIXES, is_launch, known_record
 from sags_node.config.schema import LaunchConfig
 from sags_node.config.yaml_reader import parse_yaml
 from sags_node.errors import UsageError
-from sags_node.media.picture_header import SUFFIXES
+from sags_node.media.picture_file import SUFFIXES
 from sags_node.rig import find_form
 from sags_node.sources.names import EYE
 

@@ -9,15 +9,15 @@ here changes with
 - the versions of Python, Numba and llvmlite;
 - the compile target: CPU, its features, and Numba's settings.
 
-What is read is text, not syntax: any mention of a module by its full name counts as an import. So nothing is
-missed, and an edit changes the names of the files that stand on it and of no others.
+What is read is text, not syntax: any mention of a module by its full name counts as an import, and that of a
+folder as an import of all its modules whose names stand in the text. So nothing is missed, and an edit
+changes the names of the files that stand on it and of few others.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
-import os
 import re
 import sys
 import time
@@ -29,9 +29,9 @@ import llvmlite
 import numba
 from numba.core.registry import cpu_target
 
-_PACKAGE = os.path.dirname(os.path.dirname(__file__))
-_MENTION = re.compile(rf"\b{os.path.basename(_PACKAGE)}(?:\.\w+)*".encode())
-_WORD = re.compile(rb"\w+")
+_PACKAGE = Path(__file__).parents[1]
+_MENTION = re.compile(rf"\b{_PACKAGE.name}((?:\.\w+)*)")
+_WORD = re.compile(r"\w+")
 _STARTED = time.time()
 # These settings of Numba do not change machine code. Whatever is not listed counts.
 _HARMLESS = {
@@ -54,8 +54,10 @@ def kernel_name(function: Callable[..., Any]) -> str | None:
 
 @functools.cache
 def _name(file: str) -> str | None:
-    digests: dict[str, bytes] = {}
-    waiting = [file]
+    if not Path(file).is_relative_to(_PACKAGE):
+        return None
+    digests: dict[Path, bytes] = {}
+    waiting = [Path(file)]
     while waiting:
         path = waiting.pop()
         if path in digests:
@@ -67,50 +69,37 @@ def _name(file: str) -> str | None:
         waiting += named
     digest = hashlib.sha256(_surroundings())
     for path in sorted(digests):
-        digest.update(f"\n{_inside(path)} ".encode() + digests[path])
-    return f"{_inside(file).removesuffix('.py').replace(os.sep, '.')}-{digest.hexdigest()[:24]}"
-
-
-def _inside(path: str) -> str:
-    return path.removeprefix(_PACKAGE + os.sep)
+        digest.update(f"\n{path.relative_to(_PACKAGE)} ".encode() + digests[path])
+    module = ".".join(Path(file).relative_to(_PACKAGE).with_suffix("").parts)
+    return f"{module}-{digest.hexdigest()[:24]}"
 
 
 @functools.cache
-def _read(path: str) -> tuple[bytes, set[str]] | None:
+def _read(path: Path) -> tuple[bytes, set[Path]] | None:
     """Digest of a source file, and the files of the package that it names."""
     try:
-        changed = os.stat(path).st_ctime
-        source = Path(path).read_bytes()
+        changed, source = path.stat().st_ctime, path.read_bytes()
     except OSError:
         return None
-    if _inside(path) == path or _STARTED < changed <= time.time():
+    if _STARTED < changed <= time.time():
         return None
-    named: set[str] = set()
-    for name in set(_MENTION.findall(source)):
-        found, modules = _find(name.decode())
-        named.add(found)
-        if modules and re.search(rb"from\s+%s\s+import\b" % re.escape(name), source):
-            named |= {modules[word] for word in _WORD.findall(source) if word in modules}
+    text = source.decode()
+    words = {*_WORD.findall(text), "__init__"}
+    named = {file for name in set(_MENTION.findall(text)) for file in _files(name) if file.stem in words}
     return hashlib.sha256(source).digest(), named
 
 
 @functools.cache
-def _find(name: str) -> tuple[str, dict[bytes, str]]:
-    """The file that a dotted name leads to; the rest of the name is something in it. Where that is a package,
-    also the files of its modules by their names: `from package import module`."""
+def _files(name: str) -> set[Path]:
+    """The files that a dotted name within the package may lead to; the rest of it is something in them."""
     place = _PACKAGE
     for part in name.split(".")[1:]:
-        if os.path.isfile(f"{place}/{part}.py"):
-            return f"{place}/{part}.py", {}
-        if not os.path.isfile(f"{place}/{part}/__init__.py"):
-            break
-        place = f"{place}/{part}"
-    modules = {}
-    for entry in os.listdir(place):
-        path = f"{place}/{entry}" if entry.endswith(".py") else f"{place}/{entry}/__init__.py"
-        if os.path.isfile(path):
-            modules[entry.removesuffix(".py").encode()] = path
-    return modules.pop(b"__init__"), modules
+        place /= part
+        if (file := place.with_name(f"{part}.py")).is_file():
+            return {file}
+        if not place.is_dir():
+            return {place.with_name("__init__.py")}
+    return {*place.glob("*.py"), *place.glob("*/__init__.py")}
 
 
 @functools.cache

@@ -124,20 +124,8 @@ def _make_unary(name: str) -> Any:
 
 # Of a float32: one instruction, also in vectors, where the functions of Python and NumPy are calls.
 square_root = intrinsic(_make_unary("llvm.sqrt"))
-round_to_even = intrinsic(_make_unary("llvm.rint"))
 round_up = intrinsic(_make_unary("llvm.ceil"))
 round_down = intrinsic(_make_unary("llvm.floor"))
-
-
-@intrinsic
-def scale_by_power_of_two(typing_context: Any, x: Any, exponent: Any) -> Any:
-    """x * 2**exponent for float32 x near 1 and an integer-valued float32 exponent, by its exponent bits."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        shift = builder.shl(builder.fptosi(args[1], _I32), ir.Constant(_I32, 23))
-        return builder.bitcast(builder.add(builder.bitcast(args[0], _I32), shift), _F32)
-
-    return types.float32(types.float32, types.float32), generate
 
 
 @intrinsic

@@ -1,35 +1,65 @@
-"""Picture files: others' are decoded after a look at their size; how PNG is written."""
+"""Picture files of others: looked at before they are decoded, and decoded without noise; how PNG is written.
+
+Decoders take the memory that a header asks for, fill what is missing of a cut-off picture with grey and say
+nothing of it, and print what they think of a file beside our own message, without the file's name.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import re
+import sys
 import threading
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, WebPImagePlugin
+from PIL import TiffImagePlugin as Tiff
+from PIL.ImageFile import ImageFile
 
 from sags_node.errors import SagsError
-from sags_node.media.native_output import native_output
-from sags_node.media.picture_header import KINDS, claimed_size
 
 log = logging.getLogger(__name__)
 
+KINDS = "JPEG, PNG, TIFF, BMP, WebP or binary PGM/PPM"
+SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".pnm"))
+_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+_READERS: dict[bytes, Callable[[BytesIO], ImageFile]] = {  # by how a file begins
+    _JPEG: JpegImagePlugin.JpegImageFile,
+    _PNG: PngImagePlugin.PngImageFile,
+    b"BM": BmpImagePlugin.BmpImageFile,
+    b"P5": PpmImagePlugin.PpmImageFile,
+    b"P6": PpmImagePlugin.PpmImageFile,
+    b"RIFF": WebPImagePlugin.WebPImageFile,
+}
+_ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND\xaeB`\x82"}  # marks of a picture's end
+_JPEG_MARK = re.compile(rb"\xff+([^\0\xff\xd0-\xd7])")  # but for those that stand within pixels
+warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # of damaged files; they are refused
+_LONGEST_PADDING = 512  # bytes after the end of a picture, within which its mark is looked for first
+_TIFF_PARTS = (Tiff.STRIPOFFSETS, Tiff.STRIPBYTECOUNTS), (Tiff.TILEOFFSETS, Tiff.TILEBYTECOUNTS)
 MAX_PIXELS = 64 << 20
 _MOST_KINDS = 32
 _FILTER, _PAETH = 19, 128  # cv2.IMWRITE_PNG_FILTER, which older versions have not and pass over
+_RLE = cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
 # Options of `cv2.imencode` for pictures of a camera, masks and depth: one filter for all rows, and runs
 # alone. OpenCV with a level but no filter tries all of them in each row: a third to two thirds more time.
-PNG = (
-    cv2.IMWRITE_PNG_COMPRESSION,
-    1,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_RLE,
-    _FILTER,
-    _PAETH,
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, *_RLE, _FILTER, _PAETH)
+STDERR = 2
+MOST_BYTES = 1 << 16  # of what is kept; a library can say the same for every row of a picture
+_LIBRARY = re.compile(
+    rb"libpng (error|warning): |RPly: |\[[\w,]+ @ 0x[0-9a-f]+\] |\[ ?[A-Z]+:\d+@[\d.]+\] |OpenCV\([\d.]+\) "
+    # libjpeg's warnings have no common beginning
+    rb"|Corrupt JPEG data: |Premature end of JPEG file|Invalid SOS parameters|Inconsistent progression "
+    rb"|Warning: unknown JFIF revision |Unknown Adobe color transform "
 )
+_lock = threading.RLock()  # the descriptor is the whole process's
 
 
 def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) -> NDArray[Any]:
@@ -85,3 +115,108 @@ class Complaints:
 
 
 complaints = Complaints()
+
+
+# ---- what a header says ----------------------------------------------------------------------------------
+
+
+def claimed_size(data: memoryview) -> tuple[int, int] | None:
+    """Width and height that a file claims; None where it is of no kind that is read, or claims nothing."""
+    try:
+        if _is_tiff(data):
+            tags = _tiff_tags(data)
+            return tags[Tiff.IMAGEWIDTH], tags[Tiff.IMAGELENGTH]
+        with closing(_opened(data)) as picture:
+            return picture.size
+    except Exception:  # Pillow raises a dozen kinds on damaged headers
+        return None
+
+
+def is_whole(data: memoryview) -> bool:
+    """Whether the end of a picture is there: its mark, or, where a kind has none, all of its pixels."""
+    begin = next((begin for begin in _ENDS if bytes(data[: len(begin)]) == begin), None)
+    if begin is not None:
+        near = _ENDS[begin] in bytes(data[-_LONGEST_PADDING:])
+        return near or (_jpeg_ends(data) if begin == _JPEG else _ENDS[begin] in bytes(data))
+    try:
+        if _is_tiff(data):
+            tags = _tiff_tags(data)
+            begins, lengths = next(each for each in _TIFF_PARTS if each[0] in tags)
+            return max(map(sum, zip(tags[begins], tags[lengths], strict=True))) <= len(data)
+        with closing(_opened(data)) as picture:
+            picture.load()
+    except Exception:  # as above
+        return False
+    return True
+
+
+def _jpeg_ends(data: memoryview) -> bool:
+    """Whether its segments and scans lead to an end; drivers hand over buffers that are longer."""
+    at = 2
+    while (found := _JPEG_MARK.search(data, at)) is not None and found[1] != b"\xd9":
+        length = int.from_bytes(data[found.end() : found.end() + 2], "big")
+        at = found.end() + max(2, length)
+    return found is not None
+
+
+def _is_tiff(data: memoryview) -> bool:
+    return bytes(data[:4]) in (b"II*\0", b"MM\0*")
+
+
+def _tiff_tags(data: memoryview) -> Tiff.ImageFileDirectory_v2:
+    """Of the first picture. Pillow has no mode for some that OpenCV reads, such as three floats a pixel."""
+    tags = Tiff.ImageFileDirectory_v2(bytes(data[:8]))
+    file = BytesIO(data)
+    file.seek(tags.next)
+    tags.load(file)
+    return tags
+
+
+def _opened(data: memoryview) -> ImageFile:
+    """With its header read. Not by `Image.open`, which looks for other kinds and warns of large pictures."""
+    start = bytes(data[:8])
+    return next(reader for begin, reader in _READERS.items() if start.startswith(begin))(BytesIO(data))
+
+
+# ---- what C libraries print ------------------------------------------------------------------------------
+
+
+@contextmanager
+def native_output() -> Iterator[list[str]]:
+    """Keep the lines that libraries write meanwhile; they are in the list when the block has ended.
+
+    Everything else that is written there, by other threads, goes where it should, a moment later.
+    """
+    lines: list[str] = []
+    with _lock:
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        kept = os.memfd_create("stderr", os.MFD_CLOEXEC)
+        try:
+            terminal = os.dup(STDERR)
+        except OSError:  # this process has no stderr: nothing to keep from it
+            os.close(kept)
+            yield lines
+            return
+        os.dup2(kept, STDERR)
+        try:
+            yield lines
+        finally:
+            os.dup2(terminal, STDERR)
+            os.close(terminal)
+            _sort(kept, lines)
+
+
+def _sort(kept: int, lines: list[str]) -> None:
+    size = os.lseek(kept, 0, os.SEEK_END)
+    if size:
+        others, of_library = b"", False
+        for line in os.pread(kept, MOST_BYTES, 0).splitlines(keepends=True):
+            of_library = _LIBRARY.match(line) is not None or (of_library and not line.strip())
+            if not of_library:
+                others += line
+            elif line.strip():
+                lines.append(line.decode("utf-8", "replace").strip())
+        if others:
+            os.write(STDERR, others)
+    os.close(kept)

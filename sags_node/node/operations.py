@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.config.launch_file import with_parameters
-from sags_node.config.schema import LIVE_PARAMETERS, REMOVED, LaunchConfig
+from sags_node.config.schema import LIVE_PARAMETERS, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import Budget
 from sags_node.messaging import content, published
@@ -71,8 +71,6 @@ class Operations:
         }
 
     def _set_parameters(self, args: dict[str, Any]) -> dict[str, Any]:
-        if gone := [f"there is no {key} any more: {REMOVED[key]}" for key in args if key in REMOVED]:
-            raise SagsError("\n".join(gone))
         refused = [key for key in args if key not in LIVE_PARAMETERS]
         if refused:
             raise SagsError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from sags_node.errors import UsageError
 from sags_node.files import near
-from sags_node.rig import opencv, ros, scikit_surgery
+from sags_node.rig import matrices, ros
 from sags_node.rig.check import accept_rig
 from sags_node.rig.rig import rectified_rig
 from sags_node.types import StereoRig
@@ -80,11 +80,11 @@ def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | No
     if form is Form.ROS_ARCHIVE:
         return with_unit(ros.read_archive(path / ARCHIVE if path.is_dir() else path), metres)
     if form is Form.OPENCV_PAIR:
-        return opencv.read_files(opencv.pair_in(folder), folder.resolve().name, size, metres)
+        return matrices.read_files(matrices.pair_in(folder), folder.resolve().name, size, metres)
     if form is Form.OPENCV_FILE:
-        return opencv.read_files([path], path.stem, size, metres)
+        return matrices.read_files([path], path.stem, size, metres)
     if form is Form.TEXT_FOLDER:
-        return scikit_surgery.read_folder(folder, size, metres)
+        return matrices.read_text_folder(folder, size, metres)
     raise UsageError(unknown_form(path))
 
 
@@ -103,12 +103,12 @@ def find_form(path: Path) -> Form | None:
         return Form.ROS_FOLDER
     if path.name.endswith(ARCHIVE_SUFFIXES) or (is_folder and (folder / ARCHIVE).is_file()):
         return Form.ROS_ARCHIVE
-    pair = opencv.pair_in(folder)
+    pair = matrices.pair_in(folder)
     if path in pair or (is_folder and pair):
         return Form.OPENCV_PAIR
-    if opencv.is_opencv(path):
+    if matrices.is_opencv(path):
         return Form.OPENCV_FILE
-    if is_folder and scikit_surgery.is_text_folder(folder):
+    if is_folder and matrices.is_text_folder(folder):
         return Form.TEXT_FOLDER
     return None
 

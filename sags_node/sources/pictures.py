@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
-from sags_node.media.picture_file import decode
-from sags_node.media.picture_header import KINDS, SUFFIXES, is_whole
+from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
 from sags_node.sources.names import in_order, numbers, together

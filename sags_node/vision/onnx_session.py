@@ -1,21 +1,37 @@
-"""One ONNX file, opened with limits, on the best processor there is."""
+"""A user's ONNX file: opened with limits; what is said of it; how it is fed and how its maps are read.
+
+What is said of a network stands in the file itself, in a YAML file beside it, and in the launch file. Later
+wins.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
-from sags_node.config.schema import OnnxConfig
+from sags_node.config.schema import NetworkFormat, Normalization, OnnxConfig
+from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import SagsError, UsageError
+from sags_node.types import F32, U8
 
+Eye = Literal["left", "right"]
+Size = tuple[int, int]  # width, height, px
 LARGEST_FILE = 2**31  # bytes: an ONNX file cannot be larger
+LARGEST_SIDECAR = 2**16  # bytes
 LARGEST_SIDE = 4096  # px
+KEYS = tuple(NetworkFormat.model_fields)
+PICTURE_CHANNELS = (1, 3)
+PAIR_CHANNELS = (2, 6)  # both eyes in one tensor, left first
+CHANNELS = (*PICTURE_CHANNELS, *PAIR_CHANNELS)
+GRAY_WEIGHTS = (0.299, 0.587, 0.114)
+COARSENESS = (1, 2, 4, 8)  # picture px per px of an output
 PROVIDERS = {"cuda": "CUDAExecutionProvider", "cpu": "CPUExecutionProvider"}
 TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32,
@@ -60,7 +76,13 @@ class OnnxSession:
 
         path = config.path
         assert path is not None  # no network, no session
-        _check_file(path, setting)
+        if not path.is_file():
+            raise UsageError(f"{setting}.path: {path} is no file; check the path")
+        if (size := path.stat().st_size) > LARGEST_FILE:
+            raise UsageError(
+                f"{setting}.path: {path} has {size / 1e9:.1f} GB, an ONNX file has 2 GB at most; "
+                "it is another file"
+            )
         options = ort.SessionOptions()
         options.log_severity_level = 4  # fatal: what goes wrong is raised, once
         options.intra_op_num_threads = config.threads or len(os.sched_getaffinity(0))
@@ -75,23 +97,19 @@ class OnnxSession:
             )
         self.name = path.name
         try:
-            self._session = ort.InferenceSession(
-                str(path),
-                options,
-                providers=wanted,
-                enable_fallback=0,  # it would print to stdout
+            self._session = ort.InferenceSession(  # the fallback would print to stdout
+                str(path), options, providers=wanted, enable_fallback=0
             )
-            declared, metadata = self._session.get_inputs(), self._session.get_modelmeta()
-            given = self._session.get_outputs()
+            declared, given = self._session.get_inputs(), self._session.get_outputs()
             self.outputs: tuple[str, ...] = tuple(output.name for output in given)
             self.description = f"inputs: {_in_words(declared)}; outputs: {_in_words(given)}"
-            self.metadata: Mapping[str, str] = metadata.custom_metadata_map
+            self.metadata: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
             self.inputs = tuple(self._tensor(tensor) for tensor in declared)
         except UsageError:
             raise
         except Exception as error:  # the runtime raises a class of its own for every kind of fault
             raise UsageError(
-                f"{setting}.path: {path} is no ONNX model that can be run: {first_line(error)}"
+                f"{setting}.path: {path} is no ONNX model that can be run: {_first_line(error)}"
             ) from None
         self.processor = "cuda" if "CUDA" in self._session.get_providers()[0] else "cpu"
 
@@ -104,12 +122,9 @@ class OnnxSession:
         try:
             values = self._session.run(self.outputs, dict(feeds))
         except Exception as error:  # as above
-            raise DepthNetworkError(f"{self.name} failed: {first_line(error)}") from None
-        return {
-            name: value
-            for name, value in zip(self.outputs, values, strict=True)
-            if isinstance(value, np.ndarray)
-        }
+            raise DepthNetworkError(f"{self.name} failed: {_first_line(error)}") from None
+        named = zip(self.outputs, values, strict=True)
+        return {name: value for name, value in named if isinstance(value, np.ndarray)}
 
     def _tensor(self, declared: Any) -> Tensor:
         if declared.type not in TYPES:
@@ -135,18 +150,198 @@ def _sides(shape: Sequence[Any] | None) -> str:
     return "x".join("?" if side is None else str(side) for side in shape) + " " if shape else ""
 
 
-def _check_file(path: Path, setting: str) -> None:
-    if not path.is_file():
-        raise UsageError(f"{setting}.path: {path} is no file; check the path")
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise UsageError(
-            f"{setting}.path: {path} has {size / 1e9:.1f} GB, an ONNX file has 2 GB at most; "
-            "it is another file"
-        )
-
-
-def first_line(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     """What the runtime says, without the lines and paths of its source."""
     line = str(error).strip().partition("\n")[0]
     return line.rpartition(" : ")[2][:200]
+
+
+# ---- what is said of it ----------------------------------------------------------------------------------
+
+
+def read_format(config: OnnxConfig, metadata: Mapping[str, str]) -> NetworkFormat:
+    """All that is said of the network.
+
+    Args:
+        metadata: of the ONNX file, each value as YAML; keys that `NetworkFormat` lacks are others'.
+
+    Raises:
+        UsageError: a value is wrong, or the sidecar cannot be read or holds an unknown key.
+    """
+    assert config.path is not None
+    sidecar = config.path.with_suffix(".yaml")
+    found = _validated({key: metadata[key] for key in KEYS if key in metadata}, f"metadata of {config.path}")
+    if sidecar.is_file():
+        tree = read_yaml(sidecar, "description of a network", LARGEST_SIDECAR)
+        if not isinstance(tree, dict):
+            raise UsageError(f"{sidecar}: a map of keys is expected: {', '.join(KEYS)}")
+        found |= _validated(tree, str(sidecar))
+    said = {key: getattr(config, key) for key in KEYS if getattr(config, key) is not None}
+    return NetworkFormat(**(found | said))
+
+
+def _validated(tree: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The values of a map that are said, typed; text is read as YAML, since metadata holds only text."""
+    try:
+        parsed = {
+            key: parse_yaml(value, f"{where}: {key}") if isinstance(value, str) else value
+            for key, value in tree.items()
+        }
+        checked = NetworkFormat.model_validate(parsed)
+    except ValidationError as error:
+        item = error.errors()[0]
+        key = str(item["loc"][0]) if item["loc"] else "format"
+        reason = f"known keys: {', '.join(KEYS)}" if item["type"] == "extra_forbidden" else item["msg"]
+        raise UsageError(f"{where}: {key}: {reason}") from None
+    return {key: getattr(checked, key) for key in KEYS if getattr(checked, key) is not None}
+
+
+# ---- what goes in, and what comes out --------------------------------------------------------------------
+
+
+class Fit(NamedTuple):
+    """How a picture is brought to a network's size."""
+
+    inner: Size  # it is resized to this
+    outer: Size  # and padded at the right and below to this
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """One input of a network."""
+
+    name: str
+    eyes: tuple[Eye, ...]  # whose pictures, one after the other in its channels
+    channels: int  # of one picture
+    channels_first: bool
+    dtype: type[np.generic]
+    width: int | None  # px; None: any
+    height: int | None
+
+    def fit(self, size: Size, multiple: int) -> Fit:
+        """A side that the network fixes is resized to it; one that it leaves open is padded."""
+        inner = self.width or size[0], self.height or size[1]
+        outer = (
+            self.width or -(-size[0] // multiple) * multiple,
+            self.height or -(-size[1] // multiple) * multiple,
+        )
+        return Fit(inner, outer)
+
+    def tensor(
+        self, pictures: Mapping[Eye, U8], fit: Fit, normalization: Normalization, bgr: bool
+    ) -> NDArray[Any]:
+        """The network's input [1, C, h, w] or [1, h, w, C] from pictures [H, W, 3] RGB."""
+        values = np.concatenate(
+            [self._channels(pictures[eye], fit, normalization, bgr) for eye in self.eyes], 2
+        )
+        if self.channels_first:
+            values = values.transpose(2, 0, 1)
+        return np.ascontiguousarray(values[None], self.dtype)
+
+    def _channels(self, picture: U8, fit: Fit, normalization: Normalization, bgr: bool) -> U8 | F32:
+        shrinks = fit.inner[0] < picture.shape[1] or fit.inner[1] < picture.shape[0]
+        fitted = cv2.resize(picture, fit.inner, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+        right, below = fit.outer[0] - fit.inner[0], fit.outer[1] - fit.inner[1]
+        fitted = cv2.copyMakeBorder(fitted, 0, below, 0, right, cv2.BORDER_REPLICATE)
+        mean, std = (
+            np.broadcast_to(np.array(part, np.float32), 3) for part in (normalization.mean, normalization.std)
+        )
+        if self.channels == 1:
+            fitted = cv2.cvtColor(fitted, cv2.COLOR_RGB2GRAY)[..., None]
+            mean, std = (np.dot(part, GRAY_WEIGHTS).astype(np.float32)[None] for part in (mean, std))
+        elif bgr:
+            fitted, mean, std = fitted[..., ::-1], mean[::-1], std[::-1]
+        if self.dtype == np.uint8:
+            return np.asarray(fitted)
+        return np.asarray((fitted * np.float32(1 / 255) - mean) / std, np.float32)
+
+
+def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tuple[Input, ...]:
+    """How a network takes its pictures: one input is one picture or both in its channels, two are a pair,
+    four are a pair at a small and at the full size.
+
+    Args:
+        name: of the file, for messages.
+
+    Raises:
+        UsageError: these are not the inputs of a depth network.
+    """
+    if len(tensors) not in (1, 2, 4):
+        raise UsageError(
+            f"{name} takes {len(tensors)} inputs ({', '.join(t.name for t in tensors)}); a depth network "
+            "takes one picture, a pair, or a pair at two sizes: export it with those alone"
+        )
+    tensors = _ordered(tensors, said, name)
+    shapes = [_layout(tensor, said, name) for tensor in tensors]
+    eyes: list[tuple[Eye, ...]] = [("left",), ("right",)] * (len(tensors) // 2)
+    if len(tensors) == 1:
+        eyes = [("left", "right") if shapes[0][0] in PAIR_CHANNELS else ("left",)]
+    found = []
+    for tensor, (channels, first), seen in zip(tensors, shapes, eyes, strict=True):
+        one = channels // len(seen)
+        if one not in PICTURE_CHANNELS:
+            raise UsageError(
+                f"{name}: input {tensor.name} has {channels} channels; a picture has 1 or 3, a pair 2 or 6"
+            )
+        height, width = tensor.shape[2:] if first else tensor.shape[1:3]
+        if said.size is not None:
+            width, height = width or said.size[0], height or said.size[1]
+        found.append(Input(tensor.name, seen, one, first, tensor.dtype, width, height))
+    return tuple(found)
+
+
+def _layout(tensor: Tensor, said: NetworkFormat, name: str) -> tuple[int, bool]:
+    """Number of channels, and whether they come before height and width."""
+    shape = tensor.shape
+    if len(shape) != 4 or shape[0] not in (1, None):
+        text = "x".join("?" if side is None else str(side) for side in shape)
+        raise UsageError(
+            f"{name}: input {tensor.name} is {text}; a picture is 1x3xHxW or 1xHxWx3 with batch size 1"
+        )
+    first = said.layout == "nchw" if said.layout else shape[1] in CHANNELS or shape[3] not in CHANNELS
+    return (shape[1] if first else shape[3]) or 3, first
+
+
+def has_clear_layout(tensor: Tensor) -> bool:
+    """Whether its shape says which side is the channels'."""
+    return tensor.shape[1] in CHANNELS or tensor.shape[3] in CHANNELS
+
+
+def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Sequence[Tensor]:
+    """As they are named, left and right eye in turn; else in the file's order."""
+    if said.inputs is None:
+        return tensors
+    by_name = {tensor.name: tensor for tensor in tensors}
+    if sorted(said.inputs) != sorted(by_name):
+        raise UsageError(f"{name}: inputs: its inputs are {', '.join(by_name)}; name all, left eye first")
+    return [by_name[one] for one in said.inputs]
+
+
+def maps_of(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
+    """The maps [C, h, w] of the padded picture, whole or coarser, that an output is; None: it is none.
+
+    Args:
+        values: [1, C, h, w], [1, h, w, C], [C, h, w], [h, w, C] or [h, w].
+    """
+    maps = values[0] if values.ndim == 4 and len(values) == 1 else values
+    maps = maps[None] if maps.ndim == 2 else maps
+    for coarseness in COARSENESS if maps.ndim == 3 else ():
+        shape = -(-fit.outer[1] // coarseness), -(-fit.outer[0] // coarseness)
+        if maps.shape[1:] == shape:
+            return maps
+        if maps.shape[:2] == shape:
+            return maps.transpose(2, 0, 1)
+    return None
+
+
+def sizes_of_maps(fit: Fit) -> str:
+    """What `maps_of` takes, for messages."""
+    width, height = fit.outer
+    return f"{width}x{height} px that it was given, or of a half, a quarter or an eighth of them"
+
+
+def unfit(plane: F32, fit: Fit) -> F32:
+    """A map of the padded picture as one of the picture [h, w] alone, at `fit.inner`."""
+    if plane.shape[::-1] != fit.outer:
+        plane = cv2.resize(plane, fit.outer, interpolation=cv2.INTER_LINEAR)
+    return plane[: fit.inner[1], : fit.inner[0]]

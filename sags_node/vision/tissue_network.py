@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 from sags_node.config.schema import NORMALIZATIONS, OnnxConfig, TissueConfig
 from sags_node.errors import UsageError
 from sags_node.types import U8, Bool
-from sags_node.vision.onnx_format import read_format
-from sags_node.vision.onnx_inputs import Fit, Size, recognise
-from sags_node.vision.onnx_outputs import COARSENESS, unfit
-from sags_node.vision.onnx_session import DepthNetworkError, OnnxSession
+from sags_node.vision.onnx_session import (
+    DepthNetworkError,
+    Fit,
+    OnnxSession,
+    Size,
+    maps_of,
+    read_format,
+    recognise,
+    sizes_of_maps,
+    unfit,
+)  # fmt: skip
 
 MULTIPLE = 32  # px, of sides that the network leaves open
 
@@ -73,7 +80,7 @@ class TissueNetwork:
     def _classes(self, outputs: Mapping[str, NDArray[Any]]) -> NDArray[np.intp]:
         """Class numbers [h, w] of the padded picture."""
         for name, values in outputs.items():
-            scores = _scores(values, self._fit)
+            scores = maps_of(values, self._fit)
             if scores is None or self._said.output not in (None, name):
                 continue
             if not np.isfinite(scores).all():
@@ -84,25 +91,6 @@ class TissueNetwork:
                 return np.asarray(scores[0], np.intp)
             self._is_logit |= bool(scores.min() < 0 or scores.max() > 1)
             return np.asarray(scores[0] > (0 if self._is_logit else 0.5), np.intp)
-        width, height = self._fit.outer
         raise DepthNetworkError(
-            f"{self._session.name}: no output is a mask of the {width}x{height} px that it was given, or of "
-            "a half, a quarter or an eighth of them"
+            f"{self._session.name}: no output is a mask of the {sizes_of_maps(self._fit)}"
         )
-
-
-def _scores(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
-    """The channels [C, h, w] of an output, in whichever order it has them; None: it is no map."""
-    if values.ndim == 4 and values.shape[0] == 1:
-        values = values[0]
-    if values.ndim == 2:
-        values = values[None]
-    if values.ndim != 3:
-        return None
-    for coarseness in COARSENESS:
-        shape = -(-fit.outer[1] // coarseness), -(-fit.outer[0] // coarseness)
-        if values.shape[1:] == shape:
-            return values
-        if values.shape[:2] == shape:
-            return values.transpose(2, 0, 1)
-    return None

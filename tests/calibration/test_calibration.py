@@ -11,28 +11,25 @@ import yaml
 from places import ROOT
 
 from sags_node.errors import UsageError
-from sags_node.rig import check_rig, load_rig, read_rig, rectified_camera, save_rig
-from sags_node.types import Eye, StereoRig
+from sags_node.rig import check_rig, load_rig, read_rig, rectified_camera, rectify_eyes, save_rig
+from sags_node.types import F64, StereoRig
 
 CALIB = ROOT / "calib"
 
 
-def make_rig() -> StereoRig:
-    """A rig with lens distortion and eyes turned against each other, rectified by OpenCV."""
-    K_left = np.array([[552.3, 0, 318.2], [0, 551.1, 243.6], [0, 0, 1]])
-    K_right = np.array([[549.8, 0, 323.9], [0, 548.9, 239.4], [0, 0, 1]])
-    left_distortion = np.array([-0.18, 0.09, 4e-4, -7e-4, 0.01])
-    right_distortion = np.array([-0.17, 0.08, -3e-4, 5e-4, 0.02])
-    R = cv2.Rodrigues(np.array([0.004, -0.011, 0.006]))[0]
-    t = np.array([[-5.2e-3], [4e-5], [6e-5]])
-    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-        K_left, left_distortion, K_right, right_distortion, (640, 480), R, t, flags=cv2.CALIB_ZERO_DISPARITY
-    )
-    return StereoRig(
-        "rig",
-        Eye(640, 480, K_left, left_distortion, R_left, P_left),
-        Eye(640, 480, K_right, right_distortion, R_right, P_right),
-    )
+SIZE = 640, 480
+K = (
+    np.array([[552.3, 0, 318.2], [0, 551.1, 243.6], [0, 0, 1]]),
+    np.array([[549.8, 0, 323.9], [0, 548.9, 239.4], [0, 0, 1]]),
+)
+PLUMB_BOB = np.array([-0.18, 0.09, 4e-4, -7e-4, 0.01]), np.array([-0.17, 0.08, -3e-4, 5e-4, 0.02])
+R = cv2.Rodrigues(np.array([0.004, -0.011, 0.006]))[0]
+T = np.array([-5.2e-3, 4e-5, 6e-5])  # m
+
+
+def make_rig(distortion: tuple[F64, F64] = PLUMB_BOB) -> StereoRig:
+    """A rig with lens distortion and eyes turned against each other."""
+    return rectify_eyes("rig", SIZE, K, distortion, R, T)
 
 
 def edit(folder: Path, side: str, change: dict[str, Any]) -> None:
@@ -71,11 +68,9 @@ def test_round_trip(folder: Path) -> None:
 
 def test_baseline_and_pose_come_back_from_the_rectification(folder: Path) -> None:
     rig = load_rig(folder)
-    t = np.array([-5.2e-3, 4e-5, 6e-5])
-    assert rig.baseline == pytest.approx(np.linalg.norm(t))
-    R = cv2.Rodrigues(np.array([0.004, -0.011, 0.006]))[0]
+    assert rig.baseline == pytest.approx(np.linalg.norm(T))
     np.testing.assert_allclose(rig.T_right_left[:3, :3], R, atol=1e-9)
-    np.testing.assert_allclose(rig.T_right_left[:3, 3], t, atol=1e-9)
+    np.testing.assert_allclose(rig.T_right_left[:3, 3], T, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["d4d", "hamlyn_heart", "v4l2_example"])
@@ -112,18 +107,12 @@ def test_not_a_camera_info_file(folder: Path, text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "key", ["image_width", "camera_matrix", "distortion_coefficients", "projection_matrix"]
-)
-def test_missing_field_is_named(folder: Path, key: str) -> None:
-    edit(folder, "right", {key: None})
-    message = refusal(folder)
-    assert "right.yaml" in message
-    assert f"{key} is missing" in message
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
+    ("key", "value"),  # None: the key is missing
     [
+        ("image_width", None),
+        ("camera_matrix", None),
+        ("distortion_coefficients", None),
+        ("projection_matrix", None),
         ("image_width", 0),
         ("image_width", "640"),
         ("image_width", True),
@@ -140,7 +129,7 @@ def test_wrong_value_is_named(folder: Path, key: str, value: Any) -> None:
     edit(folder, "left", {key: value})
     message = refusal(folder)
     assert "left.yaml" in message
-    assert key in message
+    assert (f"{key} is missing" if value is None else key) in message
 
 
 def swapped(folder: Path) -> None:
@@ -184,9 +173,8 @@ MIRROR = {"rectification_matrix": {"data": [1.0, 0, 0, 0, 1.0, 0, 0, 0, -1.0]}}
 def test_eyes_that_cannot_be(folder: Path, change: Callable[[Path], None], said: str) -> None:
     change(folder)
     assert re.search(said, refusal(folder))
-    assert "error" in [
-        finding.level for finding in check_rig(read_rig(folder))
-    ]  # it can be read, to be reported on
+    levels = [finding.level for finding in check_rig(read_rig(folder))]
+    assert "error" in levels  # it can be read, to be reported on
 
 
 def test_unusual_baseline_is_only_a_warning(folder: Path) -> None:
@@ -205,13 +193,6 @@ def test_numbers_that_are_not_finite(field: str, planted: float) -> None:
     values.flat[0] = planted
     bad = dataclasses.replace(rig, left=dataclasses.replace(rig.left, **{field: values}))
     assert [finding.level for finding in check_rig(bad)] == ["error"]
-
-
-def test_focal_length_in_another_unit(folder: Path) -> None:
-    K = make_rig().left.K.copy()
-    K[:2] /= 640
-    edit(folder, "left", {"camera_matrix": {"data": [float(k) for k in K.ravel()]}})
-    assert "not plausible" in refusal(folder)
 
 
 def test_rectified_camera_at_the_working_size() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import ran
-from test_calibration import make_rig
+from test_calibration import PLUMB_BOB, SIZE, K, R, T, make_rig
 
 from sags_node.config.units import UNITS
 from sags_node.errors import UsageError
@@ -22,22 +22,10 @@ from sags_node.geometry import scale_intrinsics
 from sags_node.rig import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
 from sags_node.types import F64, StereoRig
 
-SIZE = 640, 480
-K = (
-    np.array([[552.3, 0, 318.2], [0, 551.1, 243.6], [0, 0, 1]]),
-    np.array([[549.8, 0, 323.9], [0, 548.9, 239.4], [0, 0, 1]]),
-)
-PLUMB_BOB = np.array([-0.18, 0.09, 4e-4, -7e-4, 0.01]), np.array([-0.17, 0.08, -3e-4, 5e-4, 0.02])
 RATIONAL = (
     np.array([0.3, 0.1, 1e-3, -5e-4, 0.02, 0.5, 0.2, 0.01]),
     np.array([0.2, 0.1, -1e-3, 4e-4, 0.01, 0.4, 0.2, 0.02]),
 )
-R = cv2.Rodrigues(np.array([0.004, -0.011, 0.006]))[0]
-T = np.array([-5.2e-3, 4e-5, 6e-5])  # m
-
-
-def expected(distortion: tuple[F64, F64] = PLUMB_BOB) -> StereoRig:
-    return rectify_eyes("rig", SIZE, K, distortion, R, T)
 
 
 def assert_same(read: StereoRig, rig: StereoRig, tolerance: float = 1e-9) -> None:
@@ -85,10 +73,10 @@ def refusal(path: Path, size: tuple[int, int] | None = None) -> str:
 
 
 def test_rational_polynomial_in_ros_files(tmp_path: Path) -> None:
-    save_rig(expected(RATIONAL), tmp_path / "rig")
+    save_rig(make_rig(RATIONAL), tmp_path / "rig")
     tree = yaml.safe_load((tmp_path / "rig/left.yaml").read_text())
     assert tree["distortion_model"] == "rational_polynomial"
-    assert_same(load_rig(tmp_path / "rig"), expected(RATIONAL), 0)
+    assert_same(load_rig(tmp_path / "rig"), make_rig(RATIONAL), 0)
 
 
 def test_a_file_of_the_folder_stands_for_it(tmp_path: Path) -> None:
@@ -203,8 +191,8 @@ def test_an_archive_that_claims_to_be_huge_takes_no_memory(tmp_path: Path, kind:
 @pytest.mark.parametrize("suffix", [".yml", ".xml"])
 def test_the_pair_of_opencv_files(tmp_path: Path, suffix: str, distortion: tuple[F64, F64]) -> None:
     folder = write_pair(tmp_path / "rig", suffix, distortion, T * 1000)
-    assert_same(read_rig(folder, SIZE, 1e-3), expected(distortion))
-    assert_same(read_rig(folder / f"extrinsics{suffix}", SIZE, 1e-3), expected(distortion))
+    assert_same(read_rig(folder, SIZE, 1e-3), make_rig(distortion))
+    assert_same(read_rig(folder / f"extrinsics{suffix}", SIZE, 1e-3), make_rig(distortion))
 
 
 @pytest.mark.parametrize(
@@ -228,7 +216,7 @@ def test_other_models_of_opencv_files_are_refused(tmp_path: Path, said: dict[str
     intrinsics.write_text(f"{text}{key}: {said[key]}\n")
     assert f"{key}: {said[key]} is not supported" in refusal(folder, SIZE)
     intrinsics.write_text(f"{text}fisheye_model: 0\nxi: 0.\nmodel: plumb_bob\ncamera_model: SN-4711\n")
-    assert_same(read_rig(folder, SIZE), expected())
+    assert_same(read_rig(folder, SIZE), make_rig())
 
 
 @pytest.mark.parametrize(("focal", "asked"), [(352.0, True), (552.0, False)])
@@ -292,7 +280,7 @@ def test_one_opencv_file(tmp_path: Path, names: tuple[str, ...], size: dict[str,
     matrices = dict(zip(names, values, strict=True)) | {"R": R, "T": T} | size
     read = read_rig(write(tmp_path / "scope_a.yaml", matrices))
     assert read.name == "scope_a"
-    assert_same(read, expected())
+    assert_same(read, make_rig())
 
 
 def test_the_size_as_a_sequence(tmp_path: Path) -> None:
@@ -301,7 +289,7 @@ def test_the_size_as_a_sequence(tmp_path: Path) -> None:
     file = write(tmp_path / "rig.yml", matrices)
     text = file.read_text()
     file.write_text(text.replace("---", "---\nimageSize: [ 640, 480 ]", 1))
-    assert_same(read_rig(file), expected())
+    assert_same(read_rig(file), make_rig())
     for wrong in ("[ 640, 0 ]", "[ 640, 1000000000 ]", "[ .Nan, 480 ]"):
         file.write_text(text.replace("---", f"---\nimageSize: {wrong}", 1))
         assert "is not possible" in refusal(file)
@@ -318,14 +306,14 @@ def test_a_rectification_in_the_files_is_kept(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig.right.R, whole[1])
     np.testing.assert_allclose(rig.right.P[:, :3], whole[3][:, :3])
     assert rig.baseline == pytest.approx(np.linalg.norm(T))
-    assert abs(rig.left.P[0, 0] - expected().left.P[0, 0]) > 1
+    assert abs(rig.left.P[0, 0] - make_rig().left.P[0, 0]) > 1
 
 
 def test_zeros_after_the_coefficients_do_not_count(tmp_path: Path) -> None:
     """OpenCV writes 14 where fewer were fitted."""
     padded = tuple(np.pad(part, (0, 14 - len(part))) for part in RATIONAL)
     folder = write_pair(tmp_path / "rig", ".yml", (padded[0], padded[1]), T)
-    assert_same(read_rig(folder, SIZE), expected(RATIONAL))
+    assert_same(read_rig(folder, SIZE), make_rig(RATIONAL))
     padded[0][9] = 0.01
     folder = write_pair(tmp_path / "prism", ".yml", (padded[0], padded[1]), T)
     assert "10 distortion coefficients" in refusal(folder, SIZE)
@@ -384,7 +372,7 @@ def write_text(folder: Path, prefix: str = "calib.", plural: str = "s", l2r: str
 )
 def test_text_matrices_are_millimetres(tmp_path: Path, prefix: str, plural: str, l2r: str) -> None:
     folder = write_text(tmp_path / "rig", prefix, plural, l2r)
-    assert_same(read_rig(folder, SIZE), expected())
+    assert_same(read_rig(folder, SIZE), make_rig())
 
 
 def test_text_matrices_that_are_refused(tmp_path: Path) -> None:
@@ -423,7 +411,7 @@ def test_convert(tmp_path: Path) -> None:
     size = ("--size", "640x480")
     code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "out", *size, "--unit", "mm")
     assert code == 0 and "baseline 5.2 mm" in said
-    assert_same(load_rig(tmp_path / "out"), expected())
+    assert_same(load_rig(tmp_path / "out"), make_rig())
     code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", *size)
     assert code == 2 and "looks like millimetres" in said and not (tmp_path / "no").exists()
     code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640")

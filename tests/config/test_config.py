@@ -14,8 +14,6 @@ from places import ROOT
 
 from sags_node.config.launch_file import load_launch, with_parameters
 from sags_node.config.schema import (
-    REMOVED,
-    REMOVED_KINDS,
     FoldersSource,
     LaunchConfig,
     MappingConfig,
@@ -113,24 +111,6 @@ def test_one_side_of_the_working_size_keeps_the_proportions(
     asked: dict[str, int], size: tuple[int, int]
 ) -> None:
     assert VisionConfig(**asked).working_size(960, 768) == size  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("key", REMOVED)
-def test_a_key_that_is_gone_says_what_stands_in_its_place(key: str) -> None:
-    with pytest.raises(UsageError) as caught:
-        load_launch(None, [f"{key}:=1"])
-    assert str(caught.value) == f"command line: there is no {key} any more: {REMOVED[key]}"
-    with pytest.raises(UsageError, match=re.escape(f"there is no {key} any more")):
-        with_parameters(LaunchConfig(), {key: 1})
-
-
-@pytest.mark.parametrize("kind", REMOVED_KINDS)
-def test_a_kind_that_is_gone_says_what_stands_in_its_place(kind: str, tmp_path: Path) -> None:
-    (tmp_path / "launch.yaml").write_text(f"source: {{kind: {kind}, video: a.mp4}}")
-    with pytest.raises(UsageError) as caught:
-        load_launch(tmp_path)
-    said = f"there is no source.kind {kind} any more: {REMOVED_KINDS[kind]}"
-    assert str(caught.value) == f"{tmp_path / 'launch.yaml'}: {said}"
 
 
 def numbers(kind: Any, key: str, limits: tuple[object, ...] = ()) -> Iterator[tuple[str, tuple[object, ...]]]:

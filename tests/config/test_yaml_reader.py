@@ -124,7 +124,7 @@ def as_bag(text: str, folder: Path) -> object:
 
 def as_network(text: str, folder: Path) -> object:
     from sags_node.config.schema import OnnxConfig
-    from sags_node.vision.onnx_format import read_format
+    from sags_node.vision.onnx_session import read_format
 
     (folder / "net.yaml").write_text(text)
     return read_format(OnnxConfig(path=folder / "net.onnx"), {})

@@ -68,19 +68,6 @@ def test_colours_move_by_the_mean_residual_of_their_pixels(t_ns: int) -> None:
     assert not moved[4].any()  # not in the picture
 
 
-def test_a_child_does_as_its_parent_and_the_removed_are_gone() -> None:
-    residuals = filled()
-    refine(residuals, 200, np.ones((5, columns.COUNT), np.float32), np.ones((5, 3), np.float32),
-           np.ones(5, np.float32))  # fmt: skip
-    values, moments = residuals.values.copy(), residuals.adam[1].moments.copy()
-    residuals.append(np.array([3, 3]))
-    np.testing.assert_array_equal(residuals.values[:, 5:], values[:, [3, 3]])
-    assert not residuals.adam[1].moments[5:].any()  # with an optimiser of its own
-    residuals.keep(np.array([False, True, False, True, True, True, False]))
-    np.testing.assert_array_equal(residuals.values, values[:, [1, 3, 4, 3]])
-    np.testing.assert_array_equal(residuals.adam[1].moments[:3], moments[[1, 3, 4]])
-
-
 def test_more_than_the_memory_they_may_take_is_refused() -> None:
     with pytest.raises(SagsError, match="fewer frames"):
         Residuals(np.arange(1000), 100_000)

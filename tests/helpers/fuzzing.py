@@ -52,7 +52,7 @@ from sags_node.rig.read import read_rig
 from sags_node.sources.bags import read_rig as read_bag_rig
 from sags_node.sources.pose_track import PoseTrack
 from sags_node.sources.source import open_source
-from sags_node.vision.onnx_network import DepthNetwork
+from sags_node.vision.onnx_depth import DepthNetwork
 from sags_node.vision.tissue_topic import TopicMasks
 
 LONGEST = 10.0  # s for one input

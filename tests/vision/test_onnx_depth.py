@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from onnx_networks import save_matcher, save_odd, save_table
 
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import OnnxConfig, StereoConfig
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import status
 from sags_node.node.health import Statistics
@@ -24,9 +24,8 @@ from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, Bool, FrameResult, RectifiedPair, StereoFrame
-from sags_node.vision.mono_depth import MonoDepth
-from sags_node.vision.mono_scale import fit_scale_shift
-from sags_node.vision.onnx_network import DepthNetwork
+from sags_node.vision.mono_depth import MonoDepth, fit_scale_shift
+from sags_node.vision.onnx_depth import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
 from sags_node.vision.pair_watch import PairWatch
 from sags_node.vision.rectify import Rectifier
@@ -98,6 +97,7 @@ FIXED = (WIDTH, HEIGHT)
             {"expects": "imagenet", "size": FIXED, "names": ("left_img", "right_img")},
             PAIR | {"inputs": ("left_img", "right_img"), "normalization": "imagenet"},
         ),
+        ({}, PAIR | {"size": (256, 192)}),
         ({"expects": "symmetric"}, OPEN | {"normalization": "symmetric"}),
         ({"nhwc": True, "uint8": True}, {**OPEN, "normalization": None}),
         ({"nhwc": True, "expects": "unit"}, OPEN | {"normalization": "unit"}),
@@ -124,12 +124,16 @@ FIXED = (WIDTH, HEIGHT)
         ({"output": "half"}, OPEN),
         ({"output": "half", "factor": 0.5}, OPEN | {"scale": 2}),  # px of the smaller map
         ({"output": "several"}, OPEN | {"output": "final"}),
+        ({"depth_of": 1.0}, OPEN | {"meaning": "depth"}),  # of this rig, in metres, and in millimetres
+        ({"depth_of": 1000.0}, OPEN | {"meaning": "depth", "scale": 1e-3}),
     ],
     ids=str,
 )
 def test_a_stereo_network_is_fed_and_read_as_it_is_described(
     made: dict[str, Any], said: dict[str, Any], scene: Scene, tmp_path: Path
 ) -> None:
+    if "depth_of" in made:
+        made = {"depth_of": made["depth_of"] * scene.focal_baseline}
     network = load(save_matcher(tmp_path / "network.onnx", **made), scene, **said)
     assert network.is_stereo and network.processor == "cpu"
     assert error(network, scene) < 0.6
@@ -140,18 +144,6 @@ def test_a_size_that_is_no_multiple_is_padded_and_cut_off_again(scene: Scene, tm
     odd = Scene(scene.left[:-3, :-5], scene.right[:-3, :-5], *(a[:-3, :-5] for a in scene[2:4]), 1.0)
     network = DepthNetwork(config, (WIDTH - 5, HEIGHT - 3), scene.focal_baseline)
     assert error(network, odd) < 0.6
-
-
-@pytest.mark.parametrize(("metres", "scale"), [(1.0, None), (1000.0, 1e-3)])
-def test_depth_of_this_rig(metres: float, scale: float | None, scene: Scene, tmp_path: Path) -> None:
-    """A network with the rig's focal length and baseline in it; in metres, and in millimetres."""
-    path = save_matcher(tmp_path / "network.onnx", depth_of=scene.focal_baseline * metres)
-    assert error(load(path, scene, **OPEN | {"meaning": "depth", "scale": scale}), scene) < 0.6
-
-
-def test_a_declared_size_is_used(scene: Scene, tmp_path: Path) -> None:
-    network = load(save_matcher(tmp_path / "network.onnx"), scene, **PAIR, size=(256, 192))
-    assert 0.0 < error(network, scene) < 0.6
 
 
 # ---- what is said, and what is missing -------------------------------------------------------------------
@@ -190,49 +182,38 @@ def test_an_open_shape_does_not_say_where_the_channels_are(scene: Scene, tmp_pat
     assert load(path, scene, **said, layout="nchw")(scene.left, None).shape == (HEIGHT, WIDTH)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("normalisation: unit", "normalisation: known keys: inputs, layout"),
-        ("normalization: half", "normalization: .*one of unit, bytes, imagenet, symmetric"),
-        ("- 1", "a map of keys"),
-        ("a: [", "not valid YAML"),
-        ("meaning: inverse_depth", "meaning: a stereo network gives disparity or depth"),
-        ("inputs: [left, right]", "inputs: its inputs are first, second"),
-        ("output: depth", "output: its outputs are disparity"),
-    ],
-)
-def test_a_wrong_sidecar_is_named_with_its_fix(text: str, words: str, scene: Scene, tmp_path: Path) -> None:
-    path = save_matcher(tmp_path / "network.onnx")
-    path.with_suffix(".yaml").write_text(text)
-    with pytest.raises(UsageError, match=words) as caught:
-        load(path, scene)
-    assert "\n" not in str(caught.value)
-
-
-# ---- what is no depth network ----------------------------------------------------------------------------
+MATCHER: dict[str, Any] = {}
+AS_ODD = {"normalization": "unit", "multiple": 1, "meaning": "disparity"}
 
 
 @pytest.mark.parametrize(
-    ("inputs", "output", "words"),
+    ("inputs", "output", "sidecar", "words"),
     [
-        ({"x": [1, 10]}, "same", "input x is 1x10; a picture is"),
-        ({"x": [4, 3, "h", "w"]}, "same", "batch size 1"),
-        ({"a": PICTURE, "b": PICTURE, "c": PICTURE}, "same", r"takes 3 inputs \(a, b, c\)"),
-        ({"a": [1, 5, 64, 64], "b": [1, 5, 64, 64]}, "same", "a has 5 channels|is 1x5x64x64"),
-        ({"a": PICTURE, "b": PICTURE}, "small", "output out is not a map of the 320x256 px"),
-        ({"a": [1, 3, 5000, 5000]}, "same", "more than 4096 px"),
+        (MATCHER, "", "normalisation: unit", "normalisation: known keys: inputs, layout"),
+        (MATCHER, "", "normalization: half", "normalization: .*one of unit, bytes, imagenet, symmetric"),
+        (MATCHER, "", "- 1", "a map of keys"),
+        (MATCHER, "", "a: [", "not valid YAML"),
+        (MATCHER, "", "meaning: inverse_depth", "meaning: a stereo network gives disparity or depth"),
+        (MATCHER, "", "inputs: [left, right]", "inputs: its inputs are first, second"),
+        (MATCHER, "", "output: depth", "output: its outputs are disparity"),
+        ({"x": [1, 10]}, "same", "", "network.onnx: input x is 1x10; a picture is"),
+        ({"x": [4, 3, "h", "w"]}, "same", "", "network.onnx: .*batch size 1"),
+        ({"a": PICTURE, "b": PICTURE, "c": PICTURE}, "same", "", r"network.onnx takes 3 inputs \(a, b, c\)"),
+        ({"a": [1, 5, 64, 64], "b": [1, 5, 64, 64]}, "same", "", "network.onnx: .*a (has 5|is 1x5x64x64)"),
+        ({"a": PICTURE, "b": PICTURE}, "small", "", "network.onnx: .*out is not a map of the 320x256 px"),
+        ({"a": [1, 3, 5000, 5000]}, "same", "", "network.onnx: .*more than 4096 px"),
     ],
-    ids=str,
-)
-def test_a_wrong_network_is_refused_in_one_line(
-    inputs: dict[str, Sequence[Any]], output: str, words: str, scene: Scene, tmp_path: Path
+)  # fmt: skip
+def test_a_wrong_network_or_description_is_refused_in_one_line_with_its_fix(
+    inputs: dict[str, Sequence[Any]], output: str, sidecar: str, words: str, scene: Scene, tmp_path: Path
 ) -> None:
-    path = save_odd(tmp_path / "network.onnx", inputs, output)
-    said = {"inputs": tuple(inputs), "normalization": "unit", "multiple": 1, "meaning": "disparity"}
+    path, said = tmp_path / "network.onnx", AS_ODD | {"inputs": tuple(inputs)} if inputs else {}
+    path = save_odd(path, inputs, output) if inputs else save_matcher(path)
+    if sidecar:
+        path.with_suffix(".yaml").write_text(sidecar)
     with pytest.raises(UsageError, match=words) as caught:
         load(path, scene, **said)
-    assert "\n" not in str(caught.value) and "network.onnx" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_file_that_is_no_network_is_refused(
@@ -302,6 +283,10 @@ def dark(frame: StereoFrame) -> StereoFrame:
     return replace(frame, left=frame.left // 8, right=frame.right // 8)
 
 
+def one_eye(frame: StereoFrame) -> StereoFrame:
+    return replace(frame, right=None)
+
+
 def test_a_network_replaces_the_matcher(
     phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
 ) -> None:
@@ -351,24 +336,6 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     assert reason.startswith("matcher.onnx") and "\n" not in reason
     assert [record.levelname for record in caplog.records] == ["WARNING"] * 3  # twice news, once the end
     assert "3 times in a row: not tried again" in results[-1].skipped["network"]
-
-
-@pytest.mark.usefixtures("unwatched")
-def test_without_fallback_a_failure_ends_the_run(
-    phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
-) -> None:
-    path = save_matcher(tmp_path / "matcher.onnx", fault="nan")
-    pipeline = pipeline_with(phantom_session, path, "vision.onnx.fallback:=false")
-    with pytest.raises(DepthNetworkError, match="not finite"):
-        play(pipeline, [frames[0], dark(frames[1])])
-
-
-def test_a_stereo_network_needs_both_eyes(
-    phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
-) -> None:
-    pipeline = pipeline_with(phantom_session, save_matcher(tmp_path / "matcher.onnx"))
-    with pytest.raises(UsageError, match="has no right eye; name a monocular one"):
-        play(pipeline, [replace(frames[0], right=None)])
 
 
 # ---- one eye ---------------------------------------------------------------------------------------------
@@ -458,7 +425,7 @@ def test_one_camera_alone_keeps_the_declared_scale(
     known = truth(frames[0])
     declared = float(np.median(known[known > 0]))
     pipeline = pipeline_with(phantom_session, knowing, f"vision.onnx.declared_depth:={declared}")
-    results = play(pipeline, [replace(frame, right=None) for frame in frames])
+    results = play(pipeline, list(map(one_eye, frames)))
     figures = [depth_error(result, frame) for result, frame in zip(results, frames, strict=True)]
     assert not any(result.skipped for result in results)
     assert max(off for off, _ in figures) < 0.04, figures
@@ -466,12 +433,24 @@ def test_one_camera_alone_keeps_the_declared_scale(
     assert all(result.snapshot.loss < 0.05 for result in results[1:])
 
 
-def test_one_camera_alone_must_be_told_a_distance(
-    knowing: Path, phantom_session: Path, frames: list[StereoFrame]
-) -> None:
-    pipeline = pipeline_with(phantom_session, knowing)
-    with pytest.raises(UsageError, match=r"set vision\.onnx\.declared_depth"):
-        play(pipeline, [replace(frames[0], right=None)])
+@pytest.mark.usefixtures("unwatched")
+@pytest.mark.parametrize(
+    ("stereo", "shown", "override", "error", "words"),
+    [
+        (True, dark, "vision.onnx.fallback:=false", DepthNetworkError, "not finite"),
+        (True, one_eye, "vision.onnx.fallback:=true", UsageError, "has no right eye; name a monocular one"),
+        (False, one_eye, "vision.onnx.fallback:=true", UsageError, r"set vision\.onnx\.declared_depth"),
+    ],
+    ids=["no fallback", "one eye for two", "no distance"],
+)
+def test_what_no_other_depth_can_replace_ends_the_run(
+    stereo: bool, shown: Callable[[StereoFrame], StereoFrame], override: str, error: type[SagsError],
+    words: str, knowing: Path, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path,
+) -> None:  # fmt: skip
+    path = save_matcher(tmp_path / "matcher.onnx", fault="nan") if stereo else knowing
+    pipeline = pipeline_with(phantom_session, path, override)
+    with pytest.raises(error, match=words):
+        play(pipeline, [shown(frames[0])])
 
 
 def test_where_one_camera_s_network_fails_depth_is_unknown(
@@ -481,7 +460,7 @@ def test_where_one_camera_s_network_fails_depth_is_unknown(
     maps[1] = np.nan
     path = save_table(tmp_path / "network.onnx", pictures[:2], maps)
     pipeline = pipeline_with(phantom_session, path, "vision.onnx.declared_depth:=0.07")
-    good, bad = play(pipeline, [replace(frame, right=None) for frame in frames[:2]])
+    good, bad = play(pipeline, list(map(one_eye, frames[:2])))
     assert good.observation.depth.any() and "network" not in good.skipped
     assert not bad.observation.depth.any() and "not finite" in bad.skipped["network"]
     assert len(bad.snapshot.gaussians) > 200  # the model goes on

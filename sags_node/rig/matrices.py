@@ -1,13 +1,18 @@
-"""Stereo calibrations in OpenCV's own files (`cv2.FileStorage`, YAML or XML).
+"""Stereo calibrations as matrices of two cameras: OpenCV's own files, and folders of scikit-surgery.
 
-Either `intrinsics.yml` and `extrinsics.yml` as OpenCV's sample stereo_calib writes them, or one file with all
-matrices under the names that are in use. The files do not say the unit of T.
+OpenCV's (`cv2.FileStorage`, YAML or XML) are `intrinsics.yml` and `extrinsics.yml` as its sample stereo_calib
+writes them, or one file with all matrices under the names that are in use. They do not say the unit of T.
+
+Scikit-surgery's are text: `<prefix>.left.intrinsics.txt`, `.left.distortion.txt`, the same for the right eye,
+and `<prefix>.l2r.txt` [4, 4] from left to right camera coordinates, mm.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,18 +22,22 @@ from sags_node.config.yaml_reader import check_dialect
 from sags_node.errors import UsageError
 from sags_node.files import open_file, read_file
 from sags_node.rig.rig import fit_distortion, rectify_eyes
-from sags_node.types import F64, Eye, StereoRig
+from sags_node.types import F64, StereoRig
 
 LARGEST_FILE = 2**20  # bytes
 LARGEST_MATRIX = 64  # numbers
+DISTORTION = (4, 5, 8, 12, 14)
+COUNTS = {  # numbers of each matrix
+    "M1": (9,), "M2": (9,), "D1": DISTORTION, "D2": DISTORTION, "R": (9,), "T": (3,), "l2r": (16,),
+    "R1": (9,), "R2": (9,), "P1": (12,), "P2": (12,),
+}  # fmt: skip
 STARTS = (b"%YAML:", b"%YAML 1", b"<?xml", b"<opencv_storage")
 SUFFIXES = (".yml", ".yaml", ".xml")
-NAMES = {
+NAMES = {  # in OpenCV's files
     "M1": ("M1", "K1", "KL", "cameraMatrix1", "cameraMatrixL", "camera_matrix_1", "left_camera_matrix"),
     "M2": ("M2", "K2", "KR", "cameraMatrix2", "cameraMatrixR", "camera_matrix_2", "right_camera_matrix"),
     "D1": ("D1", "DL", "distCoeffs1", "distCoeffsL", "dist_coeffs_1", "left_distortion_coefficients"),
     "D2": ("D2", "DR", "distCoeffs2", "distCoeffsR", "dist_coeffs_2", "right_distortion_coefficients"),
-    "R": ("R",),
     "T": ("T", "t"),
 }
 OTHER_MODELS = ("fisheye", "equidist", "kannala", "omni", "unified", "doublesphere", "scaramuzza", "ocam")
@@ -37,6 +46,77 @@ MEI = ("xi", "xi1", "xi2")  # what only that model has
 DEEPEST = 3  # sections within sections that are looked through
 SIZES = (("image_width", "image_height"), ("imageWidth", "imageHeight"), ("width", "height"))
 SIZE_LISTS = ("imageSize", "image_size")
+MILLIMETRE = 1e-3
+PATTERNS = {  # of text files
+    "M1": "*left.intrinsic*.txt",
+    "D1": "*left.distortion*.txt",
+    "M2": "*right.intrinsic*.txt",
+    "D2": "*right.distortion*.txt",
+    "l2r": "*l2r*",
+}
+
+
+def _rig(
+    matrix: Callable[[str], F64], name: str, where: str, size: tuple[int, int] | None, R: F64, T: F64
+) -> StereoRig:
+    """The rig of M1 D1 M2 D2, which `matrix` reads, and of R [3, 3] and T [3] m."""
+    K = matrix("M1").reshape(3, 3), matrix("M2").reshape(3, 3)
+    left, right = (fit_distortion(matrix(key), f"{where}: {key}") for key in ("D1", "D2"))
+    if size is None:
+        raise UsageError(
+            f"{where} does not say the size of the pictures: give --size WxH; for a launch file "
+            "convert it first (sags calib convert)"
+        )
+    return rectify_eyes(name, size, K, (left, right), R, T)
+
+
+# ---- text ------------------------------------------------------------------------------------------------
+
+
+def is_text_folder(folder: Path) -> bool:
+    return any(folder.glob(PATTERNS["M1"]))
+
+
+def read_text_folder(folder: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+    """The rig in a folder of text matrices, named after the folder.
+
+    Args:
+        size: width and height of the pictures, px: the files do not say it.
+        metres: per unit of the translation; default: millimetres.
+
+    Raises:
+        UsageError: a file is missing, double or malformed, or the size is not given.
+    """
+    l2r = _text_matrix(folder, "l2r").reshape(4, 4)
+    T = l2r[:3, 3] * (metres or MILLIMETRE)
+    matrix = partial(_text_matrix, folder)
+    return _rig(matrix, folder.resolve().name, str(folder), size, l2r[:3, :3], T)
+
+
+def _text_matrix(folder: Path, key: str) -> F64:
+    """The numbers of one file, as one row."""
+    files = sorted(folder.glob(PATTERNS[key]))
+    if len(files) != 1:
+        found = ", ".join(file.name for file in files) or "none"
+        raise UsageError(f"{folder}: one file {PATTERNS[key]} is needed, found: {found}")
+    file = files[0]
+    try:
+        text = read_file(file, LARGEST_FILE).decode("utf-8")
+        numbers = np.array(text.replace(",", " ").split(), np.float64)
+    except OSError as error:
+        raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None
+    except ValueError:  # also of what is not UTF-8
+        raise UsageError(f"{file} holds something else than numbers; save it again") from None
+    if len(numbers) not in COUNTS[key]:
+        raise UsageError(f"{file} holds {len(numbers)} numbers, not {_needed(key)}; save it again")
+    return numbers
+
+
+def _needed(key: str) -> str:
+    return " or ".join(map(str, COUNTS[key]))
+
+
+# ---- OpenCV ----------------------------------------------------------------------------------------------
 
 
 def is_opencv(file: Path) -> bool:
@@ -71,25 +151,15 @@ def read_files(
     for file, storage in storages:
         _refuse_other_models(file, storage.root())
     where = " and ".join(map(str, files))
-    K = _matrix(storages, "M1", (9,)).reshape(3, 3), _matrix(storages, "M2", (9,)).reshape(3, 3)
-    left, right = (
-        fit_distortion(_matrix(storages, key, (4, 5, 8, 12, 14)), f"{where}: {key}") for key in ("D1", "D2")
-    )
-    size = _size(storages) or size
-    if size is None:
-        raise UsageError(
-            f"{where} does not say the size of the pictures: give --size WxH; for a launch file "
-            "convert it first (sags calib convert)"
-        )
-    T = _matrix(storages, "T", (3,)) * (metres or 1.0)
-    rig = rectify_eyes(name, size, K, (left, right), _matrix(storages, "R", (9,)).reshape(3, 3), T)
+    matrix = partial(_matrix, storages)
+    size, T = _size(storages) or size, matrix("T") * (metres or 1.0)
+    rig = _rig(matrix, name, where, size, matrix("R").reshape(3, 3), T)
     if not all(_find(storages, key) for key in ("R1", "R2", "P1", "P2")):
         return rig
     eyes = []
     for eye, R_key, P_key in ((rig.left, "R1", "P1"), (rig.right, "R2", "P2")):
-        R, P = _matrix(storages, R_key, (9,)).reshape(3, 3), _matrix(storages, P_key, (12,)).reshape(3, 4)
-        P[:, 3] *= metres or 1.0
-        eyes.append(Eye(*size, eye.K, eye.distortion, R, P))
+        P = matrix(P_key).reshape(3, 4) * [1.0, 1.0, 1.0, metres or 1.0]
+        eyes.append(replace(eye, R=matrix(R_key).reshape(3, 3), P=P))
     return StereoRig(name, *eyes)
 
 
@@ -144,7 +214,7 @@ def _find(storages: Storages, key: str) -> tuple[Path, cv2.FileNode] | None:
     return None
 
 
-def _matrix(storages: Storages, key: str, lengths: tuple[int, ...]) -> F64:
+def _matrix(storages: Storages, key: str) -> F64:
     """The numbers of one matrix, as one row."""
     found = _find(storages, key)
     if found is None:
@@ -153,9 +223,9 @@ def _matrix(storages: Storages, key: str, lengths: tuple[int, ...]) -> F64:
         raise UsageError(f"{where}: looked for a matrix named {names}; a stereo calibration needs it")
     file, node = found
     numbers = numbers_in(node)
-    if numbers is None or numbers.size not in lengths:
-        needed = " or ".join(map(str, lengths))
-        raise UsageError(f"{file}: {node.name()} is not a matrix of {needed} numbers; save the file again")
+    if numbers is None or numbers.size not in COUNTS[key]:
+        what = f"{node.name()} is not a matrix of {_needed(key)} numbers"
+        raise UsageError(f"{file}: {what}; save the file again")
     return numbers
 
 
