@@ -95,6 +95,12 @@ def scale_intrinsics(K: F64, size: tuple[int, int], new_size: tuple[int, int]) -
     return scaled
 
 
+def resized_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera whose picture is resized to `width` x `height` px."""
+    K = scale_intrinsics(camera.K, (camera.width, camera.height), (width, height))
+    return Camera(width, height, K, camera.T_world_cam)
+
+
 def scale_pixels(pixels: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
     """Pixels [..., 2] of a picture resized from `size` to `new_size` (width, height), in the resized one."""
     factors = np.array(new_size, np.float64) / size

@@ -311,6 +311,15 @@ class Colours:
 
 
 @dataclass(frozen=True, slots=True)
+class Shown:
+    """What consumers are shown of a view: the model with the detail of pictures, see `sags_node.detail`."""
+
+    rgb: U8  # [H, W, 3]
+    alpha: F32  # [H, W] 0..1, by the model or a picture
+    oldest_ns: int  # when the oldest of these pictures was captured
+
+
+@dataclass(frozen=True, slots=True)
 class RenderedView:
     """The model drawn for one camera."""
 
@@ -321,6 +330,7 @@ class RenderedView:
     depth: F32  # [H, W] m along z, 0 where the model says nothing, or nothing sure enough
     alpha: F32  # [H, W] coverage 0..1
     confidence: F32 | None = None  # [H, W] 0..1 of the depth, see `sags_node.confidence`; None: unknown
+    shown: Shown | None = None  # None: the model alone
 
     @property
     def rgb(self) -> U8:

@@ -62,6 +62,11 @@ HOLD_OUT = 8  # every so many frames, as in the literature
 )
 @lpips_option
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
+@click.option(
+    "--hidden",
+    is_flag=True,
+    help="Also hide boxes of tissue in a second run (--pace step); what is shown there.",
+)
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
 @click.option(
     "--receipt",
@@ -80,6 +85,7 @@ def evaluate(
     every: int,
     lpips_weights: Path | None,
     paper_psnr: bool,
+    hidden: bool,
     report: Path | None,
     receipt: Path | None,
     out: Path | None,
@@ -104,9 +110,11 @@ def evaluate(
     path, overrides = split(launch)
     if warm_up is not None:
         overrides.append(f"source.warm_up:={warm_up}")
+    if hidden and pace != "step":
+        raise click.UsageError("--hidden needs --pace step: boxes are taken from the node's own masks")
     if hold_out is None:
         hold_out = HOLD_OUT if pace == "step" else 0
-    options = MeasureOptions(hold_out, every, lpips_weights, paper_psnr)
+    options = MeasureOptions(hold_out, every, lpips_weights, paper_psnr, hidden)
     if report is not None:
         check_plots()
         check_report(report)

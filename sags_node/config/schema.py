@@ -778,6 +778,11 @@ class PublishConfig(Guarded):
         "somebody subscribes. true: it is drawn in every frame, which `sags eval` measures. false: nothing "
         "of it is published",
     )
+    detail: bool = Field(
+        False,
+        description="the left render and consumers' views show the pictures' own detail where the model says "
+        "that they saw the same tissue; false: the model alone",
+    )
 
 
 DeviceName = Literal["auto", "cpu", "cuda"]

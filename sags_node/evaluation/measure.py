@@ -10,7 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.config.schema import Box, PoseWay
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.detail.memory import Memory
+from sags_node.detail.seen import SeenFrame
+from sags_node.detail.show import Detail, Lessons
+from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
@@ -50,6 +53,7 @@ class MeasureOptions:
     every: int = 5  # the right eye and LPIPS are measured on every so many processed frames
     lpips_weights: Path | None = None
     paper_psnr: bool = False
+    hidden: bool = False  # a second run, in which boxes of tissue are hidden, see `measure_hidden`
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.every < 1:
@@ -92,6 +96,7 @@ class _Before:
     given: Camera  # as the session says
     truth: F32
     seconds: float  # on the recording's clock
+    lent: SeenFrame  # as views have its detail
 
     def seen(self, weight: float) -> Seen:
         """As a part of the mean of several, with a share of `weight`."""
@@ -129,6 +134,7 @@ class Measurer:
         pose: PoseWay = "session",
         on_picture: OnPicture = lambda frame_id, left: None,
         backend: str = "numba",
+        detail: bool = False,
     ) -> None:
         """
         Args:
@@ -138,6 +144,7 @@ class Measurer:
             pose: where the run had its poses from.
             on_picture: called with each frame of the recording.
             backend: what draws, as `make_rasterizer` has it.
+            detail: views have that of pictures (`publish.detail`).
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(spool))
@@ -160,6 +167,7 @@ class Measurer:
         self._on_picture = on_picture
         self._rigid = RigidOdometry()
         self._earlier: deque[_Before] = deque(maxlen=PREDICTED)  # the latest first
+        self._detail, self._memory = Detail(Lessons()) if detail else None, Memory()
         self._held: _HeldOut | None = None
 
     def run(self, frames: Iterable[StereoFrame], progress: Progress) -> None:
@@ -191,7 +199,7 @@ class Measurer:
         figures = {"online": self._quality(metrics.as_float(shown.rgb), truth, shown.tissue, costly)}
         for frames, before in enumerate(self._earlier, 1):
             group = "predict" if frames == 1 else f"predict_{frames}"
-            figures[group] = self._predict(before, shown, truth, seconds)
+            figures[group] = self._predict(before, shown, truth, seconds, frames)
         if costly and pair.right is not None:
             figures |= self._right_eye(shown, pair.left, pair.right, frame)
         self._right_before = pair.right
@@ -208,11 +216,13 @@ class Measurer:
         psnr = figures["online"]["psnr"]
         seen = Picture(frame.frame_id, psnr, pair.left, shown.rgb, shown.depth, shown.tissue)
         self.gallery.offer(place, seen)
-        after = _Before(shown, pair.camera, truth, seconds)
+        after = _Before(shown, pair.camera, truth, seconds, _lent(shown, pair))
+        self._learn(after)
         if self._held is not None and seconds > self._earlier[0].seconds:
             self._held.row.figures["between"] = self._between(self._earlier[0], self._held, after)
         self._held = None
         self._earlier.appendleft(after)
+        self._memory.add(after.lent)
         poses = self._poses(frame, pair, shown)
         return FrameRow(frame.frame_id, seconds, figures, shown.facts, track, poses, counts)
 
@@ -235,14 +245,31 @@ class Measurer:
         world = self._in_world_of_run(before.given, before.shown)
         return replace(given, T_world_cam=world @ given.T_world_cam)
 
-    def _predict(self, before: _Before, shown: SpooledFrame, truth: F32, seconds: float) -> Figures:
-        guess = self._draw(
-            extrapolated(before.shown.snapshot, seconds - before.seconds), shown.snapshot.camera
-        )
-        return {
-            "psnr": metrics.psnr(guess, truth, shown.tissue),
-            "copy_psnr": metrics.psnr(before.truth, truth, shown.tissue),
-        }
+    def _learn(self, now: _Before) -> None:
+        """As a node that draws views ahead learns from a frame."""
+        if self._detail is not None and self._earlier:
+            before = self._earlier[0]
+            expected = extrapolated(before.shown.snapshot, now.seconds - before.seconds)
+            self._detail.learn_ahead(before.lent, expected, now.lent)
+
+    def _predict(
+        self, before: _Before, shown: SpooledFrame, truth: F32, seconds: float, frames: int
+    ) -> Figures:
+        """`psnr` of what is shown of a moment some frames ahead; of the model alone, and of the picture then,
+        shown again."""
+        expected = extrapolated(before.shown.snapshot, seconds - before.seconds)
+        camera = shown.snapshot.camera
+        guess = self._draw(expected, camera)
+        figures = {"psnr": metrics.psnr(guess, truth, shown.tissue)}
+        figures["model_psnr"] = figures["psnr"]
+        if self._detail is not None:
+            view = to_view(self._rasterizer.forward(expected, camera), camera, shown.snapshot.frame_id, 0)
+            older = [seen for seen in self._memory.frames if seen.t_capture_ns < before.lent.t_capture_ns]
+            detailed = self._detail.view(
+                view, camera, expected, before.lent, older, shown.baseline, float(frames)
+            )
+            figures["psnr"] = metrics.psnr(metrics.as_float(detailed.rgb), truth, shown.tissue)
+        return figures | {"copy_psnr": metrics.psnr(before.truth, truth, shown.tissue)}
 
     def _held_out(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, before: _Before) -> FrameRow:
         camera = self._camera_of_run(pair.camera, before)
@@ -365,3 +392,11 @@ def _depth_figures(shown: SpooledFrame, reference: F32) -> dict[str, Figures]:
         measured = metrics.depth_errors(shown.measured_depth, truth, shown.tissue)
         figures["measured_depth"] = asdict(measured)
     return figures
+
+
+def _lent(shown: SpooledFrame, pair: RectifiedPair) -> SeenFrame:
+    """A frame as it lends its picture to views of other moments."""
+    snapshot, left = shown.snapshot, pair.left
+    return SeenFrame(
+        pair.t_capture_ns, snapshot.camera, snapshot.gaussians, lambda: left, shown.tissue, shown.depth
+    )

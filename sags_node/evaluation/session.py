@@ -13,6 +13,7 @@ from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import live
 from sags_node.evaluation.gallery import Picture
+from sags_node.evaluation.hidden import measure_hidden
 from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, OnPicture, Progress
 from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.spool import Spool
@@ -137,6 +138,11 @@ def measure(
         )
     receipt = Receipt(session.rig, session.working_size, options.lpips_weights)
     measurer = _measured(session, spool, options, receipt, progress, on_picture)
+    if options.hidden:
+        rows = {row.frame_id: row for row in measurer.rows}
+        found = measure_hidden(session.config, session.rig, again(session), len(rows), progress)
+        for frame_id, figures in found.items():
+            rows[frame_id].figures["hidden"] = figures
     summary = _summary(session, measurer.rows, options, overrides, measurer.depth_kind)
     return Evaluation(summary, measurer.rows, measurer.gallery.pictures, receipt.as_json())
 
@@ -202,7 +208,16 @@ def _measured(
     exclude = config.vision.tissue.exclude
     backend = backend_of(config)
     measurer = Measurer(
-        spool, rectifier, tissue, options, receipt, exclude, config.vision.pose, on_picture, backend
+        spool,
+        rectifier,
+        tissue,
+        options,
+        receipt,
+        exclude,
+        config.vision.pose,
+        on_picture,
+        backend,
+        config.publish.detail,
     )
     with again(session) as frames:
         measurer.run(frames, progress)

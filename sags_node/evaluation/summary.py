@@ -19,9 +19,10 @@ from sags_node.evaluation.trajectory import trajectory_errors
 
 GROUPS = {
     "online": ("psnr", "ssim", "lpips"),
-    "predict": ("psnr", "copy_psnr"),
-    "predict_2": ("psnr", "copy_psnr"),
-    "predict_3": ("psnr", "copy_psnr"),
+    "predict": ("psnr", "model_psnr", "copy_psnr"),
+    "predict_2": ("psnr", "model_psnr", "copy_psnr"),
+    "predict_3": ("psnr", "model_psnr", "copy_psnr"),
+    "hidden": ("psnr", "model_psnr", "copy_psnr"),
     "heldout": ("psnr", "ssim", "lpips", "copy_psnr"),
     "between": ("psnr", "carried_psnr", "mean_psnr"),
     "novel": ("psnr",),
@@ -44,8 +45,12 @@ def summarise(
 
     A figure of quality is the mean over the frames that have it, and again over each named segment
     (`online.motion.psnr`; first and last frame belong to it). Track errors are pooled over points and frames.
-    `predict` is a frame said by the one before, `predict_2` and `predict_3` by the second and third before;
-    `copy_psnr` is that picture, shown again: on tissue that hardly moves it is hard to beat.
+    `online` is the model's own picture of a frame that it has learnt from, as who draws its splats sees it.
+    `predict` is a frame said by the one before, `predict_2` and `predict_3` by the second and third before:
+    `psnr` as it is shown, with the older picture's detail where `publish.detail` is set, `model_psnr` by the
+    model alone, `copy_psnr` by that picture, shown again: on tissue that hardly moves it is hard to beat.
+    `hidden` is the same for boxes of tissue that were hidden from a second run, `copy_psnr` by the last
+    picture that showed them.
     `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around,
     `between.carried_psnr` the same with both carried along the model's motion, see `carried`.
     `right` is the right view as it was shown, with `publish.right:=true`; `right.warp_psnr` the left picture

@@ -55,6 +55,9 @@ class Content:
     scale: float = 0.0  # of a thin picture whose numbers are whole; 0: none
     window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture for one of its own
     relative: bool = False  # its lengths have no unit
+    detail_age_ns: int | None = (
+        None  # of the oldest picture in a view, before its frame; None: the model alone
+    )
 
     def cdr(self) -> bytes:
         """The whole message."""

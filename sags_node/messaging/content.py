@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -128,7 +129,11 @@ def view(name: str, drawn: DrawnView) -> dict[str, Content]:
         frame = f"{topic[:-1].replace('/', '_')}_optical_frame"
         stamp_ns, baseline = picture.t_capture_ns, drawn.baseline if eye == "right" else 0.0
         said[f"{topic}camera_info"] = cdr.camera_info(picture.camera, stamp_ns, frame, baseline)
-        said[f"{topic}image"] = cdr.image(_rgba(picture.rgb, picture.alpha), "rgba8", stamp_ns, frame)
+        size = picture.camera.width, picture.camera.height
+        rgba = _rgba(published.colours_at(picture, size), published.alpha_at(picture, size))
+        said[f"{topic}image"] = replace(
+            cdr.image(rgba, "rgba8", stamp_ns, frame), detail_age_ns=published.detail_age_ns(picture)
+        )
         if drawn.depth:
             said[f"{topic}depth"] = cdr.image(_depth(picture.depth), "32FC1", stamp_ns, frame)
             if picture.confidence is not None:
@@ -161,7 +166,9 @@ def _rgba(rgb: U8, coverage: F32) -> U8:
 def _drawn(result: FrameResult, side: Side) -> Content:
     pair, view = result.pair, result.views[side]
     rgba = _rgba(published.colours(pair, view), published.alpha(pair, view))
-    return cdr.image(rgba, "rgba8", pair.t_capture_ns, cdr.LEFT_FRAME if side == "left" else cdr.RIGHT_FRAME)
+    frame = cdr.LEFT_FRAME if side == "left" else cdr.RIGHT_FRAME
+    image = cdr.image(rgba, "rgba8", pair.t_capture_ns, frame)
+    return replace(image, detail_age_ns=published.detail_age_ns(view))
 
 
 def _confidence(gaussians: Gaussians) -> F32:

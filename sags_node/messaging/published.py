@@ -51,14 +51,33 @@ def nearest(pair: RectifiedPair, plane: Plane) -> Plane:
 
 def colours(pair: RectifiedPair, view: RenderedView) -> U8:
     """What a view of the frame shows, [H, W, 3] RGB."""
-    return view.colours.at(*size_of(pair))
+    return colours_at(view, size_of(pair))
 
 
 def alpha(pair: RectifiedPair, view: RenderedView) -> F32:
     """Its coverage, [H, W] 0..1."""
-    if pair.published is None:
+    return alpha_at(view, size_of(pair))
+
+
+def colours_at(view: RenderedView, size: tuple[int, int]) -> U8:
+    """What a view shows in a size of width and height, px: with the detail of pictures, where it has it."""
+    if view.shown is not None and view.shown.rgb.shape[1::-1] == size:
+        return view.shown.rgb
+    return view.colours.at(*size)
+
+
+def alpha_at(view: RenderedView, size: tuple[int, int]) -> F32:
+    """Its coverage in that size, 0..1."""
+    if view.shown is not None and view.shown.alpha.shape[::-1] == size:
+        return view.shown.alpha
+    if view.alpha.shape[::-1] == size:
         return view.alpha
-    return np.asarray(cv2.resize(view.alpha, size_of(pair), interpolation=cv2.INTER_LINEAR))
+    return np.asarray(cv2.resize(view.alpha, size, interpolation=cv2.INTER_LINEAR))
+
+
+def detail_age_ns(view: RenderedView) -> int | None:
+    """How long before the view's frame the oldest picture in it was captured; None: the model alone."""
+    return None if view.shown is None else max(0, view.t_capture_ns - view.shown.oldest_ns)
 
 
 def view(pair: RectifiedPair, drawn: RenderedView) -> RenderedView:

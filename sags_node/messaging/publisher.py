@@ -287,6 +287,7 @@ class Publisher:
             dtype=body.dtype,
             dropped=self._dropped,
             ahead_ns=ahead_ns or msgspec.UNSET,
+            detail_age_ns=msgspec.UNSET if body.detail_age_ns is None else body.detail_age_ns,
             scale=body.scale or msgspec.UNSET,
             window=list(body.window) or msgspec.UNSET,
             recorded_s=msgspec.UNSET if recorded_s is None else recorded_s,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -76,7 +77,9 @@ def _thin(
     _, file = cv2.imencode(".jpg" if is_jpeg else ".png", picture, _JPEG if is_jpeg else PNG)
     frame = cdr.RIGHT_FRAME if thin.topic.startswith("right") else cdr.LEFT_FRAME
     kind = "jpeg" if is_jpeg else "png"
-    return cdr.thin_picture(file, kind, encoding, result.pair.t_capture_ns, frame, scale, window)
+    drawn = result.views[_side(thin.topic)] if thin.topic.endswith("render/image") else None
+    body = cdr.thin_picture(file, kind, encoding, result.pair.t_capture_ns, frame, scale, window)
+    return body if drawn is None else replace(body, detail_age_ns=published.detail_age_ns(drawn))
 
 
 def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:

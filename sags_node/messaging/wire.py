@@ -56,6 +56,9 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     dtype: DType  # of part 1, little-endian; empty: no bulk part
     dropped: Count  # frames the node dropped so far
     ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # shown is what is expected so long after `stamp_ns`
+    detail_age_ns: Count | msgspec.UnsetType = (
+        msgspec.UNSET
+    )  # the oldest picture in a view came so long before
     scale: Scale | msgspec.UnsetType = msgspec.UNSET  # of a thin picture whose numbers are whole
     window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin picture: x, y, and px for one of its own
     recorded_s: Seconds | msgspec.UnsetType = msgspec.UNSET  # place of the frame in the recording played

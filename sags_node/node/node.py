@@ -22,6 +22,7 @@ from dataclasses import replace
 from typing import Any
 
 from sags_node.config.schema import LaunchConfig, LiveSource
+from sags_node.detail.seen import SeenFrame
 from sags_node.errors import SagsError
 from sags_node.findings import by_code, by_stage
 from sags_node.kernels.threads import configure_threads
@@ -89,7 +90,12 @@ class Node:
         statistics = Statistics(config.source)
         self._allowance = Allowance()
         backend = backend_of(config)
-        views = Views(self._allowance, latency=lambda: statistics.latency_s, backend=backend)
+        views = Views(
+            self._allowance,
+            latency=lambda: statistics.latency_s,
+            backend=backend,
+            detail=config.publish.detail,
+        )
         self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
@@ -98,12 +104,13 @@ class Node:
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
-        self._scenes: Latest[FrameResult] = Latest()
+        self._scenes: Latest[tuple[FrameResult, tuple[SeenFrame, ...]]] = Latest()
         self._whole: Latest[tuple[FrameResult, Mapping[str, ThinPicture]]] = Latest()  # and what is asked for
         self._thin: Latest[tuple[FrameResult, dict[str, Content]]] = Latest(on_put=self._wake_publishing)
         # By name, the newest only; None: closed. Single operations on a dict need no lock.
         self._drawn: dict[str, DrawnView | None] = {}
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
+        self._left_is_watched = False  # somebody looks at the left view
         self._right_is_watched = False  # somebody looks at the right eye
         self._error: BaseException | None = None
         self._stopping = threading.Event()
@@ -258,7 +265,8 @@ class Node:
                     self._state.pipeline.rate = self._rate.hz
                     self._operations.reconfigure()
                 waited = time.monotonic() - at if self._live else 0.0
-                request = FrameRequest(waited, self._right_is_watched, self._state.statistics.latency_s)
+                latency = self._state.statistics.latency_s
+                request = FrameRequest(waited, self._left_is_watched, self._right_is_watched, latency)
                 self._working_since = time.monotonic()
                 result = self._state.pipeline.process(frame, self._state.budget, request)
                 self._working_since = None
@@ -268,15 +276,16 @@ class Node:
                 dropped, before = self._frames.dropped, dropped
                 self._allowance.frame(waited, missed=dropped > before)
                 if not result.held:
-                    self._scenes.put(result)
+                    self._scenes.put((result, self._state.pipeline.seen))
         self._operations.for_mapping.serve()
 
     def _draw_views(self) -> None:
         configure_threads(1)
         while not self._scenes.closed:
-            scene = self._scenes.get(timeout=REQUEST_WAIT)
-            if scene is not None:
-                for name, drawn in self._state.views.draw_due(scene, self._watched):
+            came = self._scenes.get(timeout=REQUEST_WAIT)
+            if came is not None:
+                scene, seen = came
+                for name, drawn in self._state.views.draw_due(scene, self._watched, seen):
                     self._hand_over_view(name, drawn)
             self._operations.for_drawing.serve()
         self._operations.for_drawing.serve()
@@ -368,6 +377,7 @@ class Node:
     def _note_who_looks(self) -> None:
         views = self._state.views
         self._watched = frozenset(name for name in views.status if self._publisher.watches_view(name))
+        self._left_is_watched = self._publisher.looked_at("left/render/image")
         if self._state.config.publish.right == "auto":
             pictures = ["right/render/image", *(f"view/{name}/right/image" for name in views.pairs)]
             self._right_is_watched = any(map(self._publisher.looked_at, pictures))

@@ -132,7 +132,7 @@ class Operations:
         request = parse(ViewRequest, args)
         if request.ahead_ms:
             self._state.pipeline.predict_motion()
-        drawn = self._state.views.open(request, self._scene())
+        drawn = self._state.views.open(request, self._scene(), self._state.pipeline.seen)
         status = self._state.views.status[request.name]
         if drawn is not None or status.draw_ms == 0:  # None: what was kept of it shows another viewpoint
             self._show_view(request.name, drawn)

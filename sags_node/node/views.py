@@ -10,11 +10,12 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sags_node.detail.seen import SeenFrame
 from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.confidence import with_confidence
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
@@ -25,6 +26,7 @@ from sags_node.messaging.requests import ViewRequest
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.model.gaussians import for_right_eye
 from sags_node.node.allowance import SHARE, Allowance
+from sags_node.node.teacher import Teacher, is_of
 from sags_node.types import F32, Camera, DrawnView, FrameResult, Gaussians, RenderedView, ViewStatus
 
 MAX_VIEWS = 8
@@ -66,12 +68,14 @@ class Views:
         processor_clock: Clock = time.thread_time,
         latency: Clock = lambda: 0.0,
         backend: str = "numba",
+        detail: bool = False,
     ) -> None:
         """
         Args:
             allowance: what drawing may take of one core.
             latency: s from capture to published, as it was lately.
             backend: as `make_rasterizer` has it.
+            detail: views have that of pictures.
         """
         self.status: Mapping[str, ViewStatus] = {}
         self.pairs: Collection[str] = ()
@@ -83,8 +87,11 @@ class Views:
         self._views: dict[str, _View] = {}
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
         self._watched: Collection[str] = ()
+        self._teacher = Teacher() if detail else None
 
-    def open(self, request: ViewRequest, scene: FrameResult | None) -> DrawnView | None:
+    def open(
+        self, request: ViewRequest, scene: FrameResult | None, seen: Sequence[SeenFrame] = ()
+    ) -> DrawnView | None:
         """Open a view, or change one of that name; returns its first picture where there is a scene. Else
         it is drawn with the next one.
 
@@ -106,7 +113,7 @@ class Views:
         drawn = None
         if scene is not None and view.cost == 0:
             try:
-                drawn = self._draw(view, scene)
+                drawn = self._draw(view, scene, seen)
             except Exception:
                 self.close(request.name)
                 raise
@@ -127,13 +134,21 @@ class Views:
         sizes = {(view.request.width, view.request.height) for view in self._views.values()}
         self._rasterizers = {size: kept for size, kept in self._rasterizers.items() if size in sizes}
 
-    def draw_due(self, scene: FrameResult, watched: Collection[str]) -> Iterator[tuple[str, DrawnView]]:
+    def draw_due(
+        self, scene: FrameResult, watched: Collection[str], seen: Sequence[SeenFrame] = ()
+    ) -> Iterator[tuple[str, DrawnView]]:
         """Draw what is due of a new scene, longest overdue first. A drawing that fails costs its view alone.
 
         Args:
             watched: views that somebody subscribes to.
+            seen: frames that lend their pictures: that of the scene, and older ones (`Pipeline.seen`).
         """
         self._watched = watched
+        if self._teacher is not None and seen:
+            asked = [view.request for name, view in self._views.items() if name in watched]
+            self._teacher.take(
+                scene, seen[0], ahead=any(one.ahead_ms for one in asked), aside=any(map(is_aside, asked))
+            )
         for name, view in sorted(self._views.items(), key=lambda item: item[1].due):
             if view.finished or (view.cost > 0 and name not in watched):
                 continue
@@ -143,7 +158,7 @@ class Views:
                 continue
             view.due = max(view.due + period, now)
             try:
-                drawn = self._draw(view, scene)
+                drawn = self._draw(view, scene, seen)
             except Exception as error:
                 view.failure = f"it cannot be drawn: {str(error) or type(error).__name__}"
                 if view.failure != view.logged:
@@ -153,7 +168,7 @@ class Views:
                 yield name, drawn
         self._note()
 
-    def _draw(self, view: _View, scene: FrameResult) -> DrawnView:
+    def _draw(self, view: _View, scene: FrameResult, seen: Sequence[SeenFrame]) -> DrawnView:
         request = view.request
         started = self._processor_clock()
         snapshot = scene.snapshot
@@ -169,9 +184,12 @@ class Views:
         for eye, camera in eyes.items():
             shown = _published(scene, camera) if eye == "right" and ahead == 0 else None
             if shown is None:
-                seen = for_right_eye(gaussians, snapshot) if eye == "right" else gaussians
-                planes = self._planes(seen, camera)
+                drawn = for_right_eye(gaussians, snapshot) if eye == "right" else gaussians
+                planes = self._planes(drawn, camera)
                 shown = to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
+                if self._teacher is not None and is_of(seen, snapshot):
+                    added = self._teacher.detail(scene, seen, gaussians, shown, ahead, eye == "right")
+                    shown = replace(shown, shown=added)
             pictures[eye] = with_confidence(shown, gaussians)
         spent = self._processor_clock() - started
         view.cost = spent if view.cost == 0 else view.cost + LEARNING * (spent - view.cost)
@@ -239,6 +257,11 @@ def _published(scene: FrameResult, camera: Camera) -> RenderedView | None:
     ):
         return None
     return published.view(scene.pair, shown)
+
+
+def is_aside(request: ViewRequest) -> bool:
+    """Whether a view is asked for that the left eye does not have."""
+    return request.stereo or not np.array_equal(request.pose(), np.eye(4))
 
 
 def view_camera(request: ViewRequest, left: Camera) -> Camera:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,9 @@ import numpy as np
 
 from sags_node.confidence import HALVING, confidence_of
 from sags_node.config.schema import LaunchConfig
+from sags_node.detail.memory import Memory
+from sags_node.detail.seen import SeenFrame
+from sags_node.detail.show import Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
 from sags_node.mapping.anchors import Anchors
@@ -27,6 +31,7 @@ from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
 from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
 from sags_node.mapping.tissue_map import TissueMap
+from sags_node.messaging import published
 from sags_node.pipeline.repeats import doubted, repeated, unseen
 from sags_node.pipeline.uncalibrated import FINDING, MOST, unsure
 from sags_node.types import (
@@ -66,6 +71,7 @@ class FrameRequest:
     """What consumers want of one frame."""
 
     waited: float = 0.0  # s since it came
+    left: bool = False  # somebody looks at the left view: it gets the picture's detail
     right: bool = False  # somebody looks at the right eye: it is drawn, where there is one
     latency: float = 0.0  # s from capture to what shows it, as it was lately
 
@@ -85,6 +91,7 @@ class Pipeline:
         rate: frames that come a second; None: they come when they are taken. `reconfigure` after a change.
         newest: the frame mapped last; None before the first, and after a reset.
         held: why the last frame was not taken in; empty: it was.
+        seen: the frames that lend views their pictures, the newest first: the one mapped last and older ones.
         metric: lengths are metres: the calibration is no guess.
     """
 
@@ -119,6 +126,8 @@ class Pipeline:
         else:
             self.mapper = Mapper(self._refiner, self.map, unhurried=unhurried)
         self._surface = SurfaceTracker(unhurried)
+        self._detail = Detail(Lessons()) if config.publish.detail else None
+        self._memory = Memory()
         self._right = RightView()
         self._camera: CameraTracker | PoseRefiner | None = None  # None: its pose is given, or fixed
         if vision.pose == "estimate":
@@ -136,6 +145,7 @@ class Pipeline:
         self._reset_due = False
         self.newest: FrameResult | None = None
         self.held = ""
+        self.seen: tuple[SeenFrame, ...] = ()
         self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
         self._unwatched = 0.0  # m: how far tissue may have moved while no frame was taken in
         self._came_ns: int | None = None  # when the last frame was captured
@@ -155,7 +165,8 @@ class Pipeline:
         self.map.restart()
         self._scene.forget()
         self._still.forget()
-        self.newest = self._last = None
+        self._memory.forget()
+        self.newest, self._last, self.seen = None, None, ()
         self._came_ns = None
         self._unwatched = 0.0
 
@@ -248,7 +259,8 @@ class Pipeline:
             budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
         # Then draw what consumers watch: the right eye, and their anchors.
         with clock("render"):
-            views = {"left": mapped.view}
+            self._lend(mapped, pair, observation, judged)
+            views = {"left": self._left_eye(mapped.view, pair, request.left)}
             if right:
                 views["right"] = self._right_eye(mapped, observation, seen, judged, by_both)
         with clock("anchors"):
@@ -371,6 +383,25 @@ class Pipeline:
         if self._camera is not None:
             self._camera.learn(observation, mapped.view)
         return mapped
+
+    def _lend(self, mapped: Mapped, pair: RectifiedPair, observation: Observation, judged: Judgement) -> None:
+        """Note which pictures views may have their detail from. One in another light lends none."""
+        self.seen = ()
+        if self._detail is None or not judged.learn or judged.gain is not None:
+            return
+        now = SeenFrame(
+            pair.t_capture_ns, observation.camera, mapped.snapshot.gaussians,
+            partial(published.picture, pair, "left"), observation.tissue, mapped.view.depth,
+        )  # fmt: skip
+        self.seen = now, *self._memory.frames
+        self._memory.add(now)
+
+    def _left_eye(self, view: RenderedView, pair: RectifiedPair, wanted: bool) -> RenderedView:
+        """The model drawn for the left eye; with the picture's detail, if somebody looks."""
+        if self._detail is None or not wanted or not self.seen:
+            return view
+        now, *older = self.seen
+        return replace(view, shown=self._detail.left(view, published.camera_of(pair), now, older))
 
     def _right_eye(
         self, mapped: Mapped, observation: Observation, seen: RectifiedPair, judged: Judgement, by_both: Bool

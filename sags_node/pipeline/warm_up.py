@@ -49,7 +49,7 @@ def warm_up(config: LaunchConfig) -> None:
         }
     )
     pipeline = Pipeline(small, _rig())
-    request = FrameRequest(right=config.publish.right is not False)  # somebody may look
+    request = FrameRequest(left=True, right=config.publish.right is not False)  # somebody may look
     budget = StepBudget(2)  # the first on the whole picture, the second where it is worst
     frames = _frames()
     with _vision_beside():

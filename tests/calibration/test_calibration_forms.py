@@ -248,7 +248,7 @@ def test_a_wrong_unit_is_refused_and_the_right_one_named(unit: str, said: str, t
     code, text, _ = ran("calib", "check", folder, *command[-3:], said, "--json")
     assert code == 1 and f"say --unit {unit} (5.2 mm)" in text
     assert ran(*command, unit)[0] == 0
-    assert_same(load_rig(tmp_path / "out"), expected())
+    assert_same(load_rig(tmp_path / "out"), make_rig())
 
 
 def test_a_unit_that_no_other_one_betters_is_taken(tmp_path: Path) -> None:

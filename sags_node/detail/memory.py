@@ -1,0 +1,86 @@
+"""Pictures of tissue that is hidden now: the newest ones in which it was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sags_node.detail.seen import SeenFrame
+from sags_node.types import F32, Gaussians
+
+EVERY = 0.2  # s between frames that are kept
+MOST = 10  # frames kept
+OLDEST = 10.0  # s: what nobody has seen for longer is drawn as the model has it
+SOURCES = 2  # that one view takes: each costs a small drawing
+NEARLY = 0.5  # of what the best of them saw: a newer one is taken that saw so much
+WORTH = 0.05  # of the hidden Gaussians: with fewer, a source is not worth its drawing
+BRIGHTER = 2.0  # at most, between a source's light and that of the view
+
+
+class Memory:
+    """Keeps frames, close to each other lately and sparser before.
+
+    Attributes:
+        frames: the newest first.
+    """
+
+    def __init__(self) -> None:
+        self.frames: tuple[SeenFrame, ...] = ()
+
+    def forget(self) -> None:
+        """Begin anew: Gaussians mean others now."""
+        self.frames = ()
+
+    def add(self, frame: SeenFrame) -> None:
+        """Keep a frame, if none so new is kept yet."""
+        now = frame.t_capture_ns
+        kept = [one for one in self.frames if 0 <= now - one.t_capture_ns <= OLDEST * 1e9]
+        if kept and now - kept[0].t_capture_ns < EVERY * 1e9:
+            return
+        picture = frame.picture()  # now: it is made of a frame of which nothing else is needed
+        kept.insert(0, replace(frame, picture=lambda: picture))
+        if len(kept) > MOST:
+            ages = [EVERY + (now - one.t_capture_ns) * 1e-9 for one in kept]
+            # The one whose neighbours in time are nearest to each other, by their ages, is missed least.
+            del kept[min(range(1, len(kept) - 1), key=lambda i: ages[i + 1] / ages[i - 1])]
+        self.frames = tuple(kept)
+
+
+@dataclass(frozen=True, slots=True)
+class HiddenSource:
+    """A frame that saw tissue which is hidden now."""
+
+    frame: SeenFrame
+    gain: F32  # [3] the light of now, as factors of that frame's
+
+
+def hidden_sources(gaussians: Gaussians, now: SeenFrame, frames: Sequence[SeenFrame]) -> list[HiddenSource]:
+    """Choose the frames that saw most of what `now` does not show, the newest first.
+
+    Args:
+        gaussians: those of `now`, there or moved.
+        frames: that may be taken, the newest first.
+    """
+    hidden = np.flatnonzero(~now.shows)
+    least = max(1.0, WORTH * len(hidden))
+    candidates = []
+    for frame in frames:
+        if frame.t_capture_ns < now.t_capture_ns:
+            rows, known = frame.rows_of(gaussians.ids[hidden])
+            candidates.append((frame, rows, known & frame.shows[rows]))
+    chosen: list[HiddenSource] = []
+    left = np.ones(len(hidden), np.bool_)
+    while candidates and len(chosen) < SOURCES:
+        counts = [np.count_nonzero(seen & left) for _, _, seen in candidates]
+        if max(counts) < least:
+            break
+        newest = next(i for i, count in enumerate(counts) if count > NEARLY * max(counts))
+        frame, rows, seen = candidates.pop(newest)
+        seen = seen & left
+        before, after = frame.gaussians.colors[rows[seen]], gaussians.colors[hidden[seen]]
+        gain = after.sum(0) / np.maximum(before.sum(0), np.float32(1e-6))
+        chosen.append(HiddenSource(frame, np.clip(gain, 1 / BRIGHTER, BRIGHTER).astype(np.float32)))
+        left &= ~seen
+    return sorted(chosen, key=lambda source: -source.frame.t_capture_ns)

@@ -1,0 +1,79 @@
+"""A frame that lends its picture to other moments and other cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from sags_node.geometry import project
+from sags_node.types import F32, I64, U8, Bool, Camera, Gaussians
+
+MARGIN = np.ones((5, 5), np.uint8)  # px of the working size: nearer to a mask's edge an instrument may shine
+SAME = 0.04  # of the depth: nearer to each other, two depths are of one surface
+
+
+@dataclass(frozen=True)
+class SeenFrame:
+    """A mapped frame, as far as its picture can be carried from it."""
+
+    t_capture_ns: int
+    camera: Camera  # left eye, working size
+    gaussians: Gaussians  # of that moment
+    picture: Callable[[], U8]  # [H, W, 3] RGB of the left eye as it is published; made when it is asked for
+    mask: Bool  # [h, w] tissue
+    depth: F32  # [h, w] m, of the model drawn for it; 0 unknown
+
+    @cached_property
+    def tissue(self) -> U8:
+        """[h, w] 1: tissue."""
+        return self.mask.view(np.uint8)
+
+    @cached_property
+    def sure_tissue(self) -> U8:
+        """[h, w] 1: tissue, and no edge of an instrument beside it."""
+        eroded: U8 = cv2.erode(self.tissue, MARGIN, borderType=cv2.BORDER_REPLICATE)
+        return eroded
+
+    @cached_property
+    def pixels(self) -> F32:
+        """[N, 2] of its Gaussians; NaN behind the camera."""
+        return np.asarray(project(self.camera, self.gaussians.means)[0], np.float32)
+
+    @cached_property
+    def shows(self) -> Bool:
+        """[N] which Gaussians its picture shows."""
+        z = project(self.camera, self.gaussians.means)[1]
+        height, width = self.depth.shape
+        inside = np.all((self.pixels > -0.5) & (self.pixels < (width - 0.5, height - 0.5)), axis=1)
+        columns, rows = np.rint(np.where(inside[:, None], self.pixels, 0)).astype(np.intp).T
+        found: Bool = inside & (self.sure_tissue[rows, columns] > 0)
+        found &= np.abs(self.depth[rows, columns] - z) < np.float32(SAME) * z
+        return found
+
+    def picture_for(self, focal_px: float) -> U8:
+        """Its picture, made no finer than a view with that focal length shows."""
+        picture = self.picture()
+        height, width = picture.shape[:2]
+        times = int(self.camera.K[0, 0] * width / self.camera.width / focal_px + 0.5)
+        if times < 2:
+            return picture
+        size = max(2, width // times), max(2, height // times)
+        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+    def rows_of(self, ids: I64) -> tuple[I64, Bool]:
+        """Where Gaussians with these `ids` [M] stand among its own: rows [M], and which it has [M]."""
+        own = self.gaussians.ids
+        if ids is own:
+            return np.arange(len(ids)), np.ones(len(ids), np.bool_)
+        if not len(own):
+            return np.zeros(len(ids), np.int64), np.zeros(len(ids), np.bool_)
+        rows = self._by_id[np.minimum(np.searchsorted(own[self._by_id], ids), len(own) - 1)]
+        return rows, own[rows] == ids
+
+    @cached_property
+    def _by_id(self) -> I64:
+        return np.argsort(self.gaussians.ids, kind="stable")

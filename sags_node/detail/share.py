@@ -1,0 +1,69 @@
+"""How far to trust what is carried: learnt from how well it did in the frames before.
+
+For each tile of a source's picture: of what the one guess lacked, how much lay along the other guess's
+difference from it (least squares). Where highlights jump, or the motion is wrong, it is little.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from sags_node.detail.seen import SeenFrame
+from sags_node.types import F32, F64, U8, Bool
+
+TILES = 16  # along the longer side of a picture
+REMEMBERED = 0.8  # of the sums, from one lesson to the next
+BELIEVED = 1e-3  # of squared colours 0..1: lessons as small as this change little at first
+
+
+class Share:
+    """The share of a second guess in the mix of two. One thread learns; any may ask."""
+
+    def __init__(self) -> None:
+        self._sums: F64 | None = None  # [2, rows, columns]: lacking times difference, difference squared
+
+    def learn(self, first: U8, second: U8, truth: U8, where: Bool) -> None:
+        """Take a lesson in.
+
+        Args:
+            first, second: [h, w, 3] the two guesses.
+            truth: [h, w, 3] what was seen then.
+            where: [h, w] which pixels count.
+        """
+        height, width = where.shape
+        step = max(1, max(height, width) // TILES)
+        rows, columns = -(-height // step), -(-width // step)
+        base = first.astype(np.float32)
+        differs = (second.astype(np.float32) - base) * where[..., None]
+        lacks = truth.astype(np.float32) - base
+        found = np.stack([(lacks * differs).sum(-1), (differs * differs).sum(-1)]) / np.float32(255**2)
+        found = np.pad(found, ((0, 0), (0, rows * step - height), (0, columns * step - width)))
+        tiles: F64 = found.reshape(2, rows, step, columns, step).sum((2, 4), dtype=np.float64)
+        if self._sums is None or self._sums.shape != tiles.shape:
+            self._sums = np.full(tiles.shape, BELIEVED)
+        self._sums = REMEMBERED * self._sums + tiles
+
+    def tiles(self) -> F32:
+        """[rows, columns] 0..1 as it was learnt; [1, 1] of 1 before."""
+        if self._sums is None:
+            return np.ones((1, 1), np.float32)
+        lacking, squared = self._sums
+        return np.asarray(np.clip(lacking / squared, 0, 1), np.float32)
+
+    def of_gaussians(self, source: SeenFrame) -> F32:
+        """[N] for the Gaussians of a frame, where its picture shows them."""
+        tiles = self.tiles()
+        factors = tiles.shape[1] / source.camera.width, tiles.shape[0] / source.camera.height
+        places = np.clip(
+            (np.nan_to_num(source.pixels) + 0.5) * factors, 0, (tiles.shape[1] - 1, tiles.shape[0] - 1)
+        )
+        columns, rows = places.astype(np.intp).T
+        return np.asarray(tiles[rows, columns])
+
+
+def weight(tissue: U8, tiles: F32) -> U8:
+    """The shares [rows, columns] over a picture, where it shows tissue [h, w]: 0..255, for `carry.carry`."""
+    height, width = tissue.shape
+    wide = cv2.resize(tiles, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.multiply(tissue, wide, scale=255.0, dtype=cv2.CV_8U))

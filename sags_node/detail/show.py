@@ -1,0 +1,242 @@
+"""What consumers are shown of a view: the drawn model, with the detail of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numba import prange
+
+from sags_node.detail.carry import EVERYWHERE, carry
+from sags_node.detail.memory import hidden_sources
+from sags_node.detail.motion import SmallDrawings
+from sags_node.detail.seen import SeenFrame
+from sags_node.detail.share import Share, weight
+from sags_node.engine.rasterizer.views import to_view
+from sags_node.kernels.jit import kernel, parallel_kernel, read_only
+from sags_node.types import F32, U8, Bool, Camera, Gaussians, RenderedView, Shown, Snapshot
+
+LOOKED_AT = 4  # px: every so many along both axes tell how well pictures are carried
+AROUND = np.ones(
+    (5, 5), np.uint8
+)  # px of the working size: so much of what is seen is also made as if hidden
+UNSURE = 0.2  # of the way that hidden tissue has moved: so much of it nobody saw
+DOUBTED = 1.0  # px: so unsure, a hidden place is half the model's
+f4 = np.float32
+u8 = np.uint64
+
+
+@dataclass(frozen=True, slots=True)
+class Lessons:
+    """What was learnt of the trust in pictures. One thread teaches; any may ask."""
+
+    moved: Share = field(default_factory=Share)  # of the expected motion, against none
+    ahead: Share = field(default_factory=Share)  # of the picture in the next frame, against the model
+    aside: Share = field(default_factory=Share)  # of the left picture as the right eye sees it
+
+
+class Detail:
+    """Adds detail to views. For one thread."""
+
+    def __init__(self, lessons: Lessons) -> None:
+        self._lessons = lessons
+        self._small = SmallDrawings()
+
+    # ---- views -----------------------------------------------------------------------------------------
+
+    def left(self, view: RenderedView, camera: Camera, now: SeenFrame, older: Sequence[SeenFrame]) -> Shown:
+        """Show a frame's left view: what it sees is its own picture, what is hidden comes from older ones.
+
+        Args:
+            view: the model, drawn for that eye.
+            camera: of that eye, in the size that is shown.
+            older: frames that may have seen what is hidden now, the newest first.
+        """
+        rgb, alpha = _base(view, camera)
+        taken = np.zeros(alpha.shape, np.uint8)
+        hidden = cv2.dilate(1 - now.tissue, AROUND)
+        oldest = now.t_capture_ns
+        if hidden.any():
+            oldest = self._from_memory(rgb, taken, view, now.gaussians, camera, now, older, hidden)
+        seen = cv2.blur(now.sure_tissue * np.uint8(255), (5, 5))  # seams over five pixels
+        seen = cv2.resize(seen, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        _paste(now.picture(), read_only(seen), rgb)
+        return Shown(rgb, _covered(alpha, np.maximum(taken, seen)), oldest)
+
+    def view(
+        self,
+        view: RenderedView,
+        camera: Camera,
+        gaussians: Gaussians,
+        now: SeenFrame,
+        older: Sequence[SeenFrame],
+        baseline: float,
+        frames_ahead: float = 0.0,
+        tint: F32 | None = None,
+    ) -> Shown:
+        """Show a view of the model from anywhere, at a frame's moment or after it.
+
+        Args:
+            view: the model, drawn for that camera.
+            camera: in the size that is shown.
+            gaussians: those of the frame, there or moved.
+            now: the frame.
+            older: as for `left`.
+            baseline: m between the eyes.
+            frames_ahead: how far it is after the frame, in steps between frames.
+            tint: of `tint`, which the view has and no picture of the left eye.
+        """
+        rgb, alpha = _base(view, camera)
+        taken = np.zeros(alpha.shape, np.uint8)
+        aside = float(np.linalg.norm(camera.T_world_cam[:3, 3] - now.camera.T_world_cam[:3, 3])) / baseline
+        lessons = self._lessons
+        tiles = lessons.aside.tiles() ** f4(aside)
+        if frames_ahead > 0:
+            ahead = lessons.ahead.tiles() ** f4(frames_ahead)
+            tiles = cv2.resize(tiles, ahead.shape[::-1], interpolation=cv2.INTER_LINEAR) * ahead
+        motion = self._small.motion(gaussians, camera, now, lessons.moved.of_gaussians(now))
+        picture = now.picture_for(float(camera.K[0, 0]))
+        share = weight(now.tissue, tiles)
+        carry(rgb, view.depth, camera, now, picture, motion, share, taken, tint=tint, holes=True)
+        oldest = now.t_capture_ns
+        if len(older) and not taken.all():
+            oldest = self._from_memory(
+                rgb, taken, view, gaussians, camera, now, older, EVERYWHERE, aside, tint
+            )
+        return Shown(rgb, _covered(alpha, taken), oldest)
+
+    def _from_memory(
+        self, rgb: U8, taken: U8, view: RenderedView, gaussians: Gaussians, camera: Camera, now: SeenFrame,
+        older: Sequence[SeenFrame], wanted: U8, aside: float = 0.0, tint: F32 | None = None,
+    ) -> int:  # fmt: skip
+        """Carry what older frames saw to where nothing is taken yet; returns when the oldest of them was."""
+        oldest = now.t_capture_ns
+        for source in hidden_sources(gaussians, now, older):
+            frame = source.frame
+            motion = self._small.motion(gaussians, camera, frame)
+            share = weight(frame.sure_tissue, self._lessons.aside.tiles() ** f4(aside))
+            before = np.count_nonzero(taken)
+            picture = frame.picture_for(float(camera.K[0, 0]))
+            carry(
+                rgb, view.depth, camera, frame, picture, motion, share, taken,
+                unsure=UNSURE / DOUBTED, gain=source.gain, wanted=wanted, tint=tint,
+            )  # fmt: skip
+            if np.count_nonzero(taken) > before:
+                oldest = min(oldest, frame.t_capture_ns)
+        return oldest
+
+    def tint(self, snapshot: Snapshot, gaussians: Gaussians, camera: Camera) -> F32 | None:
+        """Draw what the right eye sees more of the tissue, [4, h, w]; None where nobody knows.
+
+        Args:
+            gaussians: of the snapshot, there or moved.
+        """
+        more = snapshot.right_colors
+        return None if more is None else self._small(gaussians, more, camera)
+
+    # ---- lessons ---------------------------------------------------------------------------------------
+
+    def learn_ahead(self, before: SeenFrame, expected: Gaussians, now: SeenFrame) -> None:
+        """Learn from a frame how well the one before it would have been carried to it.
+
+        Args:
+            expected: the Gaussians of the frame before, moved to where they were expected now.
+        """
+        camera, truth, where = _sampled(now.camera, now.picture(), now.mask)
+        drawn, depth = self._drawn(expected, camera)
+        picture, share = before.picture(), weight(before.tissue, np.ones((1, 1), f4))
+
+        def carried(motion: F32 | None) -> U8:
+            rgb = drawn.copy()
+            taken = np.zeros(depth.shape, np.uint8)
+            carry(rgb, depth, camera, before, picture, motion, share, taken, holes=True)
+            return rgb
+
+        lessons = self._lessons
+        lessons.moved.learn(
+            carried(None), carried(self._small.motion(expected, camera, before)), truth, where
+        )
+        trusted = self._small.motion(expected, camera, before, lessons.moved.of_gaussians(before))
+        lessons.ahead.learn(drawn, carried(trusted), truth, where)
+
+    def learn_aside(self, now: SeenFrame, right: U8, where: Bool, baseline: float) -> None:
+        """Learn from the right eye how well the left picture says what another eye sees.
+
+        Args:
+            right: [H, W, 3] the right picture, as it is published.
+            where: [h, w] its pixels that show tissue.
+            baseline: m.
+        """
+        camera, truth, where = _sampled(now.camera.moved_right(baseline), right, where)
+        drawn, depth = self._drawn(now.gaussians, camera)
+        rgb, share = drawn.copy(), weight(now.tissue, np.ones((1, 1), f4))
+        carry(rgb, depth, camera, now, now.picture(), None, share, np.zeros(depth.shape, np.uint8))
+        self._lessons.aside.learn(drawn, rgb, _in_light_of(drawn, truth, where), where)
+
+    def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[U8, F32]:
+        planes = self._small.rasterizer(camera.width, camera.height).forward(gaussians, camera)
+        view = to_view(planes, camera, 0, 0)
+        return view.rgb, view.depth
+
+
+def _base(view: RenderedView, camera: Camera) -> tuple[U8, F32]:
+    """The model's picture and its coverage, in the size that is shown; the picture may be written."""
+    size = camera.width, camera.height
+    alpha = view.alpha
+    if alpha.shape != size[::-1]:
+        alpha = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR))
+    return view.colours.at(*size).copy(), alpha
+
+
+def _covered(alpha: F32, taken: U8) -> F32:
+    """Coverage by the model or by a picture, 0..1."""
+    return np.asarray(np.maximum(alpha, taken * f4(1 / 255)))
+
+
+def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool]:
+    """Every `LOOKED_AT` th pixel of a picture [H, W, 3], what `where` [h, w] says there, and the camera that
+    sees just these pixels."""
+    height, width = picture.shape[:2]
+    first = LOOKED_AT // 2
+    truth = picture[first::LOOKED_AT, first::LOOKED_AT]
+    K = camera.K.copy()
+    K[0] *= width / camera.width
+    K[1] *= height / camera.height
+    K[:2, 2] += 0.5 * np.array([width / camera.width, height / camera.height]) - 0.5 - first
+    K[:2] /= LOOKED_AT
+    rows = np.minimum(
+        ((np.arange(truth.shape[0]) * LOOKED_AT + first) * len(where)) // height, len(where) - 1
+    )
+    columns = ((np.arange(truth.shape[1]) * LOOKED_AT + first) * where.shape[1]) // width
+    return Camera(truth.shape[1], truth.shape[0], K, camera.T_world_cam), truth, where[rows[:, None], columns]
+
+
+def _in_light_of(drawn: U8, picture: U8, where: Bool) -> U8:
+    """A picture with mean and contrast of the drawn one, channel by channel: eyes differ in both."""
+    if not where.any():
+        return picture
+    seen, shown = picture[where].astype(f4), drawn[where].astype(f4)
+    spread = seen - seen.mean(0)
+    gain = (spread * (shown - shown.mean(0))).sum(0) / np.maximum((spread * spread).sum(0), f4(1))
+    alike = (picture - seen.mean(0)) * gain + shown.mean(0) + f4(0.5)
+    return np.asarray(np.clip(alike, 0, 255).astype(np.uint8))
+
+
+@parallel_kernel
+def _paste(picture: U8, share: U8, shown: U8) -> None:
+    """Blends the `share` [H, W] 0..255 of a picture [H, W, 3] into another."""
+    for row in prange(len(picture)):
+        y = np.int64(row)
+        _paste_row(picture[y].reshape(-1), share[y], shown[y].reshape(-1))
+
+
+@kernel
+def _paste_row(picture: U8, share: U8, shown: U8) -> None:
+    for x in range(u8(len(share))):
+        part = f4(share[x]) * f4(1 / 255)
+        for c in range(u8(3)):
+            at = u8(3) * x + c
+            was = f4(shown[at])
+            shown[at] = np.uint8(np.int32(was + part * (f4(picture[at]) - was) + f4(0.5)))

@@ -1,0 +1,200 @@
+"""Detail of pictures in views: the kernel beside its twin, what is learnt, remembered and shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from places import SESSION
+
+from sags_node.detail.carry import carry
+from sags_node.detail.memory import EVERY, MOST, OLDEST, Memory, hidden_sources
+from sags_node.detail.seen import SAME, SeenFrame
+from sags_node.detail.share import Share, weight
+from sags_node.evaluation import metrics
+from sags_node.evaluation.measure import MeasureOptions
+from sags_node.evaluation.session import evaluate
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
+from sags_node.pipeline.session import open_session
+from sags_node.types import F32, U8, Camera, Gaussians
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
+CAMERA = Camera(
+    WIDTH, HEIGHT, np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]]), np.eye(4)
+)
+EVERYWHERE = np.full((HEIGHT, WIDTH), 255, np.uint8)
+
+
+def gaussians(count: int = 30, first_id: int = 0) -> Gaussians:
+    rng = np.random.default_rng(3)
+    means = rng.uniform((-0.04, -0.03, 0.1), (0.04, 0.03, 0.1), (count, 3)).astype(np.float32)
+    return Gaussians(
+        means, np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.full((count, 3), 0.004, np.float32),
+        np.full(count, 0.9, np.float32), np.full((count, 3), 0.5, np.float32), first_id + np.arange(count),
+    )  # fmt: skip
+
+
+def seen(stamp_ns: int = 0, depth: F32 | None = None, camera: Camera = CAMERA) -> SeenFrame:
+    picture: U8 = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    depth = np.full((HEIGHT, WIDTH), 0.1, np.float32) if depth is None else depth
+    return SeenFrame(
+        stamp_ns, camera, gaussians(), lambda: picture, np.ones((HEIGHT, WIDTH), np.bool_), depth
+    )
+
+
+def twin(shown: U8, depth: F32, camera: Camera, source: SeenFrame, share: U8) -> U8:
+    """What `carry` says it does, pixel by pixel in float64, for a depth that is known and tissue at rest."""
+    picture, out = source.picture().astype(float), shown.copy()
+    for y in range(HEIGHT):
+        for x in range(WIDTH):
+            z = float(depth[y, x])
+            point = camera.T_world_cam @ [*(np.linalg.inv(camera.K) @ [x * z, y * z, z]), 1]
+            there = source.camera.K @ (source.camera.viewmat @ point)[:3]
+            u, v = there[:2] / there[2]
+            if not (-0.5 < u < WIDTH - 0.5 and -0.5 < v < HEIGHT - 0.5):
+                continue
+            cell = min(int(v + 0.5), HEIGHT - 1), min(int(u + 0.5), WIDTH - 1)
+            if not abs(source.depth[cell] - there[2]) < SAME * there[2]:
+                continue
+            u, v = np.clip(u, 0, WIDTH - 1), np.clip(v, 0, HEIGHT - 1)
+            left, top = min(int(u), WIDTH - 2), min(int(v), HEIGHT - 2)
+            s, t = u - left, v - top
+            above = picture[top, left] + s * (picture[top, left + 1] - picture[top, left])
+            below = picture[top + 1, left] + s * (picture[top + 1, left + 1] - picture[top + 1, left])
+            level = above + t * (below - above)
+            out[y, x] = np.floor(shown[y, x] + share[cell] / 255 * (level - shown[y, x]) + 0.5)
+    return out
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.004])
+def test_the_kernel_does_what_its_twin_does(aside: float) -> None:
+    """Half of the tissue is nearer in the view, and its surface another one than the source saw there."""
+    depth = np.full((HEIGHT, WIDTH), 0.1, np.float32)
+    depth[:, : WIDTH // 2] = 0.08
+    source, camera = seen(), CAMERA.moved_right(aside)
+    share = np.random.default_rng(7).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+    shown, taken = np.full((HEIGHT, WIDTH, 3), 90, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
+    expected = twin(shown, depth, camera, source, share)
+    carry(shown, depth, camera, source, source.picture(), None, share, taken)
+    # A place that rounding puts into the neighbouring cell has another share: hardly any does.
+    assert (np.abs(shown.astype(int) - expected) > 1).mean() < 0.005
+    assert not taken[:, : WIDTH // 2 - 1].any() and (taken[:, WIDTH // 2 + 4 :] > 0).mean() > 0.9
+
+
+def test_moved_tissue_is_looked_up_where_it_was() -> None:
+    """By whole pixels, so that nothing is interpolated."""
+    source = seen()
+    motion = np.zeros((4, HEIGHT // 4, WIDTH // 4), np.float32)
+    motion[0], motion[3] = 3 * 0.1 / FOCAL, 1  # three pixels to the right since then
+    shown, taken = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
+    carry(shown, source.depth, CAMERA, source, source.picture(), motion, EVERYWHERE, taken)
+    assert np.abs(shown[:, 4:].astype(int) - source.picture()[:, 1:-3]).max() <= 1
+    assert not taken[:, :2].any()
+
+
+@pytest.mark.parametrize("depth", [np.nan, np.inf, -1.0, 0.0, 1e-30, 1e30])
+@pytest.mark.parametrize("moved", [None, np.nan, np.inf, 1e30])
+def test_it_ends_in_a_picture_whatever_it_is_given(depth: float, moved: float | None) -> None:
+    odd = np.full((HEIGHT, WIDTH), depth, np.float32)
+    source = seen(depth=odd)
+    motion = None if moved is None else np.full((4, HEIGHT // 4, WIDTH // 4), moved, np.float32)
+    shown, taken = np.full((HEIGHT, WIDTH, 3), 90, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
+    for holes in (False, True):
+        carry(
+            shown,
+            odd,
+            CAMERA.moved_right(0.01),
+            source,
+            source.picture(),
+            motion,
+            EVERYWHERE,
+            taken,
+            holes=holes,
+        )
+    assert shown[taken == 0].size == 0 or (shown[taken == 0] == 90).all()
+
+
+def test_a_share_is_the_least_squares_mix_of_both_guesses() -> None:
+    """The truth is a quarter of the way in the left half, and beyond the second guess in the right one."""
+    first = np.full((32, 64, 3), 100, np.uint8)
+    second, truth = first + np.uint8(40), first.copy()
+    truth[:, :32], truth[:, 32:] = 110, 180
+    share = Share()
+    assert share.tiles().tolist() == [[1.0]]
+    for _ in range(5):
+        share.learn(first, second, truth, np.ones((32, 64), np.bool_))
+    tiles = share.tiles()
+    half = tiles.shape[1] // 2
+    np.testing.assert_allclose(tiles[:, :half], 0.25, atol=1e-3)
+    np.testing.assert_allclose(tiles[:, half:], 1)
+    assert weight(np.zeros((32, 64), np.uint8), tiles).max() == 0  # no share where there is no tissue
+
+
+def test_memory_is_bounded_and_keeps_what_is_seldom() -> None:
+    memory = Memory()
+    for step in range(300):
+        memory.add(seen(step * 33_333_333))
+        ages = [(step * 33_333_333 - one.t_capture_ns) * 1e-9 for one in memory.frames]
+        assert len(ages) <= MOST and ages == sorted(ages) and max(ages) <= OLDEST
+        assert min(np.diff(ages), default=EVERY) >= EVERY - 1e-6
+    assert max(ages) > 3  # s, though the newest ten lie within two
+
+
+def test_hidden_tissue_comes_from_the_newest_frame_that_saw_it_in_the_light_of_now() -> None:
+    old, newer, now = seen(1), seen(2), seen(3)
+    blind = replace(seen(2), mask=np.zeros((HEIGHT, WIDTH), np.bool_))
+    hiding = replace(now, mask=np.zeros((HEIGHT, WIDTH), np.bool_))
+    assert [one.frame for one in hidden_sources(now.gaussians, hiding, [newer, old])] == [newer]
+    assert [one.frame for one in hidden_sources(now.gaussians, hiding, [blind, old])] == [old]
+    assert hidden_sources(now.gaussians, now, [newer, old]) == []
+    darker = replace(now.gaussians, colors=0.5 * now.gaussians.colors)
+    np.testing.assert_allclose(hidden_sources(darker, hiding, [old])[0].gain, 0.5)
+
+
+def test_what_is_seen_is_the_picture_and_what_is_hidden_comes_from_before() -> None:
+    """A box is hidden for the last four frames; beside it the model alone. Nothing else changes by it."""
+    asked = ["source.pace:=step", "source.frames:=12", "mapping.max_gaussians:=3000"]
+    session = open_session(SESSION, [*asked, "publish.detail:=true"])
+    pipeline = Pipeline(session.config, session.rig)
+    plain = Pipeline(open_session(SESSION, asked).config, session.rig)
+    box = np.s_[100:150, 120:180]
+    with session.source as source:
+        for number, frame in enumerate(source):
+            tissue = np.ones(frame.left.shape[:2], np.bool_) if frame.tissue is None else frame.tissue.copy()
+            true = tissue.copy()
+            if number >= 8:
+                tissue[box] = False
+            given = replace(frame, tissue=tissue)
+            result = pipeline.process(given, StepBudget(1), FrameRequest(left=True))
+            alone = plain.process(given, StepBudget(1), FrameRequest(left=True))
+            assert alone.views["left"].shown is None
+            assert np.array_equal(alone.views["left"].rgb, result.views["left"].rgb)
+    view, truth = result.views["left"], result.pair.left
+    assert view.shown is not None and np.isfinite(view.shown.alpha).all()
+    inner = np.zeros(truth.shape[:2], np.bool_)
+    inner[110:140, 130:170] = True
+    inner &= true
+    shown, drawn = (
+        metrics.psnr(metrics.as_float(each), metrics.as_float(truth), inner)
+        for each in (view.shown.rgb, view.rgb)
+    )
+    assert shown > drawn
+    assert view.shown.oldest_ns < view.t_capture_ns
+    far = pipeline.seen[0].sure_tissue.astype(bool)
+    far[90:160, 110:190] = False
+    agree = (view.shown.rgb == truth).all(-1)[far]
+    assert agree.mean() > 0.9  # the rest lies at seams
+
+
+def test_measuring_tells_detail_from_the_model_alone() -> None:
+    """Beside it the same run without detail, whose figures are the model's."""
+    played = ["source.frames:=16", "mapping.max_gaussians:=3000", "vision.width:=240", "vision.height:=192"]
+    options = MeasureOptions(hold_out=0, hidden=True)
+    with_detail = evaluate(SESSION, [*played, "publish.detail:=true"], options, iterations=1).summary
+    alone = evaluate(SESSION, played, options, iterations=1).summary
+    for group in ("predict", "hidden"):
+        assert with_detail[group]["psnr"] > with_detail[group]["model_psnr"]
+        assert alone[group]["psnr"] == alone[group]["model_psnr"] == with_detail[group]["model_psnr"]
