@@ -141,6 +141,7 @@ class Pipeline:
         self.anchors = SimpleNamespace(remove=self._no_anchor)
         self.warnings: dict[str, Any] = {}
         self.newest: FrameResult | None = None
+        self.seen = ()  # nothing lends its detail
 
     @staticmethod
     def _no_anchor(_: int) -> None:
@@ -282,7 +283,7 @@ class Run:
         patch.setattr(node, "configure_threads", lambda _: None)
         patch.setattr(publisher, "zmq", self._network)
         patch.setattr(publisher, "Peers", _Peers)
-        defaults = self.world.monotonic, self.world.monotonic, lambda: 0.0, "numba"
+        defaults = self.world.monotonic, self.world.monotonic, lambda: 0.0, "numba", False
         patch.setattr(views.Views.__init__, "__defaults__", defaults)
         patch.setattr(sys.modules["sags_node.messaging.node_clock"], "time", self.world)
 
