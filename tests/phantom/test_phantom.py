@@ -297,7 +297,7 @@ def test_a_scene_has_keys_that_a_launch_file_lacks() -> None:
     assert section_of(PhantomScene, ["seconds:=2", "smoke:=0.5"]) == PhantomScene(seconds=2, smoke=0.5)
     with pytest.raises(UsageError, match="unknown key 'smok'; did you mean 'smoke'"):
         section_of(PhantomScene, ["smok:=0.5"])
-    with pytest.raises(UsageError, match="unknown key 'source.smoke'"):
+    with pytest.raises(UsageError, match=r"unknown key 'source\.smoke'"):
         load_launch(None, ["source.smoke:=0.5"])
 
 
