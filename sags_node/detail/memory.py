@@ -67,7 +67,7 @@ def hidden_sources(gaussians: Gaussians, now: SeenFrame, frames: Sequence[SeenFr
     least = max(1.0, WORTH * len(hidden))
     candidates = []
     for frame in frames:
-        if frame.t_capture_ns < now.t_capture_ns:
+        if 0 < now.t_capture_ns - frame.t_capture_ns <= OLDEST * 1e9:  # also after a pause
             rows, known = frame.rows_of(gaussians.ids[hidden])
             candidates.append((frame, rows, known & frame.shows[rows]))
     chosen: list[HiddenSource] = []

@@ -19,9 +19,7 @@ from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, RenderedView, Shown, Snapshot
 
 LOOKED_AT = 4  # px: every so many along both axes tell how well pictures are carried
-AROUND = np.ones(
-    (5, 5), np.uint8
-)  # px of the working size: so much of what is seen is also made as if hidden
+AROUND = np.ones((5, 5), np.uint8)  # px of the working size: what is seen there is made as if hidden, too
 UNSURE = 0.2  # of the way that hidden tissue has moved: so much of it nobody saw
 DOUBTED = 1.0  # px: so unsure, a hidden place is half the model's
 f4 = np.float32

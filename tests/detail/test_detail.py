@@ -150,6 +150,8 @@ def test_hidden_tissue_comes_from_the_newest_frame_that_saw_it_in_the_light_of_n
     assert [one.frame for one in hidden_sources(now.gaussians, hiding, [newer, old])] == [newer]
     assert [one.frame for one in hidden_sources(now.gaussians, hiding, [blind, old])] == [old]
     assert hidden_sources(now.gaussians, now, [newer, old]) == []
+    after_a_pause = replace(hiding, t_capture_ns=round(OLDEST * 1e9) + 2)
+    assert [one.frame for one in hidden_sources(now.gaussians, after_a_pause, [newer, old])] == [newer]
     darker = replace(now.gaussians, colors=0.5 * now.gaussians.colors)
     np.testing.assert_allclose(hidden_sources(darker, hiding, [old])[0].gain, 0.5)
 
