@@ -67,6 +67,9 @@ HOLD_OUT = 8  # every so many frames, as in the literature
     is_flag=True,
     help="Also hide boxes of tissue in a second run (--pace step); what is shown there.",
 )
+@click.option(
+    "--aside", is_flag=True, help="Also views from 2 to 20 mm aside (--pace step, the phantom alone)."
+)
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
 @click.option(
     "--receipt",
@@ -86,6 +89,7 @@ def evaluate(
     lpips_weights: Path | None,
     paper_psnr: bool,
     hidden: bool,
+    aside: bool,
     report: Path | None,
     receipt: Path | None,
     out: Path | None,
@@ -114,7 +118,9 @@ def evaluate(
         raise click.UsageError("--hidden needs --pace step: boxes are taken from the node's own masks")
     if hold_out is None:
         hold_out = HOLD_OUT if pace == "step" else 0
-    options = MeasureOptions(hold_out, every, lpips_weights, paper_psnr, hidden)
+    if aside and pace != "step":
+        raise click.UsageError("--aside needs --pace step: only there the model is known frame by frame")
+    options = MeasureOptions(hold_out, every, lpips_weights, paper_psnr, hidden, aside)
     if report is not None:
         check_plots()
         check_report(report)
