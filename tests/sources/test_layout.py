@@ -12,9 +12,8 @@ from pydantic import ValidationError
 
 from sags_node.config.schema import GeometryConfig, VideosSource
 from sags_node.errors import UsageError
-from sags_node.sources.device import Shot
 from sags_node.sources.layout import Layout
-from sags_node.sources.pairing import Alternation
+from sags_node.sources.pairing import Alternation, Shot
 from sags_node.sources.replay import Replay
 
 RNG = np.random.default_rng(5)
