@@ -24,10 +24,9 @@ from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.freshness import Freshness
 from sags_node.messaging.stream import listen_to
-from sags_node.recording.backlog import Arrived, Backlog
+from sags_node.recording.backlog import Arrived, Backlog, Ring
 from sags_node.recording.bag_writer import NO_LIMITS, Limits
 from sags_node.recording.message_writer import Compression, MessageWriter
-from sags_node.recording.ring import Ring
 
 log = logging.getLogger(__name__)
 

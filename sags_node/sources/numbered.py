@@ -6,50 +6,32 @@ import re
 import tarfile
 import zlib
 from pathlib import Path
-from typing import Protocol
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file, read_file
 
 
-class NumberedFiles(Protocol):
+class NumberedFiles:
+    """The files in a folder.
+
+    Args:
+        suffix: of the files, with the dot.
+        largest: bytes one file may have.
+    """
+
+    def __init__(self, folder: Path, suffix: str, largest: int) -> None:
+        self._largest = largest
+        self._files = {_number(file.name, suffix): file for file in folder.iterdir()}
+
     def read(self, number: int) -> bytes | None:
         """The content of one file, None when there is none of this number.
 
         Raises:
             SagsError: it cannot be read, or is too large to be right.
         """
-
-    def close(self) -> None: ...
-
-
-def open_numbered(path: Path, suffix: str, largest: int) -> NumberedFiles | None:
-    """The files in folder `path`, or else in `path` + `.tar.gz`; None when there is neither.
-
-    Args:
-        suffix: of the files, with the dot.
-        largest: bytes one file may have.
-
-    Raises:
-        UsageError: the archive cannot be read.
-    """
-    if path.is_dir():
-        return _Unpacked(path, suffix, largest)
-    archive = path.with_name(path.name + ".tar.gz")
-    return _Packed(archive, suffix, largest) if archive.is_file() else None
-
-
-class _Unpacked:
-    def __init__(self, folder: Path, suffix: str, largest: int) -> None:
-        self._largest = largest
-        self._files = {_number(file.name, suffix): file for file in folder.iterdir()}
-
-    def read(self, number: int) -> bytes | None:
         file = self._files.get(number)
-        if file is None:
-            return None
         try:
-            return read_file(file, self._largest)
+            return None if file is None else read_file(file, self._largest)
         except OSError as error:
             raise SagsError(f"cannot read {file}: {error.strerror}") from None
 
@@ -57,7 +39,19 @@ class _Unpacked:
         """Nothing stays open."""
 
 
-class _Packed:
+def open_numbered(path: Path, suffix: str, largest: int) -> NumberedFiles | None:
+    """Open the files in folder `path`, or else in `path` + `.tar.gz`; None when there is neither.
+
+    Raises:
+        UsageError: the archive cannot be read.
+    """
+    if path.is_dir():
+        return NumberedFiles(path, suffix, largest)
+    archive = path.with_name(path.name + ".tar.gz")
+    return _Packed(archive, suffix, largest) if archive.is_file() else None
+
+
+class _Packed(NumberedFiles):
     """Reads forward as far as it is asked to; going back unpacks from the start again."""
 
     def __init__(self, archive: Path, suffix: str, largest: int) -> None:
@@ -82,7 +76,11 @@ class _Packed:
                 if member.isfile():
                     self._members[_number(Path(member.name).name, self._suffix)] = member
             member = self._members[number]
-            _check_size(member.size, self._largest, f"{self._archive}: {member.name}")
+            if member.size > self._largest:
+                raise SagsError(
+                    f"{self._archive}: {member.name} has {member.size} bytes, more than the "
+                    f"{self._largest} it can need; it is not what it seems"
+                )
             stream = self._tar.extractfile(member)
             assert stream is not None  # only members that are files are kept
             return stream.read()
@@ -98,10 +96,3 @@ def _number(name: str, suffix: str) -> int | None:
     """The last number in the name of a file; None of other files, hidden ones too."""
     found = re.search(rf"(\d+){re.escape(suffix)}$", name)
     return int(found[1]) if found and not name.startswith(".") else None
-
-
-def _check_size(size: int, largest: int, name: str) -> None:
-    if size > largest:
-        raise SagsError(
-            f"{name} has {size} bytes, more than the {largest} it can need; it is not what it seems"
-        )

@@ -38,9 +38,9 @@ MOST_FRAMES = 1000  # of a tf tree
 class NoPoseError(SagsError):
     """There is no pose for that time."""
 
-    def __init__(self, finding: Finding) -> None:
-        super().__init__(finding.text)
-        self.finding = finding
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.finding = Finding(code, text)
 
 
 class Sample(NamedTuple):
@@ -89,32 +89,26 @@ class _Edge:
         if after == len(self._stamps):
             age = (t_ns - self._stamps[-1]) * 1e-9
             raise NoPoseError(
-                Finding(
-                    "pose_stopped",
-                    f"the robot's pose has stopped: the newest is {age:.2f} s older than the picture; see to "
-                    "the robot's program, its clock and robot.offset_ms",
-                )
+                "pose_stopped",
+                f"the robot's pose has stopped: the newest is {age:.2f} s older than the picture; see to "
+                "the robot's program, its clock and robot.offset_ms",
             )
         if after == 0 and self._stamps[0] > t_ns:
-            raise NoPoseError(Finding("pose_missing", "the picture is older than all poses of the robot"))
+            raise NoPoseError("pose_missing", "the picture is older than all poses of the robot")
         before = after if self._stamps[after] == t_ns else after - 1
         gap = self._stamps[after] - self._stamps[before]
         if gap > LARGEST_GAP_NS:
             raise NoPoseError(
-                Finding(
-                    "pose_missing",
-                    f"the robot's poses are {gap * 1e-9:.2f} s apart: more than "
-                    f"{1e9 / LARGEST_GAP_NS:.0f} a second are needed",
-                )
+                "pose_missing",
+                f"the robot's poses are {gap * 1e-9:.2f} s apart: more than "
+                f"{1e9 / LARGEST_GAP_NS:.0f} a second are needed",
             )
         jump = bisect_right(self._jumps, self._stamps[after])
         if jump and self._jumps[jump - 1] > t_ns - JUMP_HELD_NS:
             raise NoPoseError(
-                Finding(
-                    "pose_jumped",
-                    "the robot's pose jumps faster than a scope can move: see to its joints' sensors and its "
-                    "base frame",
-                )
+                "pose_jumped",
+                "the robot's pose jumps faster than a scope can move: see to its joints' sensors and its "
+                "base frame",
             )
         share = 0.0 if gap == 0 else (t_ns - self._stamps[before]) / gap
         return between(self._samples[before], self._samples[after], share)
@@ -203,11 +197,8 @@ class PoseTrack:
                     return self._at(t_ns)
                 except NoPoseError as error:
                     left = deadline - time.monotonic()
-                    if (
-                        error.finding.code != "pose_stopped"
-                        or left <= 0
-                        or t_ns - self.newest_ns > IN_VAIN_NS
-                    ):
+                    in_vain = left <= 0 or t_ns - self.newest_ns > IN_VAIN_NS
+                    if in_vain or error.finding.code != "pose_stopped":
                         raise
                     self._came.wait(left)
 
@@ -221,11 +212,9 @@ class PoseTrack:
         if base[-1] != hand[-1] or len(base) == len(hand) == 1:
             there = ", ".join(sorted(self._edges)) or "none"
             raise NoPoseError(
-                Finding(
-                    "pose_missing",
-                    f"no pose of '{self._hand}' in '{self._base}' came yet; frames: {there[:200]}; see to "
-                    "robot.topic, robot.base and robot.hand",
-                )
+                "pose_missing",
+                f"no pose of '{self._hand}' in '{self._base}' came yet; frames: {there[:200]}; see to "
+                "robot.topic, robot.base and robot.hand",
             )
         return invert(self._in_root(base, t_ns)) @ self._in_root(hand, t_ns)
 

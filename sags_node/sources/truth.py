@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -15,6 +17,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.sources.pictures import list_pictures, read_picture
 from sags_node.types import F32, F64, Reference
+
+_LARGEST = 2**31  # bytes
 
 
 class Poses:
@@ -84,49 +88,45 @@ def _by_frame_number(folder: Path) -> dict[int, Path]:
 
 
 def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[np.generic]:
-    """One numeric array of an npz file; `None` in `shape` stands for any length.
+    """Load one numeric array of an npz file; `None` in `shape` stands for any length.
 
     The header is compared with the bytes that are really there before memory is taken.
 
     Raises:
         UsageError: the file is missing or damaged, or the array is missing or of another shape or type.
     """
-    try:
-        with open_file(file) as opened, zipfile.ZipFile(opened) as archive:
-            member = archive.getinfo(f"{key}.npy")
-            with archive.open(member) as stream:
-                _check_header(stream, f"{file}: '{key}'", shape, member.file_size)
-            with archive.open(member) as stream:
-                array: NDArray[np.generic] = np.load(stream, allow_pickle=False)
-                return array
-    except FileNotFoundError:
-        raise UsageError(f"{file} does not exist; check the path") from None
-    except KeyError:
-        raise UsageError(f"{file} holds no array '{key}'") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{file} is not a readable npz file: {error}") from None
+    with _explained(file, "npz"), open_file(file) as opened, zipfile.ZipFile(opened) as archive:
+        if f"{key}.npy" not in archive.namelist():
+            raise UsageError(f"{file} holds no array '{key}'")
+        with archive.open(f"{key}.npy") as stream:
+            return _load(stream, f"{file}: '{key}'", shape, archive.getinfo(f"{key}.npy").file_size)
 
 
 def load_npy(file: Path, shape: tuple[int | None, ...]) -> NDArray[np.generic]:
-    """The numeric array of an npy file; see `load_array`.
+    """Load the numeric array of an npy file; see `load_array`.
 
     Raises:
         UsageError: the file is missing or damaged, or the array is of another shape or type.
     """
+    with _explained(file, "npy"), open_file(file) as stream:
+        return _load(stream, str(file), shape, file.stat().st_size)
+
+
+@contextmanager
+def _explained(file: Path, kind: str) -> Iterator[None]:
     try:
-        with open_file(file) as stream:
-            _check_header(stream, str(file), shape, file.stat().st_size)
-            stream.seek(0)
-            array: NDArray[np.generic] = np.load(stream, allow_pickle=False)
-            return array
+        yield
     except FileNotFoundError:
         raise UsageError(f"{file} does not exist; check the path") from None
-    except (KeyError, OSError, ValueError, EOFError) as error:
-        raise UsageError(f"{file} is not a readable npy file: {error}") from None
+    except SagsError:
+        raise
+    except Exception as error:  # zipfile, zlib and numpy's parser of headers raise what each likes
+        said = " ".join(str(error).split())[:200]
+        raise UsageError(f"{file} is not a readable {kind} file: {said}") from None
 
 
-def _check_header(stream: IO[bytes], what: str, shape: tuple[int | None, ...], room: int) -> None:
-    """Compare the header of an npy stream with the wanted shape and with `room`, the bytes of the stream."""
+def _load(stream: IO[bytes], what: str, shape: tuple[int | None, ...], room: int) -> NDArray[np.generic]:
+    """Load an npy stream whose header fits the wanted shape and `room`, the bytes of the stream."""
     version = np.lib.format.read_magic(stream)
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,
@@ -142,6 +142,6 @@ def _check_header(stream: IO[bytes], what: str, shape: tuple[int | None, ...], r
     size = int(np.prod(found, dtype=object)) * dtype.itemsize
     if room > _LARGEST or size > room - stream.tell():
         raise UsageError(f"{what} claims an impossible size {list(found)}")
-
-
-_LARGEST = 2**31  # bytes
+    stream.seek(0)
+    array: NDArray[np.generic] = np.load(stream, allow_pickle=False)
+    return array

@@ -16,6 +16,7 @@ import tarfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ import msgpack
 import msgspec
 import numpy as np
 from bag_files import KINDS, play
+from dvrk_files import frame_record, write_session
 from hypothesis import strategies as st
 from made_messages import message_of
 from numbered_pictures import write_video
@@ -50,8 +52,11 @@ from sags_node.recording.recover import recover
 from sags_node.rig.check import check_rig
 from sags_node.rig.read import read_rig
 from sags_node.sources.bags import read_rig as read_bag_rig
+from sags_node.sources.dvrk import read_sidecar
+from sags_node.sources.numbered import open_numbered
 from sags_node.sources.pose_track import PoseTrack
 from sags_node.sources.source import open_source
+from sags_node.sources.truth import load_array, load_npy
 from sags_node.vision.onnx_network import DepthNetwork
 from sags_node.vision.tissue_topic import TopicMasks
 
@@ -324,6 +329,47 @@ def bag(kind: str) -> Target:
     return Target(sound, use)
 
 
+def arrays(folder: Path) -> list[bytes]:
+    numbers = np.random.default_rng(0).normal(size=(8, 4, 4))
+    for name, save in (("a.npz", np.savez), ("b.npz", np.savez_compressed)):
+        save(folder / name, T_world_cam=numbers)
+    np.save(folder / "c.npy", numbers)
+    return [file.read_bytes() for file in sorted(folder.iterdir())]
+
+
+def read_arrays(data: bytes, folder: Path) -> None:
+    (folder / "a").write_bytes(data)
+    read = partial(load_array, key="T_world_cam") if data[:1] == b"P" else load_npy
+    assert read(folder / "a", shape=(None, 4, 4)).shape[1:] == (4, 4)
+
+
+def sidecars(folder: Path) -> list[bytes]:
+    session = write_session(folder / "session", [frame_record(number) for number in range(3)])
+    return [(session / "stereo.json").read_bytes()]
+
+
+def read_dvrk(data: bytes, folder: Path) -> None:
+    (folder / "stereo.json").write_bytes(data)
+    read_sidecar(folder / "stereo.json")
+
+
+def numbered_archives(_: Path) -> list[bytes]:
+    raw = io.BytesIO()
+    with tarfile.open(fileobj=raw, mode="w") as archive:
+        for number in (0, 2, 1):
+            archive.addfile(tarfile.TarInfo(f"./frame{number:06d}.json"))
+    return [raw.getvalue()]
+
+
+def read_numbered(data: bytes, folder: Path) -> None:
+    (folder / "frames.tar.gz").write_bytes(gzip.compress(data, 1) if data[-1:] == b"\0" else data)
+    files = open_numbered(folder / "frames", ".json", 1000)
+    assert files is not None
+    for number in (1, 0, 2, 9):
+        files.read(number)
+    files.close()
+
+
 def launch_files(_: Path) -> list[bytes]:
     return [file.read_bytes() for file in sorted((ROOT / "launch").glob("*.yaml"))]
 
@@ -469,6 +515,9 @@ TARGETS: dict[str, Target] = {
     "poses": Target(poses, read_pose),
     "pictures": Target(pictures, read_picture),
     **{kind: bag(kind) for kind in BAGS},
+    "arrays": Target(arrays, read_arrays),
+    "sidecars": Target(sidecars, read_dvrk),
+    "numbered archive": Target(numbered_archives, read_numbered),
     "launch files": Target(launch_files, read_launch),
     "ros calibration": Target(ros_rigs, read_ros_rig),
     "calibration archive": Target(archives, read_archive),
