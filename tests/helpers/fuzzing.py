@@ -33,12 +33,14 @@ from numbered_pictures import write_video
 from onnx_networks import save_matcher
 from places import ROOT
 from simulated_node import Socket
+from stamped_videos import write as write_stamped
 from synthetic import plane_result
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError
 from sags_node.media.picture_file import claimed_size
+from sags_node.media.video import Video
 from sags_node.messaging import cdr, content, thin, topics
 from sags_node.messaging.control import ControlServer
 from sags_node.messaging.received import ReceivedImage, interpret
@@ -491,20 +493,24 @@ def open_network(data: bytes, folder: Path) -> None:
 def films(folder: Path) -> list[bytes]:
     shown = [np.random.default_rng(n).integers(0, 255, (48, 128, 3), np.uint8) for n in range(4)]
     made = [write_video(folder / "a.avi", shown).read_bytes()]
-    writer = cv2.VideoWriter(str(folder / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (128, 48))
-    for rgb in shown:
-        writer.write(rgb)
-    writer.release()
-    return [*made, (folder / "a.mp4").read_bytes()]
+    for suffix in FILMS.values():
+        made.append(write_stamped(folder / f"a{suffix}", shown).read_bytes())
+    return made
+
+
+FILMS = {b"RIFF": ".avi", b"\x1aE\xdf\xa3": ".mkv", b"G@\x11\x10": ".ts", b"": ".mp4"}  # by their beginning
 
 
 def read_film(data: bytes, folder: Path) -> None:
-    file = folder / ("a.avi" if data[:4] == b"RIFF" else "a.mp4")
+    file = folder / f"a{next(suffix for begin, suffix in FILMS.items() if data.startswith(begin))}"
     file.write_bytes(data)
     halves = cfg.GeometryConfig(layout="side_by_side")
     with open_source(cfg.VideosSource(left=file, geometry=halves, pace="step", frames=8)) as source:
         for frame in source:
             assert frame.right is not None and frame.left.shape == frame.right.shape
+    video = Video(file)
+    for number in (video.count - 1, 0):
+        video.read(number)
 
 
 TARGETS: dict[str, Target] = {

@@ -62,9 +62,18 @@ def recordings(tmp_path: Path) -> dict[str, Recording]:
     right_file = write_video(tmp_path / "r.avi", [pair[1] for pair in pairs])
     lr = write_video(tmp_path / "lr.avi", [np.hstack(pair) for pair in pairs])
     rl = write_video(tmp_path / "rl.avi", [np.hstack(pair[::-1]) for pair in pairs])
+    over = write_video(tmp_path / "over.avi", [np.vstack(pair[::-1]) for pair in pairs])
+    turns = write_video(tmp_path / "turns.avi", [eye for pair in pairs for eye in pair], 50.0)
+    wide = [
+        write_video(tmp_path / f"wide_{eye}.avi", [np.hstack([green, pair[eye]]) for pair in pairs])
+        for eye in (0, 1)
+    ]
     panes = write_video(
         tmp_path / "panes.avi", [np.vstack([np.hstack(p), np.hstack([green] * 2)]) for p in pairs]
     )
+    below = cfg.GeometryConfig(layout="over_under", first="right")
+    in_turn = cfg.GeometryConfig(layout="frame_sequential")
+    half = cfg.GeometryConfig(crop=(WIDTH, 0, WIDTH, HEIGHT))
     halves = cfg.GeometryConfig(layout="side_by_side")
     turned = cfg.GeometryConfig(layout="side_by_side", first="right")
     boxes = cfg.GeometryConfig(
@@ -75,5 +84,8 @@ def recordings(tmp_path: Path) -> dict[str, Recording]:
         "videos": cfg.VideosSource(left=left_file, right=right_file, pace="step"),
         "LR": cfg.VideosSource(left=lr, geometry=halves, pace="step"),
         "RL": cfg.VideosSource(left=rl, geometry=turned, pace="step"),
+        "over under": cfg.VideosSource(left=over, geometry=below, pace="step"),
+        "in turn": cfg.VideosSource(left=turns, geometry=in_turn, pace="step"),
+        "cropped": cfg.VideosSource(left=wide[0], right=wide[1], geometry=half, pace="step"),
         "panes": cfg.VideosSource(left=panes, geometry=boxes, pace="step"),
     }

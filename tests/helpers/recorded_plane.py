@@ -23,7 +23,7 @@ RATE = 30.0  # Hz
 
 @contextmanager
 def recording(options: RecordOptions) -> Iterator[tuple[Recorder, list[dict[str, Any]]]]:
-    """A recorder on a thread, ready; the summary is the last thing that it says."""
+    """A recorder on a thread, ready; its summary, or an error, is the last thing that it says."""
     recorder, said = Recorder(options), []
     failed: list[BaseException] = []
 
@@ -32,10 +32,11 @@ def recording(options: RecordOptions) -> Iterator[tuple[Recorder, list[dict[str,
             said.append(recorder.run(said.append))
         except SagsError as error:
             failed.append(error)
+            said.append({"error": str(error)})
 
     thread = threading.Thread(target=run)
     thread.start()
-    until(lambda: said or failed)
+    until(lambda: said)
     try:
         yield recorder, said
     finally:

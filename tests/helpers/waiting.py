@@ -15,10 +15,11 @@ T = TypeVar("T")
 def until(done: Callable[[], T], seconds: float = 60.0) -> T:
     """What `done` says in the end. A guard against waiting for ever, no deadline: other processes may hold
     the machine."""
-    deadline = time.monotonic() + seconds
+    deadline, pause = time.monotonic() + seconds, 0.0005
     while not (found := done()):
         assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
+        time.sleep(pause)
+        pause = min(2 * pause, 0.01)
     return found
 
 

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from recorded_plane import by_topic, record_plane, recording
 from rosbags.highlevel import AnyReader
-from synthetic import plane_result, publisher, stream
+from synthetic import at_frame, plane_result, publisher, stream
 from waiting import until
 
 from sags_node.messaging import cdr
@@ -22,6 +22,7 @@ from sags_node.messaging.topics import TOPICS
 from sags_node.recording.bag import read_messages
 from sags_node.recording.pictures import decode_picture
 from sags_node.recording.recorder import RecordOptions
+from sags_node.types import FrameResult
 
 pytestmark = pytest.mark.live
 
@@ -100,13 +101,19 @@ def test_compressed_pictures(compression: str, tmp_path: Path) -> None:
 
 
 def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
-    run_dir = tmp_path / "run"
+    run_dir, plane, stamps = tmp_path / "run", plane_result(), [0]
+
+    def frame(number: int) -> FrameResult:
+        stamps.append(time.time_ns())
+        return at_frame(plane, number, stamps[-1])
+
     with publisher(run_dir) as running:
         running.publish_parameters({"seed": 6})
-        options = RecordOptions(tmp_path / "ring", snapshot_seconds=0.6, node=NodeAddress(run_dir=run_dir))
-        with stream(running), recording(options) as (recorder, said):
+        options = RecordOptions(tmp_path / "ring", snapshot_seconds=0.3, node=NodeAddress(run_dir=run_dir))
+        with stream(running, frame), recording(options) as (recorder, said):
             for number in range(2):
-                time.sleep(1.2)
+                until_ns = stamps[-1] + 400_000_000  # the ring is full
+                until(lambda: stamps[-1] > until_ns)  # noqa: B023, used at once
                 recorder.snapshot()
                 until(lambda: len(said) > 1 + number)  # noqa: B023, used at once
     summary = said.pop()
@@ -115,6 +122,6 @@ def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
     for told in said[1:]:
         depth = by_topic(Path(told["snapshot"]))["left/depth"]
         span = (depth[-1].log_ns - depth[0].log_ns) * 1e-9
-        assert 0 < span <= 0.6
+        assert 0 < span <= 0.3
         latched = by_topic(Path(told["snapshot"]))["parameters"]
         assert len(latched) == 1 and latched[0].log_ns < depth[0].log_ns  # older, and there all the same

@@ -225,7 +225,7 @@ def test_a_full_disk_ends_with_one_message(tmp_path: Path) -> None:
         with pytest.raises(SagsError, match=r"cannot write .*: No space left on device; save what is there"):
             with recording(RecordOptions(recorder_folder, node=NodeAddress(run_dir=tmp_path / "run"))) as (
                 _,
-                _,
+                said,
             ):
                 # The file that is being written becomes a full disk.
                 (written,) = recorder_folder.glob("*.mcap")
@@ -235,4 +235,4 @@ def test_a_full_disk_ends_with_one_message(tmp_path: Path) -> None:
                 )
                 with file.open("wb") as full:
                     os.dup2(full.fileno(), number)
-                time.sleep(2)
+                until(lambda: "error" in said[-1])

@@ -144,7 +144,7 @@ def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> 
     try:
         os.close(theirs)
         until(lambda: b"recording: " in os.read(ours, 1000), START_SECONDS)
-        time.sleep(1)
+        frames_pass(node, 5)
         os.close(ours)
         process.wait(30)
     finally:
@@ -163,7 +163,7 @@ def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_pat
         while b"recording: " not in process.stderr.readline():
             assert process.poll() is None
         process.send_signal(signal.SIGHUP)
-        time.sleep(1)
+        frames_pass(node, 5)
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0

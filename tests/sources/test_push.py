@@ -25,7 +25,7 @@ from waiting import until
 from sags_node.client import ClientKeys, FrameSender
 from sags_node.config.schema import PushSource
 from sags_node.errors import UsageError
-from sags_node.messaging import cdr
+from sags_node.messaging import cdr, inbox
 from sags_node.messaging.security import read_key_pair, write_key_pair
 from sags_node.messaging.wire import Message, encode
 from sags_node.sources.push import PushedPictures
@@ -79,7 +79,11 @@ def test_one_eye_by_one_and_side_by_side_make_pairs() -> None:
 
 
 @pytest.mark.fault("network: two programs send pictures of one eye")
-def test_pictures_of_two_senders_are_not_mixed(source: PushedPictures) -> None:
+def test_pictures_of_two_senders_are_not_mixed(
+    source: PushedPictures, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inbox, "ALONE_S", 0.3)
+    monkeypatch.setattr(inbox, "RECEIPT_S", 0.1)
     with Taker(source) as taker, FrameSender(source.endpoint) as second:
         with FrameSender(source.endpoint) as first:
             until(lambda: first.send(numbered(1), numbered(1)) and taker.numbers)
