@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
+
+import yaml
 
 _NEVER = {"sec": 9223372036, "nsec": 854775807}
 
@@ -91,3 +94,9 @@ def quality(latched: bool) -> list[dict[str, Any]]:
             "avoid_ros_namespace_conventions": False,
         }
     ]
+
+
+@lru_cache
+def quality_text(latched: bool) -> str:
+    """The same in YAML, for the metadata of a channel."""
+    return yaml.safe_dump(quality(latched), sort_keys=False)

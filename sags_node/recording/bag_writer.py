@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self, TypeVar
 
 import yaml
@@ -20,7 +19,7 @@ from sags_node import __version__
 from sags_node.errors import UsageError
 from sags_node.files import writing
 from sags_node.recording.bag import METADATA, RELATIVE
-from sags_node.recording.bag_metadata import Part, Topic, describe, quality
+from sags_node.recording.bag_metadata import Part, Topic, describe, quality_text
 
 CHUNK_BYTES = 1 << 20  # what is lost at most when the process is killed between two flushes
 MESSAGE_HEAD_BYTES = 31  # of an MCAP message record
@@ -88,7 +87,7 @@ class BagWriter:
         if key not in self._schemas:
             self._schemas[key] = self._say_first(lambda writer: writer.register_schema(*key))
         metadata = {
-            "offered_qos_profiles": yaml.safe_dump(quality(latched), sort_keys=False),
+            "offered_qos_profiles": quality_text(latched),
             "topic_type_hash": type_hash,
             **(RELATIVE if relative else {}),
         }
@@ -192,9 +191,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is None:
             self.close()
         else:

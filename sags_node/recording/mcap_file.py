@@ -1,11 +1,15 @@
 """MCAP records from a file that nobody vouches for: every length is checked before memory is taken.
 
+The reader of the `mcap` package limits records, not what chunks unpack to. A message that is shorter than its
+head it takes with what follows, and it does not say where damage is.
+
 Format: https://mcap.dev/spec. A file is magic, records, magic; a record is an opcode (1 byte), a length
 (8 bytes) and its content. Messages lie in chunks, which may be compressed and carry a checksum.
 """
 
 from __future__ import annotations
 
+import bz2
 import struct
 import zlib
 from collections.abc import Iterator
@@ -177,25 +181,38 @@ def unpack_chunk(content: bytes, position: int, whole: bool = True) -> bytes:
     if (whole and not chunk_is_consistent(content)) or len(content) < _CHUNK.size + 12:
         raise DamagedError(position, "the lengths in a chunk do not add up")
     _, _, size, crc, named = _CHUNK.unpack_from(content)
-    compression = content[_CHUNK.size : _CHUNK.size + named]
-    packed = memoryview(content)[_CHUNK.size + named + 8 :]
-    if size > MAX_CHUNK_BYTES:
-        raise DamagedError(position, f"a chunk says that it unpacks to {size} bytes; at most 256 MB is read")
-    try:
-        if compression == b"":
-            data = bytes(packed)
-        elif compression == b"zstd":
-            data = zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
-        elif compression == b"lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-        else:
-            raise DamagedError(position, f"a chunk of unknown compression {compression!r}")
-    except (zstandard.ZstdError, RuntimeError) as error:
-        raise DamagedError(position, f"a chunk cannot be unpacked: {error}") from None
+    compression = bytes(content[_CHUNK.size : _CHUNK.size + named])
+    data = unpack(compression, memoryview(content)[_CHUNK.size + named + 8 :], size, position)
     if whole and len(data) != size:
         raise DamagedError(position, f"a chunk does not unpack to the {size} bytes it says")
     if whole and crc and zlib.crc32(data) != crc:
         raise DamagedError(position, "the checksum of a chunk is wrong")
+    return data
+
+
+def unpack(compression: bytes, packed: bytes | memoryview, size: int, position: int) -> bytes:
+    """Unpack the data of a chunk: no more of it than one byte beyond the `size` that it says.
+
+    Raises:
+        DamagedError: it is damaged, of an unknown compression, or says that it is too large.
+    """
+    if size > MAX_CHUNK_BYTES:
+        raise DamagedError(position, f"a chunk says that it unpacks to {size} bytes; at most 256 MB is read")
+    data: bytes
+    try:
+        match compression:
+            case b"":
+                data = bytes(packed[: size + 1])
+            case b"zstd":
+                data = zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
+            case b"lz4":
+                data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+            case b"bz2":  # of ROS 1
+                data = bz2.BZ2Decompressor().decompress(packed, max_length=size + 1)
+            case _:
+                raise DamagedError(position, f"a chunk of unknown compression {compression!r}")
+    except (zstandard.ZstdError, RuntimeError, OSError, EOFError) as error:
+        raise DamagedError(position, f"a chunk cannot be unpacked: {error}") from None
     return data
 
 

@@ -7,8 +7,10 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from bag_files import KINDS
 from fuzzing import BAGS, TARGETS, bounded_memory
 
@@ -49,20 +51,43 @@ def test_forged_lengths_of_mcap_records(length: int, tmp_path: Path) -> None:
     assert forged > 5
 
 
-@pytest.mark.parametrize("size", [2**60, 257 << 20, 5])
-def test_a_chunk_that_unpacks_to_too_much(size: int, tmp_path: Path) -> None:
-    """A bomb: a gigabyte of zeros in a few kB. It may say so, or lie."""
-    import zstandard
+def mcap(*records: tuple[int, bytes]) -> bytes:
+    """The beginning of a file: opcodes and contents."""
+    header = 1, b"\x04\0\0\0ros2" + bytes(4)
+    body = (bytes([opcode]) + struct.pack("<Q", len(said)) + said for opcode, said in (header, *records))
+    return b"\x89MCAP0\r\n" + b"".join(body)
 
-    packer = zstandard.ZstdCompressor().compressobj()
-    bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1 << 10)) + packer.flush()
-    chunk = struct.pack("<QQQI", 0, 1, size, 0) + b"\x04\0\0\0zstd" + struct.pack("<Q", len(bomb)) + bomb
+
+def chunk(packed: bytes, size: int, compression: bytes = b"") -> tuple[int, bytes]:
+    said = struct.pack("<QQQII", 0, 1, size, 0, len(compression)) + compression
+    return 6, said + struct.pack("<Q", len(packed)) + packed
+
+
+@pytest.mark.parametrize("size", [2**60, 257 << 20, 5])
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_chunk_that_unpacks_to_too_much(compression: str, size: int, tmp_path: Path) -> None:
+    """A bomb: a gigabyte of zeros in some kB or MB. It may say so, or lie."""
+    if compression == "zstd":
+        packer = zstandard.ZstdCompressor().compressobj()
+        bomb = b"".join(packer.compress(bytes(1 << 20)) for _ in range(1 << 10)) + packer.flush()
+    else:
+        lz4_packer = lz4.frame.LZ4FrameCompressor()
+        bomb = lz4_packer.begin() + b"".join(lz4_packer.compress(bytes(1 << 20)) for _ in range(1 << 10))
+        bomb += lz4_packer.flush()
     file = tmp_path / "bomb.mcap"
-    header = b"\x04\0\0\0ros2" + bytes(4)
-    body = b"\x01" + struct.pack("<Q", len(header)) + header + b"\x06" + struct.pack("<Q", len(chunk)) + chunk
-    file.write_bytes(b"\x89MCAP0\r\n" + body)
+    file.write_bytes(mcap(chunk(bomb, size, compression.encode())))
     with pytest.raises(SagsError, match="unpack"):
         bag_info(file)
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["alone", "in a chunk"])
+def test_a_message_shorter_than_its_head_is_no_message(inside: bool, tmp_path: Path) -> None:
+    """What follows would be taken for the rest of it."""
+    short, whole = (5, b"abc"), (5, struct.pack("<HIQQ", 1, 2, 3, 4) + b"12345678")
+    records = mcap(short, whole)[29:]
+    (tmp_path / "a.mcap").write_bytes(mcap(chunk(records, len(records))) if inside else mcap(short, whole))
+    with pytest.raises(SagsError, match="a message shorter than its own head"):
+        bag_info(tmp_path / "a.mcap")
 
 
 def test_what_is_no_bag(tmp_path: Path) -> None:
