@@ -32,10 +32,10 @@ def write_png(file: Path, rgb: U8) -> None:
     assert cv2.imwrite(str(file), rgb[..., ::-1])
 
 
-def write_video(file: Path, pictures: list[U8], rate: float = 25.0) -> Path:
-    """Lossy MJPG, as capture boxes write it."""
+def write_video(file: Path, pictures: list[U8], rate: float = 25.0, codec: str = "MJPG") -> Path:
+    """Lossy, as capture boxes write it."""
     height, width = pictures[0].shape[:2]
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), rate, (width, height))
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*codec), rate, (width, height))
     assert writer.isOpened()
     for rgb in pictures:
         writer.write(np.ascontiguousarray(rgb[..., ::-1]))
