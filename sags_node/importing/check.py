@@ -189,8 +189,8 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
         count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
         stamped, said, ends = [], [], []
         if isinstance(opened, Replay):
-            stamped = list(opened.judged)
-            said = [*videos.said_of(opened.oddities), *videos.check_pixels(opened.pixel_aspect)]
+            stamped = list(opened.pairs.judged)
+            said = [*videos.said_of(opened.pairs.oddities), *videos.check_pixels(opened.pairs.pixel_aspect)]
             if isinstance(opened.pairs, VideoPairs):
                 ends = videos.check_ends(opened.pairs, (opened.first + count) * source.stride)
     if first is None:
