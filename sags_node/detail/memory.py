@@ -13,9 +13,8 @@ from sags_node.types import F32, Gaussians
 EVERY = 0.2  # s between frames that are kept
 MOST = 10  # frames kept
 OLDEST = 10.0  # s: what nobody has seen for longer is drawn as the model has it
-SOURCES = 2  # that one view takes: each costs a small drawing
-NEARLY = 0.5  # of what the best of them saw: a newer one is taken that saw so much
-WORTH = 0.05  # of the hidden Gaussians: with fewer, a source is not worth its drawing
+NEARLY = 0.5  # of what the best of them saw: a newer one is taken that saw more
+WORTH = 0.05  # of the hidden Gaussians: with fewer, a frame is not worth its drawing
 BRIGHTER = 2.0  # at most, between a source's light and that of the view
 
 
@@ -56,30 +55,24 @@ class HiddenSource:
     gain: F32  # [3] the light of now, as factors of that frame's
 
 
-def hidden_sources(hidden: Gaussians, now_ns: int, frames: Sequence[SeenFrame]) -> list[HiddenSource]:
-    """Choose the frames that saw most of what is hidden, the newest first.
+def hidden_source(hidden: Gaussians, now_ns: int, frames: Sequence[SeenFrame]) -> HiddenSource | None:
+    """Choose the newest of the frames that saw most of what is hidden; None: none saw enough. A second one
+    beside it would add less than 0.05 dB.
 
     Args:
         hidden: the Gaussians there, in the light of now.
         frames: that may be taken, the newest first.
     """
-    least = max(1.0, WORTH * len(hidden))
-    candidates = []
+    seen = []
     for frame in frames:
         if 0 < now_ns - frame.t_capture_ns <= OLDEST * 1e9:  # also after a pause
             rows, known = frame.rows_of(hidden.ids)
-            candidates.append((frame, rows, known & frame.shows[rows]))
-    chosen: list[HiddenSource] = []
-    left = np.ones(len(hidden), np.bool_)
-    while candidates and len(chosen) < SOURCES:
-        counts = [np.count_nonzero(seen & left) for _, _, seen in candidates]
-        if max(counts) < least:
-            break
-        newest = next(i for i, count in enumerate(counts) if count > NEARLY * max(counts))
-        frame, rows, seen = candidates.pop(newest)
-        seen = seen & left
-        before, after = frame.gaussians.colors[rows[seen]], hidden.colors[seen]
-        gain = after.sum(0) / np.maximum(before.sum(0), np.float32(1e-6))
-        chosen.append(HiddenSource(frame, np.clip(gain, 1 / BRIGHTER, BRIGHTER).astype(np.float32)))
-        left &= ~seen
-    return sorted(chosen, key=lambda source: -source.frame.t_capture_ns)
+            seen.append((frame, rows, known & frame.shows[rows]))
+    counts = [np.count_nonzero(shown) for _, _, shown in seen]
+    most = max(counts, default=0)
+    if most < max(1.0, WORTH * len(hidden)):
+        return None
+    frame, rows, shown = seen[next(i for i, count in enumerate(counts) if count > NEARLY * most)]
+    before, after = frame.gaussians.colors[rows[shown]], hidden.colors[shown]
+    gain = after.sum(0) / np.maximum(before.sum(0), np.float32(1e-6))
+    return HiddenSource(frame, np.clip(gain, 1 / BRIGHTER, BRIGHTER).astype(np.float32))

@@ -10,7 +10,7 @@ import numpy as np
 from numba import prange
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
-from sags_node.detail.memory import hidden_sources
+from sags_node.detail.memory import hidden_source
 from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.share import Share
@@ -70,22 +70,24 @@ class Detail:
         self, rgb: U8, taken: U8, depth: F32, gaussians: Gaussians, camera: Camera, now_ns: int,
         older: Sequence[SeenFrame],
     ) -> int:  # fmt: skip
-        """Carry what older frames saw to where nothing is taken yet; returns when the oldest of them was."""
-        oldest, small = now_ns, coarse_camera(camera)
-        wanted = _free(taken, small)
-        if not len(older) or not wanted.any():
-            return oldest
-        depth, there = every_fourth(depth, small), gaussians_at(gaussians, small, wanted)
-        for source in hidden_sources(there, now_ns, older):
-            frame, lent = source.frame, source.frame.lent(float(camera.K[0, 0]), sure=True)
-            motion = self._small.motion(there, camera, frame)
-            traced = trace(depth, small, frame, lent, motion, unsure=UNSURE / DOUBTED, wanted=wanted)
-            carry(rgb, taken, traced, lent, source.gain)
-            still = _free(taken, small)
-            if not np.array_equal(still, wanted):
-                oldest = min(oldest, frame.t_capture_ns)
-            wanted = still
-        return oldest
+        """Carry what an older frame saw to where nothing is taken yet; returns when that was, or `now_ns`."""
+        small = coarse_camera(camera)
+        free = cv2.resize(
+            cv2.compare(taken, 0, cv2.CMP_EQ), (small.width, small.height), interpolation=cv2.INTER_AREA
+        )
+        if not len(older) or not free.any():
+            return now_ns
+        wanted = cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3])  # pixels lie between two places
+        there = gaussians_at(gaussians, small, wanted)
+        source = hidden_source(there, now_ns, older)
+        if source is None:
+            return now_ns
+        frame, lent = source.frame, source.frame.lent(float(camera.K[0, 0]), sure=True)
+        motion = self._small.motion(there, camera, frame)
+        depth = every_fourth(depth, small)
+        traced = trace(depth, small, frame, lent, motion, unsure=UNSURE / DOUBTED, wanted=wanted)
+        carry(rgb, taken, traced, lent, source.gain)
+        return frame.t_capture_ns if traced.share.any() else now_ns
 
     def view(
         self,
@@ -184,13 +186,6 @@ def _carried(
     traced = trace(every_fourth(depth, small), small, source, lent, motion, holes=holes)
     carry(rgb, _nothing(camera), traced, lent)
     return rgb
-
-
-def _free(taken: U8, small: Camera) -> U8:
-    """[m, n] of the coarse camera, 1: there, or beside it, is a pixel that has got nothing yet."""
-    free = cv2.compare(taken, 0, cv2.CMP_EQ)
-    free = cv2.resize(free, (small.width, small.height), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3]))
 
 
 def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool]:

@@ -9,7 +9,7 @@ import pytest
 from places import SESSION
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
-from sags_node.detail.memory import EVERY, MOST, OLDEST, Memory, hidden_sources
+from sags_node.detail.memory import EVERY, MOST, OLDEST, Memory, hidden_source
 from sags_node.detail.motion import gaussians_at
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.detail.share import Share
@@ -187,13 +187,18 @@ def test_memory_is_bounded_and_keeps_what_is_seldom() -> None:
 def test_hidden_tissue_comes_from_the_newest_frame_that_saw_it_in_the_light_of_now() -> None:
     old, newer, hidden = seen(1), seen(2), gaussians()
     blind = replace(seen(2), mask=np.zeros((HEIGHT, WIDTH), np.bool_))
-    assert [one.frame for one in hidden_sources(hidden, 3, [newer, old])] == [newer]
-    assert [one.frame for one in hidden_sources(hidden, 3, [blind, old])] == [old]
-    assert hidden_sources(gaussians(first_id=1000), 3, [newer, old]) == []
-    after_a_pause = round(OLDEST * 1e9) + 2
-    assert [one.frame for one in hidden_sources(hidden, after_a_pause, [newer, old])] == [newer]
-    darker = replace(hidden, colors=0.5 * hidden.colors)
-    np.testing.assert_allclose(hidden_sources(darker, 3, [old])[0].gain, 0.5)
+
+    def chosen(now_ns: int, *frames: SeenFrame) -> SeenFrame | None:
+        source = hidden_source(hidden, now_ns, frames)
+        return None if source is None else source.frame
+
+    assert chosen(3, newer, old) is newer
+    assert chosen(3, blind, old) is old
+    assert hidden_source(gaussians(first_id=1000), 3, [newer, old]) is None
+    assert chosen(round(OLDEST * 1e9) + 2, newer, old) is newer  # after a pause
+    darker = hidden_source(replace(hidden, colors=0.5 * hidden.colors), 3, [old])
+    assert darker is not None
+    np.testing.assert_allclose(darker.gain, 0.5)
 
 
 def test_gaussians_of_wanted_places_are_chosen_by_where_they_project() -> None:
