@@ -23,8 +23,7 @@ from sags_node.types import U8
 FRAMES = 6
 EYES = "left", "right"
 LEFT, RIGHT = (
-    [cv2.imread(str(file)) for file in sorted((SESSION / side).iterdir())[:FRAMES]]
-    for side in EYES
+    [cv2.imread(str(file)) for file in sorted((SESSION / side).iterdir())[:FRAMES]] for side in EYES
 )
 
 
@@ -124,7 +123,7 @@ def test_a_name_that_is_no_text_is_refused_before_anything_is_told_of_it(tmp_pat
         code, _, said = ran(*command)
         assert code == 2 and "holds bytes that are no UTF-8 text" in said and "rename it" in said
     (folder / "case.mcap").touch()
-    with pytest.raises(UsageError, match="no UTF-8 text.*rename it"):
+    with pytest.raises(UsageError, match=r"no UTF-8 text.*rename it"):
         load_launch(folder / "case.mcap")
 
 
