@@ -53,7 +53,7 @@ def parse_yaml(content: bytes | str, where: str) -> Any:
             raise UsageError(f"{where} {NO_TEXT}")
         return _unfolded(_Loader(text).get_single_data())
     except UnicodeDecodeError:
-        problem = "it is not UTF-8 text"
+        problem = "it is not UTF-8 text; save it as UTF-8"
     except RecursionError:
         problem = "it is nested too deeply"
     except yaml.YAMLError as error:
