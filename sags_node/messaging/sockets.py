@@ -10,9 +10,9 @@ import zmq
 from sags_node.errors import SagsError
 from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
 
+OWN_SOCKETS = "'publish.data:=[tcp://127.0.0.1:*]' 'publish.control:=tcp://127.0.0.1:*'"  # of one more node
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
 RECEIVE_BUFFER = 16384  # bytes in the kernel, which an expelled peer still gets read
-OWN_SOCKETS = "'publish.data:=[tcp://127.0.0.1:*]' 'publish.control:=tcp://127.0.0.1:*'"  # of one more node
 HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
 
 
