@@ -18,6 +18,7 @@ from typing import BinaryIO
 
 from sags_node.errors import SagsError, UsageError
 
+NO_TEXT = "holds bytes that are no UTF-8 text, so no other program can be told of it: rename it"
 LARGEST_RESULT = 64 << 20  # bytes of figures as JSON
 _checked: set[Path] = set()  # asked for without --force: what comes there before `whole` has ended stays
 _KINDS = (
@@ -27,6 +28,21 @@ _KINDS = (
     (stat.S_ISCHR, "it is a device, no file"),
     (stat.S_ISBLK, "it is a device, no file"),
 )
+
+
+def is_text(name: str) -> bool:
+    """Whether a name is UTF-8; Python reads others by surrogates, which nothing can write."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
+def check_name(path: Path) -> None:
+    """Refuse a recording whose name could not be published.
+
+    Raises:
+        UsageError: the name is no text.
+    """
+    if not is_text(str(path)):
+        raise UsageError(f"{path} {NO_TEXT}")
 
 
 def open_file(path: Path) -> BinaryIO:

@@ -152,7 +152,7 @@ def get(name: str | None, json_out: bool, node: NodeAddress) -> None:
 def set_parameters(overrides: tuple[str, ...], json_out: bool, node: NodeAddress) -> None:
     """Change parameters while the node runs; the model stays.
 
-    What can change is in docs/launch.md; the node says so, too, where it refuses.
+    Only mapping.budget_ms can change. For any other key start the node anew.
 
     \b
     sags param set mapping.budget_ms:=25
@@ -166,7 +166,7 @@ def set_parameters(overrides: tuple[str, ...], json_out: bool, node: NodeAddress
             raise UsageError(f"'{word}' is not an override; write key:=value, e.g. mapping.budget_ms:=25")
     said = {key: parse_yaml(value, f"the value of {key}:=") for key, _, value in map(_parts, overrides)}
     ask(node, "set_parameters", said)
-    show(said if json_out else ", ".join(f"{key} is {value}" for key, value in said.items()))
+    show(said if json_out else ", ".join(word.replace(":=", " is ", 1) for word in overrides))
 
 
 def _parts(override: str) -> tuple[str, str, str]:

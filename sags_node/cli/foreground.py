@@ -73,11 +73,16 @@ def _watch(
             return
 
 
-def health_table(health: NodeHealth) -> Table:
-    """One screen of what a person wants to know."""
+def ended_text(sent: int, count: int | None) -> str:
+    """What a node that has ended published; `count`: frames of its recording, where it has an end."""
+    return f"ended, {sent:,} {'' if count is None else f'of {count:,} '}frames published"
+
+
+def health_table(health: NodeHealth, state: str | None = None) -> Table:
+    """One screen of what a person wants to know; `state`: in the place of what the node says."""
     table = text.table()
     latency = health.latency_ms
-    table.add_row("state", health.state)
+    table.add_row("state", state or health.state)
     table.add_row("published", f"{health.rate_hz:.1f} Hz")
     table.add_row("latency p50 / p99", f"{latency['p50']:.0f} / {latency['p99']:.0f} ms")
     table.add_row("Gaussians", f"{health.gaussians:,}")
@@ -86,9 +91,9 @@ def health_table(health: NodeHealth) -> Table:
     if health.clock is not None and health.clock.drift_ppm is not None:
         table.add_row("capture clock", f"drifts by {health.clock.drift_ppm:+.0f} us/s from this machine's")
     table.add_row("stages (ms)", "  ".join(f"{k} {v:.1f}" for k, v in health.stage_ms.items()))
-    table.add_row("dropped", "  ".join(f"{k} {v}" for k, v in health.dropped.items()))
+    table.add_row("dropped (frames)", "  ".join(f"{k} {v}" for k, v in health.dropped.items()))
     if health.skipped:
-        table.add_row("skipped", "  ".join(f"{k} {v}" for k, v in health.skipped.items()))
+        table.add_row("skipped (frames)", "  ".join(f"{k} {v}" for k, v in health.skipped.items()))
     table.add_row("memory", f"{health.rss_mb:.0f} MB")
     for stage, warning in in_words(health.warnings).items():
         table.add_row(f"warning: {stage}", Text(warning))

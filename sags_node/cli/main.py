@@ -105,8 +105,7 @@ def sags_group(function: Callable[..., None]) -> Sags:
 def begin(verbose: bool, form: str) -> None:
     """Set up messages and signals before a command runs."""
     level = logging.INFO if verbose else logging.WARNING
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGINT, interrupt)  # also where a script's `&` had it ignored: kill -INT ends it
     signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # so is the end of the terminal, but for nohup
         signal.signal(signal.SIGHUP, interrupt)
@@ -139,7 +138,9 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
 
     It plays a launch file, a recording, a folder of videos or pictures (see sags import --check), or a video
     that shows both eyes; without any the built-in phantom session in a loop. Without a calibration it plays
-    all the same: depth then has no unit, and all that is published says so.
+    all the same: depth then has no unit, and all that is published says so. Of the table at its end, dropped
+    frames were not shown; skipped counts frames by the step that they went without, or by "frame": they
+    equalled the one before.
 
     \b
     sags run my_folder
@@ -147,7 +148,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     sags run launch/d4d_pull.yaml
     sags run launch/v4l2.yaml source.left:=/dev/video-left mapping.budget_ms:=25
     """
-    from sags_node.cli.foreground import health_table, inputs_text, run_node
+    from sags_node.cli.foreground import ended_text, health_table, inputs_text, run_node
     from sags_node.config.launch_file import load_launch
     from sags_node.config.schema import PhantomSource
     from sags_node.messaging.content import health_fields
@@ -168,7 +169,8 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
         for line in inputs_text(session.config):
             console.print(line, markup=False, soft_wrap=True)
         health = run_node(node, seconds, console, stop)
-    show(health_fields(health) if json_out else health_table(health))
+    ended = ended_text(node.sent, session.source.frame_count)
+    show(health_fields(health) if json_out else health_table(health, ended))
 
 
 @main.command()

@@ -20,7 +20,7 @@ from sags_node.config.schema import (
 )
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import UsageError, brief
-from sags_node.files import open_file
+from sags_node.files import check_name, open_file
 
 S = TypeVar("S", bound=Section)
 
@@ -74,6 +74,7 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     name = COMMAND_LINE
     if path is not None:
         file = Path(path)
+        check_name(file)
         recording = known_recording(file)
         played = any(override.startswith("source.kind:=") for override in overrides)
         if recording is None and not is_launch(file) and played:

@@ -2,7 +2,7 @@
 
 It gives what `yaml.safe_load` gives, and refuses what that takes in silence: keys that are given twice;
 aliases that contain themselves or unfold to far more than was written; zero characters, which no file name
-can hold.
+can hold, and names that cannot be told to anybody.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import yaml
 from yaml.constructor import ConstructorError
 
 from sags_node.errors import UsageError, brief
-from sags_node.files import near, read_file
+from sags_node.files import NO_TEXT, is_text, near, read_file
 
 LARGEST_FILE = 1 << 20  # bytes
 MOST_VALUES = 100_000  # with all aliases unfolded
@@ -49,9 +49,11 @@ def parse_yaml(content: bytes | str, where: str) -> Any:
     """
     try:
         text = content if isinstance(content, str) else content.decode("utf-8")
+        if not is_text(text):
+            raise UsageError(f"{where} {NO_TEXT}")
         return _unfolded(_Loader(text).get_single_data())
     except UnicodeDecodeError:
-        problem = "it is not UTF-8 text"
+        problem = "it is not UTF-8 text; save it as UTF-8"
     except RecursionError:
         problem = "it is nested too deeply"
     except yaml.YAMLError as error:
@@ -106,6 +108,8 @@ class _Loader(yaml.SafeLoader):
             parts = node.value
         elif "\0" in node.value:
             raise _RefusedError(node, "a text holds a zero character")
+        elif not is_text(node.value):
+            raise _RefusedError(node, f"{brief(node.value)} {NO_TEXT}")
         self._sizes[node] = 1 + sum(self._sizes[part] for part in parts)
         if self._sizes[node] > MOST_VALUES:
             raise _RefusedError(node, f"it holds more than {MOST_VALUES} values, with its aliases unfolded")

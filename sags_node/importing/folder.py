@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +13,7 @@ from sags_node.config.launch_file import VIDEO_SUFFIXES, is_launch, known_record
 from sags_node.config.schema import LaunchConfig
 from sags_node.config.yaml_reader import parse_yaml
 from sags_node.errors import UsageError
+from sags_node.files import check_name
 from sags_node.media.picture_file import SUFFIXES
 from sags_node.rig import find_form
 from sags_node.sources.names import EYE
@@ -48,6 +50,7 @@ def recognise(folder: Path) -> Contents:
     """
     if not folder.exists():
         raise UsageError(f"{folder} does not exist; check the path")
+    check_name(folder)
     if is_video(folder):
         return Contents("one video", videos=(folder,))
     if not folder.is_dir() and folder.suffix not in LAUNCH_SUFFIXES and known_recording(folder) is None:
@@ -166,7 +169,10 @@ def is_video(file: Path) -> bool:
 def override(key: str, path: Path | str) -> str:
     """`key:=path` as it is read back, whatever YAML would make of the path."""
     plain = f"{key}:={path}"
-    return plain if parse_yaml(str(path), plain) == str(path) else f"{key}:={json.dumps(str(path))}"
+    with suppress(UsageError):
+        if parse_yaml(str(path), plain) == str(path):
+            return plain
+    return f"{key}:={json.dumps(str(path))}"
 
 
 def _is_stereomis(folder: Path) -> bool:

@@ -23,6 +23,7 @@ from av.stream import Discard, Disposition
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 
 from sags_node.errors import SagsError, UsageError
+from sags_node.media.cut_off import ends_in_a_packet, ends_in_its_segment
 from sags_node.types import I64, U8
 
 if TYPE_CHECKING:
@@ -303,6 +304,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
                     shown.append(packet.pts)
                 if packet.is_keyframe and packet.pts is not None:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
+        is_broken = is_broken or ends_in_a_packet(path, size, container.format.name)
         if is_broken and shown:
             shown.pop()  # a part of a picture
         known = np.array([pts for pts in shown if pts is not None], np.int64)
@@ -321,7 +323,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         cut_off = ""
         if named > total:
             cut_off = f"is cut off: of {named} pictures it holds {total}"
-        elif missing > float(0.5 * base):
+        elif missing > float(0.5 * base) or ends_in_its_segment(path, size, container.format.name):
             cut_off = "is cut off: it ends before it says so"
         elif is_broken:
             cut_off = "is cut off: of its last picture a part is there"

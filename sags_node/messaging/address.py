@@ -138,7 +138,7 @@ def connect(socket: zmq.Socket[bytes], address: Address, max_message_bytes: int)
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.IPV6, int("[" in endpoint))
     if address.keys is not None:
-        assert address.keys.node is not None  # `_given` and `_known` see to it
+        assert address.keys.node is not None  # `_given` and `_known` make sure
         socket.setsockopt(zmq.CURVE_PUBLICKEY, address.keys.own.public)
         socket.setsockopt(zmq.CURVE_SECRETKEY, address.keys.own.secret)
         socket.setsockopt(zmq.CURVE_SERVERKEY, address.keys.node)

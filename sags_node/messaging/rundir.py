@@ -16,6 +16,7 @@ import msgspec
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import whole
+from sags_node.messaging.sockets import OWN_SOCKETS
 
 MAX_CONNECTION_FILE_BYTES = 16384
 MAX_UNIX_SOCKET_PATH = 107  # bytes, sun_path of Linux without its final zero
@@ -87,8 +88,8 @@ class RunDirectory:
         except OSError:
             os.close(lock)
             raise SagsError(
-                f"another node already runs as '{self._ns}' in {self.folder}; stop it, or choose another "
-                "ns:=NAME (sags bag play: --ns NAME)"
+                f"another node already runs as '{self._ns}' in {self.folder}; stop it, or start this one "
+                f"with ns:=NAME {OWN_SOCKETS} (sags bag play: --ns NAME --endpoint 'tcp://127.0.0.1:*')"
             ) from None
         return lock
 

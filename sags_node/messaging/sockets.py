@@ -10,6 +10,7 @@ import zmq
 from sags_node.errors import SagsError
 from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
 
+OWN_SOCKETS = "'publish.data:=[tcp://127.0.0.1:*]' 'publish.control:=tcp://127.0.0.1:*'"  # of one more node
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
 RECEIVE_BUFFER = 16384  # bytes in the kernel, which an expelled peer still gets read
 HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
@@ -49,8 +50,9 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | 
     try:
         socket.bind(endpoint)
     except zmq.ZMQError as error:
-        examples = {"publish.data": ":='[tcp://127.0.0.1:5560]'", "--endpoint": " tcp://127.0.0.1:5560"}
-        hint = f"choose another, e.g. {option}{examples.get(option, ':=tcp://127.0.0.1:5561')}"
+        ours = dict.fromkeys(("publish.data", "publish.control"), OWN_SOCKETS)
+        examples = ours | {"--endpoint": "--endpoint tcp://127.0.0.1:5560"}
+        hint = f"choose another, e.g. {examples.get(option, f'{option}:=tcp://127.0.0.1:5561')}"
         reason = "already in use" if error.errno == errno.EADDRINUSE else f"cannot be bound: {error.strerror}"
         raise SagsError(f"{endpoint} is {reason}; {hint}") from None
     bound = socket.getsockopt_string(zmq.LAST_ENDPOINT)

@@ -114,6 +114,7 @@ class Node:
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
+        self._sent = 0
         self._working_since: float | None = None  # when the frame came that is worked on
         self._publisher = Publisher(
             config.publish, config.ns, uuid.uuid4().hex, self._handlers(), thins=True, metric=rig.metric
@@ -207,6 +208,11 @@ class Node:
     def failed(self) -> bool:
         """Whether an error ends it: `wait` raises it."""
         return self._error is not None
+
+    @property
+    def sent(self) -> int:
+        """Frames published since the start."""
+        return self._sent
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -361,7 +367,7 @@ class Node:
             self._whole.put((result, self._publisher.thin))
         if self._state.statistics.add(result, latency_ms, self.dropped):
             self._state.status_due.set()  # until it is told, consumers refuse what comes
-        self._last_sent = result
+        self._last_sent, self._sent = result, self._sent + 1
         if self._on_result is not None:
             self._on_result(result, latency_ms)
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
+from sags_node.files import check_name
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.publisher import Publisher
 from sags_node.recording.bag import BagMessage, read_messages
@@ -100,13 +101,14 @@ class Player:
         """Publish until the bag ends or `stop`; returns messages, passes and seconds.
 
         Raises:
-            UsageError: there is no bag, or an endpoint is open to others without keys.
+            UsageError: there is no bag, its name is no text, or an endpoint is open to others without keys.
             SagsError: the bag is damaged, an endpoint is taken, or nothing in the bag was asked for.
         """
         began = time.monotonic()
         passes = 0
         offered = (*topics.TOPICS, *topics.PLAYER_TOPICS)
         session, recording = uuid.uuid4().hex, self._path.absolute()
+        check_name(recording)
         with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
             self._delay(publisher)
             while not self._stopping.is_set():

@@ -260,7 +260,7 @@ def _check_unit(rig: StereoRig, metres: float | None) -> list[Finding]:
     said = next((unit for unit, each in UNITS.items() if each == metres), None)
     least, most = ENDOSCOPE_BASELINE
     baseline = rig.baseline
-    if said is None or least <= baseline <= most:
+    if said is None or least <= baseline <= most or (said == "m" and baseline <= LARGEST_BASELINE):
         return []
     in_other = {unit: baseline / UNITS[said] * each for unit, each in UNITS.items()}
     fitting = [unit for unit, length in in_other.items() if least <= length <= most]
@@ -268,5 +268,8 @@ def _check_unit(rig: StereoRig, metres: float | None) -> list[Finding]:
         return []
     what = f"--unit {said} makes the baseline {baseline * 1e3:.3g} mm"
     ways = " or ".join(f"--unit {unit} ({in_other[unit] * 1e3:.3g} mm)" for unit in fitting)
-    fix = f"say {ways}; if it is right, write the lengths in metres into the files and leave --unit out"
+    fix = (
+        f"say {ways}; if it is right (no endoscope), divide the baseline in the files by "
+        f"{1 / UNITS[said]:.5g} (projection_matrix[3] in right.yaml, or T and P2[0][3]), and say --unit m"
+    )
     return [Finding("error", what, fix)]

@@ -36,7 +36,7 @@ ELEMENTS = {  # what the launch files use, and the Debian package that brings it
     "unixfdsrc": f"{BAD} of GStreamer 1.24",
     "avdec_h264": "gstreamer1.0-libav",
 }
-SEE_PLACE = "see to the path, address or device in the launch string"
+SEE_PLACE = "check the path, address or device in the launch string"
 SEE_STRING = "try the string with gst-launch-1.0; gst-inspect-1.0 ELEMENT lists what an element takes"
 FIXES = (  # what GStreamer says, and what helps
     (r"no element \"(\w+)\"", "install {package}"),

@@ -91,7 +91,7 @@ class _Edge:
             age = (t_ns - self._stamps[-1]) * 1e-9
             raise NoPoseError(
                 "pose_stopped",
-                f"the robot's pose has stopped: the newest is {age:.2f} s older than the picture; see to "
+                f"the robot's pose has stopped: the newest is {age:.2f} s older than the picture; check "
                 "the robot's program, its clock and robot.offset_ms",
             )
         if after == 0 and self._stamps[0] > t_ns:
@@ -108,7 +108,7 @@ class _Edge:
         if jump and self._jumps[jump - 1] > t_ns - JUMP_HELD_NS:
             raise NoPoseError(
                 "pose_jumped",
-                "the robot's pose jumps faster than a scope can move: see to its joints' sensors and its "
+                "the robot's pose jumps faster than a scope can move: check its joints' sensors and its "
                 "base frame",
             )
         share = 0.0 if gap == 0 else (t_ns - self._stamps[before]) / gap
@@ -214,7 +214,7 @@ class PoseTrack:
             there = ", ".join(sorted(self._edges)) or "none"
             raise NoPoseError(
                 "pose_missing",
-                f"no pose of '{self._hand}' in '{self._base}' came yet; frames: {there[:200]}; see to "
+                f"no pose of '{self._hand}' in '{self._base}' came yet; frames: {there[:200]}; check "
                 "robot.topic, robot.base and robot.hand",
             )
         return invert(self._in_root(base, t_ns)) @ self._in_root(hand, t_ns)

@@ -155,8 +155,7 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
         else:
             stop()
 
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as after nohup
-        signal.signal(signal.SIGINT, handle)
+    signal.signal(signal.SIGINT, handle)
     signal.signal(signal.SIGTERM, handle)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         signal.signal(signal.SIGHUP, handle)

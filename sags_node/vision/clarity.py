@@ -26,7 +26,7 @@ FINEST = 0.005  # of the detail: below is rounding
 REMEMBERED_S = 3.0  # s over which what is usual follows
 LASTING_S = 10.0  # s: what has been unclear for so long is how the scene looks now
 
-LENS = "clean the lens, and see to focus and cable"
+LENS = "clean the lens, and check focus and cable"
 SMOKE = Finding(
     "picture_smoke", "smoke or a fogged lens veils the picture, and it is not learnt: clear the view"
 )

@@ -37,7 +37,7 @@ Eyes = tuple[U8, ...]
 
 _FROZEN = Finding(
     "picture_frozen",
-    "the same picture comes again and again, under new stamps: see to the camera, the scope's processor and "
+    "the same picture comes again and again, under new stamps: check the camera, the scope's processor and "
     "the capture card",
 )
 _STILL = Finding(

@@ -34,7 +34,7 @@ REMEMBERED_S = 5.0  # s over which what is usual follows: a lasting loss of matc
 
 _LATE = Finding(
     "eyes_late",
-    "one eye is late beside the other, so there is no depth: see to the capture cards and how frames are "
+    "one eye is late beside the other, so there is no depth: check the capture cards and how frames are "
     "paired; of a recording sags import --check tells by how much",
 )
 _KNOCKED = Finding(

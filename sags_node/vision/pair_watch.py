@@ -35,11 +35,11 @@ MOVED = 1.0  # grey levels, mean: the other eye has moved for sure
 UNMOVED = 1 / 8  # of what changes in the other eye; clear pairs change alike to 1/2, fog leaves 1/4
 
 _TEXTS = {
-    "black": "the {eye} picture is black: see to the light, the lens cap and the cable",
+    "black": "the {eye} picture is black: check the light, the lens cap and the cable",
     "white": "the {eye} picture is white: lower the light or the exposure",
-    "plain": "the {eye} picture is of one colour: see to the lens, the cable and the capture card",
+    "plain": "the {eye} picture is of one colour: check the lens, the cable and the capture card",
     "fogged": f"the {{eye}} picture is fogged or out of focus beside the other: {LENS}",
-    "frozen": "the {eye} picture stands still while the other moves: see to its cable and capture card",
+    "frozen": "the {eye} picture stands still while the other moves: check its cable and capture card",
 }
 _EQUAL = Finding("eyes_equal", "both eyes show the same picture, so there is no depth: connect the other eye")
 _EXCHANGED = Finding(

@@ -48,7 +48,7 @@ NEW_SCENE_NS = 3_000_000_000
 
 _FLOW = OpticalFlow(stride=4)
 
-_DARK = Finding("picture_dark", "the picture is too dark, and is not learnt: see to the light")
+_DARK = Finding("picture_dark", "the picture is too dark, and is not learnt: check the light")
 _BRIGHT = Finding(
     "picture_bright", "the picture is overexposed, and is not learnt: lower the light or the exposure"
 )

@@ -251,6 +251,33 @@ def test_a_wrong_unit_is_refused_and_the_right_one_named(unit: str, said: str, t
     assert_same(load_rig(tmp_path / "out"), make_rig())
 
 
+@pytest.mark.parametrize(("said", "baseline"), [("cm", 0.06), ("inch", 0.09), ("m", 0.15)])
+@pytest.mark.parametrize("form", ["OpenCV", "ROS"])
+def test_a_rig_that_is_no_endoscope_is_taken_as_the_refusal_says(
+    form: str, said: str, baseline: float, tmp_path: Path
+) -> None:
+    """Its baseline reads as that of an endoscope in another unit, which does not make it one."""
+    T_rig = T * (baseline / np.linalg.norm(T))
+
+    def converted(metres: float, unit: str) -> tuple[int, str]:
+        folder = tmp_path / f"{unit}-{metres}"
+        if form == "OpenCV":
+            write_pair(folder, ".yml", PLUMB_BOB, T_rig / metres)
+        else:
+            save_rig(rectify_eyes("rig", SIZE, K, PLUMB_BOB, R, T_rig / metres), folder)
+        size = ("--size", "640x480") if form == "OpenCV" else ()
+        code, _, text = ran("calib", "convert", folder, "-o", tmp_path / "out", *size, "--unit", unit)
+        return code, text
+
+    code, text = converted(UNITS[said], said)
+    if said != "m":  # as where no unit is said
+        assert code == 2 and f"--unit {said} makes the baseline {1e3 * baseline:g} mm" in text
+        (factor,) = re.findall(r"divide the baseline in the files by (\S+) .*, and say --unit m$", text, re.M)
+        code, text = converted(UNITS[said] * float(factor), "m")
+    assert code == 0, text
+    assert load_rig(tmp_path / "out").baseline == pytest.approx(baseline, rel=1e-5)
+
+
 def test_a_unit_that_no_other_one_betters_is_taken(tmp_path: Path) -> None:
     """20 mm: of no endoscope in any unit."""
     folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T * 20 / 5.2e-3)

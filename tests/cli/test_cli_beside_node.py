@@ -17,6 +17,7 @@ import pytest
 from command_line import RUN_HERE, figures_of, pure_json, refused, sags, start, stopped, wait_for
 from places import ROOT
 
+from sags_node.config.schema import LIVE_PARAMETERS
 from sags_node.messaging import introspection as topic
 from sags_node.messaging.received import ReceivedText
 from sags_node.messaging.subscriber import Subscriber
@@ -188,7 +189,9 @@ def test_parameters_are_read_and_set(beside_node: dict[str, Any]) -> None:
     assert figures_of("param", "get", "mapping.budget_ms", "--json") == {"mapping.budget_ms": None}
     assert figures_of("param", "get", "--json")["source"]["kind"] == "folders"
     assert "max_gaussians:" in sags("param", "get", "mapping").stdout
+    assert sags("param", "set", "mapping.budget_ms:=null").stdout == "mapping.budget_ms is null\n"
     assert sags("param", "set", "mapping.budget_ms:=20").stdout == "mapping.budget_ms is 20\n"
+    assert f"Only {', '.join(LIVE_PARAMETERS)} can change" in sags("param", "set", "--help").stdout
     assert sags("param", "get", "mapping.budget_ms").stdout == "20.0\n"
     assert sags("param", "set", "mapping.budget_ms:=null").exit_code == 0
     refused(2, "param", "get", "mapping.budget", said=("unknown key 'mapping.budget'", "budget_ms"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,7 +24,7 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.node.node import Node
 from sags_node.node.service_manager import ServiceManager
 from sags_node.terminal import console as terminal
-from sags_node.terminal.console import interrupt, on_stop_signals, stop_signals
+from sags_node.terminal.console import interrupt, on_stop_signals
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -230,18 +231,17 @@ def test_a_ctrl_c_that_meets_a_finaliser_is_not_lost(stop: threading.Event) -> N
     assert stop.is_set()
 
 
-def test_a_ctrl_c_that_is_ignored_stays_so() -> None:
-    """As after nohup, and in scripts beside `&`."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with stop_signals() as stop:
-            signal.raise_signal(signal.SIGINT)
-            assert not stop.is_set()
-            signal.raise_signal(signal.SIGTERM)
-            assert stop.is_set()
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
+def test_a_script_stops_with_sigint_what_it_started_in_the_background(
+    phantom_session: Path, run_dir: Path
+) -> None:
+    """A shell lets what it starts with `&` ignore it; so would Python."""
+    node = [sys.executable, "-m", "sags_node", "run", str(phantom_session), "source.loop:=true", *RUN_HERE]
+    runs = f"until [ -e {run_dir}/sags.json ]; do sleep 0.1; done"
+    script = f"{shlex.join(node)} --seconds 60 & {runs}; kill -INT $!; wait $!"
+    done = subprocess.run(
+        ["sh", "-c", script], check=True, capture_output=True, text=True, timeout=START_SECONDS + 60
+    )
+    assert "\nstopping\n" in done.stderr
 
 
 def test_a_second_ctrl_c_breaks_off(stop: threading.Event, monkeypatch: pytest.MonkeyPatch) -> None:

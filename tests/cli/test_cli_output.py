@@ -364,7 +364,10 @@ def test_run_prints_nothing_but_json(user_files: Path) -> None:
     result = sags("run", *videos(user_files), "source.frames:=3", "--json")
     assert result.exit_code == 0 and pure_json(result.stdout)["gaussians"] > 100
     assert re.search(r"source: videos .*\n.* \d+x\d+ px at 10 frames/s, .* calibration \S+\n", result.stderr)
-    assert "state" in sags("run", *videos(user_files), "--seconds", "0.3").stdout
+    ended = sags("run", *videos(user_files), "source.frames:=3", "source.pace:=fast").stdout
+    assert re.search(r"^state +ended, 3 of 3 frames published$", ended, re.MULTILINE)
+    looped = sags("run", *videos(user_files), "source.loop:=true", "--seconds", "0.3").stdout
+    assert re.search(r"^state +ended, \d+ frames published$", looped, re.MULTILINE)
 
 
 def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ def refusal(read: Callable[[], object]) -> str:
         ("1: a\n0x1: b\n", "the key 1 is given twice"),
         ('a: "b\\0c"', "line 1: a text holds a zero character"),
         ('"a\\0b": c', "a text holds a zero character"),
+        ('"a\\udce9b"', "line 1: 'a\\udce9b' holds bytes that are no UTF-8 text"),
         ("a: b: c", "line 1: mapping values are not allowed here"),
         ("a: [", "line 1: "),
         ("a: *b", "found undefined alias"),

@@ -21,9 +21,9 @@ from sags_node.sources.source import open_source
 from sags_node.types import U8
 
 FRAMES = 6
+EYES = "left", "right"
 LEFT, RIGHT = (
-    [cv2.imread(str(file)) for file in sorted((SESSION / side).iterdir())[:FRAMES]]
-    for side in ("left", "right")
+    [cv2.imread(str(file)) for file in sorted((SESSION / side).iterdir())[:FRAMES]] for side in EYES
 )
 
 
@@ -96,11 +96,11 @@ def test_what_cannot_be_played_gets_no_file(tmp_path: Path) -> None:
         propose([left, right, left])
 
 
-@pytest.mark.parametrize("name", ["data$", "a $SAGS_DATA b", "${HOME}", "$$", "videos", "bag"])
+@pytest.mark.parametrize("name", ["data$", "a $SAGS_DATA b", "${HOME}", "$$", "a\tb", "videos", "bag"])
 def test_a_path_is_a_path_and_a_word_a_word(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Names with a dollar, and folders that are called as values of keys are."""
+    """Names with a dollar or a tab, and folders that are called as values of keys are."""
     left, right = videos(tmp_path / name, LEFT, RIGHT)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "step").mkdir()
@@ -111,6 +111,20 @@ def test_a_path_is_a_path_and_a_word_a_word(
         source = load_launch(tmp_path / "my own.yaml").source
         assert isinstance(source, VideosSource) and source.pace == "step"
         assert (source.left, source.right) == (left, right)
+
+
+def test_a_name_that_is_no_text_is_refused_before_anything_is_told_of_it(tmp_path: Path) -> None:
+    left, right = videos(tmp_path / "utf-8", LEFT, RIGHT)
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/lat\xe9in"))
+    left.parent.rename(folder)
+    both = folder / left.name, folder / right.name
+    of_both = "source.kind:=videos", *(f"source.{eye}:={file}" for eye, file in zip(EYES, both, strict=True))
+    for command in (("run", folder), ("new", *both), ("import", "--check", folder), ("doctor", *of_both)):
+        code, _, said = ran(*command)
+        assert code == 2 and "holds bytes that are no UTF-8 text" in said and "rename it" in said
+    (folder / "case.mcap").touch()
+    with pytest.raises(UsageError, match=r"no UTF-8 text.*rename it"):
+        load_launch(folder / "case.mcap")
 
 
 def test_a_variable_that_is_not_set_says_how_a_dollar_is_written(tmp_path: Path) -> None:

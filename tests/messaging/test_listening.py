@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import stat
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from independent_client import zmq_socket
 from synthetic import health, publisher, stream
 from waiting import until
 
+from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import publisher as publishing
@@ -126,12 +128,23 @@ def test_a_taken_port_is_named_with_a_way_out(tmp_path: Path) -> None:
 
 
 def test_one_name_one_node(tmp_path: Path) -> None:
-    with (
-        publisher(tmp_path / "run"),
-        pytest.raises(SagsError, match=r"another node already runs as 'sags'.*ns:=NAME"),
-        publisher(tmp_path / "run"),
-    ):
-        pass
+    """A second one is told all the keys that it needs, by its name or by the first port that is taken."""
+    first = PublishConfig(data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=tmp_path / "run")
+    with Publisher(first, "sags", "session", {}) as running:
+        data, control = running.connection.data[1], running.connection.control
+        same = first.model_copy(update={"data": (data,), "control": control})
+        other_data = same.model_copy(update={"data": first.data})
+        for config, ns, said in (
+            (same, "sags", "another node already runs as 'sags' .* ns:=NAME "),
+            (same, "other", f"{data} is already in use"),
+            (other_data, "other", f"{control} is already in use"),
+        ):
+            with pytest.raises(SagsError, match=said) as refused, Publisher(config, ns, "session", {}):
+                pass
+            keys = [word for word in shlex.split(str(refused.value)) if word.startswith("publish.")]
+            followed = load_launch(None, [*keys, f"publish.run_dir:={first.run_dir}"]).publish
+            with Publisher(followed, "other", "session", {}) as second:
+                assert len(second.connection.data) == 2 and second.connection.control not in (None, control)
     with publisher(tmp_path / "run"):
         pass
 

@@ -82,7 +82,6 @@ def random_stop(chance: random.Random) -> Stop:
 
 def main(count: int, seed: int = 0) -> int:
     """Try so many moments; how many went wrong."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # else nodes ignore it beside `&` in a script
     chance, failed = random.Random(seed), 0
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session"

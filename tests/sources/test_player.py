@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -85,6 +87,13 @@ def test_who_asks_a_played_bag_for_something_is_told_what_it_is(plane_bag: Path,
             run_overlay(OverlayOptions(NodeAddress(run_dir=run_dir), "drawn", seconds=30))
         with pytest.raises(SagsError, match=told), ControlClient(run_dir=run_dir) as client:
             client.request("add_anchor", {"u": 10, "v": 10})
+
+
+def test_a_bag_whose_name_is_no_text_is_refused(plane_bag: Path, tmp_path: Path) -> None:
+    named = Path(os.fsdecode(os.fsencode(tmp_path) + b"/lat\xe9in"))
+    shutil.copytree(plane_bag, named)
+    refused = sags("bag", "play", named, "--endpoint", "tcp://127.0.0.1:*")
+    assert refused.exit_code == 2 and "no UTF-8 text" in refused.output and "rename it" in refused.output
 
 
 def test_a_taken_port_is_named_with_the_option_that_takes_another(plane_bag: Path, tmp_path: Path) -> None:

@@ -187,20 +187,42 @@ def test_stamps_that_begin_anew_are_passed_over(tmp_path: Path, caplog: pytest.L
 
 
 @pytest.mark.parametrize(
-    ("name", "how"),
+    ("name", "how", "lost"),
     [
-        ("a.mp4", {"muxer": {"movflags": "faststart"}}), ("a.mkv", {}),
-        ("a.avi", {"codec": "mjpeg", "pixels": "yuvj420p"}),
+        ("a.mp4", {"muxer": {"movflags": "faststart"}}, 0.5),
+        ("a.avi", {"codec": "mjpeg", "pixels": "yuvj420p"}, 0.5),
+        ("a.mkv", {}, 0.5), ("a.mkv", {}, 0.02),
+        ("a.webm", {"codec": "libvpx", "options": {"deadline": "realtime"}}, 0.02),
+        ("a.ts", {}, 0.5), ("a.ts", {}, 0.02), ("a.mts", {"format": "mpegts"}, 0.02),
+        ("a.m2ts", {"format": "mpegts", "muxer": {"mpegts_m2ts_mode": "1"}}, 0.3),
+        ("a.vob", {"codec": "mpeg2video"}, 0.1),
     ],
 )  # fmt: skip
 def test_a_file_that_is_cut_off_is_told_from_a_whole_one(
-    tmp_path: Path, name: str, how: dict[str, object]
+    tmp_path: Path, name: str, how: dict[str, object], lost: float
 ) -> None:
     whole = write(tmp_path / name, pictures(range(120)), **how)  # type: ignore[arg-type]
     assert not Video(whole).cut_off
-    (tmp_path / f"cut-{name}").write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    video = Video(tmp_path / f"cut-{name}")
+    size = whole.stat().st_size
+    cut = tmp_path / f"cut-{name}"
+    cut.write_bytes(whole.read_bytes()[: size - int(lost * size) | 1])  # within a packet
+    video = Video(cut)
     assert 0 < video.count < 120 and "cut off" in video.cut_off
+    shown = [video.read(number) for number in range(video.count)]
+    assert video.stamps is not None  # of pictures that refer to later ones the last may be missing
+    numbers = np.rint((video.stamps - video.stamps[0]) * (RATE * 1e-9)).tolist()
+    assert [number_in(picture) for picture in shown if picture is not None] == numbers
+
+
+@pytest.mark.parametrize(("name", "muxer"), [("a.mkv", {"live": "1"}), ("a.ts", {})])
+def test_a_file_that_its_recorder_never_ended_is_not_called_cut_off(
+    tmp_path: Path, name: str, muxer: dict[str, str]
+) -> None:
+    """It says no length; what comes before the first packet of a stream is no packet."""
+    file = write(tmp_path / name, pictures(range(120)), muxer=muxer)
+    if name == "a.ts":
+        file.write_bytes(bytes(100) + file.read_bytes())
+    assert (Video(file).count, Video(file).cut_off) == (120, "")
 
 
 def test_a_file_whose_pictures_change_size_says_where(tmp_path: Path) -> None:

@@ -121,11 +121,11 @@ def _exchanged(frame: StereoFrame) -> StereoFrame:
 
 
 WRONG: dict[str, tuple[Spoil, str]] = {
-    "black left": (lambda f: replace(f, left=np.zeros_like(f.left)), "the left picture is black: see to"),
+    "black left": (lambda f: replace(f, left=np.zeros_like(f.left)), "the left picture is black: check"),
     "noisy black": (lambda f: replace(f, right=_plain(f, (4, 4, 4), 6.0)), "the right picture is black"),
     "video black": (lambda f: replace(f, right=_plain(f, (16, 16, 16))), "the right picture is black"),
     "white": (lambda f: replace(f, right=_plain(f, (255, 255, 255))), "the right picture is white: lower"),
-    "blue": (lambda f: replace(f, left=_plain(f, (0, 0, 200))), "the left picture is of one colour: see to"),
+    "blue": (lambda f: replace(f, left=_plain(f, (0, 0, 200))), "the left picture is of one colour: check"),
     "grey": (lambda f: replace(f, right=_plain(f, (128, 128, 128))), "the right picture is of one colour"),
     "both black": (both(np.zeros_like), "the left picture is black"),
     "one eye twice": (lambda f: replace(f, right=f.left), "both eyes show the same picture"),

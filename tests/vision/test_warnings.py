@@ -40,7 +40,7 @@ from sags_node.terminal.notices import Notices
 from sags_node.types import Camera, Finding, NodeHealth
 from sags_node.viewer.feed import Moment, Status
 
-BLACK = Finding("right_eye_black", "the right picture is black: see to the light")
+BLACK = Finding("right_eye_black", "the right picture is black: check the light")
 ROWS = Finding("rows_differ", "rows of the eyes differ by 1.2 px: the calibration no longer fits")
 
 
@@ -105,7 +105,7 @@ def test_a_code_that_nobody_could_look_up_is_refused() -> None:
 
 
 def test_codes_stand_beside_the_words() -> None:
-    black, other = BLACK, Finding("left_eye_plain", "the left picture is of one colour: see to the lens")
+    black, other = BLACK, Finding("left_eye_plain", "the left picture is of one colour: check the lens")
     said = replace(health(), warnings=by_stage([black, ROWS, other]))
     fields = json.loads(json.dumps(status(said, None)))
     assert fields["warnings"] == {"eyes": f"{black.text}; {other.text}", "calibration": ROWS.text}
