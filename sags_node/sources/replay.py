@@ -300,5 +300,5 @@ def refuse_one_eye_twice(left: U8, right: U8 | None) -> None:
     if shifted > LEAST and float(np.abs(a - b).mean()) < SURELY * shifted:
         raise UsageError(
             "both eyes get the same picture, so there is no depth; name the other eye's camera or file in "
-            "source.right, or see to the cables"
+            "source.right, or check the cables"
         )
