@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from sags_node.calibration.rows import FEWEST_MATCHES, rectified_rows
-from sags_node.rig.check import Finding
+from sags_node.checks import Finding
 from sags_node.types import F32, F64, StereoRig
 
 NOTICED = 0.1  # px of the full picture: what reference depths and matches are good for

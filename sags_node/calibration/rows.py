@@ -14,9 +14,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from sags_node.checks import Finding
 from sags_node.config.units import fitting_units, in_metres
 from sags_node.rig import already_rectified, rectifies, rectify_eyes
-from sags_node.rig.check import ENDOSCOPE_BASELINE, RECALIBRATE, Finding, size_made_for
+from sags_node.rig.check import ENDOSCOPE_BASELINE, RECALIBRATE, size_made_for
 from sags_node.types import F64, Eye, StereoRig
 
 FEWEST_MATCHES = 30

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, check_files, force_option, launch_argument, positive, split
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    force_option,
+    launch_argument,
+    positive,
+    show_findings,
+    split,
+)
 from sags_node.config.units import UNITS
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
@@ -132,14 +140,10 @@ def check(
     if stray is not None:
         raise UsageError(f"'{stray}': one calibration at a time; pictures come after --images or --session")
     with progress("comparing") as advance:
-        findings = check_calibration(
-            path, session, images, overrides_only, size, UNITS.get(unit or ""), advance
-        )
+        metres = UNITS.get(unit or "")
+        findings = check_calibration(path, session, images, overrides_only, size, metres, advance)
     rows = [asdict(finding) for finding in findings]
-    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
-    show(rows if json_out else text.rows_table(people))
-    if any(finding.level == "error" for finding in findings):
-        raise SagsError(f"{path} cannot be used as it is; see the fixes above")
+    show_findings(rows, json_out, f"{path} cannot be used as it is")
 
 
 @calib.command()
@@ -160,7 +164,8 @@ def convert(
     sags calib convert calibrationdata.tar.gz -o calib/mine
     """
     from sags_node.calibration.check import read_calibration
-    from sags_node.rig import check_rig, eye_files, refuse_errors, resized_rig, save_rig
+    from sags_node.checks import refuse_errors
+    from sags_node.rig import check_rig, eye_files, resized_rig, save_rig
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
@@ -198,6 +198,17 @@ def show_verdict(lines: Sequence[tuple[str, str]]) -> None:
     for what, said in lines:
         table.add_row(what, said)
     show(table)
+
+
+def show_findings(rows: Sequence[Mapping[str, Any]], json_out: bool, wrong: str) -> None:
+    """Print what was looked at, each with its fix.
+
+    Raises:
+        SagsError: one is an error; `wrong` says of what.
+    """
+    show(list(rows) if json_out else text.findings_table(rows))
+    if any(row["level"] == "error" for row in rows):
+        raise SagsError(f"{wrong}; see the fixes above")
 
 
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:

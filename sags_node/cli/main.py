@@ -28,6 +28,7 @@ from sags_node.cli.launching import (
     launch_argument,
     open_launched,
     positive,
+    show_findings,
     show_outcome,
     split,
     split_recording,
@@ -40,7 +41,6 @@ from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.plotting import check_plots
-from sags_node.terminal import text
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
 
 if TYPE_CHECKING:
@@ -309,11 +309,8 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     from sags_node.config.launch_file import load_launch
     from sags_node.doctor import as_rows, examine
 
-    checks = examine(load_launch(*split(launch)))
-    rows = as_rows(checks)
-    show(rows if json_out else text.rows_table(rows))
-    if any(check.level == "error" for check in checks):
-        raise SagsError("something the node needs is missing; see the fixes above")
+    rows = as_rows(examine(load_launch(*split(launch))))
+    show_findings(rows, json_out, "something the node needs is missing")
 
 
 @main.command("import")
@@ -342,12 +339,8 @@ def import_folder(folder: Path, overrides: tuple[str, ...], json_out: bool) -> N
 
     from sags_node.importing.check import check_folder as look_over
 
-    findings = look_over(folder, overrides)
-    rows = [asdict(finding) for finding in findings]
-    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
-    show(rows if json_out else text.rows_table(people))
-    if any(finding.level == "error" for finding in findings):
-        raise SagsError(f"{folder} cannot be played as it is; see the fixes above")
+    rows = [asdict(finding) for finding in look_over(folder, overrides)]
+    show_findings(rows, json_out, f"{folder} cannot be played as it is")
 
 
 @main.command("bench", hidden=True, context_settings={"ignore_unknown_options": True})
