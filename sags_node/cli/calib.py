@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,10 +13,14 @@ from rich.markup import escape
 from sags_node.cli.launching import (
     as_json,
     check_files,
+    file_option,
     force_option,
+    group_of,
     launch_argument,
+    path_option,
     positive,
     show_findings,
+    shown,
     split,
 )
 from sags_node.config.units import UNITS
@@ -33,13 +36,7 @@ OUT = ("-o", "--out", "--output")
 EYES = Path("eyes.png")
 
 path_argument = click.argument("path", type=click.Path(path_type=Path))
-out_option = click.option(
-    *OUT,
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FOLDER",
-    help="Gets left.yaml and right.yaml.",
-)
+out_option = path_option(*OUT, required=True, metavar="FOLDER", help="Gets left.yaml and right.yaml.")
 
 
 def _sides(ctx: click.Context, option: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -53,43 +50,34 @@ def _sides(ctx: click.Context, option: click.Parameter, value: str | None) -> tu
     return int(found[1]), int(found[2])
 
 
-def reading_options(command: Callable[..., None]) -> Callable[..., None]:
-    """For forms of calibration that leave something out."""
-    size = click.option(
+reading_options = group_of(  # for forms of calibration that leave something out
+    click.option(
         "--size",
         callback=_sides,
         metavar="WxH",
         help="Picture size, for forms that do not say it; default: the pictures'.",
-    )
-    unit = click.option(
+    ),
+    click.option(
         "--unit",
         type=click.Choice(list(UNITS)),
         help="Of lengths in the files; default: mm for text matrices, else m.",
-    )
-    return size(unit(command))
-
-
-def board_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Which board is seen; as `_board` takes them."""
-    options = (
-        click.option(
-            "--board",
-            type=click.Choice(["chessboard", "charuco"]),
-            default="chessboard",
-            show_default=True,
-            help="What is printed on it.",
-        ),
-        click.option(
-            "--squares", callback=_sides, required=True, metavar="CxR", help="Columns and rows of squares."
-        ),
-        click.option("--square-mm", type=positive, required=True, help="Side of a square."),
-        click.option("--marker-mm", type=positive, help="Side of a marker; charuco only."),
-        click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only."),
-        click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only."),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+    ),
+)
+board_options = group_of(  # which board is seen; as `_board` takes them
+    shown(
+        "--board",
+        type=click.Choice(["chessboard", "charuco"]),
+        default="chessboard",
+        help="What is printed on it.",
+    ),
+    click.option(
+        "--squares", callback=_sides, required=True, metavar="CxR", help="Columns and rows of squares."
+    ),
+    click.option("--square-mm", type=positive, required=True, help="Side of a square."),
+    click.option("--marker-mm", type=positive, help="Side of a marker; charuco only."),
+    click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only."),
+    click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only."),
+)
 
 
 @click.group()
@@ -100,7 +88,7 @@ def calib() -> None:
 @calib.command()
 @path_argument
 @click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
-@click.option("--session", type=click.Path(path_type=Path), help="Launch file or session to compare with.")
+@path_option("--session", help="Launch file or session to compare with.")
 @click.option(
     "--images",
     type=(click.Path(path_type=Path), click.Path(path_type=Path)),
@@ -182,10 +170,9 @@ def convert(
 
 @calib.command("live")
 @launch_argument
-@click.option("--seconds", type=positive, default=2.0, show_default=True, help="To watch.")
-@click.option(
+@shown("--seconds", type=positive, default=2.0, help="To watch.")
+@file_option(
     *OUT,
-    type=click.Path(path_type=Path, dir_okay=False),
     default=EYES,
     show_default=True,
     metavar="FILE.png",
@@ -228,23 +215,21 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
 
 @calib.command()
 @click.argument("folders", nargs=-1, type=click.Path(path_type=Path), metavar="[LEFT_FOLDER RIGHT_FOLDER]")
-@click.option("--live", type=click.Path(path_type=Path), metavar="LAUNCH", help="Take the pictures here.")
+@path_option("--live", metavar="LAUNCH", help="Take the pictures here.")
 @board_options
-@click.option(
+@shown(
     "--coefficients",
     type=click.Choice(["2", "3", "6"]),
     default="2",
-    show_default=True,
     help="Of radial distortion: 2 and 3 plumb_bob, 6 rational_polynomial.",
 )
-@click.option("--views", type=click.IntRange(6), default=25, show_default=True, help="To take; --live only.")
+@shown("--views", type=click.IntRange(6), default=25, help="To take; --live only.")
 @out_option
 @force_option
 @as_json
 def stereo(
     folders: tuple[Path, ...],
     live: Path | None,
-    squares: tuple[int, int],
     coefficients: str,
     views: int,
     out: Path,
@@ -268,7 +253,7 @@ def stereo(
 
     if (live is None) != (len(folders) == 2) or (live is not None and folders):
         raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
-    board = _board(squares, **board_of)
+    board = _board(**board_of)
     check_files(*eye_files(out), force=force)
     left, right = folders if live is None else _grab(live, board, out / "views", views)
     with progress("looking for the board") as advance:
@@ -282,21 +267,12 @@ def stereo(
 @calib.command("hand-eye")
 @launch_argument
 @board_options
-@click.option(
-    "--views", type=click.IntRange(10, 1000), default=80, show_default=True, help="Spread over the recording."
-)
-@click.option(
-    *OUT,
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FOLDER",
-    help="The rig's folder; gets hand_eye.yaml.",
-)
+@shown("--views", type=click.IntRange(10, 1000), default=80, help="Spread over the recording.")
+@path_option(*OUT, required=True, metavar="FOLDER", help="The rig's folder; gets hand_eye.yaml.")
 @force_option
 @as_json
 def hand_eye(
     launch: tuple[str, ...],
-    squares: tuple[int, int],
     views: int,
     out: Path,
     force: bool,
@@ -321,7 +297,7 @@ def hand_eye(
 
     path, overrides = split(launch)
     config = load_launch(path, overrides)
-    board = _board(squares, **board_of)
+    board = _board(**board_of)
     check_files(out / FILE, force=force)
     with progress("looking for the board") as advance:
         solution = calibrate_hand_eye(config, rig_of(config), board, views, advance)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from sags_node.config.schema import Source
     from sags_node.engine.device import Device
     from sags_node.pipeline.session import Session
+
+
+Command = Callable[..., Any]
 
 
 class Number(click.FloatRange):
@@ -40,18 +43,29 @@ launch_argument = click.argument(
 )
 as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
 all_figures = click.option("-v", "--verbose", is_flag=True, help="Print all figures, not the verdict alone.")
-lpips_option = click.option(
-    "--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights."
-)
-
-
+shown = partial(click.option, show_default=True)  # an option whose help tells its default
+path_option = partial(click.option, type=click.Path(path_type=Path))
 file_option = partial(click.option, type=click.Path(path_type=Path, dir_okay=False))
+folder_option = partial(click.option, metavar="FOLDER", type=click.Path(path_type=Path, file_okay=False))
+lpips_option = path_option("--lpips-weights", help="npz of LPIPS SqueezeNet weights.")
 figures_option = file_option(
     *("-o", "--out"),
     metavar="FILE.json",
     help="Write the figures as JSON. Earlier ones are replaced, any other file that is there is not.",
 )
 force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
+STEPWISE = ("source.loop:=false", "source.pace:=step")  # every frame of a recording, in turn
+
+
+def group_of(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Make one decorator of several options; their help is in this order."""
+
+    def decorate(command: Command) -> Command:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
 
 
 def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -108,6 +122,12 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
     if isinstance(load_launch(path, overrides).source, LiveSource):
         raise UsageError(no_cameras)
     return path, overrides
+
+
+def open_stepwise(arguments: Sequence[str], no_cameras: str) -> Session:
+    """Open a recording of which every frame is taken, in turn; see `split_recording` and `open_launched`."""
+    path, overrides = split_recording(arguments, no_cameras)
+    return open_launched(path, [*overrides, *STEPWISE])
 
 
 def open_launched(path: str | None, overrides: Sequence[str], guess: bool = False) -> Session:
@@ -209,6 +229,11 @@ def show_findings(rows: Sequence[Mapping[str, Any]], json_out: bool, wrong: str)
     show(list(rows) if json_out else text.findings_table(rows))
     if any(row["level"] == "error" for row in rows):
         raise SagsError(f"{wrong}; see the fixes above")
+
+
+def show_rows(rows: Sequence[dict[str, Any]], json_out: bool) -> None:
+    """Print records that share their keys."""
+    show(list(rows) if json_out else text.rows_table(rows))
 
 
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:

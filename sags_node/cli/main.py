@@ -27,14 +27,16 @@ from sags_node.cli.launching import (
     as_json,
     launch_argument,
     open_launched,
+    path_option,
     positive,
     show_findings,
     show_outcome,
+    shown,
     split,
     split_recording,
 )
 from sags_node.cli.new import new
-from sags_node.cli.node_options import node_options, ns_option
+from sags_node.cli.node_options import node_options, ns_option, own_control_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
@@ -173,10 +175,9 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
 
 @main.command()
 @launch_argument
-@click.option("--seconds", type=positive, default=10.0, show_default=True, help="How long it plays.")
-@click.option(
+@shown("--seconds", type=positive, default=10.0, help="How long it plays.")
+@path_option(
     *("-o", "--out"),
-    type=click.Path(path_type=Path),
     default=Path("out/demo"),
     show_default=True,
     help="Folder for report.html, sheet.png and overlay.mp4; older ones are replaced.",
@@ -243,14 +244,7 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
 
 @main.command()
 @click.argument("name")
-@click.option(
-    "-o",
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path(),
-    show_default=True,
-    help="Folder for both files.",
-)
+@path_option("-o", "--out", default=Path(), show_default=True, help="Folder for both files.")
 def keygen(name: str, out: Path) -> None:
     """Make a key pair for a node or for a client.
 
@@ -275,7 +269,7 @@ def keygen(name: str, out: Path) -> None:
 
 
 @main.command()
-@click.option("--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file.")
+@own_control_option
 @ns_option
 @node_options
 @as_json
@@ -314,13 +308,8 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
 
 
 @main.command("import")
-@click.option(
-    "--check",
-    "folder",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FOLDER",
-    help="Look it over; nothing is changed.",
+@path_option(
+    *("--check", "folder"), required=True, metavar="FOLDER", help="Look it over; nothing is changed."
 )
 @click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
 @as_json

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sags_node.cli.launching import as_json, positive
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.launching import as_json, positive, shown
+from sags_node.cli.node_options import data_options
 from sags_node.terminal import text
 from sags_node.terminal.console import show, tell
 
@@ -25,10 +25,8 @@ def topic() -> None:
 
 
 @topic.command("list")
-@endpoint_option
-@ns_option
-@node_options
-@click.option("--seconds", type=positive, default=3.0, show_default=True, help="How long to listen.")
+@data_options
+@shown("--seconds", type=positive, default=3.0, help="How long to listen.")
 @as_json
 def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
     """Every topic with its type, and the rate and size of what was heard.
@@ -45,9 +43,7 @@ def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
 
 @topic.command("echo")
 @click.argument("name")
-@endpoint_option
-@ns_option
-@node_options
+@data_options
 @click.option("--count", type=click.IntRange(1), help="Stop after so many messages; default: Ctrl-C.")
 @as_json
 def topic_echo(name: str, count: int | None, json_out: bool, node: NodeAddress) -> None:
@@ -68,10 +64,8 @@ def _measuring(name: str, doc: str, *more: Callable[..., Any]) -> None:
 
     @topic.command(name, help=doc)
     @click.argument("topic_name", metavar="NAME")
-    @endpoint_option
-    @ns_option
-    @node_options
-    @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
+    @data_options
+    @shown("--seconds", type=positive, default=5.0, help="How long to listen.")
     @as_json
     def command(topic_name: str, json_out: bool, **asked: Any) -> None:
         from sags_node.messaging import introspection as tool
