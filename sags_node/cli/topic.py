@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -59,7 +59,7 @@ def topic_echo(name: str, count: int | None, json_out: bool, node: NodeAddress) 
         show(message if json_out else text.echo_text(message))
 
 
-def _measuring(name: str, doc: str, *more: Callable[..., Any]) -> None:
+def _measuring(name: Literal["hz", "bw", "delay"], doc: str, *more: Callable[..., Any]) -> None:
     """The commands that listen to one topic for a while; `more` are options of one alone."""
 
     @topic.command(name, help=doc)
@@ -70,7 +70,7 @@ def _measuring(name: str, doc: str, *more: Callable[..., Any]) -> None:
     def command(topic_name: str, json_out: bool, **asked: Any) -> None:
         from sags_node.messaging import introspection as tool
 
-        figures = getattr(tool, f"topic_{name}")(topic_name, **asked)
+        figures = tool.topic_figures(name, topic_name, **asked)
         show(figures if json_out else getattr(text, f"{name}_text")(figures))
 
     for option in more:
