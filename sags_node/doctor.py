@@ -10,7 +10,7 @@ import importlib.metadata
 import os
 import platform
 import socket
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -267,7 +267,7 @@ def _port(endpoint: str, config: Guarded, section: str = "publish") -> Finding:
             return Finding("warning", str(error), fix)
 
 
-def _keys(key: Path, allow: Path | None) -> Finding:
+def _keys(key: Path, allow: Sequence[Path]) -> Finding:
     try:
         read_key_pair(key)
         allowed = read_allow_list(allow)

@@ -105,7 +105,7 @@ def export(
     from sags_node.export.played import KINDS, new_folder, write_played
 
     played, targets = (
-        {kind: path for kind in kinds if (path := files.get(kind)) is not None}
+        {kind: file for kind in kinds if (file := files.get(kind)) is not None}
         for kinds in (KINDS, work.KINDS)
     )
     words = played_instead(launch, session)

@@ -220,20 +220,20 @@ def show_verdict(lines: Sequence[tuple[str, str]]) -> None:
     show(table)
 
 
-def show_findings(rows: Sequence[Mapping[str, Any]], json_out: bool, wrong: str) -> None:
+def show_findings(rows: list[dict[str, Any]], json_out: bool, wrong: str) -> None:
     """Print what was looked at, each with its fix.
 
     Raises:
         SagsError: one is an error; `wrong` says of what.
     """
-    show(list(rows) if json_out else text.findings_table(rows))
+    show(rows if json_out else text.findings_table(rows))
     if any(row["level"] == "error" for row in rows):
         raise SagsError(f"{wrong}; see the fixes above")
 
 
-def show_rows(rows: Sequence[dict[str, Any]], json_out: bool) -> None:
+def show_rows(rows: list[dict[str, Any]], json_out: bool) -> None:
     """Print records that share their keys."""
-    show(list(rows) if json_out else text.rows_table(rows))
+    show(rows if json_out else text.rows_table(rows))
 
 
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:
