@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,13 +70,12 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     def with_common(
         node: NodeAddress, overlay_ns: str, json_out: bool, **rest: Any,
     ) -> None:  # fmt: skip
-        from sags_node.bridge.feed import Place
+        from sags_node.messaging.address import NodeAddress
         from sags_node.messaging.node_clock import NodeClock
 
         remote = node.endpoint is not None and node.control is not None
         clock = NodeClock.at(node) if remote else None
-        place = Place(node.ns, node.endpoint, node.control, node.run_dir, node.keys, clock)
-        overlay = Place(overlay_ns, run_dir=node.run_dir, clock=clock)  # its stamps are the node's
+        overlay = NodeAddress(overlay_ns, run_dir=node.run_dir, clock=clock)  # its stamps are the node's
         stop = threading.Event()
 
         def say(words: str, fields: Mapping[str, Any]) -> None:
@@ -86,7 +86,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
 
         on_stop_signals(stop.set)
         with clock or nullcontext():
-            command(node=place, overlay=overlay, say=say, stop=stop, **rest)
+            command(node=replace(node, clock=clock), overlay=overlay, say=say, stop=stop, **rest)
 
     return with_common
 
@@ -228,13 +228,13 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
 
     unixfdsink, for dVRK's sockets, needs GStreamer 1.24.
     """
-    from sags_node.bridge.feed import Place
     from sags_node.bridge.gst import GstOptions, run_gst
+    from sags_node.messaging.address import NodeAddress
 
     stop = threading.Event()
     on_stop_signals(stop.set)
     ready = partial(console.print, "writing as soon as an overlay is there  (Ctrl-C ends)")
-    run_gst(GstOptions(Place(overlay_ns, run_dir=run_dir), **options), ready, stop)
+    run_gst(GstOptions(NodeAddress(overlay_ns, run_dir=run_dir), **options), ready, stop)
 
 
 @bridge.command()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
@@ -54,6 +56,14 @@ class Address:
     keys: ClientKeys | None = None
 
 
+class Clock(Protocol):
+    """A clock of another machine: `node_clock.NodeClock`."""
+
+    @property
+    def problem(self) -> str | None: ...
+    def latest_ns(self) -> int: ...
+
+
 @dataclass(frozen=True, slots=True)
 class NodeAddress:
     """Where a sender is: a node, an overlay, a player. A socket that is not given is in the connection file.
@@ -63,6 +73,7 @@ class NodeAddress:
         endpoint: its data socket.
         control: its control socket.
         run_dir: of its connection file; default: the user's own.
+        clock: that stamps what it sends, where that is another machine's.
     """
 
     ns: str = "sags"
@@ -70,6 +81,11 @@ class NodeAddress:
     control: str | None = None
     run_dir: Path | None = None
     keys: ClientKeys | None = None
+    clock: Clock | None = None
+
+    def now_ns(self) -> int:
+        """What the clock that stamps what it sends shows now, at the latest."""
+        return time.time_ns() if self.clock is None else self.clock.latest_ns()
 
     def data(self) -> Address:
         """The data socket given, or the quickest one in the connection file.

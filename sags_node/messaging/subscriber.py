@@ -23,9 +23,8 @@ import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
-from sags_node.messaging.address import Address, ClientKeys, NodeAddress
+from sags_node.messaging.address import Address, ClientKeys, Clock, NodeAddress
 from sags_node.messaging.freshness import Freshness, StaleError
-from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
@@ -75,7 +74,7 @@ class Receiver:
         rates: Mapping[str, float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
         keys: ClientKeys | None = None,
-        clock: NodeClock | None = None,
+        clock: Clock | None = None,
         paused: bool = False,
         patience: float | None = None,
     ) -> None:
@@ -106,7 +105,8 @@ class Receiver:
     @classmethod
     def at(cls, node: NodeAddress, names: Iterable[str], **options: Any) -> Self:
         """Subscribes to this node, which runs; see the class."""
-        return cls(names, node.endpoint, node.ns, node.run_dir, keys=node.keys, **{"patience": 0.0} | options)
+        usual = {"keys": node.keys, "clock": node.clock, "patience": 0.0}
+        return cls(names, node.endpoint, node.ns, node.run_dir, **usual | options)
 
     @property
     def endpoint(self) -> str:
