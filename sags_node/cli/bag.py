@@ -17,15 +17,17 @@ from rich.markup import escape
 
 from sags_node.cli import bag_text as say
 from sags_node.cli.launching import (
+    STEPWISE,
     as_json,
     from_zero,
     launch_argument,
-    open_stepwise,
+    open_launched,
     path_option,
     played_instead,
     positive,
     session_option,
     shown,
+    split_recording,
 )
 from sags_node.cli.node_options import data_options, ns_option
 from sags_node.errors import SagsError, UsageError
@@ -191,9 +193,11 @@ def record(
 def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
     from sags_node.cli.played_bag import record_session
 
+    no_cameras = "live cameras are recorded from the running node; name no recording"
+    path, overrides = split_recording(launch, no_cameras)
     if options.folder.exists():
         raise UsageError(f"{options.folder} exists already; name a new folder")
-    opened = open_stepwise(launch, "live cameras are recorded from the running node; name no recording")
+    opened = open_launched(path, [*overrides, *STEPWISE])
     with progress("recording") as advance:
         return record_session(opened, options, advance)
 

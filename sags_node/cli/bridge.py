@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 INSTALL = "install it with: pip install 'sags-node[bridges]'"
 
 max_age_option = partial(shown, "--max-age", type=positive, default=0.4)
+Ready = Callable[[str, int], None]  # host and port, once peers can come
 Say = Callable[[str, Mapping[str, Any]], None]  # in words, and as fields for machines
 
 log = logging.getLogger(__name__)
@@ -67,9 +68,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     @max_age_option(help="Seconds since capture after which a picture is taken back.")
     @as_json
     @wraps(command)
-    def with_common(
-        node: NodeAddress, overlay_ns: str, json_out: bool, **rest: Any,
-    ) -> None:  # fmt: skip
+    def with_common(node: NodeAddress, overlay_ns: str, json_out: bool, **rest: Any) -> None:
         from sags_node.messaging.address import NodeAddress
         from sags_node.messaging.node_clock import NodeClock
 
@@ -147,7 +146,7 @@ def _check_installed(module: str, package: str, command: str) -> None:
     default=16,
     help="Pixels between two corners of the surface.",
 )
-def openigtlink(send: str, **options: Any) -> None:
+def openigtlink(send: str, ready: Ready, stop: threading.Event, **options: Any) -> None:
     """Serve 3D Slicer, PLUS and others that speak OpenIGTLink.
 
     Devices SagsPicture, SagsRender, SagsOverlay (IMAGE), SagsSurface (POLYDATA), SagsAnchors (POINT),
@@ -165,7 +164,6 @@ def openigtlink(send: str, **options: Any) -> None:
     _check_installed("pyigtl", "pyigtl", "openigtlink")
     from sags_node.bridge.openigtlink import IgtlOptions, run_openigtlink
 
-    ready, stop = options.pop("ready"), options.pop("stop")
     chosen = tuple(name for name in send.split(",") if name)
     os.nice(NICENESS)
     run_openigtlink(IgtlOptions(send=chosen, **options), ready, stop)
@@ -182,7 +180,7 @@ def openigtlink(send: str, **options: Any) -> None:
     metavar="URL",
     help="Pages from there may connect too, e.g. https://or.example.org; repeatable.",
 )
-def web(**options: Any) -> None:
+def web(ready: Ready, stop: threading.Event, **options: Any) -> None:
     """Serve web pages, Unity and others by WebSocket.
 
     The messages are the node's own, byte for byte, with their header as JSON. http://127.0.0.1:8766 shows the
@@ -201,7 +199,6 @@ def web(**options: Any) -> None:
     _check_installed("websockets", "websockets", "web")
     from sags_node.bridge.web import WebOptions, run_web
 
-    ready, stop = options.pop("ready"), options.pop("stop")
     run_web(WebOptions(**options), ready, stop)
 
 
@@ -243,7 +240,7 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
 @click.option("--rate", type=positive, help="Hz of each topic, at most; default: all that come.")
 @click.option("--pin", is_flag=True, help="Let peers pin anchors: a click in the 3D panel.")
 @file_option("--layout", metavar="FILE.json", help="Write the layout for this namespace, and end.")
-def foxglove(layout: Path | None, **options: Any) -> None:
+def foxglove(layout: Path | None, ready: Ready, stop: threading.Event, **options: Any) -> None:
     """Serve Foxglove: every topic live, on ws://127.0.0.1:8765.
 
     Topics come as the node sends them, and pictures as H.264 too where PyAV is there (.../h264): for a thin
@@ -260,7 +257,6 @@ def foxglove(layout: Path | None, **options: Any) -> None:
     Needs: pip install 'sags-node[bridges]'
     """
     _check_installed("foxglove", "foxglove-sdk", "foxglove")
-    ready, stop = options.pop("ready"), options.pop("stop")
     if layout is not None:
         from sags_node.bridge.foxglove_layout import layout_of
 

@@ -18,7 +18,6 @@ from sags_node.cli.launching import (
     from_zero,
     launch_argument,
     open_launched,
-    open_stepwise,
     played_instead,
     positive,
     session_option,
@@ -114,27 +113,26 @@ def export(
             f"--{next(iter(played))} exports all frames: name a recording, and leave out --mesh, --points, "
             "--splats, --orbit, --sequence, --at, --fit"
         )
-    if played and words is not None:
-        for kind, target in played.items():
-            if KINDS[kind].is_folder:
-                new_folder(target)
-            else:
-                check_files(target, force=force)
-        opened = open_stepwise(words, NO_CAMERAS)
-        with progress("exporting") as advance:
-            rows = write_played(opened, played, advance)
-        show_rows(rows, json_out)
-        return
-    if sequence is None:
+    for kind, target in played.items():
+        if KINDS[kind].is_folder:
+            new_folder(target)
+        else:
+            check_files(target, force=force)
+    if sequence is None and not played:
         work.check_targets(targets, force)
-    elif targets or at is not None or words is None:
+    elif sequence is not None and (targets or at is not None or words is None):
         raise UsageError("--sequence exports all frames: name a recording, no --at and no other files")
     if words is None and (launch or at is not None or fit is not None):
         raise UsageError("--at, --fit and key:=value need a recording: sags export RECORDING ...")
     if words is not None:
         path, changed = split_recording(words, NO_CAMERAS)
         opened = open_launched(path, [*changed, *STEPWISE])
-    if sequence is not None and words is not None:
+    if played:
+        with progress("exporting") as advance:
+            rows = write_played(opened, played, advance)
+        show_rows(rows, json_out)
+        return
+    if sequence is not None:
         fitted = None if fit is None else str(fit.resolve())
         about = {"session": opened.name, "overrides": changed, "fit": fitted}
         many.check_sequence(sequence, about, force)

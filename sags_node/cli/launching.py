@@ -124,12 +124,6 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
     return path, overrides
 
 
-def open_stepwise(arguments: Sequence[str], no_cameras: str) -> Session:
-    """Open a recording of which every frame is taken, in turn; see `split_recording` and `open_launched`."""
-    path, overrides = split_recording(arguments, no_cameras)
-    return open_launched(path, [*overrides, *STEPWISE])
-
-
 def open_launched(path: str | None, overrides: Sequence[str], guess: bool = False) -> Session:
     """Open a session and make its kernels ready; says what is played, what takes long and what it runs on.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -14,16 +15,12 @@ from zmq.utils.monitor import recv_monitor_message
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.rundir import read_connection
 from sags_node.messaging.security import KeyPair, public_key, read_key_pair
+from sags_node.messaging.sockets import HANDSHAKES
 
 HANDSHAKE_MS = 5000
+LOOK_S = 0.1  # between looks for a node that is not there
 RETRIES = 3  # failed handshakes in a row, where one alone may be a node that is just starting anew
 
-_FAILED = (
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH,
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL,
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL,
-)
-_EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | _FAILED[0] | _FAILED[1] | _FAILED[2]
 _HOW = "make a key pair with sags keygen, have its .pub put into the node's publish.allow, and give --key"
 
 
@@ -119,6 +116,24 @@ class NodeAddress:
         return _known(connection.control, connection.public_key, self.keys)
 
 
+def found(find: Callable[[], Address], deadline: float) -> Address:
+    """Wait for a node until `deadline` (monotonic s), while there is none.
+
+    Raises:
+        UsageError: there is one, and it wants other keys.
+        SagsError: none came in time.
+    """
+    while True:
+        try:
+            return find()
+        except UsageError:
+            raise
+        except SagsError:
+            if time.monotonic() >= deadline:
+                raise
+        time.sleep(LOOK_S)
+
+
 THE_NODE = NodeAddress()  # of this machine, where nothing else is said
 
 
@@ -172,7 +187,7 @@ class HandshakeWatch:
     """Why a consumer gets nothing: without it a refused socket is merely silent."""
 
     def __init__(self, socket: zmq.Socket[bytes], address: Address) -> None:
-        self._monitor = socket.get_monitor_socket(_EVENTS)
+        self._monitor = socket.get_monitor_socket(HANDSHAKES)
         self._address = address
         self._failures = 0  # in a row
         self._last = (0, 0)  # event and value of the last one

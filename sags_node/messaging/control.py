@@ -16,8 +16,8 @@ from typing import Annotated, Any, Self
 import msgspec
 import zmq
 
-from sags_node.errors import SagsError, UsageError, brief
-from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect
+from sags_node.errors import SagsError, brief
+from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect, found
 from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, RateLimitedLog
@@ -300,16 +300,7 @@ class ControlClient:
         Raises:
             SagsError: none came in time.
         """
-        while True:
-            try:
-                address = self._find()
-                break
-            except UsageError:
-                raise
-            except SagsError:
-                if time.monotonic() > deadline:
-                    raise
-            time.sleep(LOOK_MS * 1e-3)
+        address = found(self._find, deadline)
         if address != self._address:
             self._context.destroy(linger=0)
             self._connect(address)

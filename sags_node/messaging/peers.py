@@ -14,14 +14,11 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from sags_node.messaging.security import RateLimitedLog
+from sags_node.messaging.sockets import HANDSHAKES
 from sags_node.workers import go_on
 
 MAX_PEERS = 64  # of one socket; ZeroMQ has no such limit of its own
 CHECK_MS = 20  # how soon a key that was taken off the list is seen
-
-_EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED
-_EVENTS |= zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
-_EVENTS |= zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +37,7 @@ class Peers:
         self, socket: zmq.Socket[bytes], name: str, revocations: Callable[[], int] = lambda: 0
     ) -> None:
         self._socket, self._name = socket, name
-        self._monitor = socket.get_monitor_socket(_EVENTS)
+        self._monitor = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | HANDSHAKES)
         self._revocations, self._revoked = revocations, revocations()
         # By libzmq's descriptor a duplicate of it, so that what is cut off is not the next one of its number.
         self._open: dict[int, sockets.socket] = {}

@@ -12,6 +12,12 @@ from sags_node.errors import SagsError
 from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
 
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
+HANDSHAKES = (  # events of a socket's monitor
+    zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
 HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
 
 

@@ -23,7 +23,7 @@ import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
-from sags_node.messaging.address import Address, ClientKeys, Clock, NodeAddress
+from sags_node.messaging.address import Address, ClientKeys, Clock, NodeAddress, found
 from sags_node.messaging.freshness import Freshness, StaleError
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
@@ -96,7 +96,8 @@ class Receiver:
         self._asked = _ALWAYS if paused else frozenset(self._kept)
         self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
-        self._connect(self._found(self._patience if patience is None else patience))
+        patience = self._patience if patience is None else patience
+        self._connect(found(self._find, time.monotonic() + patience))
         turn = self._receive_next, self._stopping, "sags-subscriber"
         self._thread = threading.Thread(target=go_on, args=turn, name="sags-subscriber", daemon=True)
         self._thread.start()
@@ -236,19 +237,6 @@ class Receiver:
         return None if state in VALID_STATES else f"the sender says it is {state!r}"
 
     # ---- the receiver thread ---------------------------------------------------------------------------
-
-    def _found(self, patience: float) -> Address:
-        """Where the node is, once it runs; see the class."""
-        deadline = time.monotonic() + patience
-        while True:
-            try:
-                return self._find()
-            except UsageError:  # there is one, and it wants other keys
-                raise
-            except SagsError:
-                if time.monotonic() >= deadline:
-                    raise
-            time.sleep(POLL_MS * 1e-3)
 
     def _connect(self, address: Address) -> None:
         resources, asked = ExitStack(), self._asked

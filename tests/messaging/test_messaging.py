@@ -293,7 +293,7 @@ def test_a_subscriber_that_never_reads_harms_nobody(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("socket: ten thousand subscriptions")
-def test_subscription_spam_is_bounded(tmp_path: Path) -> None:
+def test_subscription_spam_stops_nobody(tmp_path: Path) -> None:
     """Nobody wants what is unknown, and others are still served."""
     with publisher(tmp_path / "run") as running:
         endpoint = running.connection.data[-1]
