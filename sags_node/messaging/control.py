@@ -11,22 +11,20 @@ from dataclasses import dataclass
 from functools import partial
 from math import inf
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, Self
 
 import msgspec
 import zmq
 
-from sags_node.errors import SagsError, UsageError, brief
-from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect
+from sags_node.errors import SagsError, brief
+from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect, found
 from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, RateLimitedLog
-from sags_node.messaging.sockets import receive_frames
+from sags_node.messaging.sockets import waiting
 from sags_node.messaging.wire import PROTOCOL
 
 MAX_REQUEST_BYTES = 65536  # per part
-MAX_UNANSWERED_BYTES = 4 << 20  # one peer may have sent; more than its high-water mark can hold
 MAX_REPLY_BYTES = 1 << 20
 MAX_REQUEST_PARTS = 4  # identity, the empty delimiter of REQ, the request
 MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread from its frames
@@ -41,7 +39,6 @@ ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls who has no key
 PLAIN = Client("a client without a key")  # it came in all the same, so it may do everything
 
 Handler = Callable[[dict[str, Any]], Any]
-Took = Callable[[int, int], None]
 Identifier = int | Annotated[str, msgspec.Meta(max_length=128)] | None
 
 log = logging.getLogger(__name__)
@@ -100,7 +97,6 @@ class ControlServer:
     A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
 
     Args:
-        took: called with the file descriptor of a peer and the bytes of each request read from it.
         gate: who came through it with which key.
 
     Attributes:
@@ -111,12 +107,10 @@ class ControlServer:
         self,
         socket: zmq.Socket[bytes],
         handlers: Mapping[str, Handler],
-        took: Took = lambda *_: None,
         gate: Gate = Gate(),  # noqa: B008  it is frozen
     ) -> None:
         self._socket = socket
         self._handlers = handlers
-        self._took = took
         self._gate = gate
         self._rate = RequestRate()
         self.refused = Counter[str](requests_not_allowed=0, requests_too_often=0)
@@ -131,15 +125,10 @@ class ControlServer:
 
     def serve(self) -> None:
         """Answer what has arrived and what has been finished, without waiting."""
-        for _ in range(MAX_REQUESTS_AT_ONCE):
-            try:
-                frames = receive_frames(self._socket, MAX_REQUEST_PARTS)
-            except zmq.Again:
-                break
-            parts = [frame.bytes for frame in frames]
-            self._took(int(frames[-1].get(zmq.SRCFD)), sum(map(len, parts)))
-            if len(parts) in (2, 3):
-                self._handle(self._sender(frames[-1], parts[:-1]), parts[-1])
+        for frames in waiting(self._socket, MAX_REQUESTS_AT_ONCE, MAX_REQUEST_PARTS):
+            *envelope, body = [frame.bytes for frame in frames]
+            if len(envelope) in (1, 2):
+                self._handle(self._sender(frames[-1], envelope), body)
         now = time.monotonic()
         finished = [
             entry for entry in self._pending if entry[2].done() or (entry[3] < now and entry[2].cancel())
@@ -311,16 +300,7 @@ class ControlClient:
         Raises:
             SagsError: none came in time.
         """
-        while True:
-            try:
-                address = self._find()
-                break
-            except UsageError:
-                raise
-            except SagsError:
-                if time.monotonic() > deadline:
-                    raise
-            time.sleep(LOOK_MS * 1e-3)
+        address = found(self._find, deadline)
         if address != self._address:
             self._context.destroy(linger=0)
             self._connect(address)
@@ -348,7 +328,5 @@ class ControlClient:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

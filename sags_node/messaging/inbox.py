@@ -23,7 +23,7 @@ from sags_node.messaging import wire
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.receipt import Receipt
 from sags_node.messaging.security import RateLimitedLog, authenticated, check_endpoint
-from sags_node.messaging.sockets import bind, limit, receive_frames
+from sags_node.messaging.sockets import bind, limit, waiting
 from sags_node.messaging.wire import Message
 from sags_node.types import Finding
 from sags_node.workers import go_on
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_PART_BYTES = 64 << 20  # a picture of 4096 x 4096 px, 4 bytes each
-MAX_UNTAKEN_BYTES = 4 * MAX_PART_BYTES  # that a peer may have sent and we not read
 RECEIVE_HIGH_WATER = 8  # messages of a sender that wait in the socket
 SEND_HIGH_WATER = 4
 MOST_AT_ONCE = 64  # messages read in one go
@@ -108,9 +107,7 @@ class Inbox:
             gate = self._resources.enter_context(authenticated(context, config, section))
             self._socket = context.socket(zmq.ROUTER)
             limit(self._socket, SEND_HIGH_WATER, RECEIVE_HIGH_WATER, MAX_PART_BYTES)
-            self._socket.setsockopt(zmq.RCVBUF, -1)  # the system's: pictures are large
-            self._peers = Peers(self._socket, section, MAX_UNTAKEN_BYTES, gate.revocations)
-            self._resources.callback(self._peers.close)
+            self._resources.callback(Peers(self._socket, section, gate.revocations).close)
             self.endpoint = bind(self._socket, endpoint, f"{section}.endpoint", gate.keys)
         except BaseException:
             self._resources.close()
@@ -169,16 +166,9 @@ class Inbox:
     def _waiting(self) -> list[tuple[_Sender, Message, int]]:
         """What has come, in its order; of each sender's topics the newest."""
         came: list[tuple[_Sender, Message, int]] = []
-        while len(came) < MOST_AT_ONCE:
-            try:
-                identity, *frames = receive_frames(self._socket, wire.MAX_PARTS + 1)
-            except zmq.Again:
-                break
+        for identity, *frames in waiting(self._socket, MOST_AT_ONCE, wire.MAX_PARTS + 1):
             arrival_ns = time.time_ns()
             sender = self._sender(identity.bytes)
-            if frames:
-                size = sum(len(frame.buffer) for frame in frames)
-                self._peers.took(int(frames[-1].get(zmq.SRCFD)), size)
             try:
                 came.append((sender, wire.decode([frame.buffer for frame in frames]), arrival_ns))
             except wire.WireError as error:

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -23,7 +22,7 @@ from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
 from sags_node.messaging.security import Gate, RateLimitedLog, authenticated, check_endpoint
-from sags_node.messaging.sockets import bind, limit, receive_frames
+from sags_node.messaging.sockets import bind, limit, waiting
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
 
@@ -33,7 +32,6 @@ log = logging.getLogger(__name__)
 SEND_HIGH_WATER = 2 * len(topics.TOPICS)
 MAX_SUBSCRIPTIONS_AT_ONCE = 200
 MAX_SUBSCRIPTION_BYTES = 512  # also the longest step of a CURVE handshake
-MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers them until the peer goes
 MAX_PREFIXES = 1024  # noted: a view may be subscribed to before it is opened, so any name may come
 SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
 MAX_THIN = 8  # thin pictures made at once, as many as views
@@ -127,7 +125,7 @@ class Publisher:
         self._data = self._context.socket(zmq.XPUB)
         limit(self._data, SEND_HIGH_WATER, SUBSCRIPTIONS_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
         self._poller = zmq.Poller()
-        self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES, gate)
+        self._watch("data", self._data, gate)
         self._data.setsockopt(
             zmq.XPUB_VERBOSE, 1
         )  # each new peer's subscription is seen: the last values are due
@@ -139,9 +137,9 @@ class Publisher:
         if config.control:
             router = self._context.socket(zmq.ROUTER)
             limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
-            self._watch("control", router, control.MAX_UNANSWERED_BYTES, gate)
+            self._watch("control", router, gate)
             control_endpoint = bind(router, config.control, "publish.control", keys)
-            self._control = control.ControlServer(router, handlers, self._peers["control"].took, gate)
+            self._control = control.ControlServer(router, handlers, gate)
         self.connection = Connection(
             protocol=PROTOCOL,
             ns=self.ns,
@@ -154,8 +152,8 @@ class Publisher:
         )
         self._run.write_connection(self.connection)
 
-    def _watch(self, name: str, socket: zmq.Socket[bytes], max_untaken: int, gate: Gate) -> None:
-        self._peers[name] = Peers(socket, name, max_untaken, gate.revocations)
+    def _watch(self, name: str, socket: zmq.Socket[bytes], gate: Gate) -> None:
+        self._peers[name] = Peers(socket, name, gate.revocations)
         self._poller.register(socket, zmq.POLLIN)
 
     @property
@@ -328,11 +326,7 @@ class Publisher:
     def _serve_subscriptions(self) -> None:
         """Note who wants what, and send the last values once for all who have just asked."""
         resend: set[str] = set()
-        for _ in range(MAX_SUBSCRIPTIONS_AT_ONCE):
-            try:
-                frames = receive_frames(self._data, 1)
-            except zmq.Again:
-                break
+        for frames in waiting(self._data, MAX_SUBSCRIPTIONS_AT_ONCE, 1):
             self._subscription(frames[0].bytes, resend)
         for name in sorted(resend):
             if name in self._kept:
@@ -421,7 +415,5 @@ class Publisher:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

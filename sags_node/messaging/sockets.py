@@ -1,9 +1,10 @@
-"""What every socket here has in common: bounded memory, and never more read than a message may hold."""
+"""What every socket here has in common: bounded queues, and never more read than a message may hold."""
 
 from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
 
 import zmq
 
@@ -11,18 +12,22 @@ from sags_node.errors import SagsError
 from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
 
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
-RECEIVE_BUFFER = 16384  # bytes in the kernel, which an expelled peer still gets read
+HANDSHAKES = (  # events of a socket's monitor
+    zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
 HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
 
 
 def limit(
     socket: zmq.Socket[bytes], send_high_water: int, receive_high_water: int, max_part_bytes: int
 ) -> None:
-    """Bound what one peer can make a bound socket hold. ZeroMQ cannot bound the number of parts."""
+    """Bound how many whole messages of a peer may wait, and their parts' size; ZeroMQ bounds nothing else."""
     socket.setsockopt(zmq.SNDHWM, send_high_water)
     socket.setsockopt(zmq.RCVHWM, receive_high_water)
     socket.setsockopt(zmq.MAXMSGSIZE, max_part_bytes)
-    socket.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
     socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
@@ -57,6 +62,16 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | 
     if ipc:
         os.chmod(bound.removeprefix("ipc://"), 0o600)
     return bound
+
+
+def waiting(socket: zmq.Socket[bytes], most: int, most_parts: int) -> Iterator[list[zmq.Frame]]:
+    """The messages that have arrived, at most `most` of them, so that no peer keeps the reader; their parts
+    as in `receive_frames`."""
+    for _ in range(most):
+        try:
+            yield receive_frames(socket, most_parts)
+        except zmq.Again:
+            return
 
 
 def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:
