@@ -25,6 +25,7 @@ from sags_node.messaging.sockets import waiting
 from sags_node.messaging.wire import PROTOCOL
 
 MAX_REQUEST_BYTES = 65536  # per part
+MAX_UNANSWERED_BYTES = 4 << 20  # one peer may have sent; more than its high-water mark can hold
 MAX_REPLY_BYTES = 1 << 20
 MAX_REQUEST_PARTS = 4  # identity, the empty delimiter of REQ, the request
 MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread from its frames
@@ -39,6 +40,7 @@ ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls who has no key
 PLAIN = Client("a client without a key")  # it came in all the same, so it may do everything
 
 Handler = Callable[[dict[str, Any]], Any]
+Took = Callable[[int, int], None]
 Identifier = int | Annotated[str, msgspec.Meta(max_length=128)] | None
 
 log = logging.getLogger(__name__)
@@ -97,6 +99,7 @@ class ControlServer:
     A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
 
     Args:
+        took: called with the file descriptor of a peer and the bytes of each request read from it.
         gate: who came through it with which key.
 
     Attributes:
@@ -107,10 +110,12 @@ class ControlServer:
         self,
         socket: zmq.Socket[bytes],
         handlers: Mapping[str, Handler],
+        took: Took = lambda *_: None,
         gate: Gate = Gate(),  # noqa: B008  it is frozen
     ) -> None:
         self._socket = socket
         self._handlers = handlers
+        self._took = took
         self._gate = gate
         self._rate = RequestRate()
         self.refused = Counter[str](requests_not_allowed=0, requests_too_often=0)
@@ -126,7 +131,8 @@ class ControlServer:
     def serve(self) -> None:
         """Answer what has arrived and what has been finished, without waiting."""
         for frames in waiting(self._socket, MAX_REQUESTS_AT_ONCE, MAX_REQUEST_PARTS):
-            *envelope, body = [frame.bytes for frame in frames]
+            *envelope, body = parts = [frame.bytes for frame in frames]
+            self._took(int(frames[-1].get(zmq.SRCFD)), sum(map(len, parts)))
             if len(envelope) in (1, 2):
                 self._handle(self._sender(frames[-1], envelope), body)
         now = time.monotonic()

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_PART_BYTES = 64 << 20  # a picture of 4096 x 4096 px, 4 bytes each
+MAX_UNTAKEN_BYTES = 4 * MAX_PART_BYTES  # that a peer may have sent and we not read
 RECEIVE_HIGH_WATER = 8  # messages of a sender that wait in the socket
 SEND_HIGH_WATER = 4
 MOST_AT_ONCE = 64  # messages read in one go
@@ -107,7 +108,9 @@ class Inbox:
             gate = self._resources.enter_context(authenticated(context, config, section))
             self._socket = context.socket(zmq.ROUTER)
             limit(self._socket, SEND_HIGH_WATER, RECEIVE_HIGH_WATER, MAX_PART_BYTES)
-            self._resources.callback(Peers(self._socket, section, gate.revocations).close)
+            self._socket.setsockopt(zmq.RCVBUF, -1)  # the system's: pictures are large
+            self._peers = Peers(self._socket, section, MAX_UNTAKEN_BYTES, gate.revocations)
+            self._resources.callback(self._peers.close)
             self.endpoint = bind(self._socket, endpoint, f"{section}.endpoint", gate.keys)
         except BaseException:
             self._resources.close()
@@ -169,6 +172,9 @@ class Inbox:
         for identity, *frames in waiting(self._socket, MOST_AT_ONCE, wire.MAX_PARTS + 1):
             arrival_ns = time.time_ns()
             sender = self._sender(identity.bytes)
+            if frames:
+                size = sum(len(frame.buffer) for frame in frames)
+                self._peers.took(int(frames[-1].get(zmq.SRCFD)), size)
             try:
                 came.append((sender, wire.decode([frame.buffer for frame in frames]), arrival_ns))
             except wire.WireError as error:

@@ -1,14 +1,17 @@
-"""Who is connected to a bound socket, from ZeroMQ's socket monitor: counted and capped."""
+"""Who is connected to a bound socket, from ZeroMQ's socket monitor: counted, capped, and expelled."""
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import socket as sockets
+import struct
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
+from dataclasses import dataclass
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
@@ -18,30 +21,55 @@ from sags_node.messaging.sockets import HANDSHAKES
 from sags_node.workers import go_on
 
 MAX_PEERS = 64  # of one socket; ZeroMQ has no such limit of its own
-CHECK_MS = 20  # how soon a key that was taken off the list is seen
+SMALL_TALK = 1024  # bytes per second that a peer may send besides its messages: heartbeats
+QUARANTINE = 2.0  # s without new tcp peers after a flood; its sender would be back at once
+CHECK_MS = 20  # how soon a flood is seen
+MAX_EVENTS_AT_ONCE = 1000
+
+_ADDRESS_BYTES = 16  # of sockaddr_in
+_BYTES_RECEIVED = 128  # where tcpi_bytes_received lies in Linux's struct tcp_info
+_libc = ctypes.CDLL(None)
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Peer:
+    connection: sockets.socket  # a duplicate, so that its descriptor cannot pass on to another peer
+    since: float
+    taken: int = 0  # bytes of its messages that the node has read
+    expelled: bool = False
 
 
 class Peers:
     """Follows the connections of one bound socket, from a thread of its own.
 
+    libzmq takes in subscriptions on the thread that uses the socket and does not come back while they keep
+    coming, so that thread could not stop a flood.
+
     Args:
         socket: not yet bound.
         name: of the socket, for the log.
-        revocations: when it grows all tcp peers are cut off, as nothing tells which key a connection came
-            with. Those who may come in are back at once.
+        max_untaken: bytes a tcp peer may have sent beyond what `took` says was read. This bounds what ZeroMQ
+            itself does not: the number of parts of a message, and of subscriptions.
+        revocations: when it grows all tcp peers are cut off. Those who may come in are back at once.
     """
 
     def __init__(
-        self, socket: zmq.Socket[bytes], name: str, revocations: Callable[[], int] = lambda: 0
+        self,
+        socket: zmq.Socket[bytes],
+        name: str,
+        max_untaken: int,
+        revocations: Callable[[], int] = lambda: 0,
     ) -> None:
-        self._socket, self._name = socket, name
+        self._socket = socket
         self._monitor = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | HANDSHAKES)
+        self._name = name
+        self._max_untaken = max_untaken
         self._revocations, self._revoked = revocations, revocations()
-        # By libzmq's descriptor a duplicate of it, so that what is cut off is not the next one of its number.
-        self._open: dict[int, sockets.socket] = {}
+        self._open: dict[int, _Peer] = {}  # by the file descriptor that libzmq has
         self._count: Counter[str] = Counter()
+        self._closed_until = 0.0
         self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
         self._thread = threading.Thread(
@@ -52,60 +80,102 @@ class Peers:
     def counts(self) -> dict[str, int]:
         """Connections that are open, and that were refused since the start, some of those by reason.
 
-        `refused` also holds a connection that is in the middle of its handshake.
+        `refused` also holds a connection that is in the middle of its handshake; `flooding` counts peers that
+        were expelled for sending too much, `too_many` those expelled for want of room or just after a flood.
         """
         return {
             "open": len(self._open),
             "refused": self._count["accepted"] - self._count["admitted"],
             "unlisted_key": self._count["unlisted_key"],
             "too_many": self._count["too_many"],
+            "flooding": self._count["flooding"],
         }
+
+    def took(self, descriptor: int, size: int) -> None:
+        """Note that a message of a peer was read."""
+        peer = self._open.get(descriptor)
+        if peer is not None:
+            peer.taken += size
 
     def close(self) -> None:
         """End the thread; before the socket is closed, on its thread."""
         self._socket.disable_monitor()  # first: libzmq waits for a reader when many events have gathered
         self._stopping.set()
         self._thread.join()
-        for connection in self._open.values():
-            connection.close()
+        for peer in self._open.values():
+            peer.connection.close()
 
     def _follow(self) -> None:
-        if self._monitor.poll(CHECK_MS):
-            said = recv_monitor_message(self._monitor)
+        self._monitor.poll(CHECK_MS)
+        for _ in range(MAX_EVENTS_AT_ONCE):
+            try:
+                said = recv_monitor_message(self._monitor, zmq.NOBLOCK)
+            except zmq.Again:
+                break
             self._note(said["event"], int(said["value"]))
+        self._expel_floods()
         before, self._revoked = self._revoked, self._revocations()
         if self._revoked != before:
-            for connection in self._open.values():
-                if connection.family != sockets.AF_UNIX:  # which need no key
-                    _cut_off(connection)
+            self._expel_all()
 
-    def _note(self, event: int, descriptor: int) -> None:
+    def _expel_floods(self) -> None:
+        now = time.monotonic()
+        for peer in self._open.values():
+            allowed = self._max_untaken + peer.taken + SMALL_TALK * (now - peer.since)
+            if not peer.expelled and _bytes_received(peer.connection) > allowed:
+                self._expel(peer, "flooding")
+                self._closed_until = now + QUARANTINE
+
+    def _expel_all(self) -> None:
+        """Nothing tells which key a connection came with: each has to show it anew."""
+        for peer in self._open.values():
+            if not peer.expelled and peer.connection.family != sockets.AF_UNIX:
+                self._expel(peer, "renewed")
+
+    def _note(self, event: int, value: int) -> None:
+        """`value` is the descriptor of a connection that begins or ends."""
         if event == zmq.EVENT_ACCEPTED:
             self._count["accepted"] += 1
             try:
-                connection = sockets.socket(fileno=os.dup(descriptor))
+                peer = _Peer(sockets.socket(fileno=os.dup(value)), time.monotonic())
             except OSError:
                 return  # it has gone already
-            self._open[descriptor] = connection
-            if len(self._open) > MAX_PEERS:
-                self._count["too_many"] += 1
-                _cut_off(connection)
-                self._log()
+            self._open[value] = peer
+            closed = peer.since < self._closed_until and peer.connection.family != sockets.AF_UNIX
+            if closed or len(self._open) > MAX_PEERS:
+                self._expel(peer, "too_many")
         elif event == zmq.EVENT_DISCONNECTED:
-            if (ended := self._open.pop(descriptor, None)) is not None:
-                ended.close()
+            ended = self._open.pop(value, None)
+            if ended is not None:
+                ended.connection.close()
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self._count["admitted"] += 1
         else:
             self._count["unlisted_key"] += event == zmq.EVENT_HANDSHAKE_FAILED_AUTH
             self._log()
 
+    def _expel(self, peer: _Peer, why: str) -> None:
+        """Cut the connection off under libzmq, which then closes its end of it."""
+        peer.expelled = True
+        self._count[why] += 1
+        self._log()
+        try:
+            peer.connection.shutdown(sockets.SHUT_RDWR)
+        except OSError:
+            return  # it has gone by itself
+        if peer.connection.family != sockets.AF_UNIX:
+            # After a shutdown Linux still reads what a tcp peer goes on sending. To connect to no address
+            # (AF_UNSPEC) resets the connection.
+            _libc.connect(peer.connection.fileno(), bytes(_ADDRESS_BYTES), _ADDRESS_BYTES)
+
     def _log(self) -> None:
         if self._seldom.due():
             log.warning("%s socket: connections refused since the start: %s", self._name, self.counts())
 
 
-def _cut_off(connection: sockets.socket) -> None:
-    """End a connection under libzmq, which then closes it."""
-    with suppress(OSError):  # it has gone by itself
-        connection.shutdown(sockets.SHUT_RDWR)
+def _bytes_received(connection: sockets.socket) -> int:
+    """What a tcp peer has sent so far; 0 for ipc, whose peers are processes of the same user."""
+    if connection.family == sockets.AF_UNIX:
+        return 0
+    info = connection.getsockopt(sockets.IPPROTO_TCP, sockets.TCP_INFO, _BYTES_RECEIVED + 8)
+    return int(struct.unpack_from("=Q", info, _BYTES_RECEIVED)[0])

@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 SEND_HIGH_WATER = 2 * len(topics.TOPICS)
 MAX_SUBSCRIPTIONS_AT_ONCE = 200
 MAX_SUBSCRIPTION_BYTES = 512  # also the longest step of a CURVE handshake
+MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers them until the peer goes
 MAX_PREFIXES = 1024  # noted: a view may be subscribed to before it is opened, so any name may come
 SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
 MAX_THIN = 8  # thin pictures made at once, as many as views
@@ -125,7 +126,7 @@ class Publisher:
         self._data = self._context.socket(zmq.XPUB)
         limit(self._data, SEND_HIGH_WATER, SUBSCRIPTIONS_HIGH_WATER, MAX_SUBSCRIPTION_BYTES)
         self._poller = zmq.Poller()
-        self._watch("data", self._data, gate)
+        self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES, gate)
         self._data.setsockopt(
             zmq.XPUB_VERBOSE, 1
         )  # each new peer's subscription is seen: the last values are due
@@ -137,9 +138,9 @@ class Publisher:
         if config.control:
             router = self._context.socket(zmq.ROUTER)
             limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
-            self._watch("control", router, gate)
+            self._watch("control", router, control.MAX_UNANSWERED_BYTES, gate)
             control_endpoint = bind(router, config.control, "publish.control", keys)
-            self._control = control.ControlServer(router, handlers, gate)
+            self._control = control.ControlServer(router, handlers, self._peers["control"].took, gate)
         self.connection = Connection(
             protocol=PROTOCOL,
             ns=self.ns,
@@ -152,8 +153,8 @@ class Publisher:
         )
         self._run.write_connection(self.connection)
 
-    def _watch(self, name: str, socket: zmq.Socket[bytes], gate: Gate) -> None:
-        self._peers[name] = Peers(socket, name, gate.revocations)
+    def _watch(self, name: str, socket: zmq.Socket[bytes], max_untaken: int, gate: Gate) -> None:
+        self._peers[name] = Peers(socket, name, max_untaken, gate.revocations)
         self._poller.register(socket, zmq.POLLIN)
 
     @property

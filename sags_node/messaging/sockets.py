@@ -1,4 +1,4 @@
-"""What every socket here has in common: bounded queues, and never more read than a message may hold."""
+"""What every socket here has in common: bounded memory, and never more read than a message may hold."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from sags_node.errors import SagsError
 from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
 
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
+RECEIVE_BUFFER = 16384  # bytes in the kernel, which an expelled peer still gets read
 HANDSHAKES = (  # events of a socket's monitor
     zmq.EVENT_HANDSHAKE_SUCCEEDED
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
@@ -24,10 +25,11 @@ HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
 def limit(
     socket: zmq.Socket[bytes], send_high_water: int, receive_high_water: int, max_part_bytes: int
 ) -> None:
-    """Bound how many whole messages of a peer may wait, and their parts' size; ZeroMQ bounds nothing else."""
+    """Bound what one peer can make a bound socket hold. ZeroMQ cannot bound the number of parts."""
     socket.setsockopt(zmq.SNDHWM, send_high_water)
     socket.setsockopt(zmq.RCVHWM, receive_high_water)
     socket.setsockopt(zmq.MAXMSGSIZE, max_part_bytes)
+    socket.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)
     socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)

@@ -408,6 +408,7 @@ class _Peers:
     def counts(self) -> dict[str, int]:
         return {"open": 0, "refused": 0}
 
+    def took(self, descriptor: int, size: int) -> None: ...
     def close(self) -> None: ...
 
 
