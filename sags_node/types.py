@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+U32 = NDArray[np.uint32]
 I8 = NDArray[np.int8]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
@@ -315,7 +316,7 @@ class Shown:
     """What consumers are shown of a view: the model with the detail of pictures, see `sags_node.detail`."""
 
     rgb: U8  # [H, W, 3]
-    alpha: F32  # [H, W] 0..1, by the model or a picture
+    taken: U8  # [H, W] 0..255 of it is a picture's
     oldest_ns: int  # when the oldest of these pictures was captured
 
 

@@ -35,7 +35,7 @@ LIVE = (
 )
 LIVE_FIGURES = (
     "frames", "processed", "rate_hz", "latency_ms", "frame_ms", "stage_ms", "iterations_per_frame", "online",
-    "depth", "gaussians", "rungs", "warnings", "settings",
+    "shown", "depth", "gaussians", "rungs", "warnings", "settings",
 )  # fmt: skip
 FIT_FIGURES = ("seconds", "gaussians", "heldout", "train", "depth", "device", "settings")
 

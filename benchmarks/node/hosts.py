@@ -72,7 +72,8 @@ def _played(
     """One run, seen from outside; pictures are compared at the full working size."""
     sockets = ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
     played = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
-    forced = [*sockets, *played, f"publish.run_dir:={run_dir}"]
+    alone = "publish.detail:=false"  # what is looked at is the model, not the camera's pictures
+    forced = [*sockets, *played, alone, f"publish.run_dir:={run_dir}"]
     session = open_session(launch, [*overrides, *forced])
     warm_up(session.config)
     arguments = [*([] if launch is None else [launch]), *overrides, *forced]
@@ -85,7 +86,7 @@ def _played(
             return own
         full = session.working_size
         receipt = Receipt(session.rig, full, None)
-        judge = live.Judge(copies, Rectifier(session.rig, *full), options, receipt)
+        judge = live.Judge(copies, Rectifier(session.rig, *full), options, receipt, detail=False)
         with again(session) as frames:
             judge.run(frames, lambda what, frames: None)
         size = list(copies.size())

@@ -54,7 +54,8 @@ def measure_methods(
             chosen = [
                 *overrides, f"mapping.method:={method}", f"vision.width:={width}", f"vision.height:={height}"
             ]  # fmt: skip
-            seen = evaluate(launch, chosen, MeasureOptions(hold_out=0), pace="realtime")
+            alone = [*chosen, "publish.detail:=false"]  # the model is compared, not the camera's pictures
+            seen = evaluate(launch, alone, MeasureOptions(hold_out=0), pace="realtime")
             live = seen.summary
             fixed = [*chosen, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]
             row: dict[str, Any] = {"method": method, "width": width, "height": height}

@@ -111,7 +111,7 @@ class Peers:
             await asyncio.sleep(0)
 
     async def _attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        name = writer.get_extra_info("peername")[0]
+        name = (writer.get_extra_info("peername") or ["one that has gone"])[0]
         if len(self._peers) >= MOST_PEERS:
             self._warn("refused %s: %d are connected already", name, MOST_PEERS)
             writer.close()

@@ -63,6 +63,9 @@ HOLD_OUT = 8  # every so many frames, as in the literature
     is_flag=True,
     help="Also hide boxes of tissue in a second run (--pace step); what is shown there.",
 )
+@click.option(
+    "--aside", is_flag=True, help="Also views from 2 to 20 mm aside (--pace step, the phantom alone)."
+)
 @path_option("--report", help="Folder for an HTML report.")
 @path_option(
     "--receipt",
@@ -78,6 +81,7 @@ def evaluate(
     warm_up: int | None,
     hold_out: int | None,
     hidden: bool,
+    aside: bool,
     report: Path | None,
     receipt: Path | None,
     out: Path | None,
@@ -107,7 +111,9 @@ def evaluate(
         raise click.UsageError("--hidden needs --pace step: boxes are taken from the node's own masks")
     if hold_out is None:
         hold_out = HOLD_OUT if pace == "step" else 0
-    options = MeasureOptions(hold_out, hidden=hidden, **what)
+    if aside and pace != "step":
+        raise click.UsageError("--aside needs --pace step: only there the model is known frame by frame")
+    options = MeasureOptions(hold_out, hidden=hidden, aside=aside, **what)
     if report is not None:
         check_plots()
         check_report(report)

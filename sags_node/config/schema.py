@@ -779,7 +779,7 @@ class PublishConfig(Guarded):
         "of it is published",
     )
     detail: bool = Field(
-        False,
+        True,
         description="the left render and consumers' views show the pictures' own detail where the model says "
         "that they saw the same tissue; false: the model alone",
     )

@@ -56,19 +56,18 @@ class HiddenSource:
     gain: F32  # [3] the light of now, as factors of that frame's
 
 
-def hidden_sources(gaussians: Gaussians, now: SeenFrame, frames: Sequence[SeenFrame]) -> list[HiddenSource]:
-    """Choose the frames that saw most of what `now` does not show, the newest first.
+def hidden_sources(hidden: Gaussians, now_ns: int, frames: Sequence[SeenFrame]) -> list[HiddenSource]:
+    """Choose the frames that saw most of what is hidden, the newest first.
 
     Args:
-        gaussians: those of `now`, there or moved.
+        hidden: the Gaussians there, in the light of now.
         frames: that may be taken, the newest first.
     """
-    hidden = np.flatnonzero(~now.shows)
     least = max(1.0, WORTH * len(hidden))
     candidates = []
     for frame in frames:
-        if 0 < now.t_capture_ns - frame.t_capture_ns <= OLDEST * 1e9:  # also after a pause
-            rows, known = frame.rows_of(gaussians.ids[hidden])
+        if 0 < now_ns - frame.t_capture_ns <= OLDEST * 1e9:  # also after a pause
+            rows, known = frame.rows_of(hidden.ids)
             candidates.append((frame, rows, known & frame.shows[rows]))
     chosen: list[HiddenSource] = []
     left = np.ones(len(hidden), np.bool_)
@@ -79,7 +78,7 @@ def hidden_sources(gaussians: Gaussians, now: SeenFrame, frames: Sequence[SeenFr
         newest = next(i for i, count in enumerate(counts) if count > NEARLY * max(counts))
         frame, rows, seen = candidates.pop(newest)
         seen = seen & left
-        before, after = frame.gaussians.colors[rows[seen]], gaussians.colors[hidden[seen]]
+        before, after = frame.gaussians.colors[rows[seen]], hidden.colors[seen]
         gain = after.sum(0) / np.maximum(before.sum(0), np.float32(1e-6))
         chosen.append(HiddenSource(frame, np.clip(gain, 1 / BRIGHTER, BRIGHTER).astype(np.float32)))
         left &= ~seen

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from sags_node.detail.carry import NEAREST, coarse_camera
 from sags_node.detail.seen import SeenFrame
 from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
-from sags_node.geometry import resized_camera
-from sags_node.types import F32, Bool, Camera, Gaussians
+from sags_node.types import F32, I64, U8, Camera, Gaussians
 
-SMALLER = 4  # than the view: motion is smooth, and no detail is lost by it
 LEAST_COVERED = 0.05
 SIZES = 4  # of views, for which rasterisers are kept
 
@@ -28,9 +27,9 @@ class SmallDrawings:
         Returns:
             [4, h, w]: their means, 0 where little is covered, and the coverage.
         """
-        size = -(-camera.width // SMALLER), -(-camera.height // SMALLER)
+        small = coarse_camera(camera)
         drawn = replace(gaussians, colors=values, sh_rest=None, slopes=None)
-        planes = self.rasterizer(*size).forward(drawn, resized_camera(camera, *size))
+        planes = self.rasterizer(small.width, small.height).forward(drawn, small)
         coverage = planes[4]
         found = np.zeros((4, *coverage.shape), np.float32)
         found[3] = coverage
@@ -65,13 +64,26 @@ class SmallDrawings:
         moved = np.ascontiguousarray(moved @ since.camera.viewmat[:3, :3].T.astype(np.float32))
         if trust is not None:
             moved *= trust[rows, None]
-        return self(gaussians if known.all() else _some(gaussians, known), moved[known], camera)
+        if not known.all():
+            gaussians, moved = _some(gaussians, np.flatnonzero(known)), moved[known]
+        return self(gaussians, moved, camera)
 
 
-def _some(gaussians: Gaussians, kept: Bool) -> Gaussians:
-    """The rows `kept` [N] of what places and covers."""
+def gaussians_at(gaussians: Gaussians, camera: Camera, wanted: U8) -> Gaussians:
+    """Those whose means fall on pixels `wanted` [h, w] of a camera."""
+    P = (camera.K @ camera.viewmat[:3]).astype(np.float32)
+    x, y, z = P[:, :3] @ gaussians.means.T + P[:, 3:]
+    z = np.maximum(z, np.float32(NEAREST))
+    columns, rows = (np.clip(one / z + np.float32(0.5), -1, 1e6).astype(np.intp) for one in (x, y))
+    height, width = wanted.shape
+    inside = np.flatnonzero((columns >= 0) & (rows >= 0) & (columns < width) & (rows < height))
+    return _some(gaussians, inside[wanted[rows[inside], columns[inside]] > 0])
+
+
+def _some(gaussians: Gaussians, rows: I64) -> Gaussians:
+    """Their places, shapes, colours and ids [M]."""
     smoothing = gaussians.smoothing
     return Gaussians(
-        gaussians.means[kept], gaussians.quats[kept], gaussians.scales[kept], gaussians.opacities[kept],
-        gaussians.colors[kept], gaussians.ids[kept], smoothing=None if smoothing is None else smoothing[kept],
+        gaussians.means[rows], gaussians.quats[rows], gaussians.scales[rows], gaussians.opacities[rows],
+        gaussians.colors[rows], gaussians.ids[rows], smoothing=None if smoothing is None else smoothing[rows],
     )  # fmt: skip

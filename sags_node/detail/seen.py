@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
 import numpy as np
 
 from sags_node.geometry import project
-from sags_node.types import F32, I64, U8, Bool, Camera, Gaussians
+from sags_node.types import F32, I64, U8, Bool, Camera, Gaussians, Shown
 
 MARGIN = np.ones((5, 5), np.uint8)  # px of the working size: nearer to a mask's edge an instrument may shine
 SAME = 0.04  # of the depth: nearer to each other, two depths are of one surface
@@ -26,6 +26,8 @@ class SeenFrame:
     picture: Callable[[], U8]  # [H, W, 3] RGB of the left eye as it is published; made when it is asked for
     mask: Bool  # [h, w] tissue
     depth: F32  # [h, w] m, of the model drawn for it; 0 unknown
+    whole: Shown | None = None  # its left view: lends what is hidden, too
+    _lent: dict[tuple[int, bool], U8] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def tissue(self) -> U8:
@@ -54,15 +56,34 @@ class SeenFrame:
         found &= np.abs(self.depth[rows, columns] - z) < np.float32(SAME) * z
         return found
 
-    def picture_for(self, focal_px: float) -> U8:
-        """Its picture, made no finer than a view with that focal length shows."""
-        picture = self.picture()
+    def lent(self, focal_px: float, sure: bool = False) -> U8:
+        """Its picture with what it shows tissue in, [H, W, 4]: red, green, blue, and 255: tissue.
+
+        Args:
+            focal_px: of a view: no finer than that shows is the picture.
+            sure: tissue beside an instrument is none.
+        """
+        picture, tissue = self.picture(), self.sure_tissue if sure else self.tissue
         height, width = picture.shape[:2]
-        times = int(self.camera.K[0, 0] * width / self.camera.width / focal_px + 0.5)
-        if times < 2:
-            return picture
-        size = max(2, width // times), max(2, height // times)
-        return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+        times = max(1, int(self.camera.K[0, 0] * width / self.camera.width / focal_px + 0.5))
+        key = times, sure
+        if key not in self._lent:
+            tissue = cv2.resize(255 * tissue, (width, height), interpolation=cv2.INTER_NEAREST)
+            if self.whole is not None:
+                picture = cv2.copyTo(picture, tissue, self.whole.rgb.copy())
+                tissue = cv2.compare(self.whole.taken, 0, cv2.CMP_GT)
+            if times > 1:
+                size = max(2, width // times), max(2, height // times)
+                picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+                tissue = cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
+            packed = cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)
+            self._lent[key] = np.asarray(cv2.insertChannel(tissue, packed, 3))
+        return self._lent[key]
+
+    @property
+    def oldest_ns(self) -> int:
+        """When the oldest of what it lends was captured."""
+        return self.t_capture_ns if self.whole is None else self.whole.oldest_ns
 
     def rows_of(self, ids: I64) -> tuple[I64, Bool]:
         """Where Gaussians with these `ids` [M] stand among its own: rows [M], and which it has [M]."""

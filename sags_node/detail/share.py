@@ -6,7 +6,6 @@ difference from it (least squares). Where highlights jump, or the motion is wron
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from sags_node.detail.seen import SeenFrame
@@ -60,10 +59,3 @@ class Share:
         )
         columns, rows = places.astype(np.intp).T
         return np.asarray(tiles[rows, columns])
-
-
-def weight(tissue: U8, tiles: F32) -> U8:
-    """The shares [rows, columns] over a picture, where it shows tissue [h, w]: 0..255, for `carry.carry`."""
-    height, width = tissue.shape
-    wide = cv2.resize(tiles, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(cv2.multiply(tissue, wide, scale=255.0, dtype=cv2.CV_8U))

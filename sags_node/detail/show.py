@@ -9,15 +9,17 @@ import cv2
 import numpy as np
 from numba import prange
 
-from sags_node.detail.carry import EVERYWHERE, carry
+from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import hidden_sources
-from sags_node.detail.motion import SmallDrawings
+from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SeenFrame
-from sags_node.detail.share import Share, weight
+from sags_node.detail.share import Share
 from sags_node.engine.rasterizer.views import to_view
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
-from sags_node.types import F32, U8, Bool, Camera, Gaussians, RenderedView, Shown, Snapshot
+from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 
+LESSON_EVERY = 4  # frames: what lessons teach changes slowly, and each costs a small view
 LOOKED_AT = 4  # px: every so many along both axes tell how well pictures are carried
 AROUND = np.ones((5, 5), np.uint8)  # px of the working size: what is seen there is made as if hidden, too
 UNSURE = 0.2  # of the way that hidden tissue has moved: so much of it nobody saw
@@ -44,32 +46,54 @@ class Detail:
 
     # ---- views -----------------------------------------------------------------------------------------
 
-    def left(self, view: RenderedView, camera: Camera, now: SeenFrame, older: Sequence[SeenFrame]) -> Shown:
+    def left(
+        self, drawn: U8, depth: F32, camera: Camera, now: SeenFrame, older: Sequence[SeenFrame]
+    ) -> Shown:
         """Show a frame's left view: what it sees is its own picture, what is hidden comes from older ones.
 
         Args:
-            view: the model, drawn for that eye.
+            drawn: [H, W, 3] RGB, the model for that eye.
+            depth: [h, w] m of it, of any size; 0 unknown.
             camera: of that eye, in the size that is shown.
             older: frames that may have seen what is hidden now, the newest first.
         """
-        rgb, alpha = _base(view, camera)
-        taken = np.zeros(alpha.shape, np.uint8)
+        rgb, size = drawn.copy(), (camera.width, camera.height)
         hidden = cv2.dilate(1 - now.tissue, AROUND)
-        oldest = now.t_capture_ns
-        if hidden.any():
-            oldest = self._from_memory(rgb, taken, view, now.gaussians, camera, now, older, hidden)
+        taken = np.asarray(cv2.resize(255 - 255 * hidden, size, interpolation=cv2.INTER_NEAREST))
+        oldest = self._from_memory(rgb, taken, depth, now.gaussians, camera, now.t_capture_ns, older)
         seen = cv2.blur(now.sure_tissue * np.uint8(255), (5, 5))  # seams over five pixels
-        seen = cv2.resize(seen, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        seen = cv2.resize(seen, size, interpolation=cv2.INTER_LINEAR)
         _paste(now.picture(), read_only(seen), rgb)
-        return Shown(rgb, _covered(alpha, np.maximum(taken, seen)), oldest)
+        return Shown(rgb, np.maximum(taken, seen), oldest)
+
+    def _from_memory(
+        self, rgb: U8, taken: U8, depth: F32, gaussians: Gaussians, camera: Camera, now_ns: int,
+        older: Sequence[SeenFrame],
+    ) -> int:  # fmt: skip
+        """Carry what older frames saw to where nothing is taken yet; returns when the oldest of them was."""
+        oldest, small = now_ns, coarse_camera(camera)
+        wanted = _free(taken, small)
+        if not len(older) or not wanted.any():
+            return oldest
+        depth, there = every_fourth(depth, small), gaussians_at(gaussians, small, wanted)
+        for source in hidden_sources(there, now_ns, older):
+            frame, lent = source.frame, source.frame.lent(float(camera.K[0, 0]), sure=True)
+            motion = self._small.motion(there, camera, frame)
+            traced = trace(depth, small, frame, lent, motion, unsure=UNSURE / DOUBTED, wanted=wanted)
+            carry(rgb, taken, traced, lent, source.gain)
+            still = _free(taken, small)
+            if not np.array_equal(still, wanted):
+                oldest = min(oldest, frame.t_capture_ns)
+            wanted = still
+        return oldest
 
     def view(
         self,
-        view: RenderedView,
+        drawn: U8,
+        depth: F32,
         camera: Camera,
         gaussians: Gaussians,
         now: SeenFrame,
-        older: Sequence[SeenFrame],
         baseline: float,
         frames_ahead: float = 0.0,
         tint: F32 | None = None,
@@ -77,17 +101,16 @@ class Detail:
         """Show a view of the model from anywhere, at a frame's moment or after it.
 
         Args:
-            view: the model, drawn for that camera.
+            drawn: [H, W, 3] RGB, the model for that camera.
+            depth: as for `left`.
             camera: in the size that is shown.
             gaussians: those of the frame, there or moved.
             now: the frame.
-            older: as for `left`.
             baseline: m between the eyes.
             frames_ahead: how far it is after the frame, in steps between frames.
             tint: of `tint`, which the view has and no picture of the left eye.
         """
-        rgb, alpha = _base(view, camera)
-        taken = np.zeros(alpha.shape, np.uint8)
+        rgb, taken = drawn.copy(), _nothing(camera)
         aside = float(np.linalg.norm(camera.T_world_cam[:3, 3] - now.camera.T_world_cam[:3, 3])) / baseline
         lessons = self._lessons
         tiles = lessons.aside.tiles() ** f4(aside)
@@ -95,44 +118,19 @@ class Detail:
             ahead = lessons.ahead.tiles() ** f4(frames_ahead)
             tiles = cv2.resize(tiles, ahead.shape[::-1], interpolation=cv2.INTER_LINEAR) * ahead
         motion = self._small.motion(gaussians, camera, now, lessons.moved.of_gaussians(now))
-        picture = now.picture_for(float(camera.K[0, 0]))
-        share = weight(now.tissue, tiles)
-        carry(rgb, view.depth, camera, now, picture, motion, share, taken, tint=tint, holes=True)
-        oldest = now.t_capture_ns
-        if len(older) and not taken.all():
-            oldest = self._from_memory(
-                rgb, taken, view, gaussians, camera, now, older, EVERYWHERE, aside, tint
-            )
-        return Shown(rgb, _covered(alpha, taken), oldest)
-
-    def _from_memory(
-        self, rgb: U8, taken: U8, view: RenderedView, gaussians: Gaussians, camera: Camera, now: SeenFrame,
-        older: Sequence[SeenFrame], wanted: U8, aside: float = 0.0, tint: F32 | None = None,
-    ) -> int:  # fmt: skip
-        """Carry what older frames saw to where nothing is taken yet; returns when the oldest of them was."""
-        oldest = now.t_capture_ns
-        for source in hidden_sources(gaussians, now, older):
-            frame = source.frame
-            motion = self._small.motion(gaussians, camera, frame)
-            share = weight(frame.sure_tissue, self._lessons.aside.tiles() ** f4(aside))
-            before = np.count_nonzero(taken)
-            picture = frame.picture_for(float(camera.K[0, 0]))
-            carry(
-                rgb, view.depth, camera, frame, picture, motion, share, taken,
-                unsure=UNSURE / DOUBTED, gain=source.gain, wanted=wanted, tint=tint,
-            )  # fmt: skip
-            if np.count_nonzero(taken) > before:
-                oldest = min(oldest, frame.t_capture_ns)
-        return oldest
+        lent, small = now.lent(float(camera.K[0, 0])), coarse_camera(camera)
+        traced = trace(every_fourth(depth, small), small, now, lent, motion, tiles, holes=True)
+        carry(rgb, taken, traced, lent, tint=tint)
+        return Shown(rgb, taken, now.oldest_ns)
 
     def tint(self, snapshot: Snapshot, gaussians: Gaussians, camera: Camera) -> F32 | None:
-        """Draw what the right eye sees more of the tissue, [4, h, w]; None where nobody knows.
+        """Draw what the right eye sees more of the tissue, [m, n, 3]; None where nobody knows.
 
         Args:
             gaussians: of the snapshot, there or moved.
         """
         more = snapshot.right_colors
-        return None if more is None else self._small(gaussians, more, camera)
+        return None if more is None else self._small(gaussians, more, camera)[:3].transpose(1, 2, 0)
 
     # ---- lessons ---------------------------------------------------------------------------------------
 
@@ -144,34 +142,29 @@ class Detail:
         """
         camera, truth, where = _sampled(now.camera, now.picture(), now.mask)
         drawn, depth = self._drawn(expected, camera)
-        picture, share = before.picture(), weight(before.tissue, np.ones((1, 1), f4))
-
-        def carried(motion: F32 | None) -> U8:
-            rgb = drawn.copy()
-            taken = np.zeros(depth.shape, np.uint8)
-            carry(rgb, depth, camera, before, picture, motion, share, taken, holes=True)
-            return rgb
-
         lessons = self._lessons
-        lessons.moved.learn(
-            carried(None), carried(self._small.motion(expected, camera, before)), truth, where
-        )
-        trusted = self._small.motion(expected, camera, before, lessons.moved.of_gaussians(before))
-        lessons.ahead.learn(drawn, carried(trusted), truth, where)
 
-    def learn_aside(self, now: SeenFrame, right: U8, where: Bool, baseline: float) -> None:
+        def carried(trust: F32 | None) -> U8:
+            motion = None if trust is None else self._small.motion(expected, camera, before, trust)
+            return _carried(drawn, depth, camera, before, motion, holes=True)
+
+        moved = carried(np.ones(len(before.gaussians), f4))
+        lessons.moved.learn(carried(None), moved, truth, where)
+        lessons.ahead.learn(drawn, carried(lessons.moved.of_gaussians(before)), truth, where)
+
+    def learn_aside(self, now: SeenFrame, right: U8, baseline: float) -> None:
         """Learn from the right eye how well the left picture says what another eye sees.
 
         Args:
             right: [H, W, 3] the right picture, as it is published.
-            where: [h, w] its pixels that show tissue.
             baseline: m.
         """
+        known = now.depth[now.mask & (now.depth > 0)]
+        where = right_eye_mask(now.mask, known, float(now.camera.K[0, 0]), baseline)
         camera, truth, where = _sampled(now.camera.moved_right(baseline), right, where)
         drawn, depth = self._drawn(now.gaussians, camera)
-        rgb, share = drawn.copy(), weight(now.tissue, np.ones((1, 1), f4))
-        carry(rgb, depth, camera, now, now.picture(), None, share, np.zeros(depth.shape, np.uint8))
-        self._lessons.aside.learn(drawn, rgb, _in_light_of(drawn, truth, where), where)
+        carried = _carried(drawn, depth, camera, now, None)
+        self._lessons.aside.learn(drawn, carried, _in_light_of(drawn, truth, where), where)
 
     def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[U8, F32]:
         planes = self._small.rasterizer(camera.width, camera.height).forward(gaussians, camera)
@@ -179,18 +172,25 @@ class Detail:
         return view.rgb, view.depth
 
 
-def _base(view: RenderedView, camera: Camera) -> tuple[U8, F32]:
-    """The model's picture and its coverage, in the size that is shown; the picture may be written."""
-    size = camera.width, camera.height
-    alpha = view.alpha
-    if alpha.shape != size[::-1]:
-        alpha = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR))
-    return view.colours.at(*size).copy(), alpha
+def _nothing(camera: Camera) -> U8:
+    return np.zeros((camera.height, camera.width), np.uint8)
 
 
-def _covered(alpha: F32, taken: U8) -> F32:
-    """Coverage by the model or by a picture, 0..1."""
-    return np.asarray(np.maximum(alpha, taken * f4(1 / 255)))
+def _carried(
+    drawn: U8, depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None, holes: bool = False
+) -> U8:
+    """A drawn picture with all that a source has for it."""
+    rgb, lent, small = drawn.copy(), source.lent(np.inf), coarse_camera(camera)
+    traced = trace(every_fourth(depth, small), small, source, lent, motion, holes=holes)
+    carry(rgb, _nothing(camera), traced, lent)
+    return rgb
+
+
+def _free(taken: U8, small: Camera) -> U8:
+    """[m, n] of the coarse camera, 1: there, or beside it, is a pixel that has got nothing yet."""
+    free = cv2.compare(taken, 0, cv2.CMP_EQ)
+    free = cv2.resize(free, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3]))
 
 
 def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool]:

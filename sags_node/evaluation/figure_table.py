@@ -33,6 +33,8 @@ def _psnr(what: str, key: str, baseline: str = "", baseline_key: str = "") -> Fi
 
 _COPY = "the picture before, shown again"
 _STEREO = "stereo alone"
+_WARP = "left picture, warped"
+_AWAY = (2, 5, 10, 20)
 
 GROUPS: dict[str, list[Figure]] = {
     "Speed": [
@@ -57,9 +59,12 @@ GROUPS: dict[str, list[Figure]] = {
         Figure("frames with the warning", "warnings.*"),
     ],
     "Picture": [
-        _psnr("shown, PSNR over tissue", "online.psnr", _COPY, "predict.copy_psnr"),
-        Figure("shown, SSIM (1: equal)", "online.ssim", "", 3),
-        Figure("shown, LPIPS (0: equal)", "online.lpips", "", 3),
+        _psnr("the model, PSNR over tissue", "online.psnr", _COPY, "predict.copy_psnr"),
+        Figure("the model, SSIM (1: equal)", "online.ssim", "", 3),
+        Figure("the model, LPIPS (0: equal)", "online.lpips", "", 3),
+        _psnr("left render, mostly the frame's own picture", "shown.psnr", _COPY, "predict.copy_psnr"),
+        Figure("left render, SSIM", "shown.ssim", "", 3),
+        Figure("left render, LPIPS", "shown.lpips", "", 3),
         _psnr("predicted one frame ahead", "predict.psnr", _COPY, "predict.copy_psnr"),
         _psnr("predicted two frames ahead", "predict_2.psnr", _COPY, "predict_2.copy_psnr"),
         _psnr("predicted three frames ahead", "predict_3.psnr", _COPY, "predict_3.copy_psnr"),
@@ -68,20 +73,28 @@ GROUPS: dict[str, list[Figure]] = {
         _psnr("three frames ahead, the model alone", "predict_3.model_psnr"),
         _psnr("hidden tissue", "hidden.psnr", "last seen", "hidden.copy_psnr"),
         _psnr("hidden tissue, the model alone", "hidden.model_psnr"),
+        *(
+            _psnr(
+                f"from {away} mm aside", f"view_{away}.psnr", "left picture, warped", f"view_{away}.warp_psnr"
+            )
+            for away in (2, 5, 10, 20)
+        ),
+        *(_psnr(f"from {mm} mm aside", f"view_{mm}.psnr", _WARP, f"view_{mm}.warp_psnr") for mm in _AWAY),
+        *(_psnr(f"from {mm} mm aside, the model alone", f"view_{mm}.model_psnr") for mm in _AWAY),
         _psnr("kept back, drawn from the frame before", "heldout.psnr", _COPY, "heldout.copy_psnr"),
         Figure("kept back, SSIM", "heldout.ssim", "", 3),
         Figure("kept back, LPIPS", "heldout.lpips", "", 3),
         _psnr("kept back, once the next is known", "between.psnr", "mean of both", "between.mean_psnr"),
         _psnr("both carried along the motion", "between.carried_psnr", "mean of both", "between.mean_psnr"),
         _psnr("right eye, from the model", "novel.psnr"),
-        _psnr("right eye, as it was shown", "right.psnr", "left picture, warped", "right.warp_psnr"),
+        _psnr("right eye, as it was shown", "right.psnr", _WARP, "right.warp_psnr"),
         _psnr("right eye, the model alone", "right.model_psnr", _COPY, "right.copy_psnr"),
         Figure("right eye, share that is compared", "right.coverage", "%"),
         Figure("flicker where nothing moves", "flicker.picture", "grey levels", 2, "input", "flicker.input"),
         Figure("flicker of the right eye", "flicker.right", "grey levels", 2, "input", "flicker.input"),
         Figure("share of the tissue that stands still", "flicker.share", "%"),
-        _psnr("shown, masked pixels counted as equal", "online.paper_psnr"),
-        Figure("shown, SSIM, masked pixels counted as equal", "online.paper_ssim", "", 3),
+        _psnr("the model, masked pixels counted as equal", "online.paper_psnr"),
+        Figure("the model, SSIM, masked pixels counted as equal", "online.paper_ssim", "", 3),
         _psnr("kept back, masked pixels counted as equal", "heldout.paper_psnr"),
         Figure("kept back, SSIM, masked pixels counted as equal", "heldout.paper_ssim", "", 3),
     ],

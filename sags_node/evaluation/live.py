@@ -239,12 +239,13 @@ class Judge:
     """
 
     def __init__(
-        self, copies: Copies, rectifier: Rectifier, options: MeasureOptions, receipt: Receipt
+        self, copies: Copies, rectifier: Rectifier, options: MeasureOptions, receipt: Receipt, detail: bool
     ) -> None:
         """
         Args:
             rectifier: pictures are compared at its size; smaller ones are enlarged.
             receipt: takes note of what is compared.
+            detail: what was shown has that of camera images: it is not the model's own.
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(copies))
@@ -254,6 +255,7 @@ class Judge:
         self._places = count()
         self._rectifier = rectifier
         self._options = options
+        self._shown = "shown" if detail else "online"
         self._before: F32 | None = None  # the camera's picture of the frame before
         self._lpips = Lpips(options.lpips_weights) if options.lpips_weights else None
 
@@ -283,9 +285,9 @@ class Judge:
         self._receipt.add(frame, tissue)
         truth, place = metrics.as_float(left), next(self._places)
         lpips = self._lpips if place % self._options.every == 0 else None
-        online = quality(metrics.as_float(rgb), truth, tissue, self._options, lpips)
-        self.gallery.offer(place, Picture(frame.frame_id, online["psnr"], left, rgb, depth, tissue))
-        figures = {"online": online}
+        found = quality(metrics.as_float(rgb), truth, tissue, self._options, lpips)
+        self.gallery.offer(place, Picture(frame.frame_id, found["psnr"], left, rgb, depth, tissue))
+        figures = {self._shown: found}
         if self._before is not None:
             figures["predict"] = {"copy_psnr": metrics.psnr(self._before, truth, tissue)}
         reference = frame.reference

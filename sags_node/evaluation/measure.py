@@ -12,11 +12,12 @@ import numpy as np
 from sags_node.config.schema import Box, PoseWay
 from sags_node.detail.memory import Memory
 from sags_node.detail.seen import SeenFrame
-from sags_node.detail.show import Detail, Lessons
+from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
 from sags_node.evaluation import calibration, metrics
+from sags_node.evaluation.aside import Aside
 from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.flicker import Flicker
 from sags_node.evaluation.gallery import Gallery, Picture
@@ -54,6 +55,7 @@ class MeasureOptions:
     lpips_weights: Path | None = None
     paper_psnr: bool = False
     hidden: bool = False  # a second run, in which boxes of tissue are hidden, see `measure_hidden`
+    aside: bool = False  # views of the phantom from places that no eye of it has, see `Aside`
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.every < 1:
@@ -97,6 +99,7 @@ class _Before:
     truth: F32
     seconds: float  # on the recording's clock
     lent: SeenFrame  # as views have its detail
+    right: U8 | None  # [H, W, 3] the other eye's picture
 
     def seen(self, weight: float) -> Seen:
         """As a part of the mean of several, with a share of `weight`."""
@@ -135,6 +138,7 @@ class Measurer:
         on_picture: OnPicture = lambda frame_id, left: None,
         backend: str = "numba",
         detail: bool = False,
+        aside: Aside | None = None,
     ) -> None:
         """
         Args:
@@ -145,6 +149,7 @@ class Measurer:
             on_picture: called with each frame of the recording.
             backend: what draws, as `make_rasterizer` has it.
             detail: views have that of pictures (`publish.detail`).
+            aside: measures views from there.
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(spool))
@@ -169,6 +174,7 @@ class Measurer:
         self._earlier: deque[_Before] = deque(maxlen=PREDICTED)  # the latest first
         self._detail, self._memory = Detail(Lessons()) if detail else None, Memory()
         self._held: _HeldOut | None = None
+        self._aside = aside
 
     def run(self, frames: Iterable[StereoFrame], progress: Progress) -> None:
         """Measure all frames of the recording that the run was played from, but for those of its warm-up."""
@@ -213,16 +219,19 @@ class Measurer:
                 figures |= _depth_figures(shown, frame.reference.depth)
                 counts = _calibration(shown, frame.reference.depth)
             track = self._follow(shown, frame.reference, pair.camera)
+        after = _Before(shown, pair.camera, truth, seconds, self._lent(shown, pair), pair.right)
+        if self._aside is not None and self._aside.due(shown):
+            figures |= self._aside(
+                shown, pair.left, lambda camera: self._view(after, shown.snapshot.gaussians, camera, 0)
+            )
         psnr = figures["online"]["psnr"]
         seen = Picture(frame.frame_id, psnr, pair.left, shown.rgb, shown.depth, shown.tissue)
         self.gallery.offer(place, seen)
-        after = _Before(shown, pair.camera, truth, seconds, _lent(shown, pair))
         self._learn(after)
         if self._held is not None and seconds > self._earlier[0].seconds:
             self._held.row.figures["between"] = self._between(self._earlier[0], self._held, after)
         self._held = None
         self._earlier.appendleft(after)
-        self._memory.add(after.lent)
         poses = self._poses(frame, pair, shown)
         return FrameRow(frame.frame_id, seconds, figures, shown.facts, track, poses, counts)
 
@@ -246,11 +255,27 @@ class Measurer:
         return replace(given, T_world_cam=world @ given.T_world_cam)
 
     def _learn(self, now: _Before) -> None:
-        """As a node that draws views ahead learns from a frame."""
-        if self._detail is not None and self._earlier:
+        """As a node that draws views learns from a frame."""
+        if self._detail is None or len(self.rows) % LESSON_EVERY:
+            return
+        if now.right is not None:
+            self._detail.learn_aside(now.lent, now.right, now.shown.baseline)
+        if self._earlier:
             before = self._earlier[0]
             expected = extrapolated(before.shown.snapshot, now.seconds - before.seconds)
             self._detail.learn_ahead(before.lent, expected, now.lent)
+
+    def _lent(self, shown: SpooledFrame, pair: RectifiedPair) -> SeenFrame:
+        """A frame as it lends its picture to views of other moments."""
+        snapshot, left, camera = shown.snapshot, pair.left, shown.snapshot.camera
+        lent = SeenFrame(
+            pair.t_capture_ns, camera, snapshot.gaussians, lambda: left, shown.tissue, shown.depth
+        )
+        if self._detail is None:
+            return lent
+        whole = self._detail.left(shown.rgb, shown.depth, camera, lent, self._memory.frames)
+        self._memory.add(lent)
+        return replace(lent, whole=whole)
 
     def _predict(
         self, before: _Before, shown: SpooledFrame, truth: F32, seconds: float, frames: int
@@ -258,18 +283,23 @@ class Measurer:
         """`psnr` of what is shown of a moment some frames ahead; of the model alone, and of the picture then,
         shown again."""
         expected = extrapolated(before.shown.snapshot, seconds - before.seconds)
-        camera = shown.snapshot.camera
-        guess = self._draw(expected, camera)
-        figures = {"psnr": metrics.psnr(guess, truth, shown.tissue)}
-        figures["model_psnr"] = figures["psnr"]
-        if self._detail is not None:
-            view = to_view(self._rasterizer.forward(expected, camera), camera, shown.snapshot.frame_id, 0)
-            older = [seen for seen in self._memory.frames if seen.t_capture_ns < before.lent.t_capture_ns]
-            detailed = self._detail.view(
-                view, camera, expected, before.lent, older, shown.baseline, float(frames)
-            )
-            figures["psnr"] = metrics.psnr(metrics.as_float(detailed.rgb), truth, shown.tissue)
-        return figures | {"copy_psnr": metrics.psnr(before.truth, truth, shown.tissue)}
+        guess, model = self._view(before, expected, shown.snapshot.camera, frames)
+        pictures = {"psnr": guess, "model_psnr": model, "copy_psnr": before.truth}
+        return {name: metrics.psnr(picture, truth, shown.tissue) for name, picture in pictures.items()}
+
+    def _view(self, of: _Before, gaussians: Gaussians, camera: Camera, ahead: int) -> tuple[F32, F32]:
+        """What a view of a frame shows, and the model alone in it, [H, W, 3] 0..1.
+
+        Args:
+            gaussians: of the frame, moved `ahead` frames.
+        """
+        planes = self._rasterizer.forward(gaussians, camera)
+        model = colours_of(planes)
+        if self._detail is None:
+            return model, model
+        drawn, baseline = to_view(planes, camera, 0, 0), of.shown.baseline
+        shown = self._detail.view(drawn.rgb, drawn.depth, camera, gaussians, of.lent, baseline, float(ahead))
+        return metrics.as_float(shown.rgb), model
 
     def _held_out(self, frame: StereoFrame, pair: RectifiedPair, seconds: float, before: _Before) -> FrameRow:
         camera = self._camera_of_run(pair.camera, before)
@@ -392,11 +422,3 @@ def _depth_figures(shown: SpooledFrame, reference: F32) -> dict[str, Figures]:
         measured = metrics.depth_errors(shown.measured_depth, truth, shown.tissue)
         figures["measured_depth"] = asdict(measured)
     return figures
-
-
-def _lent(shown: SpooledFrame, pair: RectifiedPair) -> SeenFrame:
-    """A frame as it lends its picture to views of other moments."""
-    snapshot, left = shown.snapshot, pair.left
-    return SeenFrame(
-        pair.t_capture_ns, snapshot.camera, snapshot.gaussians, lambda: left, shown.tissue, shown.depth
-    )

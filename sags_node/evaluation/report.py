@@ -152,8 +152,8 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
         line_plot(
             "How near the picture is to the camera's: PSNR, dB; higher is better",
             [
-                figure("shown", BLUE, "online.psnr"),
-                figure("predicted a frame ahead", ORANGE, "predict.psnr"),
+                figure("a frame ahead", ORANGE, "predict.psnr"),
+                figure("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
                 figure("the picture before, again", GREY, "predict.copy_psnr"),
                 figure("kept back, never seen", GREEN, "heldout.psnr", dots=True),
             ],

@@ -12,6 +12,7 @@ from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import live
+from sags_node.evaluation.aside import Aside
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.hidden import measure_hidden
 from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, OnPicture, Progress
@@ -108,7 +109,8 @@ def _live(
         vision = session.config.vision.model_copy(update={"width": size[0], "height": size[1], "scale": 1.0})
         session = replace(session, config=session.config.model_copy(update={"vision": vision}))
         receipt = Receipt(session.rig, size, options.lpips_weights)
-        judge = live.Judge(copies, Rectifier(session.rig, *size), options, receipt)
+        detail = session.config.publish.detail
+        judge = live.Judge(copies, Rectifier(session.rig, *size), options, receipt, detail)
         with again(session) as frames:
             judge.run(frames, progress)
     summary = _summary(session, judge.rows, options, overrides, judge.depth_kind)
@@ -218,6 +220,7 @@ def _measured(
         on_picture,
         backend,
         config.publish.detail,
+        Aside(config, session.source.frame_count or 0) if options.aside else None,
     )
     with again(session) as frames:
         measurer.run(frames, progress)

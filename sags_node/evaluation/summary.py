@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.evaluation import calibration
+from sags_node.evaluation.aside import AWAY
 from sags_node.evaluation.lpips import BACKBONE
 from sags_node.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.evaluation.metrics import percentiles
@@ -19,10 +20,12 @@ from sags_node.evaluation.trajectory import trajectory_errors
 
 GROUPS = {
     "online": ("psnr", "ssim", "lpips"),
+    "shown": ("psnr", "ssim", "lpips"),
     "predict": ("psnr", "model_psnr", "copy_psnr"),
     "predict_2": ("psnr", "model_psnr", "copy_psnr"),
     "predict_3": ("psnr", "model_psnr", "copy_psnr"),
     "hidden": ("psnr", "model_psnr", "copy_psnr"),
+    **{f"view_{millimetres}": ("psnr", "model_psnr", "warp_psnr") for millimetres in AWAY},
     "heldout": ("psnr", "ssim", "lpips", "copy_psnr"),
     "between": ("psnr", "carried_psnr", "mean_psnr"),
     "novel": ("psnr",),
@@ -46,11 +49,13 @@ def summarise(
     A figure of quality is the mean over the frames that have it, and again over each named segment
     (`online.motion.psnr`; first and last frame belong to it). Track errors are pooled over points and frames.
     `online` is the model's own picture of a frame that it has learnt from, as who draws its splats sees it.
+    `shown` is the left render of a live run with `publish.detail`: where tissue is seen, its own picture.
     `predict` is a frame said by the one before, `predict_2` and `predict_3` by the second and third before:
     `psnr` as it is shown, with the older picture's detail where `publish.detail` is set, `model_psnr` by the
     model alone, `copy_psnr` by that picture, shown again: on tissue that hardly moves it is hard to beat.
     `hidden` is the same for boxes of tissue that were hidden from a second run, `copy_psnr` by the last
     picture that showed them.
+    `view_2` to `view_20` are views of the phantom from so many mm aside, see `Aside`.
     `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around,
     `between.carried_psnr` the same with both carried along the model's motion, see `carried`.
     `right` is the right view as it was shown, with `publish.right:=true`; `right.warp_psnr` the left picture

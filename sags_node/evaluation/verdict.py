@@ -89,10 +89,22 @@ def _middle(figures: Flat, key: str) -> str:
 
 
 def _picture(figures: Flat) -> str:
-    if figures.get("online.psnr") is None:
-        return ""
+    """What a view shows of the next frame, as the left render of a frame is mostly its own picture; of a live
+    run, whose views are not known, that render."""
     copied = figures.get("predict.copy_psnr")
-    return f"{figures['online.psnr']:.1f} dB PSNR{'' if copied is None else f' ({BEFORE.format(copied)})'}"
+    beside = [] if copied is None else [BEFORE.format(copied)]
+    said = figures.get("predict.psnr")
+    if said is not None:
+        name, model = "of the next frame", figures.get("predict.model_psnr")
+        if model is not None and model != said:
+            beside.append(f"the model alone: {model:.1f} dB")
+    else:
+        name, said = "of the frame itself, mostly its own picture", figures.get("shown.psnr")
+        if said is None:
+            name, said = "by the model", figures.get("online.psnr")
+    if said is None:
+        return ""
+    return f"{said:.1f} dB PSNR {name}" + (f" ({'; '.join(beside)})" if beside else "")
 
 
 def _unseen(figures: Flat) -> str:

@@ -67,12 +67,13 @@ def colours_at(view: RenderedView, size: tuple[int, int]) -> U8:
 
 
 def alpha_at(view: RenderedView, size: tuple[int, int]) -> F32:
-    """Its coverage in that size, 0..1."""
-    if view.shown is not None and view.shown.alpha.shape[::-1] == size:
-        return view.shown.alpha
-    if view.alpha.shape[::-1] == size:
-        return view.alpha
-    return np.asarray(cv2.resize(view.alpha, size, interpolation=cv2.INTER_LINEAR))
+    """Its coverage in that size, by the model or a picture, 0..1."""
+    alpha = view.alpha
+    if alpha.shape[::-1] != size:
+        alpha = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR))
+    if view.shown is None or view.shown.taken.shape[::-1] != size:
+        return alpha
+    return np.asarray(np.maximum(alpha, view.shown.taken * np.float32(1 / 255)))
 
 
 def detail_age_ns(view: RenderedView) -> int | None:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sags_node.detail.seen import SeenFrame
-from sags_node.detail.show import Detail, Lessons
-from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
 from sags_node.messaging import published
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.types import FrameResult, Gaussians, RenderedView, Shown, Snapshot
 
-ASIDE_EVERY = 8  # scenes between lessons from the right eye: what they teach changes slowly
 ROUNDING = 1e-3  # s, of stamps
 
 
@@ -23,6 +22,7 @@ class Teacher:
     def __init__(self) -> None:
         self._detail = Detail(Lessons())
         self._before: tuple[Snapshot, SeenFrame] | None = None
+        self._whole: SeenFrame | None = None  # with its left view, where nobody else looks at that
         self._step = 0.0  # s between the last two scenes
         self._scenes = 0
 
@@ -39,13 +39,12 @@ class Teacher:
             snapshot, seen = before
             seconds = (now.t_capture_ns - seen.t_capture_ns) * 1e-9
             self._step = seconds if seconds > 0 else self._step
-            if ahead and 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
+            due = ahead and self._scenes % LESSON_EVERY == 0
+            if due and 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
                 self._detail.learn_ahead(seen, gaussians_ahead(snapshot, seconds), now)
-        pair, observation = scene.pair, scene.observation
-        if aside and pair.right is not None and self._scenes % ASIDE_EVERY == 1:
-            known = now.depth[observation.tissue & (now.depth > 0)]
-            where = right_eye_mask(observation.tissue, known, float(now.camera.K[0, 0]), pair.baseline)
-            self._detail.learn_aside(now, published.picture(pair, "right"), where, pair.baseline)
+        pair = scene.pair
+        if aside and pair.right is not None and self._scenes % LESSON_EVERY == 2:
+            self._detail.learn_aside(now, published.picture(pair, "right"), pair.baseline)
 
     def detail(
         self, scene: FrameResult, seen: Sequence[SeenFrame], gaussians: Gaussians, view: RenderedView,
@@ -59,10 +58,17 @@ class Teacher:
             right: it has the colours that the right eye sees.
         """
         now, *older = seen
+        if now.whole is None:
+            if self._whole is None or self._whole.t_capture_ns != now.t_capture_ns:
+                left, camera = scene.views["left"], published.camera_of(scene.pair)
+                drawn = left.colours.at(camera.width, camera.height)
+                whole = self._detail.left(drawn, left.depth, camera, now, older)
+                self._whole = replace(now, whole=whole)
+            now = self._whole
         frames = ahead / self._step if self._step > 0 else float(ahead > 0)
         tint = self._detail.tint(scene.snapshot, gaussians, view.camera) if right else None
         baseline = scene.pair.baseline
-        return self._detail.view(view, view.camera, gaussians, now, older, baseline, frames, tint)
+        return self._detail.view(view.rgb, view.depth, view.camera, gaussians, now, baseline, frames, tint)
 
 
 def is_of(seen: Sequence[SeenFrame], snapshot: Snapshot) -> bool:

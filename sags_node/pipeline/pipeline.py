@@ -401,7 +401,11 @@ class Pipeline:
         if self._detail is None or not wanted or not self.seen:
             return view
         now, *older = self.seen
-        return replace(view, shown=self._detail.left(view, published.camera_of(pair), now, older))
+        camera = published.camera_of(pair)
+        drawn = view.colours.at(camera.width, camera.height)
+        shown = self._detail.left(drawn, view.depth, camera, now, older)
+        self.seen = replace(now, whole=shown), *older
+        return replace(view, shown=shown)
 
     def _right_eye(
         self, mapped: Mapped, observation: Observation, seen: RectifiedPair, judged: Judgement, by_both: Bool
