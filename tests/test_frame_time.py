@@ -21,7 +21,7 @@ from sags_node.node.node import Node
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig
-from sags_node.sources.rate import MEASURED, FrameRate
+from sags_node.sources.clock import MEASURED, FrameRate
 from sags_node.types import FrameResult, StereoFrame
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)

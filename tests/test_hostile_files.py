@@ -219,45 +219,42 @@ def test_a_link_to_a_file_is_one(tmp_path: Path) -> None:
 # ---- libraries that talk ---------------------------------------------------------------------------------
 
 
-def test_a_damaged_mesh_is_refused_in_one_message(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """What the reader had not read was drawn where memory happened to say."""
-    file = tmp_path / "mesh.ply"
-    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {a}\n" for a in "xyz")
-    faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    file.write_text(header + faces + "0 0 0\n0.01 0 nonsense\n")
-    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: could not convert string to float"):
-        mesh_of(ObjectSpec(file=file))
-    assert capfd.readouterr() == ("", "")
+def ply(faces: bytes, count: int = 1, form: str = "ascii") -> bytes:
+    """Four corners and a face."""
+    head = f"ply\nformat {form} 1.0\nelement vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz")
+    head += f"element face {count}\nproperty list uchar int vertex_indices\nend_header\n"
+    corners = (0, 0, 0), (0.01, 0, 0), (0, 0.01, 0), (0.01, 0.01, 0)
+    text = "".join("{:g} {:g} {:g}\n".format(*corner) for corner in corners).encode()
+    return head.encode() + (text if form == "ascii" else struct.pack("<12f", *sum(corners, ()))) + faces
+
+
+def face(form: str, *corners: int) -> bytes:
+    if form == "ascii":
+        return ply(" ".join(map(str, (len(corners), *corners))).encode())
+    return ply(struct.pack(f"<B{len(corners)}i", len(corners), *corners), form="binary_little_endian")
+
+
+MISSING = "a face names a vertex that is not there"  # Open3D's reader would end the process
+FEW = r"a face has \d different corners"
+MESHES = {
+    "words": (ply(b"")[:-4] + b"nonsense\n", "could not convert string to float"),
+    **{f"{form}, {sides} sides, corner {corner}": (face(form, *range(sides - 1), corner), MISSING)
+       for form in ("ascii", "binary") for sides in (3, 5) for corner in (4, 2**31 - 1, -1)},
+    **{f"face {text.decode()}": (ply(text), FEW) for text in (b"0", b"2 0 1", b"4 0 1 2 1")},
+}  # fmt: skip
 
 
 @pytest.mark.fault("file: a mesh whose faces name corners that there are not")
-@pytest.mark.parametrize("corner", [4, 2**31 - 1, -1])
-@pytest.mark.parametrize("sides", [3, 5])
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_faces_with_missing_corners_are_refused(form: str, sides: int, corner: int, tmp_path: Path) -> None:
-    """Open3D's reader would end the process."""
-    header = f"ply\nformat {form} 1.0\nelement vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz")
-    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    face = [*range(sides - 1), corner]
-    if form == "ascii":
-        body = ("0 0 0\n0.01 0 0\n0 0.01 0\n0.01 0.01 0\n" + " ".join(map(str, (sides, *face)))).encode()
-    else:
-        body = struct.pack("<12f", 0, 0, 0, 0.01, 0, 0, 0, 0.01, 0, 0.01, 0.01, 0) + struct.pack(
-            f"<B{sides}i", sides, *face
-        )
-    file = tmp_path / "mesh.ply"
-    file.write_bytes(header.encode() + body)
-    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: a face names a vertex that is not there"):
-        mesh_of(ObjectSpec(file=file))
-
-
-@pytest.mark.parametrize("face", ["0", "2 0 1", "4 0 1 2 1"])
-def test_faces_that_are_none_are_refused(face: str, tmp_path: Path) -> None:
-    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {a}\n" for a in "xyz")
-    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    (tmp_path / "mesh.ply").write_text(f"{header}0 0 0\n0.01 0 0\n0 0.01 0\n{face}\n")
-    with pytest.raises(UsageError, match=r"mesh\.ply is damaged: a face has \d different corners"):
+@pytest.mark.parametrize("name", MESHES)
+def test_a_damaged_mesh_is_refused_in_one_message(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What the reader had not read was drawn where memory happened to say."""
+    content, said = MESHES[name]
+    (tmp_path / "mesh.ply").write_bytes(content)
+    with pytest.raises(UsageError, match=rf"mesh\.ply is damaged: {said}"):
         mesh_of(ObjectSpec(file=tmp_path / "mesh.ply"))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_video_that_cannot_be_written_is_one_message(

@@ -23,7 +23,7 @@ from sags_node.node.node import Node
 from sags_node.pipeline.session import open_session
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources import live
-from sags_node.sources.device import Shot
+from sags_node.sources.pairing import Shot
 from sags_node.sources.v4l2 import open_cameras
 
 pytestmark = pytest.mark.live

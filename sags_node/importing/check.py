@@ -167,10 +167,10 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
         count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
         stamped, said, ends = [], [], []
         if isinstance(opened, Replay):
-            stamped = list(opened.judged)
+            stamped = list(opened.pairs.judged)
             said = [
-                *(parted("warning", each) for each in opened.oddities),
-                *videos.check_pixels(opened.pixel_aspect),
+                *(parted("warning", each) for each in opened.pairs.oddities),
+                *videos.check_pixels(opened.pairs.pixel_aspect),
             ]
             if isinstance(opened.pairs, VideoPairs):
                 ends = videos.check_ends(opened.pairs, (opened.first + count) * source.stride)

@@ -41,8 +41,7 @@ from sags_node.node.service_manager import ServiceManager
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.recording.child import RecorderProcess
-from sags_node.sources.clock import CaptureClock
-from sags_node.sources.rate import FrameRate
+from sags_node.sources.clock import CaptureClock, FrameRate
 from sags_node.sources.source import Source, findings_of
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
 

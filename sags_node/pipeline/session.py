@@ -98,7 +98,7 @@ def open_posed(config: LaunchConfig, rig: StereoRig, references: bool = True) ->
     """
     size = rig.left.width, rig.left.height
     source = open_source(config.source, references, size=size, rig=rig if config.rig is None else None)
-    for finding in source.judged if isinstance(source, Replay) else ():
+    for finding in source.pairs.judged if isinstance(source, Replay) else ():
         log.warning("%s; %s", finding.what, finding.fix)
     return source if config.robot is None else Posed(source, config, rig)
 

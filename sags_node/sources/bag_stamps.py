@@ -9,7 +9,7 @@ import numpy as np
 from sags_node.checks import Finding
 from sags_node.config.schema import BagSource
 from sags_node.errors import UsageError
-from sags_node.sources.stamps import nearest, pair
+from sags_node.sources.pairing import nearest, pair
 from sags_node.types import I64
 
 Key = tuple[int, int]  # when a message was recorded and its own stamp, ns: names it within its topic

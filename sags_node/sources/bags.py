@@ -24,7 +24,7 @@ from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_sta
 from sags_node.rig import accept_rig
 from sags_node.sources.bag_stamps import DIFFER_FIX, Key, judge_stamps, pair_messages
 from sags_node.sources.layout import Layout
-from sags_node.sources.pictures import RawPair, size_text
+from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64, U8, Eye, StereoRig
 
 # What drivers and this node call an eye's picture, the most usual first; "/compressed" may follow.
@@ -95,11 +95,8 @@ def _stamp(path: Path, message: BagMessage) -> int:
         raise SagsError(f"{path}: {message.topic}: {error}") from None
 
 
-class BagPairs:
+class BagPairs(Pairs):
     """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough.
-
-    Attributes:
-        stamps: [count, 2] ns, capture of the left and the right picture.
 
     Raises:
         UsageError: there is no bag, its topics are not clear, or nothing pairs.
@@ -114,9 +111,7 @@ class BagPairs:
         self._keys, self.stamps = pair_messages(config, left, right)
         self.count = len(self._keys)
         steps = np.diff(self.stamps[:, 0])
-        self.rate: float | None = (
-            float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else None
-        )
+        self.rate = float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else None
         self.judged = judge_stamps(self._keys, self.stamps, self.rate, (len(left), len(right)))
         self._layout = Layout(config.geometry)
         self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
@@ -128,16 +123,7 @@ class BagPairs:
         self._waiting: dict[tuple[int, Key], BagMessage] = {}
         self._messages: Iterator[BagMessage] | None = None
 
-    def skip(self) -> bool:
-        self._next += 1
-        return self._next <= self.count
-
     def read(self) -> RawPair | None:
-        """The next pair, None at the end.
-
-        Raises:
-            SagsError: a picture is damaged, of an encoding that is not read, or of another size.
-        """
         if self._next >= self.count:
             return None
         if self._messages is None:

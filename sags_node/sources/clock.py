@@ -1,4 +1,4 @@
-"""The clock that stamped the pictures, against this machine's wall clock.
+"""What stamps tell of a live source: how far its clock is from this machine's, and how often frames come.
 
 Nobody can tell how long a picture was on its way. But no picture arrives before it was taken: the smallest
 difference between arrival and stamp is the difference of the clocks, and the shortest way. How that smallest
@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from statistics import median
 
 import numpy as np
 
-from sags_node.types import ClockStatus
+from sags_node.types import ClockStatus, StereoFrame
 
 BIN_NS = 1_000_000_000  # the smallest difference of each second is kept
 KEPT = 120  # s
 SURE = 20  # s: for less the jitter of the way says more than the drift (1 ms in 20 s: 50 ppm)
 SET_NS = 100_000_000  # a difference that much larger is a slow way
 SET_S = 10  # unless it is in each of so many seconds: then the clock was set
+MEASURED = 30  # periods behind a rate
+OTHER = 0.1  # share by which a rate must be another one to count
 STARTED_NS = 1_000_000_000  # a stamp so far back: the clock began anew; less: a picture was overtaken
 
 
@@ -94,3 +97,30 @@ class CaptureClock:
 
     def _offset_at(self, stamp_ns: int) -> int:
         return round(self._lowest + self._drift * (stamp_ns - self._bins[0][0]))
+
+
+class FrameRate:
+    """The rate of a live source, by the stamps and numbers of the frames that are taken: what a camera, a
+    capture card or a program says of it is often wrong, and a camera takes longer pictures in the dark.
+
+    Attributes:
+        hz: frames a second.
+    """
+
+    def __init__(self, nominal_hz: float) -> None:
+        self.hz = nominal_hz
+        self._periods: deque[float] = deque(maxlen=MEASURED)  # s
+        self._last: StereoFrame | None = None
+
+    def add(self, frame: StereoFrame) -> bool:
+        """A frame was taken; True: `hz` has changed."""
+        last, self._last = self._last, frame
+        if last is None or frame.epoch != last.epoch or frame.frame_id <= last.frame_id:
+            return False
+        seconds = (frame.t_capture_ns - last.t_capture_ns) * 1e-9
+        self._periods.append(seconds / (frame.frame_id - last.frame_id))
+        measured = 1 / max(median(self._periods), 1e-3)
+        if len(self._periods) < MEASURED or abs(measured / self.hz - 1) < OTHER:
+            return False
+        self.hz = measured
+        return True

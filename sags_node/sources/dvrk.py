@@ -19,8 +19,7 @@ from sags_node.errors import UsageError
 from sags_node.files import read_file
 from sags_node.media.video import Video
 from sags_node.sources.layout import side_by_side
-from sags_node.sources.pictures import RawPair
-from sags_node.sources.stamps import nearest
+from sags_node.sources.pairing import nearest
 from sags_node.sources.videos import OneVideoPairs
 from sags_node.types import I64
 
@@ -66,12 +65,8 @@ class Sidecar(msgspec.Struct):
     side_by_side: Literal["undefined", "LR", "RL"] = "undefined"
 
 
-class DvrkPairs:
+class DvrkPairs(OneVideoPairs):
     """The frames of a session.
-
-    Attributes:
-        stamps: [count, 2] ns, capture of the left and the right picture.
-        cut_off, reach: as of `VideoPairs`.
 
     Raises:
         UsageError: files are missing or damaged, or the video is not stereo.
@@ -86,35 +81,15 @@ class DvrkPairs:
                 f"{file} does not say that the video is stereo; set source.side_by_side to LR or RL"
             )
         video = Video(file.parent / Path(sidecar.video_file).name)  # a name cannot lead out of the folder
+        super().__init__(video, side_by_side(order))
+        self.pixel_aspect, self.oddities = 1.0, ()  # the sidecar knows better how the video was made
         try:
-            self._pairs = OneVideoPairs(video, side_by_side(order))
             self.stamps = _stamps(file, sidecar, video)
         except UsageError:
-            video.close()
+            self.close()
             raise
-        self.count = len(self.stamps)
-        self.cut_off, self.reach = self._pairs.cut_off, min(self.count, self._pairs.reach)
         steps = np.diff(self.stamps[:, 0])
         self.rate = float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else video.rate
-        self._next = 0
-
-    def seek(self, index: int) -> None:
-        self._pairs.seek(index)
-        self._next = index
-
-    def skip(self) -> bool:
-        self._next += 1
-        return self._next <= self.count and self._pairs.skip()
-
-    def read(self) -> RawPair | None:
-        """The next pair, None at the end."""
-        if self._next >= self.count:
-            return None
-        self._next += 1
-        return self._pairs.read()
-
-    def close(self) -> None:
-        self._pairs.close()
 
 
 def find_sidecar(path: Path) -> Path:

@@ -40,7 +40,7 @@ class Llff(NamedTuple):
     T_world_cam: F64  # [N, 4, 4] m, or its inverse, with whatever axes the file has
 
 
-class EndoNerfPairs:
+class EndoNerfPairs(FolderPairs):
     """The frames of a clip, in order of the files' names (numbers in names sort as numbers).
 
     Raises:
@@ -51,16 +51,12 @@ class EndoNerfPairs:
         folder = config.folder
         right = None if baseline_of(config) is None else folder / "images_right"
         self._llff = read_llff(config)
-        self._pictures = FolderPairs(
+        self._T_world_cam = self._llff.T_world_cam
+        self._depth_files: list[Path] | None = None
+        super().__init__(
             folder / "images", right, folder / "masks", instruments=config.instruments, numbered=True
         )
         self._depth_unit = config.depth_unit
-        self._depth_files: list[Path] | None = None
-        self.rate: float | None = None
-        self.count = self._pictures.count
-        self._next = 0
-        self._T_world_cam = self._llff.T_world_cam
-        self.judged: tuple[Finding, ...] = ()
         self._check_camera(folder)
         if (folder / "depth").is_dir():
             pairs = pair_files((folder / "images", folder / "depth"), numbered=True)
@@ -93,32 +89,12 @@ class EndoNerfPairs:
         assert pair is not None and pair.depth is not None and pair.tissue is not None  # `count` is checked
         return Seen(pair.left, pair.depth, pair.tissue)
 
-    def seek(self, index: int) -> None:
-        self._pictures.seek(index)
-        self._next = index
-
-    def skip(self) -> bool:
-        self._next += 1
-        return self._pictures.skip()
-
     def read(self) -> RawPair | None:
-        """The next frame, None at the end.
-
-        Raises:
-            SagsError: a picture is damaged, or of another size or form than it must be.
-        """
-        pair = self._pictures.read()
+        index, pair = self._next, super().read()
         if pair is None:
             return None
-        index = self._next
-        self._next += 1
-        return pair._replace(
-            depth=None if self._depth_files is None else self._read_depth(self._depth_files[index]),
-            T_world_cam=self._T_world_cam[index],
-        )
-
-    def close(self) -> None:
-        self._pictures.close()
+        depth = None if self._depth_files is None else self._read_depth(self._depth_files[index])
+        return pair._replace(depth=depth, T_world_cam=self._T_world_cam[index])
 
     def _read_depth(self, file: Path) -> F32:
         """Depth [H, W] m; a count of 0 is unknown."""
@@ -127,10 +103,10 @@ class EndoNerfPairs:
             raise SagsError(
                 f"{file} has {counts.shape[2]} channels; a depth picture is a grey PNG of 8 or 16 bit"
             )
-        if counts.shape[1::-1] != self._pictures.size:
+        if counts.shape[1::-1] != self.size:
             raise SagsError(
                 f"{file} is {size_text(*counts.shape[1::-1])} px but the pictures are "
-                f"{size_text(*self._pictures.size)}; all pictures of a clip must have one size"
+                f"{size_text(*self.size)}; all pictures of a clip must have one size"
             )
         known = counts > 0
         if not known.any():
@@ -146,10 +122,10 @@ class EndoNerfPairs:
                 f"{file} holds {len(llff.T_world_cam)} poses but {folder / 'images'} {self.count} pictures; "
                 "there must be one pose for each picture"
             )
-        if self._pictures.size != (llff.width, llff.height):
+        if self.size != (llff.width, llff.height):
             raise UsageError(
                 f"{file} is for {size_text(llff.width, llff.height)} px but the pictures are "
-                f"{size_text(*self._pictures.size)}; scale columns 4, 9, 14 (height, width, focal length)"
+                f"{size_text(*self.size)}; scale columns 4, 9, 14 (height, width, focal length)"
             )
 
     def _check_unit(self, file: Path) -> None:

@@ -18,10 +18,9 @@ import numpy as np
 
 from sags_node.config.schema import GstSource
 from sags_node.errors import SagsError
-from sags_node.sources.device import Shot
 from sags_node.sources.gst_process import GstProcess
 from sags_node.sources.live import EndedError, Input, LiveStereo
-from sags_node.sources.live_pairs import LivePairs
+from sags_node.sources.pairing import Shot
 from sags_node.types import Samples, Side
 
 log = logging.getLogger(__name__)
@@ -51,8 +50,7 @@ def open_pipeline(config: GstSource, size: tuple[int, int] | None = None) -> Liv
         SagsError: GStreamer is not installed, the pipeline is wrong, or no picture comes in time.
     """
     only = Input("GStreamer", None, lambda: Pipeline(config), config.deadline)
-    pairs = LivePairs(config.pair_tolerance_ms, config.latency_ms)
-    return LiveStereo([only], config.geometry, pairs, size)
+    return LiveStereo([only], config, size)
 
 
 def whole_launch(config: GstSource) -> tuple[str, list[str]]:

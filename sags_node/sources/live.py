@@ -8,17 +8,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
-from typing import NamedTuple, Protocol, Self
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
 
-from sags_node.config.schema import GeometryConfig
+from sags_node.config.schema import GstSource, V4l2Source
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources.device import Picture, Shot
 from sags_node.sources.layout import Layout
-from sags_node.sources.live_pairs import LivePairs
-from sags_node.sources.pairing import Alternation
-from sags_node.types import U8, Side, StereoFrame
+from sags_node.sources.pairing import Alternation, LivePairs, Picture, Shot
+from sags_node.types import U8, Side
 from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
@@ -63,43 +60,33 @@ class Input(NamedTuple):
     deadline: float  # s without a picture before it is opened again
 
 
-class LiveStereo:
-    """A `Source` of live stereo frames.
-
-    `frame_id` counts the left eye's pictures, so a left picture that found no partner leaves a gap. `epoch`
-    grows when the wall clock is set back.
+class LiveStereo(LivePairs):
+    """A `Source` of live stereo frames from devices.
 
     Args:
         inputs: one that delivers both eyes, or one for each.
-        geometry: how pictures become those of the eyes.
-        pairs: where the pictures go in.
+        config: how pictures become those of the eyes, and which are pairs.
         size: width and height that an eye's pictures must have, px; None: as they come.
 
     Raises:
-        UsageError: the pictures do not fit `geometry` or `size`.
+        UsageError: the pictures do not fit the geometry or `size`.
         SagsError: a device is missing or cannot be opened.
     """
 
-    frame_count: int | None = None
-
     def __init__(
-        self,
-        inputs: Sequence[Input],
-        geometry: GeometryConfig,
-        pairs: LivePairs,
-        size: tuple[int, int] | None = None,
+        self, inputs: Sequence[Input], config: V4l2Source | GstSource, size: tuple[int, int] | None = None
     ) -> None:
-        self._pairs = pairs
-        self._layout = Layout(geometry)
+        super().__init__(config.pair_tolerance_ms, config.latency_ms)
+        self._layout = Layout(config.geometry)
         self._size = size
         self._alternation: Alternation | None = None
         self._readers: list[DeviceReader] = []
         try:
             for one in inputs:
                 opened = self._checked(one)
-                self._readers.append(DeviceReader(one, self._checked, opened, self._put, pairs.stopped))
+                self._readers.append(DeviceReader(one, self._checked, opened, self._put, self.stopped))
         except SagsError:
-            self._close()
+            self.close()
             raise
         self.rate = self._readers[0].rate
         if self._layout.is_sequential:
@@ -113,30 +100,15 @@ class LiveStereo:
     @property
     def dropped(self) -> int:
         """Pictures of either eye that found no partner."""
-        return self._pairs.unpaired + (self._alternation.alone if self._alternation else 0)
+        return super().dropped + (self._alternation.alone if self._alternation else 0)
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         for reader in self._readers:
             reader.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-        self._close()
-
-    def _close(self) -> None:
+    def close(self) -> None:
         for reader in self._readers:
             reader.close()
-
-    def stop(self) -> None:
-        """End the iteration; any thread may call this."""
-        self._pairs.stop()
-
-    def __iter__(self) -> Iterator[StereoFrame]:
-        """Pairs as they arrive, until `stop` or the end of a file; silent while a camera is away."""
-        return iter(self._pairs)
 
     def _checked(self, one: Input) -> CaptureDevice:
         """Open a device whose pictures have the right size: those of the rig, or as they were at first."""
@@ -158,13 +130,13 @@ class LiveStereo:
     def _put(self, picture: Shot | None, side: Side | None) -> None:
         """Take a picture in; None: there are no more."""
         if picture is None:
-            self._pairs.end()
+            self.end()
             return
         side = picture.side or side
         if side is not None:
-            self._pairs.put(side, _of(picture, self._layout.eye(picture.image, side)))
+            self.add(side, _of(picture, self._layout.eye(picture.image, side)))
         elif (pair := self._both(picture)) is not None:
-            self._pairs.put_both(*pair)
+            self.add_both(*pair)
 
     def _both(self, picture: Shot) -> tuple[Picture, Picture] | None:
         """Left and right of an input that shows both, once they are there."""

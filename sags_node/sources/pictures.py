@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sags_node.checks import Finding
 from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
@@ -18,7 +19,7 @@ from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
 from sags_node.sources.names import in_order, numbers, together
-from sags_node.types import F32, F64, U8, Bool, Reference
+from sags_node.types import F32, F64, I64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +42,55 @@ class RawPair(NamedTuple):
     reference: Reference | None = None
 
 
-class FolderPairs:
+class Pairs:
+    """A reader of a recording: its pairs in order, from any start.
+
+    Attributes:
+        count: pairs as announced; a video may end earlier.
+        rate: the recording's own; None: it does not know it.
+        stamps: [count, 2] ns, of the left and the right picture; None: they are even.
+        pixel_aspect: width of a pixel over its height, as far as the recording says it.
+        oddities: what is to be said of its files, each with a remedy after a semicolon.
+        cut_off: why a file must have been longer; "": all are whole.
+        reach: how many pairs are there, also of the right eye, where a file is cut off.
+        judged: what is odd about its stamps or poses, as `sags import --check` says it.
+    """
+
+    count: int
+    rate: float | None = None
+    stamps: I64 | None = None
+    pixel_aspect = 1.0
+    oddities: Sequence[str] = ()
+    cut_off = ""
+    reach: int
+    judged: tuple[Finding, ...] = ()
+    _next = 0
+
+    def seek(self, index: int) -> None:
+        """Make `index` the next pair."""
+        self._next = index
+
+    def skip(self) -> bool:
+        """Pass over one pair as cheaply as possible; False at the end."""
+        if self._next >= self.count:
+            return False
+        self._next += 1
+        return True
+
+    def read(self) -> RawPair | None:
+        """The next pair, None at the end.
+
+        Raises:
+            LostPictureError: it cannot be read; those behind it may be.
+            SagsError: it is damaged, or does not fit those before.
+        """
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Release the files, where they stay open between pairs."""
+
+
+class FolderPairs(Pairs):
     """Pictures of two folders, paired by sorted name (numbers in names sort as numbers), or of the left one.
 
     Attributes:
@@ -51,8 +100,6 @@ class FolderPairs:
     Raises:
         UsageError: a folder is missing or empty, or the folders do not fit each other.
     """
-
-    rate: float | None = None  # folders do not know it
 
     def __init__(
         self,
@@ -81,23 +128,10 @@ class FolderPairs:
             self._eight_bits = EightBits(map(read_samples, _spread(eyes)), levels)
             if levels is None:
                 self._eight_bits.tell(left)
-        self._next = 0
         self.read()  # the first pair shows whether the eyes fit each other
         self.seek(0)
 
-    def seek(self, index: int) -> None:
-        self._next = index
-
-    def skip(self) -> bool:
-        self._next += 1
-        return self._next <= self.count
-
     def read(self) -> RawPair | None:
-        """The next pair, None at the end.
-
-        Raises:
-            SagsError: a picture is damaged or has another size than the first one.
-        """
         index = self._next
         if index >= self.count:
             return None
@@ -110,9 +144,6 @@ class FolderPairs:
             mask = self._checked(read_picture(files[-1], STORED), files[-1])
             tissue = self._masks.tissue(mask, files[-1])
         return RawPair(left, right, tissue)
-
-    def close(self) -> None:
-        """Nothing stays open between pictures."""
 
     def _eye(self, file: Path) -> U8:
         samples = self._checked(read_samples(file), file)

@@ -32,6 +32,7 @@ SMALLEST_JUMP = 0.002  # m, and 1 degree: below it fast samples only jitter
 SMALLEST_TURN = np.radians(1)
 LATE_NS = 1_000_000_000  # a stamp that is so much older was not overtaken: the robot was started anew
 JUMP_HELD_NS = 1_000_000_000  # so long a track must be smooth again after a jump
+KEPT = 20_000  # samples of each frame, of a robot that goes on telling
 MOST_FRAMES = 1000  # of a tf tree
 
 
@@ -134,7 +135,7 @@ class PoseTrack:
         kept: samples of each frame that are kept.
     """
 
-    def __init__(self, base: str | None = None, hand: str | None = None, kept: int = 20_000) -> None:
+    def __init__(self, base: str | None = None, hand: str | None = None, kept: int = KEPT) -> None:
         self._base, self._hand = _plain(base or BASE), _plain(hand or HAND)
         self._kept = kept
         self._edges: dict[str, _Edge | _Fixed] = {}

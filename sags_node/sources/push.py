@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
-from types import TracebackType
-from typing import Self
 
 import cv2
 
@@ -17,13 +14,13 @@ from sags_node.messaging.topics import IMAGE
 from sags_node.messaging.wire import Message, WireError
 from sags_node.recording.pictures import ENCODINGS, decode_picture
 from sags_node.sources.sent import SentPictures
-from sags_node.types import U8, Finding, StereoFrame
+from sags_node.types import U8, Finding
 
 NEWEST = 2  # of each eye's waiting pictures: what is older will not be shown
 
 
-class PushedPictures:
-    """A `Source` of live stereo frames; see `LivePairs` for their numbers and epochs.
+class PushedPictures(SentPictures):
+    """A `Source` of live stereo frames that other programs push.
 
     Args:
         size: width and height that pictures must have, px; None: those of the first.
@@ -32,52 +29,26 @@ class PushedPictures:
         UsageError, SagsError: see `Inbox`.
     """
 
-    frame_count: int | None = None
-
     def __init__(self, config: PushSource, size: tuple[int, int] | None = None) -> None:
-        self.rate = config.rate
-        self._sent = SentPictures(config, size)
-        self._inbox = Inbox(
-            config.endpoint, config, "source", self._take, self._sent.slowness, NEWEST, _eyes_of
-        )
+        super().__init__(config, size)
+        self._inbox = Inbox(config.endpoint, config, "source", self._take_in, self.slowness, NEWEST, _eyes_of)
         self.endpoint = self._inbox.endpoint
-
-    @property
-    def dropped(self) -> int:
-        """Pairs that are missing: lost on the way, or without the other eye's picture."""
-        return self._sent.dropped
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is wrong with who sends, and how to fix it. May be read from any thread."""
         return self._inbox.findings
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
+    def close(self) -> None:
         self._inbox.close()
 
-    def stop(self) -> None:
-        """End the iteration; any thread may call this."""
-        self._sent.pairs.stop()
-
-    def __iter__(self) -> Iterator[StereoFrame]:
-        """Pairs as they arrive, until `stop`; silent while nobody sends."""
-        return iter(self._sent.pairs)
-
-    def _take(self, message: Message, arrival_ns: int) -> None:
+    def _take_in(self, message: Message, arrival_ns: int) -> None:
         eye, last = _eye_and_kind(message)
         stamp_ns = message.meta.stamp_ns
         if last == "image_raw" and eye in ("left", "right"):
-            self._sent.put(
-                "left" if eye == "left" else "right", stamp_ns, arrival_ns, partial(_picture, message)
-            )
+            self.put("left" if eye == "left" else "right", stamp_ns, arrival_ns, partial(_picture, message))
         elif last == "image_raw" and eye == "stereo":
-            self._sent.put_both(stamp_ns, arrival_ns, partial(_picture, message))
+            self.put_both(stamp_ns, arrival_ns, partial(_picture, message))
         else:
             raise SagsError(
                 f"topic {message.topic}: pictures come on NAME/left/image_raw, NAME/right/image_raw or "

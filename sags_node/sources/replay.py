@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import lru_cache
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Self
 
+import cv2
 import numpy as np
 
 from sags_node.config import schema as cfg
@@ -19,12 +19,11 @@ from sags_node.sources.bags import BagPairs
 from sags_node.sources.dvrk import DvrkPairs
 from sags_node.sources.endonerf import EndoNerfPairs
 from sags_node.sources.layout import Layout
-from sags_node.sources.one_eye import refuse_one_eye_twice
-from sags_node.sources.pictures import FolderPairs, RawPair
+from sags_node.sources.pictures import FolderPairs, Pairs
 from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
 from sags_node.sources.videos import OneVideoPairs, VideoPairs
-from sags_node.types import I64, StereoFrame
+from sags_node.types import U8, StereoFrame
 
 log = logging.getLogger(__name__)
 
@@ -37,28 +36,10 @@ Recording = (
     | cfg.DvrkSource
 )
 DEFAULT_RATE = 30.0  # of folders, which do not know theirs
-
-
-class Pairs(Protocol):
-    """The readers of recordings: pairs in order, from any start."""
-
-    rate: float | None  # the recording's own
-    count: int  # as announced; a video may end earlier
-
-    def seek(self, index: int) -> None:
-        """Make `index` the next pair."""
-
-    def skip(self) -> bool:
-        """Pass over one pair as cheaply as possible; False at the end."""
-
-    def read(self) -> RawPair | None:
-        """The next pair, None at the end.
-
-        Raises:
-            LostPictureError: it cannot be read; those behind it may be.
-        """
-
-    def close(self) -> None: ...
+# Two eyes that are one: compared in pictures so small that noise and compression are averaged away.
+WIDTH = 80  # px
+SURELY = 0.25  # of what a shift by one of their pixels changes; the eyes of a scope differ by 1 to 5 of it
+LEAST = 1.0  # grey levels, of such a shift: less is a picture of nothing, which tells nothing
 
 
 class Replay:
@@ -73,10 +54,7 @@ class Replay:
 
     Attributes:
         first: number of the first frame.
-        judged: what is odd about its stamps or poses, as `sags import --check` says it.
         pairs: what is read.
-        pixel_aspect: width of a pixel over its height, as far as the recording says it.
-        oddities: what is to be said of its files, each with a remedy after a semicolon.
 
     Args:
         config: which recording, and how to play it.
@@ -109,18 +87,12 @@ class Replay:
         self.pairs = open_pairs(config, references)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
-        self._stamps: I64 | None = None  # [turns, 2] ns, of the left and the right picture
-        self.pixel_aspect, self.oddities = 1.0, list[str]()
-        if isinstance(self.pairs, VideoPairs | OneVideoPairs):
-            self.pixel_aspect, self.oddities = self.pairs.pixel_aspect, self.pairs.oddities
-        for oddity in self.oddities:
+        for oddity in self.pairs.oddities:
             _say(oddity)
-        if isinstance(self.pairs, BagPairs | DvrkPairs | VideoPairs | OneVideoPairs) and config.rate is None:
-            stamps = self.pairs.stamps
-            self._stamps = None if stamps is None else stamps[:: config.stride]
-        # The recording's own stamps of the left pictures, ns: by them poses of the same recording are found.
-        self._recorded = self.pairs.stamps[:: config.stride, 0] if isinstance(self.pairs, BagPairs) else None
-        self.judged = self.pairs.judged if isinstance(self.pairs, BagPairs | EndoNerfPairs) else ()
+        stamps = None if self.pairs.stamps is None else self.pairs.stamps[:: config.stride]
+        self._stamps = stamps if config.rate is None else None  # [turns, 2] ns, of both eyes' pictures
+        # Those of the left pictures, ns: by them poses of the same recording are found.
+        self._recorded = stamps[:, 0] if stamps is not None and isinstance(self.pairs, BagPairs) else None
         self.dropped = 0
         self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
         self._dropped_in_a_row = 0
@@ -131,7 +103,7 @@ class Replay:
             raise UsageError(
                 f"source.start {config.start} s lies behind the recording's end at {seconds:.2f} s"
             )
-        if isinstance(self.pairs, VideoPairs | OneVideoPairs | DvrkPairs) and self.pairs.cut_off:
+        if self.pairs.cut_off:
             there = -(-self.pairs.reach // config.stride) - self.first
             if config.frames is None or config.frames > there:
                 self.pairs.close()
@@ -163,9 +135,7 @@ class Replay:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
         self.pairs.close()
 
@@ -311,3 +281,24 @@ def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, 
             return BagPairs(config)
         case cfg.DvrkSource():
             return DvrkPairs(config)
+
+
+def refuse_one_eye_twice(left: U8, right: U8 | None) -> None:
+    """Look at the first pair [H, W, 3] of a recording: of one eye twice no depth can come.
+
+    Live cameras are not refused: both may send a test picture until the scope is plugged in. There the watch
+    on both eyes warns (`eyes_equal`).
+
+    Raises:
+        UsageError: both pictures are surely of the same eye.
+    """
+    if right is None or left.shape != right.shape:
+        return
+    size = WIDTH, max(1, round(left.shape[0] * WIDTH / left.shape[1]))
+    a, b = (cv2.resize(eye, size, interpolation=cv2.INTER_AREA).astype(np.float32) for eye in (left, right))
+    shifted = float(np.abs(a[:, 1:] - a[:, :-1]).mean())
+    if shifted > LEAST and float(np.abs(a - b).mean()) < SURELY * shifted:
+        raise UsageError(
+            "both eyes get the same picture, so there is no depth; name the other eye's camera or file in "
+            "source.right, or see to the cables"
+        )

@@ -7,8 +7,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from sags_node.recording.bag import read_messages
 from sags_node.rig.hand_eye import FILE, read_hand_eye
 from sags_node.ros.endpoints import Delivery, Reader
 from sags_node.ros.graph import Graph
-from sags_node.sources.pose_track import POSE_TYPES, NoPoseError, PoseTrack
+from sags_node.sources.pose_track import KEPT, POSE_TYPES, NoPoseError, PoseTrack
 from sags_node.sources.ros2 import absolute
 from sags_node.sources.source import Source, findings_of
 from sags_node.types import F64, Finding, StereoFrame, StereoRig
@@ -37,15 +36,17 @@ STATIC = "/tf_static"
 WHOLE = 10_000_000  # samples of a bag: all
 
 
-class Robot(Protocol):
+class Robot:
     """Where poses come from, from its making to `close`."""
 
-    track: PoseTrack
+    def __init__(self, config: BagRobot | PushRobot | Ros2Robot, kept: int = KEPT) -> None:
+        self.track = PoseTrack(config.base, config.hand, kept)
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Receive no more poses."""
 
 
-class _BagPoses:
+class _BagPoses(Robot):
     """All poses of a bag.
 
     Raises:
@@ -56,7 +57,7 @@ class _BagPoses:
     def __init__(self, config: BagRobot, source: object) -> None:
         if not isinstance(source, BagSource):
             raise UsageError("robot.kind bag takes poses from the bag of the pictures: set source.kind:=bag")
-        self.track = PoseTrack(config.base, config.hand, kept=WHOLE)
+        super().__init__(config, WHOLE)
         wanted = absolute(config.topic)
         seen: dict[str, str] = {}
         wrong, first_wrong = 0, ""  # messages that are no pose: at their time there is none, as in tf2
@@ -78,15 +79,12 @@ class _BagPoses:
                 f"{source.path} has no poses on {wanted}; topics with poses: {there}; set robot.topic"
             )
 
-    def close(self) -> None:
-        pass
 
-
-class _PushedPoses:
+class _PushedPoses(Robot):
     """Poses that another program hands in; see `Inbox`."""
 
     def __init__(self, config: PushRobot) -> None:
-        self.track = PoseTrack(config.base, config.hand)
+        super().__init__(config)
         self._inbox = Inbox(config.endpoint, config, "robot", self._take, about=_pose_of)
         self.endpoint = self._inbox.endpoint
 
@@ -110,11 +108,11 @@ def _pose_of(message: Message) -> list[str]:
     return [] if message.meta.type == TF else ["the robot's pose"]
 
 
-class _RosPoses:
+class _RosPoses(Robot):
     """Poses of a ROS 2 graph; see `Graph`."""
 
     def __init__(self, config: Ros2Robot) -> None:
-        self.track = PoseTrack(config.base, config.hand)
+        super().__init__(config)
         self._topic = absolute(config.topic)
         self._graph = Graph(config)
         self._readers: dict[str, Reader] = {}
@@ -196,9 +194,7 @@ class Posed:
         self._offset_ns = hand_eye.offset_ns
         if config.robot.offset_ms is not None:
             self._offset_ns = round(config.robot.offset_ms * 1e6)
-        if isinstance(
-            config.source, LiveSource
-        ):  # the offset is to the stamp, which had no latency taken off
+        if isinstance(config.source, LiveSource):  # the offset is to the stamp, latency included
             self._offset_ns += round(config.source.latency_ms * 1e6)
         self.robot = open_robot(config)
         self._recorded = isinstance(config.robot, BagRobot)
@@ -228,10 +224,8 @@ class Posed:
         self._source.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._source.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._source.__exit__(*error)
         self.robot.close()
 
     def stop(self) -> None:

@@ -7,8 +7,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from functools import partial
-from types import TracebackType
-from typing import Self
 
 from sags_node.config.schema import Ros2Source
 from sags_node.errors import SagsError, UsageError
@@ -21,7 +19,7 @@ from sags_node.ros.endpoints import Reader
 from sags_node.ros.graph import Graph, receive_buffer
 from sags_node.sources.sent import SentPictures
 from sags_node.types import Eye as Calibrated
-from sags_node.types import Finding, Side, StereoFrame, StereoRig
+from sags_node.types import Finding, Side, StereoRig
 from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
@@ -34,8 +32,8 @@ INFO_S = 10.0  # longest wait for the calibration: cameras may just be starting
 ZEROS_S = 2.0  # longest wait where they say that they have none: drivers start before they have read it
 
 
-class RosCameras:
-    """A `Source` of live stereo frames; see `LivePairs` for their numbers and epochs.
+class RosCameras(SentPictures):
+    """A `Source` of live stereo frames from a ROS 2 graph.
 
     Pictures come raw or compressed, as their sender publishes them. Its process may end and come again. While
     the cameras say another calibration than `rig` none is given: its depth would be wrong.
@@ -48,13 +46,10 @@ class RosCameras:
         UsageError, SagsError: see `Graph`.
     """
 
-    frame_count: int | None = None
-
     def __init__(
         self, config: Ros2Source, size: tuple[int, int] | None = None, rig: StereoRig | None = None
     ) -> None:
-        self.rate = config.rate
-        self._sent = SentPictures(config, size)
+        super().__init__(config, size)
         self._graph = Graph(config)
         self._rig = rig
         self._infos = None if rig is None else _CameraInfos(self._graph, config)
@@ -65,13 +60,8 @@ class RosCameras:
         self._left_out: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
         self._silent: Mapping[Side, RateLimitedLog] = {"left": RateLimitedLog(), "right": RateLimitedLog()}
         self._heard: dict[Side, float] = {}
-        turn = self._read, self._sent.pairs.stopped, "ros2"
+        turn = self._read, self.stopped, "ros2"
         self._thread = threading.Thread(target=go_on, args=turn, name="ros2", daemon=True)
-
-    @property
-    def dropped(self) -> int:
-        """Pairs that are missing: lost on the way, or without the other eye's picture."""
-        return self._sent.dropped
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -82,25 +72,13 @@ class RosCameras:
         said = f"{changed}: zoom, focus or picture size was changed, and nothing is shown"
         return (Finding("calibration_changed", f"{said}; set it back, or restart the node to take it over"),)
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         self._heard = dict.fromkeys(self._names, time.monotonic())
         self._thread.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
+    def close(self) -> None:
         if self._thread.ident is not None:
             self._thread.join(CLOSE_S)
-
-    def stop(self) -> None:
-        """End the iteration; any thread may call this."""
-        self._sent.pairs.stop()
-
-    def __iter__(self) -> Iterator[StereoFrame]:
-        """Pairs as they arrive, until `stop`; silent while nobody publishes."""
-        return iter(self._sent.pairs)
 
     # ---- the reading thread ----------------------------------------------------------------------------
 
@@ -151,13 +129,13 @@ class RosCameras:
     def _put(self, eye: Side, kind: str, data: bytes) -> None:
         name, arrival_ns = self._names[eye], time.time_ns()
         decode = partial(decode_picture, data, kind, name)
-        put = partial(self._sent.put, eye) if len(self._names) == 2 else self._sent.put_both
+        put = partial(self.put, eye) if len(self._names) == 2 else self.put_both
         try:
             put(header_stamp(data), arrival_ns, decode)
         except SagsError as error:
             if self._left_out[eye].due():
                 log.warning("%s: left out: %s", name, str(error).removeprefix(f"{name}: "))
-        arrivals = self._sent.arrivals[eye]
+        arrivals = self.arrivals[eye]
         if arrivals.share_lost > MUCH_LOST and self._left_out[eye].due():
             log.warning("%s", _explained(name, arrivals.share_lost))
 

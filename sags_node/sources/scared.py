@@ -25,7 +25,7 @@ from sags_node.rig import check_intrinsics, rectified_rig
 from sags_node.rig.matrices import numbers_in, open_storage
 from sags_node.sources.layout import Layout
 from sags_node.sources.numbered import NumberedFiles, open_numbered
-from sags_node.sources.pictures import FolderPairs, RawPair
+from sags_node.sources.pictures import FolderPairs, Pairs, RawPair
 from sags_node.sources.videos import OneVideoPairs
 from sags_node.types import F32, F64, Eye, Reference, StereoRig
 
@@ -56,7 +56,7 @@ class Rectification:
         return T
 
 
-class ScaredPairs:
+class ScaredPairs(Pairs):
     """The frames of a keyframe's video with their poses and, if `references`, the structured light depth.
 
     Raises:
@@ -80,7 +80,6 @@ class ScaredPairs:
         )
         self.rate = self._pictures.rate
         self.count = self._pictures.count if self._poses is None else len(self._poses)
-        self._next = 0
 
     def seek(self, index: int) -> None:
         self._pictures.seek(index)
@@ -91,11 +90,6 @@ class ScaredPairs:
         return self._next <= self.count and self._pictures.skip()
 
     def read(self) -> RawPair | None:
-        """The next frame, None at the end.
-
-        Raises:
-            SagsError: a file of this frame is damaged or not of the stated form.
-        """
         index, self._next = self._next, self._next + 1
         pair = self._pictures.read() if index < self.count else None
         if pair is None:

@@ -10,9 +10,8 @@ import numpy as np
 from sags_node.config.schema import SentSource
 from sags_node.errors import SagsError
 from sags_node.sources.clock import CaptureClock
-from sags_node.sources.device import Picture
 from sags_node.sources.layout import Layout
-from sags_node.sources.live_pairs import LivePairs
+from sags_node.sources.pairing import LivePairs, Picture
 from sags_node.sources.pictures import size_text
 from sags_node.types import U8, Side
 
@@ -75,11 +74,10 @@ class Arrivals:
         return max(0.0, float(steps.sum() / np.median(steps)) - len(steps))
 
 
-class SentPictures:
-    """Both eyes' pictures from another program. Used by one receiving thread.
+class SentPictures(LivePairs):
+    """A `Source` of both eyes' pictures from another program. One receiving thread puts them in.
 
     Attributes:
-        pairs: where they come out.
         arrivals: of each eye.
 
     Args:
@@ -87,7 +85,8 @@ class SentPictures:
     """
 
     def __init__(self, config: SentSource, size: tuple[int, int] | None) -> None:
-        self.pairs = LivePairs(config.pair_tolerance_ms, config.latency_ms)
+        super().__init__(config.pair_tolerance_ms, config.latency_ms)
+        self.rate = config.rate
         self.arrivals: dict[Side, Arrivals] = {"left": Arrivals(), "right": Arrivals()}
         self._size = size
         self._one = Layout(config.geometry.model_copy(update={"layout": "separate"}))
@@ -96,20 +95,19 @@ class SentPictures:
         self._both = Layout(config.geometry.model_copy(update={"layout": both}))
         self._own = config.stamps == "own"
         self._clocks: Mapping[Side, CaptureClock] = {"left": CaptureClock(), "right": CaptureClock()}
-        self._rate = config.rate
         self._age_ns = 0.0  # of pictures when they come
 
     @property
     def dropped(self) -> int:
         """Pairs that are missing: lost on the way, or without the other eye's picture."""
-        return max(self.pairs.unpaired, *(eye.lost for eye in self.arrivals.values()))
+        return max(super().dropped, *(eye.lost for eye in self.arrivals.values()))
 
     def slowness(self) -> str | None:
         """What is wrong with how pictures come, for who sends them; None: nothing."""
         rate = min(arrivals.rate for arrivals in self.arrivals.values())
-        if rate < ENOUGH * self._rate:
+        if rate < ENOUGH * self.rate:
             return (
-                f"{rate:.1f} of {self._rate:g} pictures a second come: send faster, or set "
+                f"{rate:.1f} of {self.rate:g} pictures a second come: send faster, or set "
                 f"source.rate:={round(rate, 1):g}"
             )
         if not self._own and self._age_ns > LATE_NS:
@@ -128,7 +126,7 @@ class SentPictures:
         t_ns = self._on_wall(eye, stamp_ns, arrival_ns)
         self.arrivals[eye].add(stamp_ns)
         picture = self._checked(decode(), self._one)
-        self.pairs.put(eye, Picture(t_ns, self._one.eye(picture, eye), stamp_ns, arrival_ns))
+        self.add(eye, Picture(t_ns, self._one.eye(picture, eye), stamp_ns, arrival_ns))
 
     def put_both(self, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
         """Take one picture of both eyes in, side by side unless the geometry says otherwise; see `put`."""
@@ -137,7 +135,7 @@ class SentPictures:
             arrivals.add(stamp_ns)
         eyes = self._both.eyes(self._checked(decode(), self._both))
         left, right = (Picture(t_ns, eye, stamp_ns, arrival_ns) for eye in eyes)
-        self.pairs.put_both(left, right)
+        self.add_both(left, right)
 
     def _on_wall(self, eye: Side, stamp_ns: int, arrival_ns: int) -> int:
         if self._own:

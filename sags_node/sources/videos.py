@@ -10,8 +10,8 @@ import numpy as np
 from sags_node.errors import SagsError, UsageError
 from sags_node.media.video import Video
 from sags_node.sources.layout import Layout
-from sags_node.sources.pictures import RawPair, size_text
-from sags_node.sources.stamps import pair
+from sags_node.sources.pairing import pair
+from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64, U8, Bool
 
 log = logging.getLogger(__name__)
@@ -21,23 +21,7 @@ PARTNERED = 0.5  # share of the pictures that have a partner, where stamps of tw
 UNEVEN_RATES = 0.1  # that the usual rates of two files with gaps or jitter may differ
 
 
-class _InOrder:
-    """Pairs that are read by their number."""
-
-    count: int
-    _next = 0
-
-    def seek(self, index: int) -> None:
-        self._next = index
-
-    def skip(self) -> bool:
-        if self._next >= self.count:
-            return False
-        self._next += 1
-        return True
-
-
-class VideoPairs(_InOrder):
+class VideoPairs(Pairs):
     """Two videos, or the left one alone, which says how long it is.
 
     Pictures of one number are a pair. Where stamps say that some are missing, those nearest in time are.
@@ -45,10 +29,6 @@ class VideoPairs(_InOrder):
     Attributes:
         left, right: the videos; right None: there is one eye.
         by_number: not by stamps.
-        stamps: [count, 2] ns, of the left and the right picture; None: they are even.
-        pixel_aspect: width of a pixel over its height.
-        cut_off: why a file must have been longer; "": both are whole.
-        reach: how many pairs are there, also of the right eye.
         oddities: see `Video`; also how many pictures have no partner.
 
     Args:
@@ -57,6 +37,8 @@ class VideoPairs(_InOrder):
     Raises:
         UsageError: a file is missing or not a video, or the two differ in size or rate.
     """
+
+    oddities: list[str]
 
     def __init__(self, left: Path, right: Path | None, layout: Layout) -> None:
         self.left = Video(left)
@@ -80,12 +62,6 @@ class VideoPairs(_InOrder):
         self.reach = min(self.count, *(each.count for each in self._videos))
 
     def read(self) -> RawPair | None:
-        """The next pair, None at the end.
-
-        Raises:
-            LostPictureError: one of the two cannot be decoded.
-            SagsError: the right video is shorter than the left one.
-        """
         if self._next >= self.count:
             return None
         index, self._next = self._next, self._next + 1
@@ -171,12 +147,11 @@ class VideoPairs(_InOrder):
         return np.stack([of_left, right.stamps[self._numbers[:, 1]] - self._late], axis=1)
 
 
-class OneVideoPairs(_InOrder):
+class OneVideoPairs(Pairs):
     """One video of both eyes: in halves or boxes of a picture, in rows, or one after the other.
 
     Attributes:
         size: width and height of an eye's picture, px.
-        stamps, pixel_aspect, cut_off, reach, oddities: as of `VideoPairs`.
 
     Raises:
         UsageError: its pictures cannot be split as asked.
@@ -194,7 +169,6 @@ class OneVideoPairs(_InOrder):
         self.rate = None if video.rate is None else video.rate / in_turn
         self._numbers = _turns(video) if layout.is_sequential else np.arange(video.count)[:, None]
         self.count = len(self._numbers)
-        self.stamps: I64 | None = None
         if video.stamps is not None and not video.is_even:
             of_eyes = video.stamps[self._numbers]
             left = layout.order.index("left") if layout.is_sequential else 0
@@ -205,11 +179,6 @@ class OneVideoPairs(_InOrder):
         self.oddities = video.oddities
 
     def read(self) -> RawPair | None:
-        """The next pair, None at the end.
-
-        Raises:
-            LostPictureError: it cannot be decoded.
-        """
         if self._next >= self.count:
             return None
         index, self._next = self._next, self._next + 1

@@ -6,10 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-import bag_files as files
-import cv2
 import numpy as np
 from bag_files import MS, START, picture
+from numbered_pictures import write_video
 
 
 def frame_record(number: int, **realtime: int | None) -> dict[str, Any]:
@@ -45,12 +44,7 @@ def write_session(folder: Path, frames: list[dict[str, Any]], shown: int = 8, or
     }
     (folder / "stereo.json").write_text(json.dumps(sidecar, indent=1, sort_keys=True))  # as jsoncpp writes it
     (folder / "index.json").write_text("{}")
-    video = cv2.VideoWriter(
-        str(folder / "stereo.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (2 * files.WIDTH, files.HEIGHT)
-    )
-    for number in range(shown):
-        eyes = [picture(number, 0), np.full_like(picture(0, 0), 200)]
-        both = np.hstack(eyes if order == "LR" else eyes[::-1])
-        video.write(cv2.cvtColor(both, cv2.COLOR_RGB2BGR))
-    video.release()
+    eyes = [[picture(number, 0), np.full_like(picture(0, 0), 200)] for number in range(shown)]
+    both = [np.hstack(pair if order == "LR" else pair[::-1]) for pair in eyes]
+    write_video(folder / "stereo.mp4", both, codec="mp4v")
     return folder

@@ -32,10 +32,10 @@ def write_png(file: Path, rgb: U8) -> None:
     assert cv2.imwrite(str(file), rgb[..., ::-1])
 
 
-def write_video(file: Path, pictures: list[U8], rate: float = 25.0) -> Path:
-    """Lossy MJPG, as capture boxes write it."""
+def write_video(file: Path, pictures: list[U8], rate: float = 25.0, codec: str = "MJPG") -> Path:
+    """Lossy, as capture boxes write it."""
     height, width = pictures[0].shape[:2]
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), rate, (width, height))
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*codec), rate, (width, height))
     assert writer.isOpened()
     for rgb in pictures:
         writer.write(np.ascontiguousarray(rgb[..., ::-1]))
@@ -62,9 +62,18 @@ def recordings(tmp_path: Path) -> dict[str, Recording]:
     right_file = write_video(tmp_path / "r.avi", [pair[1] for pair in pairs])
     lr = write_video(tmp_path / "lr.avi", [np.hstack(pair) for pair in pairs])
     rl = write_video(tmp_path / "rl.avi", [np.hstack(pair[::-1]) for pair in pairs])
+    over = write_video(tmp_path / "over.avi", [np.vstack(pair[::-1]) for pair in pairs])
+    turns = write_video(tmp_path / "turns.avi", [eye for pair in pairs for eye in pair], 50.0)
+    wide = [
+        write_video(tmp_path / f"wide_{eye}.avi", [np.hstack([green, pair[eye]]) for pair in pairs])
+        for eye in (0, 1)
+    ]
     panes = write_video(
         tmp_path / "panes.avi", [np.vstack([np.hstack(p), np.hstack([green] * 2)]) for p in pairs]
     )
+    below = cfg.GeometryConfig(layout="over_under", first="right")
+    in_turn = cfg.GeometryConfig(layout="frame_sequential")
+    half = cfg.GeometryConfig(crop=(WIDTH, 0, WIDTH, HEIGHT))
     halves = cfg.GeometryConfig(layout="side_by_side")
     turned = cfg.GeometryConfig(layout="side_by_side", first="right")
     boxes = cfg.GeometryConfig(
@@ -75,5 +84,8 @@ def recordings(tmp_path: Path) -> dict[str, Recording]:
         "videos": cfg.VideosSource(left=left_file, right=right_file, pace="step"),
         "LR": cfg.VideosSource(left=lr, geometry=halves, pace="step"),
         "RL": cfg.VideosSource(left=rl, geometry=turned, pace="step"),
+        "over under": cfg.VideosSource(left=over, geometry=below, pace="step"),
+        "in turn": cfg.VideosSource(left=turns, geometry=in_turn, pace="step"),
+        "cropped": cfg.VideosSource(left=wide[0], right=wide[1], geometry=half, pace="step"),
         "panes": cfg.VideosSource(left=panes, geometry=boxes, pace="step"),
     }

@@ -36,7 +36,7 @@ from sags_node.messaging.wire import decode
 from sags_node.node import health, latest, node, views
 from sags_node.node import operations as node_operations
 from sags_node.pipeline.pipeline import FrameRequest
-from sags_node.sources import live_pairs
+from sags_node.sources import pairing
 from sags_node.sources.sent import SentPictures
 from sags_node.types import FrameResult, StereoFrame
 
@@ -193,7 +193,7 @@ class Source:
     def __exit__(self, *_: object) -> None: ...
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        for frame in self.sent.pairs:
+        for frame in self.sent:
             self._run.given += 1
             yield frame
 
@@ -202,13 +202,13 @@ class Source:
         return self.sent.dropped
 
     def stop(self) -> None:
-        self.sent.pairs.stop()
+        self.sent.stop()
 
     def _film(self, eye: str) -> None:
         """Lost, late, doubled, outdated and future pictures, silence, and stamps that go back."""
         world = self._run.world
         chance, offset, number = world.random, 0, 0
-        while not self.sent.pairs.stopped.is_set():
+        while not self.sent.stopped.is_set():
             number += 1
             world.wait(lambda: False, max(0.0, number / RATE - world.now))
             what = chance.random()
@@ -276,7 +276,7 @@ class Run:
     def _replace(self, patch: pytest.MonkeyPatch) -> None:
         for module in (node, health, publisher):
             patch.setattr(module, "time", self.world)
-        for module in (node, latest, live_pairs, node_operations):
+        for module in (node, latest, pairing, node_operations):
             patch.setattr(module, "threading", self.world.threading)
         patch.setattr(node, "os", self._wake)
         patch.setattr(node, "Pipeline", lambda *_, rate: Pipeline(self, rate))

@@ -44,8 +44,8 @@ CLOSE_UP = [[0.995, 0, 0.1, -0.003], [0, 1, 0, 0.002], [-0.1, 0, 0.995, 0.012], 
 @pytest.fixture(scope="module")
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
     # No frame is left out and the rung is given, so what is shown does not depend on how busy the machine is.
-    # On this rung the node's renders are drawn at full size, as views always are.
-    options = ["source.pace:=fast", f"mapping.rung:={WHOLE}"]
+    # On this rung the node's renders are drawn at full size, as views always are. Views are the model alone.
+    options = ["source.pace:=fast", f"mapping.rung:={WHOLE}", "publish.detail:=false"]
     running = RunningNode(phantom_session, tmp_path_factory.mktemp("node"), *options)
     yield running
     assert running.stop() == 0, running.said()

@@ -28,8 +28,8 @@ from sags_node.recording.info import bag_info
 from sags_node.recording.pictures import decode_picture
 from sags_node.rig import save_rig
 from sags_node.sources.bags import read_rig
+from sags_node.sources.pairing import pair
 from sags_node.sources.replay import Replay
-from sags_node.sources.stamps import pair
 from sags_node.types import StereoFrame
 
 COUNT = 10

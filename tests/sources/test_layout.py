@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from sags_node.config.schema import GeometryConfig, VideosSource
 from sags_node.errors import UsageError
-from sags_node.sources.device import Shot
 from sags_node.sources.layout import Layout
-from sags_node.sources.pairing import Alternation
-from sags_node.sources.replay import Replay
+from sags_node.sources.pairing import Alternation, Shot
 
 RNG = np.random.default_rng(5)
 LEFT, RIGHT = RNG.integers(0, 256, (2, 24, 32, 3), np.uint8)
@@ -182,72 +179,6 @@ def test_a_lost_picture_does_not_exchange_the_eyes() -> None:
     pairs, alone = pairs_of(kept, jitter_ms=4)
     assert pairs == [(0, 1), (4, 5), (6, 7), (10, 11), (14, 15), (16, 17), (18, 19)]
     assert alone == 2  # 2 and 9: 3 and 8 are missing
-
-
-# ---- files -----------------------------------------------------------------------------------------------
-
-
-def write_video(file: Path, pictures: np.ndarray) -> None:
-    """Lossless."""
-    height, width = pictures.shape[1:3]
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"FFV1"), 20, (width, height))
-    if not writer.isOpened():
-        pytest.skip("OpenCV here cannot write FFV1")
-    for picture in pictures:
-        writer.write(picture[..., ::-1])
-    writer.release()
-
-
-def played(config: VideosSource) -> tuple[list[tuple[np.ndarray, np.ndarray]], float]:
-    with Replay(config) as source:
-        return [(frame.left, frame.right) for frame in source], source.rate
-
-
-SMOOTH = np.stack([cv2.resize(p, (64, 48), interpolation=cv2.INTER_LINEAR) for p in (LEFT, RIGHT)])
-NEAR = 3  # grey levels: RGB in YUV 4:4:4 or BGR0 of the codec
-
-
-def movie(count: int) -> np.ndarray:
-    """[count, 2, 48, 64, 3]: both eyes, another picture each time."""
-    return np.stack([np.roll(SMOOTH, 3 * n, axis=2) for n in range(count)])
-
-
-def test_a_video_of_both_eyes_over_under(tmp_path: Path) -> None:
-    eyes = movie(4)
-    write_video(tmp_path / "both.avi", np.concatenate([eyes[:, 1], eyes[:, 0]], axis=1))
-    geometry = GeometryConfig(layout="over_under", first="right")
-    frames, rate = played(VideosSource(left=tmp_path / "both.avi", geometry=geometry, pace="step"))
-    assert len(frames) == 4 and rate == 20
-    for (left, right), expected in zip(frames, eyes, strict=True):
-        assert np.abs(left.astype(int) - expected[0]).max() <= NEAR
-        assert np.abs(right.astype(int) - expected[1]).max() <= NEAR
-
-
-@pytest.mark.parametrize("start", [0.0, 0.2])
-def test_a_video_of_the_eyes_in_turn(tmp_path: Path, start: float) -> None:
-    eyes = movie(5)
-    write_video(tmp_path / "turns.avi", eyes.reshape(10, 48, 64, 3))
-    geometry = GeometryConfig(layout="frame_sequential")
-    config = VideosSource(left=tmp_path / "turns.avi", geometry=geometry, pace="step", start=start)
-    frames, rate = played(config)
-    assert rate == 10  # pairs a second
-    assert len(frames) == 5 - start * rate
-    for (left, right), expected in zip(frames, eyes[round(start * rate) :], strict=True):
-        assert np.abs(left.astype(int) - expected[0]).max() <= NEAR
-        assert np.abs(right.astype(int) - expected[1]).max() <= NEAR
-
-
-def test_two_videos_are_cropped_alike(tmp_path: Path) -> None:
-    eyes = movie(2)
-    for side, name in enumerate(("left", "right")):
-        write_video(tmp_path / f"{name}.avi", eyes[:, side])
-    geometry = GeometryConfig(crop=(8, 4, 32, 24), flip="both")
-    config = VideosSource(
-        left=tmp_path / "left.avi", right=tmp_path / "right.avi", geometry=geometry, pace="step"
-    )
-    frames, _ = played(config)
-    for found, expected in zip(frames[1], eyes[1], strict=True):
-        assert np.abs(found.astype(int) - expected[4:28, 8:40][::-1, ::-1]).max() <= NEAR
 
 
 def test_one_video_of_both_eyes_needs_no_other() -> None:

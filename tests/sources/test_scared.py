@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import figures_of
+from numbered_pictures import write_video
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
@@ -124,21 +125,14 @@ def pack(file: Path, members: dict[str, bytes]) -> None:
             archive.addfile(member, io.BytesIO(data))
 
 
-def write_video(file: Path, frames: list[U8]) -> None:
-    height, width = frames[0].shape[:2]
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (width, height))
-    for frame in frames:
-        writer.write(np.ascontiguousarray(frame[..., ::-1]))
-    writer.release()
-
-
 @pytest.fixture
 def keyframe(tmp_path: Path) -> Path:
     """As it is downloaded: a video of stacked pictures and packed data."""
     folder = tmp_path / "dataset_1/keyframe_2"
     (folder / "data").mkdir(parents=True)
     write_calibration(folder / "endoscope_calibration.yaml")
-    write_video(folder / "data/rgb.mp4", [np.vstack(pictures(number)) for number in range(FRAMES)])
+    shown = [np.vstack(pictures(number)) for number in range(FRAMES)]
+    write_video(folder / "data/rgb.mp4", shown, codec="mp4v")
     # In the order of a file system, with what a Mac leaves behind.
     order = [0, 2, 1, 5, 3, 4]
     poses = {f"./frame_data{number:06d}.json": frame_json(number) for number in order}

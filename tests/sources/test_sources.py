@@ -46,7 +46,9 @@ def replay(config: Recording, clock: Clock) -> Replay:
     return Replay(config, clock=clock, wall_ns=clock.wall_ns, sleep=clock.sleep)
 
 
-@pytest.mark.parametrize("kind", ["folders", "videos", "LR", "RL", "panes"])
+@pytest.mark.parametrize(
+    "kind", ["folders", "videos", "LR", "RL", "over under", "in turn", "cropped", "panes"]
+)
 def test_every_kind_plays_the_same_frames(tmp_path: Path, kind: str) -> None:
     config = recordings(tmp_path)[kind]
     with open_source(config) as source:
@@ -62,7 +64,7 @@ def test_every_kind_plays_the_same_frames(tmp_path: Path, kind: str) -> None:
     assert frames[0].tissue is None and frames[0].reference is None and frames[0].T_world_cam is None
 
 
-@pytest.mark.parametrize("kind", ["folders", "videos", "LR", "panes"])
+@pytest.mark.parametrize("kind", ["folders", "videos", "LR", "in turn", "panes"])
 def test_start_frames_and_loop(tmp_path: Path, kind: str) -> None:
     config = recordings(tmp_path)[kind]
     config = config.model_copy(update={"start": 5 / 25, "frames": 8, "loop": True})

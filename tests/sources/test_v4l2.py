@@ -1,4 +1,4 @@
-"""Live cameras with a camera made of Python: pairing, unplugging, silence, frozen pictures.
+"""Cameras of the kernel, made of Python: stamps of drivers, unplugging, silence, frozen pictures.
 
 tests/sources/test_v4l2_vivid.py checks the same source against a real kernel driver.
 """
@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -21,20 +20,14 @@ from sags_node import workers
 from sags_node.config.schema import GeometryConfig, V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources import live
-from sags_node.sources.device import STRANGE, Device, Picture, Shot, wall_stamp
 from sags_node.sources.live import LiveStereo
-from sags_node.sources.pairing import QUEUE_LENGTH, Pairing
-from sags_node.sources.v4l2 import open_cameras
-from sags_node.types import StereoFrame
+from sags_node.sources.pairing import Shot
+from sags_node.sources.v4l2 import STRANGE, Device, open_cameras, wall_stamp
 
 pytestmark = pytest.mark.live
 
 MS = 1_000_000
 CONFIG = V4l2Source(left="/dev/left", right="/dev/right", width=8, height=4, rate=50, deadline=60)
-
-
-def shot(t_ms: float, value: int = 0, width: int = 8) -> Picture:
-    return Picture(round(t_ms * MS), np.full((4, width, 3), value, np.uint8))
 
 
 class FakeCamera:
@@ -45,7 +38,7 @@ class FakeCamera:
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
-        self.pictures: queue.Queue[Picture | None] = queue.Queue()
+        self.pictures: queue.Queue[Shot | None] = queue.Queue()
         self.closed = False
 
     def read(self, timeout: float) -> Shot | None:
@@ -55,7 +48,7 @@ class FakeCamera:
             return None
         if picture is None:
             raise self.gone("camera is gone")
-        return Shot(*picture)
+        return picture
 
     def close(self) -> None:
         self.closed = True
@@ -78,8 +71,9 @@ class Plugs:
 
     def put(self, t_ms: float, value: int = 0, skew_ms: float = 0.0) -> None:
         """One moment in front of both newest cameras."""
-        self.opened["/dev/left"][-1].pictures.put(shot(t_ms, value))
-        self.opened["/dev/right"][-1].pictures.put(shot(t_ms + skew_ms, value))
+        image = np.full((4, 8, 3), value, np.uint8)
+        for path, t in (("/dev/left", t_ms), ("/dev/right", t_ms + skew_ms)):
+            self.opened[path][-1].pictures.put(Shot(round(t * MS), image))
 
 
 @pytest.fixture
@@ -91,167 +85,34 @@ def plugs(monkeypatch: pytest.MonkeyPatch) -> Plugs:
 
 
 class Collector:
-    """Takes frames in a thread, as a node does."""
+    """Takes what the left pictures show in a thread, as a node does."""
 
     def __init__(self, source: LiveStereo) -> None:
-        self.frames: list[StereoFrame] = []
+        self.values: list[int] = []
+        self.skews_ms: set[float] = set()
         self.thread = threading.Thread(target=self._take, args=(source,))
         self.thread.start()
 
     def _take(self, source: LiveStereo) -> None:
         for frame in source:
-            self.frames.append(frame)
-
-    def wait_for(self, count: int) -> None:
-        until(lambda: len(self.frames) >= count)
-
-    def values(self) -> list[int]:
-        return [int(frame.left[0, 0, 0]) for frame in self.frames]
+            self.skews_ms.add((frame.t_capture_right_ns - frame.t_capture_ns) / MS)
+            self.values.append(int(frame.left[0, 0, 0]))
 
 
-# ---- pairing ---------------------------------------------------------------------------------------------
-
-
-def drain(pairing: Pairing) -> list[tuple[int, int, int]]:
-    pairs = []
-    while (pair := pairing.take()) is not None:
-        pairs.append((pair[0], round(pair[1].t_ns / MS), round(pair[2].t_ns / MS)))
-    return pairs
-
-
-def test_pairs_by_nearest_stamp_and_counts_the_rest() -> None:
-    pairing = Pairing(20 * MS)
-    for t in (0, 33, 66):
-        pairing.add_left(shot(t))
-    for t in (30, 70, 101):
-        pairing.add_right(shot(t))
-    # Left 0 has right 30 only, which is too far and nearer to left 33.
-    assert drain(pairing) == [(1, 33, 30), (2, 66, 70)]
-    assert pairing.unpaired == 1
-    pairing.add_left(shot(99))
-    assert drain(pairing) == [(3, 99, 101)]
-
-
-def test_prefers_a_nearer_successor_within_the_tolerance() -> None:
-    pairing = Pairing(20 * MS)
-    pairing.add_left(shot(0))
-    pairing.add_left(shot(16))
-    pairing.add_right(shot(15))
-    assert drain(pairing) == [(1, 16, 15)]
-    assert pairing.unpaired == 1
-
-
-def test_one_eye_alone_neither_pairs_nor_grows() -> None:
-    pairing = Pairing(20 * MS)
-    for n in range(100):
-        pairing.add_left(shot(33 * n))
-    assert drain(pairing) == []
-    assert pairing.unpaired == 100 - QUEUE_LENGTH
-
-
-@pytest.mark.parametrize("phase_ms", [-16.0, -7.0, 0.0, 9.0, 16.0])
-def test_free_running_cameras_pair_from_the_first_moment(phase_ms: float) -> None:
-    """Two 30 Hz cameras, any phase, some jitter: all but the odd picture at the start find a partner."""
-    rng = np.random.default_rng(3)
-    moments = [(1000 / 30 * n + rng.normal(0, 0.2), "left") for n in range(200)]
-    moments += [(1000 / 30 * n + phase_ms + rng.normal(0, 0.2), "right") for n in range(200)]
-    pairing = Pairing(20 * MS)
-    pairs = []
-    for t, eye in sorted(moments):
-        (pairing.add_left if eye == "left" else pairing.add_right)(shot(t))
-        pairs += drain(pairing)
-    assert len(pairs) >= 199
-    assert max(abs(left - right) for _, left, right in pairs) <= 20
-
-
-@pytest.mark.fault("clock: set back by an hour between the eyes")
-def test_recovers_when_the_wall_clock_is_set_back() -> None:
-    pairing = Pairing(20 * MS)
-    pairing.add_right(shot(3_600_000))  # its partner came after the clock was set back one hour
-    pairs = []
-    for n in range(10):
-        pairing.add_left(shot(33 * n))
-        pairing.add_right(shot(33 * n + 1))
-        pairs += drain(pairing)
-    assert len(pairs) >= 10 - QUEUE_LENGTH
-
-
-@pytest.mark.parametrize(
-    ("driver_ns", "expected"),
-    [
-        (95_000_000_000, 995_000_000_000),  # 5 s old: it waited in the driver
-        (99_980_000_000, 999_980_000_000),  # 20 ms old
-        (100_060_000_000, 1_000_000_000_000),  # ahead of its arrival
-        (0, 1_000_000_000_000),  # the driver gives none
-        (1_000_000_000_000, 1_000_000_000_000),  # a wall clock stamp
-    ],
-)
-def test_wall_stamp(driver_ns: int, expected: int) -> None:
-    assert wall_stamp(driver_ns, 100_000_000_000, 1_000_000_000_000) == expected
-
-
-@pytest.mark.fault("camera: pictures wait in its driver while the process is stopped")
-@pytest.mark.parametrize("first", [True, False])
-@pytest.mark.parametrize("stopped_s", [0.9, 1.1, 3.0, 3600.0])
-def test_what_waited_in_the_driver_keeps_its_age(
-    stopped_s: float, first: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Four buffers of before a stop, also where they are the very first."""
-    old = [stopped_s] * 4
-    for age, told in zip(
-        [0.02] * (not first) + old, taken_at(monkeypatch, [0.02] * (not first) + old), strict=True
-    ):
-        assert told == pytest.approx(age, abs=0.01)
-
-
-def test_stamps_of_a_clock_of_its_own_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A driver that counts from when it was plugged in: what it says is old is new."""
-    told = taken_at(monkeypatch, [1000.0] * 60)
-    assert told[STRANGE:] == [0.0] * (60 - STRANGE)
-
-
-def taken_at(monkeypatch: pytest.MonkeyPatch, ages: list[float]) -> list[float]:
-    """How old pictures are said to be of which a driver says `ages`, s."""
-    wall_ns, monotonic_ns = 10**18, 10**14
-
-    class Capture:
-        waitAny = staticmethod(lambda captures, timeout: (True, [0]))
-        isOpened = set = release = lambda self, *_: True
-
-        def __init__(self, *_: object) -> None:
-            self.count = 0
-
-        def read(self) -> tuple[bool, np.ndarray]:
-            self.count += 1
-            return True, np.zeros((4, 8, 3), np.uint8)
-
-        def get(self, what: int) -> float:
-            if what == cv2.CAP_PROP_POS_MSEC:  # each is another one
-                return 1e-6 * (monotonic_ns + self.count - round(ages[self.count - 1] * 1e9))
-            return {cv2.CAP_PROP_FRAME_WIDTH: 8.0, cv2.CAP_PROP_FRAME_HEIGHT: 4.0}.get(what, 0.0)
-
-    monkeypatch.setattr(cv2, "VideoCapture", Capture)
-    monkeypatch.setattr(time, "time_ns", lambda: wall_ns)
-    monkeypatch.setattr(time, "monotonic_ns", lambda: monotonic_ns)
-    camera = Device("/dev/null", CONFIG)
-    return [(wall_ns - camera.read(1.0).t_ns) * 1e-9 for _ in ages]  # type: ignore[union-attr]
-
-
-# ---- the source ------------------------------------------------------------------------------------------
-
-
-def test_delivers_pairs_with_both_stamps(plugs: Plugs) -> None:
+@pytest.mark.fault("camera: absent while the node stops")
+def test_pairs_come_until_the_end_and_all_is_closed(plugs: Plugs) -> None:
     with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
-        for n in range(5):
+        for n in range(3):
             plugs.put(20 * n, value=n, skew_ms=3)
-            collector.wait_for(n + 1)
-    collector.thread.join(30)
-    assert not collector.thread.is_alive()
-    assert collector.values() == [0, 1, 2, 3, 4]
-    assert [frame.frame_id for frame in collector.frames] == [0, 1, 2, 3, 4]
-    assert [frame.t_capture_ns for frame in collector.frames] == [20 * MS * n for n in range(5)]
-    assert {f.t_capture_right_ns - f.t_capture_ns for f in collector.frames} == {3 * MS}
+            until(lambda n=n: len(collector.values) == n + 1)
+        plugs.absent.update(plugs.opened)
+        plugs.opened["/dev/left"][0].pictures.put(None)
+        until(lambda: plugs.opened["/dev/left"][0].closed)
+        source.stop()
+        collector.thread.join(30)
+        assert not collector.thread.is_alive()
+    assert collector.values == [0, 1, 2] and collector.skews_ms == {3}
     assert source.dropped == 0 and source.frame_count is None and source.rate == 50
     assert all(camera.closed for cameras in plugs.opened.values() for camera in cameras)
 
@@ -284,7 +145,7 @@ def test_unplugged_camera_comes_back(
     with open_cameras(CONFIG, open_device=plugs) as source:
         collector = Collector(source)
         plugs.put(0, value=1)
-        collector.wait_for(1)
+        until(lambda: collector.values == [1])
 
         plugs.absent.add("/dev/right")
         attempts = plugs.attempts
@@ -295,8 +156,7 @@ def test_unplugged_camera_comes_back(
         plugs.absent.clear()
         until(lambda: len(plugs.opened["/dev/right"]) == 2)
         plugs.put(5000, value=2)
-        collector.wait_for(2)
-    assert collector.values() == [1, 2]
+        until(lambda: collector.values == [1, 2])
     said = "it will be opened again" if error is SagsError else f"internal error: {error.__name__}: camera is"
     assert said in caplog.text and "/dev/right is open again" in caplog.text
 
@@ -315,65 +175,32 @@ def test_silent_camera_is_opened_again(plugs: Plugs, caplog: pytest.LogCaptureFi
             plugs.put(1000.0 + 20 * number, value=2)
 
         with repeating(film):
-            until(lambda: 2 in collector.values())
+            until(lambda: 2 in collector.values)
     assert "no new picture for" in caplog.text
 
 
-@pytest.mark.fault("camera: absent while the node stops")
-def test_stop_ends_the_wait_for_absent_cameras(plugs: Plugs) -> None:
-    with open_cameras(CONFIG, open_device=plugs) as source:
-        collector = Collector(source)
-        source.stop()
-        collector.thread.join(30)
-        assert not collector.thread.is_alive()
-    assert collector.frames == []
-
-
-@pytest.mark.fault("clock: set forward by an hour under a camera")
-def test_clock_set_forward_goes_on(plugs: Plugs) -> None:
-    with open_cameras(CONFIG, open_device=plugs) as source:
-        collector = Collector(source)
-        for n, t in enumerate((10_000, 10_020, 3_610_000, 3_610_020)):
-            plugs.put(t)
-            collector.wait_for(n + 1)
-    assert [frame.epoch for frame in collector.frames] == [0, 0, 0, 0]
-    assert [frame.t_capture_ns // MS for frame in collector.frames] == [10_000, 10_020, 3_610_000, 3_610_020]
-
-
-@pytest.mark.fault("clock: set back under a camera")
-def test_clock_set_back_grows_the_epoch(plugs: Plugs) -> None:
-    with open_cameras(CONFIG, open_device=plugs) as source:
-        collector = Collector(source)
-        for n, t in enumerate((10_000, 10_020, 5_000, 5_020)):
-            plugs.put(t)
-            collector.wait_for(n + 1)
-    assert [frame.epoch for frame in collector.frames] == [0, 0, 1, 1]
-
-
-@pytest.mark.parametrize(("first", "left_value"), [("left", 10), ("right", 20)])
-def test_side_by_side(plugs: Plugs, first: str, left_value: int) -> None:
+@pytest.mark.parametrize(("first", "value"), [("left", 10), ("right", 20)])
+def test_one_camera_shows_both_eyes(plugs: Plugs, first: str, value: int) -> None:
     geometry = GeometryConfig(layout="side_by_side", first=first)
-    config = CONFIG.model_copy(update={"geometry": geometry, "right": None, "width": 16})
-    halves = np.concatenate([shot(0, 10).image, shot(0, 20).image], axis=1)
-    with open_cameras(config, open_device=plugs) as source:
-        collector = Collector(source)
-        plugs.opened["/dev/left"][0].pictures.put(Picture(7 * MS, halves))
-        collector.wait_for(1)
-    frame = collector.frames[0]
-    assert frame.left.shape == frame.right.shape == (4, 8, 3)
-    assert (frame.left == left_value).all() and (frame.right == 30 - left_value).all()
-    assert frame.t_capture_ns == frame.t_capture_right_ns == 7 * MS
-    assert source.dropped == 0
+    halves = np.repeat([[[10], [20]]], 8, axis=1).astype(np.uint8) + np.zeros((4, 16, 3), np.uint8)
+    said = {"geometry": geometry, "right": None, "width": 16}
+    with open_cameras(CONFIG.model_copy(update=said), open_device=plugs) as source:
+        plugs.opened["/dev/left"][0].pictures.put(Shot(7 * MS, halves))
+        frame = next(iter(source))
+    assert frame.right is not None and frame.left.shape == frame.right.shape == (4, 8, 3)
+    assert (frame.left == value).all() and (frame.right == 30 - value).all()
+    assert frame.t_capture_ns == frame.t_capture_right_ns == 7 * MS and source.dropped == 0
 
 
 def test_mistakes_at_opening(plugs: Plugs) -> None:
-    with pytest.raises(UsageError, match=r"source\.right names no camera"):
-        open_cameras(CONFIG.model_copy(update={"right": None}), open_device=plugs)
-    with pytest.raises(UsageError, match="same camera, /dev/left"):
-        open_cameras(CONFIG.model_copy(update={"right": "/dev/left"}), open_device=plugs)
-    with pytest.raises(UsageError, match="9 px wide, which is odd"):
-        halves = GeometryConfig(layout="side_by_side")
-        open_cameras(CONFIG.model_copy(update={"geometry": halves, "width": 9}), open_device=plugs)
+    halves = {"geometry": GeometryConfig(layout="side_by_side"), "width": 9}
+    for said, words in (
+        ({"right": None}, r"source\.right names no camera"),
+        ({"right": "/dev/left"}, "same camera, /dev/left"),
+        (halves, "9 px wide, which is odd"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            open_cameras(CONFIG.model_copy(update=said), open_device=plugs)
     plugs.absent.add("/dev/right")
     with pytest.raises(SagsError, match="/dev/right does not exist"):
         open_cameras(CONFIG, open_device=plugs)
@@ -386,9 +213,9 @@ def test_mistakes_at_opening(plugs: Plugs) -> None:
 class FakeCapture:
     """Stands for cv2.VideoCapture: one picture per entry of `stamps_ms`, then silence or an error."""
 
-    stamps_ms: ClassVar[list[float]] = []
-    gone_at_the_end: ClassVar[bool] = False
-    set_by_driver: ClassVar[dict[int, float]] = {}
+    stamps_ms: list[float]
+    gone_at_the_end = False
+    set_by_driver: dict[int, float]
 
     def __init__(self, path: str, backend: int) -> None:
         assert backend == cv2.CAP_V4L2
@@ -421,21 +248,63 @@ class FakeCapture:
     def release(self) -> None:
         pass
 
-    @staticmethod
-    def fourcc(*letters: str) -> int:
-        return int.from_bytes("".join(letters).encode(), "little")
-
 
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Device]:
-    def build(stamps_ms: list[float], gone: bool = False, **asked: object) -> Device:
-        monkeypatch.setattr(FakeCapture, "stamps_ms", stamps_ms)
-        monkeypatch.setattr(FakeCapture, "gone_at_the_end", gone)
-        monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+    def build(
+        stamps_ms: list[float], gone: bool = False, driver: dict[int, float] | None = None, **asked: object
+    ) -> Device:
+        said = {"stamps_ms": stamps_ms, "gone_at_the_end": gone, "set_by_driver": driver or {}}
+        monkeypatch.setattr(cv2, "VideoCapture", type("Capture", (FakeCapture,), said))
         (tmp_path / "video0").touch()
         return Device(str(tmp_path / "video0"), CONFIG.model_copy(update=asked))
 
     return build
+
+
+@pytest.mark.parametrize(
+    ("driver_ns", "expected"),
+    [
+        (95_000_000_000, 995_000_000_000),  # 5 s old: it waited in the driver
+        (99_980_000_000, 999_980_000_000),  # 20 ms old
+        (100_060_000_000, 1_000_000_000_000),  # ahead of its arrival
+        (0, 1_000_000_000_000),  # the driver gives none
+        (1_000_000_000_000, 1_000_000_000_000),  # a wall clock stamp
+    ],
+)
+def test_wall_stamp(driver_ns: int, expected: int) -> None:
+    assert wall_stamp(driver_ns, 100_000_000_000, 1_000_000_000_000) == expected
+
+
+@pytest.fixture
+def told(device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[float]]:
+    """How old pictures are said to be of which a driver says these ages, s."""
+
+    def read(ages: list[float]) -> list[float]:
+        wall_ns, monotonic_ns = 10**18, 10**14
+        # Each stamp is another one.
+        camera = device([1e-6 * (monotonic_ns + n - round(age * 1e9)) for n, age in enumerate(ages)])
+        monkeypatch.setattr(time, "time_ns", lambda: wall_ns)
+        monkeypatch.setattr(time, "monotonic_ns", lambda: monotonic_ns)
+        return [(wall_ns - camera.read(1.0).t_ns) * 1e-9 for _ in ages]  # type: ignore[union-attr]
+
+    return read
+
+
+@pytest.mark.fault("camera: pictures wait in its driver while the process is stopped")
+@pytest.mark.parametrize("before", [[], [0.02]], ids=["the first", "later"])
+@pytest.mark.parametrize("stopped_s", [0.9, 1.1, 3.0, 3600.0])
+def test_what_waited_in_the_driver_keeps_its_age(
+    stopped_s: float, before: list[float], told: Callable[..., list[float]]
+) -> None:
+    """Four buffers of before a stop, also where they are the very first."""
+    ages = before + [stopped_s] * 4
+    assert told(ages) == pytest.approx(ages, abs=0.01)
+
+
+def test_stamps_of_a_clock_of_its_own_are_found_out(told: Callable[..., list[float]]) -> None:
+    """A driver that counts from when it was plugged in: what it says is old is new."""
+    assert told([1000.0] * 60)[STRANGE:] == [0.0] * (60 - STRANGE)
 
 
 @pytest.mark.fault("camera: the driver gives one picture again and again")
@@ -473,22 +342,17 @@ def test_driver_without_stamps_gets_the_arrival_time(device: Callable[..., Devic
 
 
 def test_device_that_fails_says_so(device: Callable[..., Device]) -> None:
-    camera = device([], gone=True)
     with pytest.raises(SagsError, match="video0 stopped delivering pictures"):
-        camera.read(0.1)
+        device([], gone=True).read(0.1)
+    with pytest.raises(SagsError, match=r"camera /dev/video-none does not exist; (present: |there is no)"):
+        Device("/dev/video-none", CONFIG)
 
 
 def test_refused_controls_warn_but_do_not_stop(
-    device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    device: Callable[..., Device], caplog: pytest.LogCaptureFixture
 ) -> None:
-    mjpg = float(FakeCapture.fourcc(*"MJPG"))
-    monkeypatch.setattr(FakeCapture, "set_by_driver", {cv2.CAP_PROP_FPS: 15.0, cv2.CAP_PROP_FOURCC: mjpg})
-    camera = device([], fourcc="YUYV")
+    mjpg = float(int.from_bytes(b"MJPG", "little"))
+    camera = device([], driver={cv2.CAP_PROP_FPS: 15.0, cv2.CAP_PROP_FOURCC: mjpg}, fourcc="YUYV")
     assert camera.rate == 15
     assert "wanted 50 frames/s, the driver gives 15" in caplog.text
     assert "wanted pixel format YUYV, the driver gives MJPG" in caplog.text
-
-
-def test_missing_device_is_named_with_what_is_there() -> None:
-    with pytest.raises(SagsError, match=r"camera /dev/video-none does not exist; (present: |there is no)"):
-        Device("/dev/video-none", CONFIG)

@@ -13,8 +13,7 @@ from places import ROOT
 from sags_node.config.schema import FoldersSource
 from sags_node.errors import UsageError
 from sags_node.pipeline.session import open_session
-from sags_node.sources.one_eye import refuse_one_eye_twice
-from sags_node.sources.replay import Replay
+from sags_node.sources.replay import Replay, refuse_one_eye_twice
 from sags_node.types import U8
 
 

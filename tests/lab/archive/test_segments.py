@@ -30,6 +30,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline.session import open_session
 from sags_node.sources import replay
 from sags_node.sources.bags import BagPairs
+from sags_node.sources.pictures import Pairs
 from sags_node.sources.replay import Replay
 
 WHOLE = Recording("case1", "/data", weight=100.0)
@@ -40,22 +41,14 @@ class Long(BagPairs):
     """The pairs of a recording that nobody has to write."""
 
     def __init__(self, count: int, rate: float, stamps: Any = None) -> None:
-        self.count, self.rate, self.judged = count, rate, ()
-        if stamps is not None:
-            self.stamps = stamps
-
-    def close(self) -> None:
-        pass
+        self.count, self.rate, self.stamps = count, rate, stamps
 
 
-class LongVideo:
+class LongVideo(Pairs):
     """The same without stamps."""
 
     def __init__(self, count: int, rate: float) -> None:
         self.count, self.rate = count, rate
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.fixture
