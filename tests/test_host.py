@@ -63,7 +63,7 @@ def test_a_quota_below_two_cores_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     files = {"proc__self__cgroup": "0::/\n", "sys__fs__cgroup__cpu.max": "150000 100000\n"}
     found = doctor.check_cores(made(tmp_path, **files))
     assert found.level == "warning" and "CPUQuota" in found.fix
-    assert "the machine has 8" in found.found and "time of 1.5" in found.found
+    assert "the machine has 8" in found.what and "time of 1.5" in found.what
     assert doctor.check_cores(made(tmp_path, **{"sys__fs__cgroup__cpu.max": "200000 100000\n"})).level == "ok"
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     assert "cpuset" in doctor.check_cores(tmp_path / "nothing").fix
@@ -79,11 +79,11 @@ def test_a_quota_below_two_cores_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     ],
 )
 def test_governors(governor: str, driver: str, level: str, said: str, tmp_path: Path) -> None:
-    assert doctor.check_governor(tmp_path).found == "not known"
+    assert doctor.check_governor(tmp_path).what == "not known"
     folder = "sys__devices__system__cpu__cpu3__cpufreq__"
     files = {f"{folder}scaling_governor": f"{governor}\n", f"{folder}scaling_driver": f"{driver}\n"}
     found = doctor.check_governor(made(tmp_path, **files))
-    assert (found.level, found.found) == (level, said)
+    assert (found.level, found.what) == (level, said)
     assert bool(found.fix) == (governor != "performance")
 
 
@@ -100,5 +100,5 @@ def test_memory(free: int, swap: int, unused: int, level: str, said: str, tmp_pa
     amounts = {"MemAvailable": free, "SwapTotal": swap, "SwapFree": unused}
     lines = "".join(f"{name}:  {amount * 10**9 // 1024} kB\n" for name, amount in amounts.items())
     found = doctor.check_memory(made(tmp_path, proc__meminfo=f"{lines}HugePages_Total:  0\n"))
-    assert found.level == level and said in found.found
+    assert found.level == level and said in found.what
     assert bool(found.fix) == (level == "warning")

@@ -5,11 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, Received
 from sags_node.messaging.subscriber import Subscriber
 
@@ -17,21 +15,6 @@ LEAST_HZ = 0.5  # a bridge passes on the newest of what comes, so losing some of
 EVERY_SECOND = ("status", "diagnostics")
 SILENT_AFTER = 2.5  # s without one of these
 LOOK = 0.2  # s between looks for a sender that is not there
-
-
-@dataclass(frozen=True, slots=True)
-class Place(NodeAddress):
-    """Where a sender is.
-
-    Attributes:
-        clock: that stamped what it sends, where that is another machine's.
-    """
-
-    clock: NodeClock | None = None
-
-    def now_ns(self) -> int:
-        """What that clock shows now, at the latest."""
-        return time.time_ns() if self.clock is None else self.clock.latest_ns()
 
 
 class Feed:
@@ -47,10 +30,11 @@ class Feed:
         SagsError: the endpoint is malformed. That nobody is there yet is no error.
     """
 
-    def __init__(self, topics: Iterable[str], place: Place, max_age: float, wake: Callable[[], None]) -> None:
-        self.ns = place.ns
+    def __init__(
+        self, topics: Iterable[str], sender: NodeAddress, max_age: float, wake: Callable[[], None]
+    ) -> None:
         self._topics = list(topics)
-        self._place, self._max_age, self._wake = place, max_age, wake
+        self._sender, self._max_age, self._wake = sender, max_age, wake
         self._asked: frozenset[str] = frozenset()
         self._subscriber: Subscriber | None = None
         self._resources = ExitStack()
@@ -85,14 +69,13 @@ class Feed:
         self._resources.close()
 
     def _connect(self) -> None:
-        place = self._place
         try:
             rates = dict.fromkeys(self._topics, LEAST_HZ)
-            subscriber = Subscriber.at(place, self._topics, rates=rates, clock=place.clock, paused=True)
+            subscriber = Subscriber.at(self._sender, self._topics, rates=rates, paused=True)
         except UsageError:
             raise
         except SagsError as error:
-            if place.endpoint is not None:  # where it is, is known: the endpoint is wrong
+            if self._sender.endpoint is not None:  # where it is, is known: the endpoint is wrong
                 raise
             self._absent, self._next_look = str(error), time.monotonic() + LOOK
             return

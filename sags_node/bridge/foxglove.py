@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,8 +22,8 @@ from foxglove.channels import CompressedVideoChannel
 from foxglove.messages import CompressedVideo, Timestamp
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener, WebSocketServer
 
-from sags_node.bridge.feed import Place
-from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source, silent
+from sags_node.bridge.options import ServerOptions
+from sags_node.bridge.relay import Outlet, Output, Relay, Source, silent
 from sags_node.bridge.requests import Requests
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
@@ -36,16 +37,12 @@ SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class FoxgloveOptions:
-    """How `sags bridge foxglove` runs; the defaults are those of the command."""
+class FoxgloveOptions(ServerOptions):
+    """How `sags bridge foxglove` runs."""
 
-    node: Place
-    overlay: Place
-    host: str = "127.0.0.1"
     port: int = 8765  # Foxglove's default
     rate: float | None = None  # Hz of each topic; default: all that come
     pin: bool = False  # let peers pin anchors
-    max_age: float = MAX_AGE
 
 
 def outputs(options: FoxgloveOptions) -> list[Output]:
@@ -85,19 +82,15 @@ def run_foxglove(options: FoxgloveOptions, ready: Callable[[str, int], None], st
         SagsError: the port cannot be bound, or an endpoint is malformed.
     """
     offered = outputs(options)
-    bridge = Foxglove(options, offered)
-    try:
-        relay = Relay((options.node, options.overlay), offered, bridge, options.max_age)
-        try:
-            ready(options.host, bridge.port)
-            relay.run(stop)
-        finally:
-            relay.close()
-    finally:
-        bridge.close()
+    with (
+        closing(Foxglove(options, offered)) as bridge,
+        closing(Relay((options.node, options.overlay), offered, bridge, options.max_age)) as relay,
+    ):
+        ready(options.host, bridge.port)
+        relay.run(stop)
 
 
-class Foxglove:
+class Foxglove(Outlet):
     """The outlet: one channel for each output.
 
     Raises:
@@ -307,9 +300,7 @@ def _served(
             supported_encodings=["json"] if options.pin else None,
         )
     except (RuntimeError, OSError) as error:
-        raise SagsError(
-            f"cannot listen on {options.host} port {options.port}: {error}; choose another --port (0: any)"
-        ) from None
+        raise SagsError(options.not_bound(error)) from None
 
 
 def empty_of(shown: Received, now_ns: int, reason: str) -> bytes | None:

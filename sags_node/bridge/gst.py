@@ -12,14 +12,16 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sags_node.bridge.feed import Place
-from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source
+from sags_node.bridge.options import MAX_AGE
+from sags_node.bridge.relay import Outlet, Output, Relay, Source
 from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.received import Frame, ReceivedImage, ReceivedText
 from sags_node.sources.gst_process import GstProcess
 from sags_node.types import U8
@@ -32,7 +34,7 @@ STOPPING = 5.0  # s for a writer to end
 class GstOptions:
     """How `sags bridge gst` runs; the defaults are those of the command."""
 
-    overlay: Place
+    overlay: NodeAddress
     left: str | None = None  # what comes behind the pictures of that eye, as for gst-launch-1.0
     right: str | None = None
     rate: float = 60.0  # Hz of the display
@@ -49,41 +51,31 @@ def run_gst(options: GstOptions, ready: Callable[[], None], stop: threading.Even
         UsageError: no eye is to be written.
         SagsError: a pipeline fails.
     """
-    launches = {
-        eye: launch
-        for eye, launch in (("left", options.left), ("right", options.right))
-        if launch is not None
-    }
+    eyes = {"left": options.left, "right": options.right}
+    launches = {eye: launch for eye, launch in eyes.items() if launch is not None}
     if not launches:
         raise UsageError("give --left, --right or both: what comes behind the pictures of that eye")
-    displays = _Displays(launches, options)
     ns = options.overlay.ns
     outputs = [Output(eye, (Source(ns, f"{eye}/overlay/color_key"),)) for eye in launches]
     outputs.append(Output("key", (Source(ns, "status"),)))
-    try:
-        relay = Relay((options.overlay,), outputs, displays, options.max_age)
-        try:
-            ready()
-            while not stop.is_set():
-                relay.step()
-                displays.look()
-                relay.wait()
-        finally:
-            relay.close()
-    finally:
-        displays.close()
+    with (
+        closing(_Displays(launches, options)) as displays,
+        closing(Relay((options.overlay,), outputs, displays, options.max_age)) as relay,
+    ):
+        ready()
+        while not stop.is_set():
+            relay.step()
+            displays.look()
+            relay.wait()
 
 
-class _Displays:
+class _Displays(Outlet):
     """The outlet: one pipeline for each eye, from its first picture on."""
 
     def __init__(self, launches: Mapping[str, str], options: GstOptions) -> None:
         self._launches, self._options = launches, options
         self._key: tuple[int, int, int] | None = None  # RGB
         self._displays: dict[str, Display] = {}
-
-    def wants(self, output: Output) -> bool:
-        return True
 
     def send(self, output: Output, frame: Frame) -> bool:
         received = frame[output.sources[0].topic]
@@ -108,9 +100,6 @@ class _Displays:
     def blank(self, output: Output, reason: str) -> None:
         if output.name in self._displays:
             self._displays[output.name].blank()
-
-    def report(self, missing: Mapping[str, str], shows: bool) -> None:
-        """A display shows pictures only; the overlay's `status` has the words."""
 
     def look(self) -> None:
         """Raises: SagsError: a pipeline has failed."""

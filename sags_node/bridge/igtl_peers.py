@@ -5,21 +5,20 @@ pyigtl's own holds a hundred messages, serves one peer and takes over the signal
 
 from __future__ import annotations
 
+import asyncio
 import logging
-import selectors
 import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from sags_node.bridge import igtl
-from sags_node.errors import SagsError
 from sags_node.messaging.security import RateLimitedLog
 
 MOST_PEERS = 8
 SEND_BUFFER = 1 << 18  # bytes in the kernel: less than a picture, so that nothing old waits there
-READ_AT_ONCE = 1 << 16
 LOOK = 0.05  # s between calls of `idle`
 
 log = logging.getLogger(__name__)
@@ -27,50 +26,35 @@ log = logging.getLogger(__name__)
 Hear = Callable[[igtl.Said], None]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Peer:
-    socket: socket.socket
-    name: str
+    writer: asyncio.StreamWriter
     waiting: dict[str, tuple[bytes, float]] = field(default_factory=dict)  # device: message, monotonic limit
-    sending: bytes | memoryview = b""  # the rest of the message that has begun
-    came: bytearray = field(default_factory=bytearray)
+    owed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def give(self, device: str, message: bytes, limit: float) -> None:
+        self.waiting[device] = (message, limit)
+        self.owed.set()
 
 
 class Peers:
     """Listens from its own thread, from `start` until it is closed.
 
     Args:
-        port: 0 for any free one.
+        listener: bound; closed at the end.
         hear: called with what peers send, from that thread.
         idle: called there every `LOOK` s.
-
-    Raises:
-        SagsError: the address cannot be bound.
     """
 
-    def __init__(self, host: str, port: int, hear: Hear, idle: Callable[[], None]) -> None:
+    def __init__(self, listener: socket.socket, hear: Hear, idle: Callable[[], None]) -> None:
         self._hear, self._idle = hear, idle
-        self._lock = threading.Lock()
-        self._peers: dict[socket.socket, _Peer] = {}
+        self._peers: set[_Peer] = set()
         self._greeting: tuple[str, bytes] | None = None
         self._seldom = RateLimitedLog()
-        try:
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._listener = socket.create_server((host, port), family=family, backlog=MOST_PEERS)
-        except OSError as error:
-            raise SagsError(
-                f"cannot listen on {host} port {port}: {error.strerror}; choose another --port (0: any)"
-            ) from None
-        self._listener.setblocking(False)
-        self.port = int(self._listener.getsockname()[1])
-        self._bell, self._ring = socket.socketpair()  # a byte in it wakes the thread
-        self._bell.setblocking(False)
-        self._ring.setblocking(False)
-        self._selector = selectors.DefaultSelector()
-        for readable in (self._listener, self._bell):
-            self._selector.register(readable, selectors.EVENT_READ)
-        self._stopping = False
-        self._thread = threading.Thread(target=self._serve, name="sags-igtl-peers", daemon=True)
+        self._listener = listener
+        self._loop = asyncio.new_event_loop()
+        self._stop = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="sags-igtl-peers", daemon=True)
 
     def start(self) -> None:
         """Let peers in."""
@@ -87,10 +71,12 @@ class Peers:
             valid: s from now on, after which it is not begun any more.
         """
         limit = time.monotonic() + valid
-        with self._lock:
-            for peer in self._peers.values():
-                peer.waiting[device] = (message, limit)
-            self._wake()
+
+        def give() -> None:
+            for peer in self._peers:
+                peer.give(device, message, limit)
+
+        self._call(give)
 
     def greet(self, device: str, message: bytes) -> None:
         """Give a message to all peers, and to each who comes later."""
@@ -99,119 +85,76 @@ class Peers:
 
     def close(self) -> None:
         """Cut all connections. What is sent from now on goes nowhere."""
-        with self._lock:
-            self._stopping = True
-        self._thread.join()  # it looks every `LOOK` s
-        self._bell.close()
-        self._ring.close()
+        self._call(self._stop.set)
+        self._thread.join()
 
     # ---- the thread ----------------------------------------------------------------------------------------
 
-    def _wake(self) -> None:
-        """Under the lock: after `_stopping` the bell may be gone."""
-        if self._stopping:
-            return
-        try:
-            self._ring.send(b"\0")
-        except BlockingIOError:
-            pass  # it is awake
+    def _call(self, what: Callable[[], object]) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(what)
 
-    def _serve(self) -> None:
-        next_idle = 0.0
-        while not self._stopping:
-            for key, events in self._selector.select(LOOK):
-                found = key.fileobj
-                assert isinstance(found, socket.socket)
-                if found is self._bell:
-                    self._bell.recv(4096)
-                elif found is self._listener:
-                    self._accept()
-                else:
-                    self._attend(self._peers[found], events)
-            if time.monotonic() >= next_idle:
-                next_idle = time.monotonic() + LOOK
-                self._idle()
-            self._watch_writable()
-        for peer in list(self._peers.values()):
-            self._drop(peer)
-        self._listener.close()
-        self._selector.close()
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._serve())
 
-    def _accept(self) -> None:
-        try:
-            accepted, address = self._listener.accept()
-        except OSError:  # it has gone again
-            return
+    async def _serve(self) -> None:
+        server = await asyncio.start_server(self._attend, sock=self._listener)
+        while not self._stop.is_set():
+            self._idle()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._stop.wait(), LOOK)
+        server.close()
+        while self._peers:  # each ends by itself once its connection is gone
+            for peer in self._peers:
+                peer.writer.transport.abort()
+            await asyncio.sleep(0)
+
+    async def _attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        name = (writer.get_extra_info("peername") or ["one that has gone"])[0]
         if len(self._peers) >= MOST_PEERS:
-            accepted.close()
-            if self._seldom.due():
-                log.warning("refused %s: %d are connected already", address[0], MOST_PEERS)
+            self._warn("refused %s: %d are connected already", name, MOST_PEERS)
+            writer.close()
             return
-        accepted.setblocking(False)
+        accepted: socket.socket = writer.get_extra_info("socket")
         accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         accepted.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        peer = _Peer(accepted, f"{address[0]}:{address[1]}")
-        with self._lock:
-            if self._greeting is not None:
-                device, message = self._greeting
-                peer.waiting[device] = (message, float("inf"))
-            self._peers[accepted] = peer
-        self._selector.register(accepted, selectors.EVENT_READ)
-
-    def _attend(self, peer: _Peer, events: int) -> None:
+        writer.transport.set_write_buffer_limits(0)  # the next message begins when one is in the kernel
+        peer = _Peer(writer)
+        if self._greeting is not None:
+            peer.give(*self._greeting, float("inf"))
+        self._peers.add(peer)
+        writing = asyncio.ensure_future(self._write(peer))
         try:
-            if events & selectors.EVENT_READ and not self._read(peer):
-                self._drop(peer)
-                return
-            if events & selectors.EVENT_WRITE:
-                self._write(peer)
-        except BlockingIOError:
-            return
-        except OSError:  # it is gone
-            self._drop(peer)
+            if not await self._read(reader):
+                self._warn("%s was cut off: it sent no OpenIGTLink, or a large message", name)
+        finally:
+            self._peers.discard(peer)
+            writing.cancel()
+            writer.transport.abort()
 
-    def _read(self, peer: _Peer) -> bool:
-        """Take in what a peer says; False when it has gone, or speaks another language."""
-        came = peer.socket.recv(READ_AT_ONCE)
-        peer.came += came
-        while len(peer.came) >= igtl.HEADER_BYTES:
-            head = igtl.header(bytes(peer.came[: igtl.HEADER_BYTES]))
-            if head is None:
-                if self._seldom.due():
-                    log.warning("%s was cut off: it sent no OpenIGTLink, or a large message", peer.name)
-                return False
-            end = igtl.HEADER_BYTES + head.body_bytes
-            if len(peer.came) < end:
-                break
-            heard = igtl.said(head, bytes(peer.came[igtl.HEADER_BYTES : end]))
-            del peer.came[:end]
-            if heard is not None:
-                self._hear(heard)
-        return bool(came)
+    async def _read(self, reader: asyncio.StreamReader) -> bool:
+        """Take in what a peer says until it has gone; False when it speaks another language."""
+        with suppress(asyncio.IncompleteReadError, OSError):
+            while (head := igtl.header(await reader.readexactly(igtl.HEADER_BYTES))) is not None:
+                heard = igtl.said(head, await reader.readexactly(head.body_bytes))
+                if heard is not None:
+                    self._hear(heard)
+            return False
+        return True
 
-    def _write(self, peer: _Peer) -> None:
-        """Go on with the message that has begun; else begin the one that waits longest and is still new."""
-        if not peer.sending:
-            with self._lock:
-                for device in list(peer.waiting):
-                    message, limit = peer.waiting.pop(device)
-                    if time.monotonic() < limit:
-                        peer.sending = memoryview(message)
-                        break
-        if peer.sending:
-            peer.sending = memoryview(peer.sending)[peer.socket.send(peer.sending) :]
+    async def _write(self, peer: _Peer) -> None:
+        """Send the one that waits longest, of those that are still new, one after the other."""
+        with suppress(OSError):  # it has gone: `_read` sees it, too
+            while await peer.owed.wait():
+                if not peer.waiting:
+                    peer.owed.clear()
+                    continue
+                message, limit = peer.waiting.pop(next(iter(peer.waiting)))
+                if time.monotonic() < limit:
+                    peer.writer.write(message)
+                    await peer.writer.drain()
 
-    def _watch_writable(self) -> None:
-        """Be woken by the peers that have something to get."""
-        for peer in self._peers.values():
-            owed = bool(peer.sending) or bool(peer.waiting)
-            events = selectors.EVENT_READ | (selectors.EVENT_WRITE if owed else 0)
-            if self._selector.get_key(peer.socket).events != events:
-                self._selector.modify(peer.socket, events)
-
-    def _drop(self, peer: _Peer) -> None:
-        self._selector.unregister(peer.socket)
-        with self._lock:
-            del self._peers[peer.socket]
-        peer.socket.close()
+    def _warn(self, words: str, *args: object) -> None:
+        if self._seldom.due():
+            log.warning(words, *args)

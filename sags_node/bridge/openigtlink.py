@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,10 +24,10 @@ import numpy as np
 
 from sags_node.bridge import igtl
 from sags_node.bridge.compressed import over_black
-from sags_node.bridge.feed import Place
-from sags_node.bridge.igtl_peers import Peers
+from sags_node.bridge.igtl_peers import MOST_PEERS, Peers
+from sags_node.bridge.options import ServerOptions
 from sags_node.bridge.pins import Pin, Pins, Release
-from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source
+from sags_node.bridge.relay import Outlet, Output, Relay, Source
 from sags_node.bridge.requests import Requests
 from sags_node.bridge.surface import surface_of
 from sags_node.confidence import SURE_OF_ANCHOR
@@ -62,18 +63,14 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class IgtlOptions:
-    """How `sags bridge openigtlink` runs; the defaults are those of the command."""
+class IgtlOptions(ServerOptions):
+    """How `sags bridge openigtlink` runs."""
 
-    node: Place
-    overlay: Place
-    host: str = "127.0.0.1"
     port: int = 18944  # Slicer's default
     send: tuple[str, ...] = ()  # names of outputs; default: all
     rate: float = 10.0  # Hz
     surface_rate: float = 2.0  # Hz
     surface_step: int = 16  # px
-    max_age: float = MAX_AGE
 
 
 def outputs(options: IgtlOptions) -> list[Output]:
@@ -119,19 +116,15 @@ def run_openigtlink(options: IgtlOptions, ready: Callable[[str, int], None], sto
         log.warning(
             "crcmod was installed without a C compiler: pictures take seconds; install gcc, then crcmod anew"
         )
-    bridge = OpenIgtLink(options)
-    try:
-        relay = Relay((options.node, options.overlay), offered, bridge, options.max_age)
-        try:
-            ready(options.host, bridge.port)
-            relay.run(stop)
-        finally:
-            relay.close()
-    finally:
-        bridge.close()
+    with (
+        closing(OpenIgtLink(options)) as bridge,
+        closing(Relay((options.node, options.overlay), offered, bridge, options.max_age)) as relay,
+    ):
+        ready(options.host, bridge.port)
+        relay.run(stop)
 
 
-class OpenIgtLink:
+class OpenIgtLink(Outlet):
     """The outlet: packs each message once, for all peers.
 
     Raises:
@@ -139,21 +132,17 @@ class OpenIgtLink:
     """
 
     def __init__(self, options: IgtlOptions) -> None:
-        place = options.node
         self._step, self._max_age = options.surface_step, options.max_age
-        self._shapes: dict[
-            str, tuple[U8, F64]
-        ] = {}  # of pictures that are shown: one without light, and its place
+        # Of pictures that are shown: one without light, and its place.
+        self._shapes: dict[str, tuple[U8, F64]] = {}
         self._pins = Pins()
         self._answers: deque[Callable[[], list[Release]]] = deque()  # for the peers' thread
-        self._now_ns = place.now_ns
+        self._now_ns = options.node.now_ns
+        listener = options.listen(MOST_PEERS)
+        self.port = int(listener.getsockname()[1])
         self._requests = Requests(options.node)
-        self._peers = Peers(options.host, options.port, self._hear, self._idle)
+        self._peers = Peers(listener, self._hear, self._idle)
         self._peers.start()
-
-    @property
-    def port(self) -> int:
-        return self._peers.port
 
     def close(self) -> None:
         self._peers.close()
@@ -328,14 +317,6 @@ def _written(dark: U8, reason: str) -> U8:
     """A picture without light that says why."""
     scale = max(dark.shape[0] / 1000, 0.4)
     written = dark.copy()
-    cv2.putText(
-        written,
-        reason,
-        (8, dark.shape[0] // 2),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        scale,
-        (255, 170, 0),
-        1,
-        cv2.LINE_AA,
-    )
+    place, font = (8, dark.shape[0] // 2), cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(written, reason, place, font, scale, (255, 170, 0), 1, cv2.LINE_AA)
     return written

@@ -13,12 +13,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from sags_node.bridge.feed import EVERY_SECOND, SILENT_AFTER, Feed, Place
+from sags_node.bridge.feed import EVERY_SECOND, SILENT_AFTER, Feed
+from sags_node.bridge.options import MAX_AGE
 from sags_node.messaging import topics
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.received import Frame
 from sags_node.messaging.wire import Meta
 
-MAX_AGE = 0.4  # s since capture: with `LOOK` and the way to a peer, what stops is taken back within 0.5 s
 LOOK = 0.04  # s; how soon it is noticed that something has become too old
 LEAD = 0.2  # s before it is due that a rare output's topics are asked for: a subscription takes up to 0.1 s
 NO_UNIT = "its lengths have no unit, as nobody has calibrated the eyes; docs/calibration.md"
@@ -55,11 +56,11 @@ class Output:
 
 
 class Outlet(Protocol):
-    """What a bridge speaks to; all is called from the thread of the loop."""
+    """What a bridge speaks to, and what most of them do; all is called from the thread of the loop."""
 
     def wants(self, output: Output) -> bool:
         """Whether any peer asks for it."""
-        ...
+        return True
 
     def send(self, output: Output, frame: Frame) -> bool:
         """Pass a new one on to those who ask for it; False where this frame has nothing for it."""
@@ -67,12 +68,12 @@ class Outlet(Protocol):
 
     def blank(self, output: Output, reason: str) -> None:
         """Take back what was sent: it is not new any more."""
-        ...
+        return None
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
-        """What is asked for and does not come, output -> reason, and whether anything does; called when that
-        changes."""
-        ...
+        """Hear what is asked for and does not come, output -> reason, and whether anything does; called when
+        that changes."""
+        return None
 
 
 @dataclass(slots=True)
@@ -100,7 +101,7 @@ class Relay:
 
     def __init__(
         self,
-        senders: Sequence[Place],
+        senders: Sequence[NodeAddress],
         outputs: Sequence[Output],
         outlet: Outlet,
         max_age: float = MAX_AGE,
@@ -109,11 +110,11 @@ class Relay:
         self._arrived = threading.Event()
         self._courses: dict[str, _Course] = {}
         self._reported: tuple[dict[str, str], bool] | None = None
-        self._places = {place.ns: place for place in senders}
+        self._senders = {sender.ns: sender for sender in senders}
         self._feeds: dict[str, Feed] = {}
         try:
-            for place in senders:
-                self._feeds[place.ns] = Feed(self._topics(place.ns), place, max_age, self._arrived.set)
+            for ns, sender in self._senders.items():
+                self._feeds[ns] = Feed(self._topics(ns), sender, max_age, self._arrived.set)
         except BaseException:
             self.close()
             raise
@@ -185,7 +186,7 @@ class Relay:
             return None
         seconds = any(source.topic in EVERY_SECOND for source in output.sources)
         limit = output.period + LEAD + (SILENT_AFTER if seconds else self._max_age)
-        age = (self._places[output.sources[0].ns].now_ns() - course.shown_ns) * 1e-9
+        age = (self._senders[output.sources[0].ns].now_ns() - course.shown_ns) * 1e-9
         return f"no whole frame for {age:.1f} s" if age > limit else None
 
     def _frame(self, output: Output) -> Frame | None:

@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -17,8 +18,8 @@ from itertools import chain
 import numpy as np
 
 from sags_node.bridge.compressed import LARGEST, Compressor, suffix
-from sags_node.bridge.feed import Place
-from sags_node.bridge.relay import MAX_AGE, Output, Relay, Source, silent
+from sags_node.bridge.options import BridgeOptions
+from sags_node.bridge.relay import Outlet, Output, Relay, Source, silent
 from sags_node.bridge.requests import Requests
 from sags_node.bridge.ros2_requests import ANSWER, Inbox
 from sags_node.config.schema import RosGraph
@@ -44,15 +45,12 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Ros2Options:
-    """How `sags bridge ros2` runs; the defaults are those of the command."""
+class Ros2Options(BridgeOptions):
+    """How `sags bridge ros2` runs."""
 
-    node: Place
-    overlay: Place
     graph: RosGraph = field(default_factory=RosGraph)
     views: tuple[str, ...] = ("ros",)  # that consumers may open
     points: int = 8000  # of a cloud, at most; 20 bytes each
-    max_age: float = MAX_AGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,18 +132,14 @@ def run_ros2(options: Ros2Options, ready: Callable[[int, str], None], stop: thre
         SagsError: DDS cannot be started, or an endpoint is malformed.
     """
     offered = offers(options)
-    bridge = Ros2(options, offered)
-    try:
-        outputs = [offer.output for offer in offered]
-        relay = Relay((options.node, options.overlay), outputs, bridge, options.max_age)
-        try:
-            _tell_of_buffers()
-            ready(bridge.graph.domain, bridge.graph.interface)
-            relay.run(stop)
-        finally:
-            relay.close()
-    finally:
-        bridge.close()
+    outputs, senders = [offer.output for offer in offered], (options.node, options.overlay)
+    with (
+        closing(Ros2(options, offered)) as bridge,
+        closing(Relay(senders, outputs, bridge, options.max_age)) as relay,
+    ):
+        _tell_of_buffers()
+        ready(bridge.graph.domain, bridge.graph.interface)
+        relay.run(stop)
 
 
 def _tell_of_buffers() -> None:
@@ -160,7 +154,7 @@ def _tell_of_buffers() -> None:
         )
 
 
-class Ros2:
+class Ros2(Outlet):
     """The outlet: one writer for each output.
 
     Raises:
@@ -168,10 +162,9 @@ class Ros2:
     """
 
     def __init__(self, options: Ros2Options, offered: Sequence[Offer]) -> None:
-        place = options.node
         self.graph = Graph(options.graph)
-        self._ns = place.ns
-        self._places = {each.ns: each for each in (options.node, options.overlay)}
+        self._ns = ns = options.node.ns
+        self._senders = {each.ns: each for each in (options.node, options.overlay)}
         self._offers = {offer.output.name: offer for offer in offered}
         self._writers = {name: self._writer(name, offer) for name, offer in self._offers.items()}
         self._diagnostics = self._writers[GLOBAL["diagnostics"]]
@@ -182,10 +175,10 @@ class Ros2:
         self._silent = False
         self._namesake = False
         self._refused: dict[str, int] = {}
-        answers = self.graph.writer(f"/{place.ns}/{ANSWER}", topics.STRING, Delivery(reliable=True, depth=10))
+        answers = self.graph.writer(f"/{ns}/{ANSWER}", topics.STRING, Delivery(reliable=True, depth=10))
         self._requests = Requests(options.node)
-        self._inbox = Inbox(self.graph, place.ns, options.views, self._requests, answers)
-        self.graph.call_it(f"/{place.ns}")
+        self._inbox = Inbox(self.graph, ns, options.views, self._requests, answers)
+        self.graph.call_it(f"/{ns}")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._attend, name="sags-bridge-ros2")
         self._thread.start()
@@ -211,7 +204,7 @@ class Ros2:
         received = frame[source.topic]
         if source.topic == "diagnostics" and isinstance(received, ReceivedRos):
             self._stages = [status.name for status in received.message.status]
-        age_ns = self._places[source.ns].now_ns() - received.stamp_ns  # readers compare it with our clock
+        age_ns = self._senders[source.ns].now_ns() - received.stamp_ns  # readers compare it with our clock
         data = self._offers[output.name].make(received)
         self._pace.wait(len(data))
         self._writers[output.name].write(data, time.time_ns() - age_ns)

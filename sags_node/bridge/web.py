@@ -23,8 +23,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
-from sags_node.bridge.feed import Feed, Place
-from sags_node.bridge.relay import LOOK, MAX_AGE, Output, Relay, Source
+from sags_node.bridge.feed import Feed
+from sags_node.bridge.options import ServerOptions
+from sags_node.bridge.relay import LOOK, Outlet, Output, Relay, Source
 from sags_node.bridge.requests import Requests
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.received import Frame
@@ -43,16 +44,12 @@ PINNING = ("add_anchor", "remove_anchor")  # what peers may ask of the node, wit
 
 
 @dataclass(frozen=True, slots=True)
-class WebOptions:
-    """How `sags bridge web` runs; the defaults are those of the command."""
+class WebOptions(ServerOptions):
+    """How `sags bridge web` runs."""
 
-    node: Place
-    overlay: Place
-    host: str = "127.0.0.1"
     port: int = 8766
     pin: bool = False  # let peers pin anchors
     origins: tuple[str, ...] = ()  # of pages that may connect, beside our own
-    max_age: float = MAX_AGE
 
 
 class _Said(msgspec.Struct):
@@ -80,8 +77,8 @@ def run_web(options: WebOptions, ready: Callable[[str, int], None], stop: thread
         UsageError: wrong keys.
         SagsError: the port cannot be bound, or an endpoint is malformed.
     """
-    for place in (options.overlay, options.node):  # what is wrong is said now, not to the first peer
-        Feed((), place, options.max_age, lambda: None).close()
+    for sender in (options.overlay, options.node):  # what is wrong is said now, not to the first peer
+        Feed((), sender, options.max_age, lambda: None).close()
     requests = Requests(options.node)
     try:
         server, port = _served(options, requests, stop)
@@ -100,14 +97,7 @@ def run_web(options: WebOptions, ready: Callable[[str, int], None], stop: thread
 
 def _served(options: WebOptions, requests: Requests, stop: threading.Event) -> tuple[Server, int]:
     """A server that is bound and does not serve yet, and its port."""
-    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
-    try:
-        listener = socket.create_server((options.host, options.port), family=family, backlog=MOST_PEERS)
-    except OSError as error:
-        raise SagsError(
-            f"cannot listen on {options.host} port {options.port}: {error.strerror}; "
-            "choose another --port (0: any)"
-        ) from None
+    listener = options.listen(MOST_PEERS)
     port = int(listener.getsockname()[1])
     own = ["127.0.0.1", "localhost", "[::1]", f"[{options.host}]" if ":" in options.host else options.host]
     pages = [re.compile(re.escape(f"http://{host}:{port}")) for host in own]
@@ -163,7 +153,7 @@ def _page(connection: ServerConnection, request: Request) -> Response | None:
     return Response(http.HTTPStatus.OK, "OK", Headers(headers), body)
 
 
-class Peer:
+class Peer(Outlet):
     """The outlet to one peer, on its thread."""
 
     def __init__(self, connection: ServerConnection, options: WebOptions, requests: Requests) -> None:
@@ -219,8 +209,8 @@ class Peer:
         if self._relay is not None:
             self._relay.close()
         self._missing = frozenset()
-        places = (self._options.node, self._options.overlay)
-        self._relay = Relay(places, outputs, self, self._options.max_age)
+        senders = (self._options.node, self._options.overlay)
+        self._relay = Relay(senders, outputs, self, self._options.max_age)
 
     def _source(self, name: str) -> Source:
         """Raises: UsageError: there is no such topic."""
@@ -248,9 +238,6 @@ class Peer:
 
     # ---- out -----------------------------------------------------------------------------------------------
 
-    def wants(self, output: Output) -> bool:
-        return True
-
     def send(self, output: Output, frame: Frame) -> bool:
         received = frame[output.sources[0].topic]
         head = {
@@ -262,9 +249,6 @@ class Peer:
         text += b" " * (-len(text) % 4)  # what follows can be looked at as numbers of 4 bytes, where it lies
         self._connection.send(b"".join((struct.pack("<I", len(text)), text, *received.parts)))
         return True
-
-    def blank(self, output: Output, reason: str) -> None:
-        """`report` says it."""
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
         for name in missing.keys() - self._missing:

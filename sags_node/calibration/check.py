@@ -12,12 +12,12 @@ from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.pictures import Pair, pairs_of_files, pairs_of_session
 from sags_node.calibration.principal_points import judge_known_depths
 from sags_node.calibration.rows import Rows, judge_matches, judge_rectified, judge_scale, rectified_rows
+from sags_node.checks import Finding, is_wrong
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.phantom import cached_session
 from sags_node.rig import (
-    Finding,
     already_rectified,
     check_eyes,
     check_pair,
@@ -92,7 +92,7 @@ def judge(
 ) -> list[Finding]:
     """Look over a calibration, and compare it with raw pictures where there are some."""
     findings = check_eyes(rig)
-    if _broken(findings):
+    if is_wrong(findings):
         return findings
     findings += check_pair(rig, metres)
     if rig.left.P[0, 3] == rig.right.P[0, 3]:  # without a baseline pictures tell nothing
@@ -158,10 +158,6 @@ def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | 
     if rig is None:
         raise UsageError("the session names no calibration: set rig to its folder")
     return as_pictures_come(with_unit(rig, metres), config)
-
-
-def _broken(findings: Sequence[Finding]) -> bool:
-    return any(finding.level == "error" for finding in findings)
 
 
 def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:

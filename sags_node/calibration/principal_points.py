@@ -13,15 +13,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sags_node.calibration.rows import FEWEST_MATCHES, rectified_rows
-from sags_node.rig.check import Finding
+from sags_node.calibration.rows import FEWEST_MATCHES, fit_without_outliers, rectified_rows
+from sags_node.checks import Finding
 from sags_node.types import F32, F64, StereoRig
 
 NOTICED = 0.1  # px of the full picture: what reference depths and matches are good for
 SLOPE = 0.03  # of the depth, over `AROUND`: more is an edge, and its depth belongs to either side
 AROUND = 9  # px
-OUTLIER = 3.0  # times the spread
-ROUNDS = 10
+OUTLIER = 3.0 * 1.4826  # times the median distance: 3 sigma
 
 
 def judge_known_depths(rig: StereoRig, matches: Sequence[F64], depths: Sequence[F32 | None]) -> list[Finding]:
@@ -40,7 +39,8 @@ def judge_known_depths(rig: StereoRig, matches: Sequence[F64], depths: Sequence[
     each = [float(np.median(pair[:, 0] - pair[:, 1])) for pair in known]
     seen, true = np.concatenate(known).T
     offset = float(np.median(seen - true))
-    scale, free = _line(true, seen)
+    line = np.column_stack([true, np.ones(len(true))])
+    scale, free = map(float, fit_without_outliers(line, seen, OUTLIER)[0])
     f_b = float(rig.left.P[0, 0]) * rig.baseline
     depth = f_b / float(np.median(true))
     nearer = offset * depth**2 / f_b * 1e3
@@ -89,14 +89,3 @@ def _disparities(rig: StereoRig, matches: F64, depth: F32) -> F64:
     smooth = (nearest > 0) & (farthest - nearest < SLOPE * nearest)  # 0 is unknown
     true = rig.left.P[0, 0] * rig.baseline / depth[lines, columns][smooth].astype(np.float64)
     return np.column_stack([seen[smooth], true])
-
-
-def _line(true: F64, seen: F64) -> tuple[float, float]:
-    """Scale and offset of seen from true disparities, least squares without what lies far from the rest."""
-    design, kept = np.column_stack([true, np.ones(len(true))]), np.ones(len(true), bool)
-    found = np.array([1.0, 0.0])
-    for _ in range(ROUNDS):
-        found = np.linalg.lstsq(design[kept], seen[kept], rcond=None)[0]
-        away = np.abs(seen - design @ found)
-        kept = away <= OUTLIER * 1.4826 * np.median(away) + 1e-9  # 1.4826: median distance to sigma
-    return float(found[0]), float(found[1])

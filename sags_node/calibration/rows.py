@@ -14,10 +14,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from sags_node.checks import Finding
 from sags_node.config.units import fitting_units, in_metres
 from sags_node.rig import already_rectified, rectifies, rectify_eyes
-from sags_node.rig.check import ENDOSCOPE_BASELINE, RECALIBRATE, Finding, size_made_for
-from sags_node.types import F64, Eye, StereoRig
+from sags_node.rig.check import ENDOSCOPE_BASELINE, RECALIBRATE, size_made_for
+from sags_node.types import F64, Bool, Eye, StereoRig
 
 FEWEST_MATCHES = 30
 LARGEST_ROW_ERROR = 1 / 180  # of the width, median: beyond it stereo finds no match
@@ -29,6 +30,7 @@ LEAST_SCALE = 0.004  # between the eyes: beyond it depth leans by more than matc
 SURE_SCALE = 4.0  # times its standard error
 EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale fixes depth
 ROUNDS = 10
+TINY = 1e-12  # so that an exact fit keeps all
 ALIGNED = (0.35, 1.0)  # px of a picture 640 px wide, or smaller, median and 90 %: rows that were rectified
 WORSE = 2.0  # times: rows of these after they were rectified once more
 RECTIFIED = "rectified:=true"
@@ -274,18 +276,31 @@ def _rows_differ(rows: Rows) -> Finding:
 def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float, float]:
     """Pitch and roll (degrees), scale and its standard error, and the RMS that these leave, of row errors [M]
     of points `left` [M, 2] of the left picture, all at distance 1; wrong matches left out."""
-    design, kept = np.column_stack([np.ones(len(errors)), left]), np.ones(len(errors), np.bool_)
-    found: F64 = np.zeros(3)
-    for _ in range(ROUNDS):
-        found = np.linalg.lstsq(design[kept], errors[kept], rcond=None)[0].astype(np.float64)
-        away = np.abs(errors - design @ found)
-        kept = away <= WRONG_MATCH * np.median(away) + 1e-12
+    design = np.column_stack([np.ones(len(errors)), left])
+    found, kept = fit_without_outliers(design, errors, WRONG_MATCH)
     inner = design[kept]
-    variance = float(np.sum(away[kept] ** 2)) / max(len(inner) - 3, 1)
+    variance = float(np.sum((errors[kept] - inner @ found) ** 2)) / max(len(inner) - 3, 1)
     spread = float(np.linalg.pinv(inner.T @ inner)[2, 2])
     pitch, roll = np.degrees(found[:2])
     turn = round(float(pitch), 3), round(float(roll), 3)
     return turn, float(found[2]), float(np.sqrt(variance * spread)), float(np.sqrt(variance))
+
+
+def fit_without_outliers(design: F64, values: F64, farthest: float) -> tuple[F64, Bool]:
+    """Fit values [M] = design [M, K] @ x by least squares, again without what lies far from the rest.
+
+    Args:
+        farthest: that is kept, in median distances.
+
+    Returns:
+        x [K], and which values were kept [M].
+    """
+    kept = np.ones(len(values), np.bool_)
+    for _ in range(ROUNDS):
+        found: F64 = np.linalg.lstsq(design[kept], values[kept], rcond=None)[0].astype(np.float64)
+        away = np.abs(values - design @ found)
+        kept = away <= farthest * np.median(away) + TINY
+    return found, kept
 
 
 def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:

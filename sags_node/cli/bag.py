@@ -10,23 +10,26 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.markup import escape
 
 from sags_node.cli import bag_text as say
 from sags_node.cli.launching import (
+    STEPWISE,
     as_json,
     from_zero,
     launch_argument,
     open_launched,
+    path_option,
     played_instead,
     positive,
     session_option,
+    shown,
     split_recording,
 )
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.node_options import data_options, ns_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.terminal.console import console, on_stop_signals, progress, show
 
@@ -47,57 +50,43 @@ def bag() -> None:
 @bag.command()
 @launch_argument
 @session_option
-@click.option(
-    "-o",
-    "--out",
-    "--output",
-    type=click.Path(path_type=Path),
-    help="New folder; default: sags_<date>_<time>.",
-)
+@path_option("-o", "--out", "--output", help="New folder; default: sags_<date>_<time>.")
 @click.option("--topics", multiple=True, metavar="NAME", help="Record only this; may be repeated.")
-@click.option(
+@shown(
     "--compression",
     type=click.Choice(["none", "jpeg", "png"]),
     default="none",
-    show_default=True,
     help="Of 8-bit pictures. jpeg: alpha and masks become png, so that they stay exact.",
 )
-@click.option(
-    "--max-cache",
+@shown(
+    *("--max-cache", "max_cache_mb"),
     type=positive,
     default=256.0,
-    show_default=True,
     metavar="MB",
     help="What may wait for the disk; beyond it messages are dropped and counted.",
 )
-@click.option(
-    "-b",
-    "--max-bag-size",
+@shown(
+    *("-b", "--max-bag-size"),
     type=click.IntRange(0),
     default=0,
-    show_default=True,
     metavar="BYTES",
     help="Go on in a new file of the folder when one is so large; 0: never.",
 )
-@click.option(
-    "-d",
-    "--max-bag-duration",
+@shown(
+    *("-d", "--max-bag-duration"),
     type=from_zero,
     default=0.0,
-    show_default=True,
     metavar="SECONDS",
     help="Go on in a new file of the folder when one is so long; 0: never.",
 )
 @click.option(
-    "--snapshot-mode",
+    *("--snapshot-mode", "snapshot_seconds"),
     type=positive,
     metavar="SECONDS",
     help="Keep only the last seconds in memory; write them on SIGUSR1.",
 )
 @click.option("--stdin", "from_stdin", is_flag=True, help="A line on stdin saves the ring; its end ends it.")
-@endpoint_option
-@ns_option
-@node_options
+@data_options
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @as_json
 def record(
@@ -105,15 +94,13 @@ def record(
     session: str | None,
     out: Path | None,
     topics: tuple[str, ...],
-    compression: str,
-    max_cache: float,
     max_bag_size: int,
     max_bag_duration: float,
-    snapshot_mode: float | None,
     from_stdin: bool,
     seconds: float | None,
     json_out: bool,
     node: NodeAddress,
+    **how: Any,
 ) -> None:
     """Record what a running node publishes until Ctrl-C.
 
@@ -142,9 +129,8 @@ def record(
     words = played_instead(launch, session)
     if launch and words is None:
         raise UsageError(f"{launch[0]}: key:=value needs a recording: sags bag record RECORDING key:=value")
-    if words is not None and (
-        snapshot_mode is not None or from_stdin or seconds is not None or node.endpoint
-    ):
+    live = how["snapshot_seconds"] is not None or from_stdin or seconds is not None or node.endpoint
+    if words is not None and live:
         raise UsageError(
             "a recording is recorded as a whole: no --snapshot-mode, --stdin, --seconds, --endpoint"
         )
@@ -152,7 +138,6 @@ def record(
     from sags_node.findings import by_code, by_stage
     from sags_node.messaging.stream import check_topic
     from sags_node.recording.bag_writer import Limits
-    from sags_node.recording.message_writer import Compression
     from sags_node.recording.recorder import Recorder, RecordOptions
     from sags_node.recording.state import findings
     from sags_node.terminal.console import tell as warn
@@ -163,20 +148,17 @@ def record(
             click.echo(json.dumps(said))
             sys.stdout.flush()
         else:
-            console.print(
-                escape(" ".join(f"{what}: {value}" for what, value in said.items())), soft_wrap=True
-            )
+            line = " ".join(f"{what}: {value}" for what, value in said.items())
+            console.print(escape(line), soft_wrap=True)
 
     with _failure_reported(tell if from_stdin else None):
         names = tuple(check_topic(say.plain(name, node.ns)).name for name in topics)
         options = RecordOptions(
             folder=out or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
             topics=names,
-            compression=cast(Compression, compression),
-            max_cache_mb=max_cache,
-            snapshot_seconds=snapshot_mode,
             limits=Limits(max_bag_size, max_bag_duration),
             node=node,
+            **how,
         )
         if words is not None:
             summary = _recorded(words, options)
@@ -211,19 +193,18 @@ def record(
 def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
     from sags_node.cli.played_bag import record_session
 
-    path, overrides = split_recording(
-        launch, "live cameras are recorded from the running node; name no recording"
-    )
+    no_cameras = "live cameras are recorded from the running node; name no recording"
+    path, overrides = split_recording(launch, no_cameras)
     if options.folder.exists():
         raise UsageError(f"{options.folder} exists already; name a new folder")
-    opened = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    opened = open_launched(path, [*overrides, *STEPWISE])
     with progress("recording") as advance:
         return record_session(opened, options, advance)
 
 
 @bag.command()
 @recording
-@click.option("-r", "--rate", type=positive, default=1.0, show_default=True, help="Times as fast.")
+@shown("-r", "--rate", type=positive, default=1.0, help="Times as fast.")
 @click.option("-l", "--loop", is_flag=True, help="Begin anew at the end.")
 @click.option("-d", "--delay", type=from_zero, default=0.0, help="Seconds to wait before.")
 @click.option(
@@ -241,24 +222,19 @@ def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
 @click.option("--topics", multiple=True, metavar="NAME", help="Play only this; may be repeated.")
 @click.option("-x", "--exclude", multiple=True, metavar="NAME", help="Do not play this; may be repeated.")
 @click.option("-m", "--remap", multiple=True, metavar="OLD:=NEW", help="Publish under another name.")
-@click.option("--endpoint", default="tcp://127.0.0.1:5556", show_default=True, help="Where to publish.")
+@shown("--endpoint", default="tcp://127.0.0.1:5556", help="Where to publish.")
 @ns_option
 @as_json
 def play(
     path: Path,
-    rate: float,
-    loop: bool,
-    delay: float,
-    clock_hz: float | None,
     start_paused: bool,
-    start_offset: float,
-    playback_duration: float | None,
     topics: tuple[str, ...],
     exclude: tuple[str, ...],
     remap: tuple[str, ...],
     endpoint: str,
     ns: str,
     json_out: bool,
+    **how: Any,
 ) -> None:
     """Publish a recording again; Enter pauses and goes on.
 
@@ -274,15 +250,10 @@ def play(
     from sags_node.recording.player import Player, PlayOptions
 
     options = PlayOptions(
-        rate=rate,
-        loop=loop,
-        delay=delay,
-        start_offset=start_offset,
-        playback_duration=playback_duration,
         topics=tuple(say.plain(name, ns) for name in topics),
         exclude=tuple(say.plain(name, ns) for name in exclude),
         remap=say.remappings(remap, ns),
-        clock_hz=clock_hz,
+        **how,
     )
     player = Player(path, options, PublishConfig(data=(endpoint,), control=None), ns, start_paused)
     on_stop_signals(player.stop)
@@ -308,7 +279,7 @@ def info(path: Path, json_out: bool) -> None:
 
 @bag.command()
 @recording
-@click.option("-o", "--out", "--output", type=click.Path(path_type=Path), required=True, help="New folder.")
+@path_option("-o", "--out", "--output", required=True, help="New folder.")
 @as_json
 def recover(path: Path, out: Path, json_out: bool) -> None:
     """Save what is whole of a damaged MCAP file or folder.

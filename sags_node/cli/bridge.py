@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, positive
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.launching import as_json, file_option, path_option, positive, shown
+from sags_node.cli.node_options import NICENESS, endpoint_option, node_options, ns_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, on_stop_signals, show
@@ -24,9 +25,10 @@ from sags_node.terminal.console import console, on_stop_signals, show
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
-NICENESS = 19  # the node goes first, where both want the same cores
 INSTALL = "install it with: pip install 'sags-node[bridges]'"
 
+max_age_option = partial(shown, "--max-age", type=positive, default=0.4)
+Ready = Callable[[str, int], None]  # host and port, once peers can come
 Say = Callable[[str, Mapping[str, Any]], None]  # in words, and as fields for machines
 
 log = logging.getLogger(__name__)
@@ -61,28 +63,19 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; with --endpoint.")
     @ns_option
     @node_options
-    @click.option("--overlay-ns", default="overlay", show_default=True, help="Namespace of a sags overlay.")
-    @click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection files.")
-    @click.option(
-        "--max-age",
-        type=positive,
-        default=0.4,
-        show_default=True,
-        help="Seconds since capture after which a picture is taken back.",
-    )
+    @shown("--overlay-ns", default="overlay", help="Namespace of a sags overlay.")
+    @path_option("--run-dir", help="Of the connection files.")
+    @max_age_option(help="Seconds since capture after which a picture is taken back.")
     @as_json
     @wraps(command)
-    def with_common(
-        node: NodeAddress, overlay_ns: str, json_out: bool, **rest: Any,
-    ) -> None:  # fmt: skip
-        from sags_node.bridge.feed import Place
+    def with_common(node: NodeAddress, overlay_ns: str, json_out: bool, **rest: Any) -> None:
+        from sags_node.messaging.address import NodeAddress
         from sags_node.messaging.node_clock import NodeClock
         from sags_node.messaging.rundir import read_connection
 
         remote = node.endpoint is not None and node.control is not None
         clock = NodeClock.at(node) if remote else None
-        place = Place(node.ns, node.endpoint, node.control, node.run_dir, node.keys, clock)
-        overlay = Place(overlay_ns, run_dir=node.run_dir, clock=clock)  # its stamps are the node's
+        overlay = NodeAddress(overlay_ns, run_dir=node.run_dir, clock=clock)  # its stamps are the node's
         stop = threading.Event()
 
         def say(words: str, fields: Mapping[str, Any]) -> None:
@@ -98,7 +91,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
 
         on_stop_signals(stop.set)
         with clock or nullcontext():
-            command(node=place, overlay=overlay, say=say, stop=stop, **rest)
+            command(node=replace(node, clock=clock), overlay=overlay, say=say, stop=stop, **rest)
 
     return with_common
 
@@ -107,10 +100,8 @@ def _listening(port: int) -> Callable[[Callable[..., None]], Callable[..., None]
     """Options of a bridge that peers connect to; the command gets them as `host`, `port` and `ready`."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve on.")
-        @click.option(
-            "--port", type=click.IntRange(0, 65535), default=port, show_default=True, help="0: any free one."
-        )
+        @shown("--host", default="127.0.0.1", help="Address to serve on.")
+        @shown("--port", type=click.IntRange(0, 65535), default=port, help="0: any free one.")
         @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
         @wraps(command)
         def with_address(host: str, insecure: bool, say: Say, **rest: Any) -> None:
@@ -153,16 +144,15 @@ def _check_installed(module: str, package: str, command: str) -> None:
     default="",
     help="Some of picture,render,overlay,surface,anchors,camera; default: all.",
 )
-@click.option("--rate", type=positive, default=10.0, show_default=True, help="Hz of all but the surface.")
-@click.option("--surface-rate", type=positive, default=2.0, show_default=True, help="Hz of the surface.")
-@click.option(
+@shown("--rate", type=positive, default=10.0, help="Hz of all but the surface.")
+@shown("--surface-rate", type=positive, default=2.0, help="Hz of the surface.")
+@shown(
     "--surface-step",
     type=click.IntRange(2, 128),
     default=16,
-    show_default=True,
     help="Pixels between two corners of the surface.",
 )
-def openigtlink(send: str, **options: Any) -> None:
+def openigtlink(send: str, ready: Ready, stop: threading.Event, **options: Any) -> None:
     """Serve 3D Slicer, PLUS and others that speak OpenIGTLink.
 
     Devices SagsPicture, SagsRender, SagsOverlay (IMAGE), SagsSurface (POLYDATA), SagsAnchors (POINT),
@@ -180,7 +170,6 @@ def openigtlink(send: str, **options: Any) -> None:
     _check_installed("pyigtl", "pyigtl", "openigtlink")
     from sags_node.bridge.openigtlink import IgtlOptions, run_openigtlink
 
-    ready, stop = options.pop("ready"), options.pop("stop")
     chosen = tuple(name for name in send.split(",") if name)
     os.nice(NICENESS)
     run_openigtlink(IgtlOptions(send=chosen, **options), ready, stop)
@@ -197,7 +186,7 @@ def openigtlink(send: str, **options: Any) -> None:
     metavar="URL",
     help="Pages from there may connect too, e.g. https://or.example.org; repeatable.",
 )
-def web(**options: Any) -> None:
+def web(ready: Ready, stop: threading.Event, **options: Any) -> None:
     """Serve web pages, Unity and others by WebSocket.
 
     The messages are the node's own, byte for byte, with their header as JSON. http://127.0.0.1:8766 shows the
@@ -216,23 +205,16 @@ def web(**options: Any) -> None:
     _check_installed("websockets", "websockets", "web")
     from sags_node.bridge.web import WebOptions, run_web
 
-    ready, stop = options.pop("ready"), options.pop("stop")
     run_web(WebOptions(**options), ready, stop)
 
 
 @bridge.command()
 @click.option("--left", metavar="LAUNCH", help="What comes behind the left eye's pictures.")
 @click.option("--right", metavar="LAUNCH", help="What comes behind the right eye's.")
-@click.option("--rate", type=positive, default=60.0, show_default=True, help="Hz of the display.")
-@click.option("--overlay-ns", default="overlay", show_default=True, help="Namespace of the sags overlay.")
-@click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection file.")
-@click.option(
-    "--max-age",
-    type=positive,
-    default=0.4,
-    show_default=True,
-    help="Seconds since capture after which there is only the key colour.",
-)
+@shown("--rate", type=positive, default=60.0, help="Hz of the display.")
+@shown("--overlay-ns", default="overlay", help="Namespace of the sags overlay.")
+@path_option("--run-dir", help="Of the connection file.")
+@max_age_option(help="Seconds since capture after which there is only the key colour.")
 def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
     """Write the overlay into GStreamer, on its key colour.
 
@@ -249,13 +231,13 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
 
     unixfdsink, for dVRK's sockets, needs GStreamer 1.24.
     """
-    from sags_node.bridge.feed import Place
     from sags_node.bridge.gst import GstOptions, run_gst
+    from sags_node.messaging.address import NodeAddress
 
     stop = threading.Event()
     on_stop_signals(stop.set)
     ready = partial(console.print, "writing as soon as an overlay is there  (Ctrl-C ends)")
-    run_gst(GstOptions(Place(overlay_ns, run_dir=run_dir), **options), ready, stop)
+    run_gst(GstOptions(NodeAddress(overlay_ns, run_dir=run_dir), **options), ready, stop)
 
 
 @bridge.command()
@@ -263,13 +245,8 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
 @_listening(port=8765)
 @click.option("--rate", type=positive, help="Hz of each topic, at most; default: all that come.")
 @click.option("--pin", is_flag=True, help="Let peers pin anchors: a click in the 3D panel.")
-@click.option(
-    "--layout",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE.json",
-    help="Write the layout for this namespace, and end.",
-)
-def foxglove(layout: Path | None, **options: Any) -> None:
+@file_option("--layout", metavar="FILE.json", help="Write the layout for this namespace, and end.")
+def foxglove(layout: Path | None, ready: Ready, stop: threading.Event, **options: Any) -> None:
     """Serve Foxglove: every topic live, on ws://127.0.0.1:8765.
 
     Topics come as the node sends them, and pictures as H.264 too where PyAV is there (.../h264): for a thin
@@ -286,7 +263,6 @@ def foxglove(layout: Path | None, **options: Any) -> None:
     Needs: pip install 'sags-node[bridges]'
     """
     _check_installed("foxglove", "foxglove-sdk", "foxglove")
-    ready, stop = options.pop("ready"), options.pop("stop")
     if layout is not None:
         from sags_node.bridge.foxglove_layout import layout_of
 
@@ -305,9 +281,7 @@ def foxglove(layout: Path | None, **options: Any) -> None:
 @click.option(
     "--domain", type=click.IntRange(0, 232), help="Number of the graph; default: $ROS_DOMAIN_ID, else 0."
 )
-@click.option(
-    "--interface", default="lo", show_default=True, help="Network interface; lo: this machine only."
-)
+@shown("--interface", default="lo", help="Network interface; lo: this machine only.")
 @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
 @click.option(
     "--view",
@@ -318,11 +292,10 @@ def foxglove(layout: Path | None, **options: Any) -> None:
     metavar="NAME",
     help="A view that peers may open and see; several times.",
 )
-@click.option(
+@shown(
     "--points",
     type=click.IntRange(1),
     default=8000,
-    show_default=True,
     help="Of /sags/points, at most; /sags/points/all has all.",
 )
 def ros2(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,19 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, check_files, force_option, launch_argument, positive, split
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    file_option,
+    force_option,
+    group_of,
+    launch_argument,
+    path_option,
+    positive,
+    show_findings,
+    shown,
+    split,
+)
 from sags_node.config.units import UNITS
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
@@ -25,13 +36,7 @@ OUT = ("-o", "--out", "--output")
 EYES = Path("eyes.png")
 
 path_argument = click.argument("path", type=click.Path(path_type=Path))
-out_option = click.option(
-    *OUT,
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FOLDER",
-    help="Gets left.yaml and right.yaml.",
-)
+out_option = path_option(*OUT, required=True, metavar="FOLDER", help="Gets left.yaml and right.yaml.")
 
 
 def _sides(ctx: click.Context, option: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -45,43 +50,34 @@ def _sides(ctx: click.Context, option: click.Parameter, value: str | None) -> tu
     return int(found[1]), int(found[2])
 
 
-def reading_options(command: Callable[..., None]) -> Callable[..., None]:
-    """For forms of calibration that leave something out."""
-    size = click.option(
+reading_options = group_of(  # for forms of calibration that leave something out
+    click.option(
         "--size",
         callback=_sides,
         metavar="WxH",
         help="Picture size, for forms that do not say it; default: the pictures'.",
-    )
-    unit = click.option(
+    ),
+    click.option(
         "--unit",
         type=click.Choice(list(UNITS)),
         help="Of lengths in the files; default: mm for text matrices, else m.",
-    )
-    return size(unit(command))
-
-
-def board_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Which board is seen; as `_board` takes them."""
-    options = (
-        click.option(
-            "--board",
-            type=click.Choice(["chessboard", "charuco"]),
-            default="chessboard",
-            show_default=True,
-            help="What is printed on it.",
-        ),
-        click.option(
-            "--squares", callback=_sides, required=True, metavar="CxR", help="Columns and rows of squares."
-        ),
-        click.option("--square-mm", type=positive, required=True, help="Side of a square."),
-        click.option("--marker-mm", type=positive, help="Side of a marker; charuco only."),
-        click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only."),
-        click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only."),
-    )
-    for option in reversed(options):
-        command = option(command)
-    return command
+    ),
+)
+board_options = group_of(  # which board is seen; as `_board` takes them
+    shown(
+        "--board",
+        type=click.Choice(["chessboard", "charuco"]),
+        default="chessboard",
+        help="What is printed on it.",
+    ),
+    click.option(
+        "--squares", callback=_sides, required=True, metavar="CxR", help="Columns and rows of squares."
+    ),
+    click.option("--square-mm", type=positive, required=True, help="Side of a square."),
+    click.option("--marker-mm", type=positive, help="Side of a marker; charuco only."),
+    click.option("--dictionary", metavar="NAME", help="Of the markers, e.g. 4X4_50; charuco only."),
+    click.option("--legacy", is_flag=True, help="Printed by an OpenCV before 4.6; charuco only."),
+)
 
 
 @click.group()
@@ -92,7 +88,7 @@ def calib() -> None:
 @calib.command()
 @path_argument
 @click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
-@click.option("--session", type=click.Path(path_type=Path), help="Launch file or session to compare with.")
+@path_option("--session", help="Launch file or session to compare with.")
 @click.option(
     "--images",
     type=(click.Path(path_type=Path), click.Path(path_type=Path)),
@@ -132,14 +128,10 @@ def check(
     if stray is not None:
         raise UsageError(f"'{stray}': one calibration at a time; pictures come after --images or --session")
     with progress("comparing") as advance:
-        findings = check_calibration(
-            path, session, images, overrides_only, size, UNITS.get(unit or ""), advance
-        )
+        metres = UNITS.get(unit or "")
+        findings = check_calibration(path, session, images, overrides_only, size, metres, advance)
     rows = [asdict(finding) for finding in findings]
-    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
-    show(rows if json_out else text.rows_table(people))
-    if any(finding.level == "error" for finding in findings):
-        raise SagsError(f"{path} cannot be used as it is; see the fixes above")
+    show_findings(rows, json_out, f"{path} cannot be used as it is")
 
 
 @calib.command()
@@ -160,7 +152,8 @@ def convert(
     sags calib convert calibrationdata.tar.gz -o calib/mine
     """
     from sags_node.calibration.check import read_calibration
-    from sags_node.rig import check_rig, eye_files, refuse_errors, resized_rig, save_rig
+    from sags_node.checks import refuse_errors
+    from sags_node.rig import check_rig, eye_files, resized_rig, save_rig
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
@@ -178,10 +171,9 @@ def convert(
 
 @calib.command("live")
 @launch_argument
-@click.option("--seconds", type=positive, default=2.0, show_default=True, help="To watch.")
-@click.option(
+@shown("--seconds", type=positive, default=2.0, help="To watch.")
+@file_option(
     *OUT,
-    type=click.Path(path_type=Path, dir_okay=False),
     default=EYES,
     show_default=True,
     metavar="FILE.png",
@@ -224,23 +216,21 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
 
 @calib.command()
 @click.argument("folders", nargs=-1, type=click.Path(path_type=Path), metavar="[LEFT_FOLDER RIGHT_FOLDER]")
-@click.option("--live", type=click.Path(path_type=Path), metavar="LAUNCH", help="Take the pictures here.")
+@path_option("--live", metavar="LAUNCH", help="Take the pictures here.")
 @board_options
-@click.option(
+@shown(
     "--coefficients",
     type=click.Choice(["2", "3", "6"]),
     default="2",
-    show_default=True,
     help="Of radial distortion: 2 and 3 plumb_bob, 6 rational_polynomial.",
 )
-@click.option("--views", type=click.IntRange(6), default=25, show_default=True, help="To take; --live only.")
+@shown("--views", type=click.IntRange(6), default=25, help="To take; --live only.")
 @out_option
 @force_option
 @as_json
 def stereo(
     folders: tuple[Path, ...],
     live: Path | None,
-    squares: tuple[int, int],
     coefficients: str,
     views: int,
     out: Path,
@@ -264,7 +254,7 @@ def stereo(
 
     if (live is None) != (len(folders) == 2) or (live is not None and folders):
         raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
-    board = _board(squares, **board_of)
+    board = _board(**board_of)
     check_files(*eye_files(out), force=force)
     left, right = folders if live is None else _grab(live, board, out / "views", views)
     with progress("looking for the board") as advance:
@@ -278,21 +268,12 @@ def stereo(
 @calib.command("hand-eye")
 @launch_argument
 @board_options
-@click.option(
-    "--views", type=click.IntRange(10, 1000), default=80, show_default=True, help="Spread over the recording."
-)
-@click.option(
-    *OUT,
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FOLDER",
-    help="The rig's folder; gets hand_eye.yaml.",
-)
+@shown("--views", type=click.IntRange(10, 1000), default=80, help="Spread over the recording.")
+@path_option(*OUT, required=True, metavar="FOLDER", help="The rig's folder; gets hand_eye.yaml.")
 @force_option
 @as_json
 def hand_eye(
     launch: tuple[str, ...],
-    squares: tuple[int, int],
     views: int,
     out: Path,
     force: bool,
@@ -317,7 +298,7 @@ def hand_eye(
 
     path, overrides = split(launch)
     config = load_launch(path, overrides)
-    board = _board(squares, **board_of)
+    board = _board(**board_of)
     check_files(out / FILE, force=force)
     with progress("looking for the board") as advance:
         solution = calibrate_hand_eye(config, rig_of(config), board, views, advance)

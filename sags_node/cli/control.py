@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sags_node.cli.launching import as_json
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.launching import as_json, group_of, path_option
+from sags_node.cli.node_options import endpoint_option, node_options, ns_option, own_control_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.terminal import text
 from sags_node.terminal.console import show
@@ -22,11 +21,8 @@ ANCHORS_WAIT = 3.0  # s for the anchors of a frame
 
 def asking(command: Callable[..., None]) -> Callable[..., None]:
     """Options of a command that asks a node; it gets the node as `node`."""
-    control = click.option(
-        "--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file."
-    )
-    run_dir = click.option("--run-dir", type=click.Path(path_type=Path), help="Of the connection file.")
-    return control(ns_option(run_dir(node_options(as_json(command)))))
+    run_dir = path_option("--run-dir", help="Of the connection file.")
+    return group_of(own_control_option, ns_option, run_dir, node_options, as_json)(command)
 
 
 def ask(node: NodeAddress, op: str, args: dict[str, Any] | None = None) -> Any:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from sags_node.cli.launching import (
+    STEPWISE,
     Number,
     as_json,
     check_files,
     file_option,
+    folder_option,
     force_option,
     from_zero,
     launch_argument,
@@ -20,12 +21,13 @@ from sags_node.cli.launching import (
     played_instead,
     positive,
     session_option,
+    show_rows,
+    shown,
     split_recording,
 )
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.node_options import data_options
 from sags_node.errors import UsageError
-from sags_node.terminal import text
-from sags_node.terminal.console import progress, show
+from sags_node.terminal.console import progress
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
@@ -37,12 +39,7 @@ NO_CAMERAS = "live cameras are exported from the running node; name no recording
 @launch_argument
 @session_option
 @click.option("--at", type=from_zero, help="Seconds into the session; default: its end.")
-@click.option(
-    "--fit",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="What sags fit made of that session, in place of the online model.",
-)
+@folder_option("--fit", help="What sags fit made of that session, in place of the online model.")
 @file_option("--splats", metavar="F.ply", help="All Gaussians with the fields of 3D Gaussian Splatting.")
 @file_option(
     "--points", metavar="F.ply|.pcd", help="The surface that the left camera sees, x y z (m) and rgb."
@@ -53,10 +50,8 @@ NO_CAMERAS = "live cameras are exported from the running node; name no recording
     help="The same surface as triangles; where nothing is known is a hole.",
 )
 @file_option("--orbit", metavar="F.mp4", help="A video around the tissue.")
-@click.option(
+@folder_option(
     "--sequence",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
     help="All Gaussians of every frame of a recording, a .ply each, and a video that plays in a loop. The "
     "same command again goes on where it was ended.",
 )
@@ -64,41 +59,32 @@ NO_CAMERAS = "live cameras are exported from the running node; name no recording
 @file_option(
     "--render", metavar="F.mp4", help="The model as the left eye sees it, each frame of a recording."
 )
-@click.option(
+@folder_option(
     "--depth",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
     help="The model's depth of every frame of a recording, 16-bit PNGs in units of 0.01 mm, 0 unknown.",
 )
-@click.option(
+@shown(
     "--orbit-degrees",
     type=Number(0, 60),
     default=12.0,
-    show_default=True,
     help="How far the camera of the video tilts from where it was.",
 )
-@click.option("--orbit-seconds", type=positive, default=6.0, show_default=True, help="Length of the video.")
+@shown("--orbit-seconds", type=positive, default=6.0, help="Length of the video.")
 @force_option
-@endpoint_option
-@ns_option
-@node_options
+@data_options
 @as_json
 def export(
     launch: tuple[str, ...],
     session: str | None,
     at: float | None,
     fit: Path | None,
-    splats: Path | None,
-    points: Path | None,
-    mesh: Path | None,
-    orbit: Path | None,
     sequence: Path | None,
     orbit_degrees: float,
     orbit_seconds: float,
     force: bool,
     node: NodeAddress,
     json_out: bool,
-    **of_every_frame: Path | None,
+    **files: Path | None,
 ) -> None:
     """Write the model at one moment for other programs, in metres.
 
@@ -115,48 +101,49 @@ def export(
     from sags_node.export import export as work
     from sags_node.export import scene as source
     from sags_node.export import sequence as many
-    from sags_node.export.played import KINDS, new_folder
+    from sags_node.export.played import KINDS, new_folder, write_played
 
-    played = {kind: path for kind, path in of_every_frame.items() if path is not None}
-    asked = {"splats": splats, "points": points, "mesh": mesh, "orbit": orbit}
-    targets = {kind: path for kind, path in asked.items() if path is not None}
+    played, targets = (
+        {kind: file for kind in kinds if (file := files.get(kind)) is not None}
+        for kinds in (KINDS, work.KINDS)
+    )
     words = played_instead(launch, session)
     if played and (targets or sequence or at is not None or fit is not None or words is None):
         raise UsageError(
             f"--{next(iter(played))} exports all frames: name a recording, and leave out --mesh, --points, "
             "--splats, --orbit, --sequence, --at, --fit"
         )
-    if played and words is not None:
-        for kind, target in played.items():
-            if KINDS[kind].is_folder:
-                new_folder(target)
-            else:
-                check_files(target, force=force)
-        _export_played(words, played, json_out)
-        return
-    if sequence is None:
+    for kind, target in played.items():
+        if KINDS[kind].is_folder:
+            new_folder(target)
+        else:
+            check_files(target, force=force)
+    if sequence is None and not played:
         work.check_targets(targets, force)
-    elif targets or at is not None or words is None:
+    elif sequence is not None and (targets or at is not None or words is None):
         raise UsageError("--sequence exports all frames: name a recording, no --at and no other files")
     if words is None and (launch or at is not None or fit is not None):
         raise UsageError("--at, --fit and key:=value need a recording: sags export RECORDING ...")
     if words is not None:
         path, changed = split_recording(words, NO_CAMERAS)
-        opened = open_launched(path, [*changed, "source.loop:=false", "source.pace:=step"])
-    if sequence is not None and words is not None:
+        opened = open_launched(path, [*changed, *STEPWISE])
+    if played:
+        with progress("exporting") as advance:
+            rows = write_played(opened, played, advance)
+        show_rows(rows, json_out)
+        return
+    if sequence is not None:
         fitted = None if fit is None else str(fit.resolve())
         about = {"session": opened.name, "overrides": changed, "fit": fitted}
         many.check_sequence(sequence, about, force)
         with progress("exporting") as advance:
-            scenes = (
-                source.scenes_of_session(opened)
-                if fit is None
-                else source.scenes_of_fit(fit, opened, advance)
-            )
-            rows = many.write_sequence(
-                sequence, scenes, opened.source.rate, opened.source.frame_count, advance
-            )
-        show(rows if json_out else text.rows_table(rows))
+            if fit is None:
+                scenes = source.scenes_of_session(opened)
+            else:
+                scenes = source.scenes_of_fit(fit, opened, advance)
+            rate, count = opened.source.rate, opened.source.frame_count
+            rows = many.write_sequence(sequence, scenes, rate, count, advance)
+        show_rows(rows, json_out)
         return
     with progress("exporting") as advance:
         if words is None:
@@ -166,14 +153,4 @@ def export(
         else:
             scene = source.from_fit(fit, opened, at, advance)
         rows = work.export(scene, targets, work.Orbit(orbit_degrees, orbit_seconds), advance)
-    show(rows if json_out else text.rows_table(rows))
-
-
-def _export_played(launch: Sequence[str], played: Mapping[str, Path], json_out: bool) -> None:
-    from sags_node.export.played import write_played
-
-    path, overrides = split_recording(launch, NO_CAMERAS)
-    opened = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
-    with progress("exporting") as advance:
-        rows = write_played(opened, played, advance)
-    show(rows if json_out else text.rows_table(rows))
+    show_rows(rows, json_out)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from sags_node.config.schema import Source
     from sags_node.engine.device import Device
     from sags_node.pipeline.session import Session
+
+
+Command = Callable[..., Any]
 
 
 class Number(click.FloatRange):
@@ -40,18 +43,29 @@ launch_argument = click.argument(
 )
 as_json = click.option("--json", "json_out", is_flag=True, help="Print JSON on stdout, for machines.")
 all_figures = click.option("-v", "--verbose", is_flag=True, help="Print all figures, not the verdict alone.")
-lpips_option = click.option(
-    "--lpips-weights", type=click.Path(path_type=Path), help="npz of LPIPS SqueezeNet weights."
-)
-
-
+shown = partial(click.option, show_default=True)  # an option whose help tells its default
+path_option = partial(click.option, type=click.Path(path_type=Path))
 file_option = partial(click.option, type=click.Path(path_type=Path, dir_okay=False))
+folder_option = partial(click.option, metavar="FOLDER", type=click.Path(path_type=Path, file_okay=False))
+lpips_option = path_option("--lpips-weights", help="npz of LPIPS SqueezeNet weights.")
 figures_option = file_option(
     *("-o", "--out"),
     metavar="FILE.json",
     help="Write the figures as JSON. Earlier ones are replaced, any other file that is there is not.",
 )
 force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
+STEPWISE = ("source.loop:=false", "source.pace:=step")  # every frame of a recording, in turn
+
+
+def group_of(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Make one decorator of several options; their help is in this order."""
+
+    def decorate(command: Command) -> Command:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
 
 
 def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -198,6 +212,22 @@ def show_verdict(lines: Sequence[tuple[str, str]]) -> None:
     for what, said in lines:
         table.add_row(what, said)
     show(table)
+
+
+def show_findings(rows: list[dict[str, Any]], json_out: bool, wrong: str) -> None:
+    """Print what was looked at, each with its fix.
+
+    Raises:
+        SagsError: one is an error; `wrong` says of what.
+    """
+    show(rows if json_out else text.findings_table(rows))
+    if any(row["level"] == "error" for row in rows):
+        raise SagsError(f"{wrong}; see the fixes above")
+
+
+def show_rows(rows: list[dict[str, Any]], json_out: bool) -> None:
+    """Print records that share their keys."""
+    show(rows if json_out else text.rows_table(rows))
 
 
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:

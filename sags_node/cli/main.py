@@ -27,20 +27,22 @@ from sags_node.cli.launching import (
     as_json,
     launch_argument,
     open_launched,
+    path_option,
     positive,
+    show_findings,
     show_outcome,
+    shown,
     split,
     split_recording,
 )
 from sags_node.cli.new import new
-from sags_node.cli.node_options import node_options, ns_option
+from sags_node.cli.node_options import node_options, ns_option, own_control_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.plotting import check_plots
-from sags_node.terminal import text
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
 
 if TYPE_CHECKING:
@@ -175,10 +177,9 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
 
 @main.command()
 @launch_argument
-@click.option("--seconds", type=positive, default=10.0, show_default=True, help="How long it plays.")
-@click.option(
+@shown("--seconds", type=positive, default=10.0, help="How long it plays.")
+@path_option(
     *("-o", "--out"),
-    type=click.Path(path_type=Path),
     default=Path("out/demo"),
     show_default=True,
     help="Folder for report.html, sheet.png and overlay.mp4; older ones are replaced.",
@@ -245,14 +246,7 @@ def phantom(folder: Path, overrides: tuple[str, ...]) -> None:
 
 @main.command()
 @click.argument("name")
-@click.option(
-    "-o",
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path(),
-    show_default=True,
-    help="Folder for both files.",
-)
+@path_option("-o", "--out", default=Path(), show_default=True, help="Folder for both files.")
 def keygen(name: str, out: Path) -> None:
     """Make a key pair for a node or for a client.
 
@@ -277,7 +271,7 @@ def keygen(name: str, out: Path) -> None:
 
 
 @main.command()
-@click.option("--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file.")
+@own_control_option
 @ns_option
 @node_options
 @as_json
@@ -311,21 +305,13 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     from sags_node.config.launch_file import load_launch
     from sags_node.doctor import as_rows, examine
 
-    checks = examine(load_launch(*split(launch)))
-    rows = as_rows(checks)
-    show(rows if json_out else text.rows_table(rows))
-    if any(check.level == "error" for check in checks):
-        raise SagsError("something the node needs is missing; see the fixes above")
+    rows = as_rows(examine(load_launch(*split(launch))))
+    show_findings(rows, json_out, "something the node needs is missing")
 
 
 @main.command("import")
-@click.option(
-    "--check",
-    "folder",
-    type=click.Path(path_type=Path),
-    required=True,
-    metavar="FOLDER",
-    help="Look it over; nothing is changed.",
+@path_option(
+    *("--check", "folder"), required=True, metavar="FOLDER", help="Look it over; nothing is changed."
 )
 @click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
 @as_json
@@ -344,12 +330,8 @@ def import_folder(folder: Path, overrides: tuple[str, ...], json_out: bool) -> N
 
     from sags_node.importing.check import check_folder as look_over
 
-    findings = look_over(folder, overrides)
-    rows = [asdict(finding) for finding in findings]
-    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
-    show(rows if json_out else text.rows_table(people))
-    if any(finding.level == "error" for finding in findings):
-        raise SagsError(f"{folder} cannot be played as it is; see the fixes above")
+    rows = [asdict(finding) for finding in look_over(folder, overrides)]
+    show_findings(rows, json_out, f"{folder} cannot be played as it is")
 
 
 @main.command("bench", hidden=True, context_settings={"ignore_unknown_options": True})

@@ -45,6 +45,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
     sags new left.mp4 right.mp4 rig:=calib/mine
     sags new /dev/video0 source.width:=1920 source.height:=1080
     """
+    from sags_node.checks import is_wrong
     from sags_node.config.launch_file import load_launch, tree_of, written_in
     from sags_node.doctor import examine
     from sags_node.importing.proposal import propose
@@ -58,21 +59,18 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
     with console.status("looking at the pictures"):
         found = propose(named, [word for word in words if ":=" in word])
     rows: list[dict[str, Any]] = [asdict(finding) for finding in found.findings]
-    if not any(row["level"] == "error" for row in rows):
-        checks = examine(load_launch(named[0], found.launch))
-        rows += [
-            {"level": check.level, "what": f"{check.name}: {check.found}", "fix": check.fix}
-            for check in checks
-            if check.level != "ok" and check.name not in SAID_BY_PICTURES
-        ]
-    people = [{key: row[key] for key in ("level", "what", "fix")} for row in rows]
-    wrong = any(finding.level == "error" for finding in found.findings)
+    wrong = is_wrong(found.findings)
     if not wrong:
+        rows += [
+            {"level": each.level, "what": f"{name}: {each.what}", "fix": each.fix}
+            for name, each in examine(load_launch(named[0], found.launch))
+            if each.level != "ok" and name not in SAID_BY_PICTURES
+        ]
         tree = written_in(file.parent, tree_of(found.launch))
         with whole(file) as partial:
             partial.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
         load_launch(file)  # it is said to play: this says why not, if it does not
-    show({"launch": None if wrong else str(file), "found": rows} if json_out else text.rows_table(people))
+    show({"launch": None if wrong else str(file), "found": rows} if json_out else text.findings_table(rows))
     if wrong:
         raise SagsError(f"{named[0]} cannot be played as it is; see the fixes above")
     where = escape(shlex.quote(str(file)))

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
+from sags_node.cli.launching import Command, group_of, path_option
+
+NICENESS = 19  # of a client's process: the node goes first, where both want the same cores
+
 endpoint_option = click.option(
     "--endpoint", help="Data socket of the node; default: the connection file of the node on this machine."
+)
+own_control_option = click.option(
+    "--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file."
 )
 ns_option = click.option("--ns", default="sags", show_default=True, help="Namespace of the topics.")
 
 
-def node_options(command: Callable[..., None]) -> Callable[..., None]:
+def node_options(command: Command) -> Command:
     """Options for a node that wants keys; the command gets them, and what other options say of where the node
     is, as `node`."""
 
-    @click.option(
-        "--key",
-        metavar="FILE.key",
-        type=click.Path(path_type=Path),
-        help="Your secret key file (sags keygen), for a node that wants one.",
+    @path_option(
+        "--key", metavar="FILE.key", help="Your secret key file (sags keygen), for a node that wants one."
     )
     @click.option(
         "--server-key",
@@ -38,3 +41,6 @@ def node_options(command: Callable[..., None]) -> Callable[..., None]:
         command(*args, node=NodeAddress(**said, keys=client_keys(key, server_key)), **rest)
 
     return with_node
+
+
+data_options = group_of(endpoint_option, ns_option, node_options)  # for what the node sends

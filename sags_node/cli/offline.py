@@ -9,6 +9,7 @@ from typing import Any, cast
 import click
 
 from sags_node.cli.launching import (
+    STEPWISE,
     all_figures,
     as_json,
     check_files,
@@ -16,8 +17,10 @@ from sags_node.cli.launching import (
     launch_argument,
     lpips_option,
     open_launched,
+    path_option,
     show_outcome,
     show_verdict,
+    shown,
     source_text,
     split,
     split_recording,
@@ -32,11 +35,10 @@ HOLD_OUT = 8  # every so many frames, as in the literature
 
 @click.command("eval")
 @launch_argument
-@click.option(
+@shown(
     "--pace",
     type=click.Choice(["realtime", "step"]),
     default="realtime",
-    show_default=True,
     help="realtime: a node of its own, on the recording's clock; step: every frame in turn, no sockets.",
 )
 @click.option(
@@ -53,13 +55,7 @@ HOLD_OUT = 8  # every so many frames, as in the literature
     type=click.IntRange(0),
     help="Leave out every N-th frame; 0: none.  [default: 8 with --pace step; a live node sees all]",
 )
-@click.option(
-    "--every",
-    type=click.IntRange(1),
-    default=5,
-    show_default=True,
-    help="Right eye and LPIPS on every N-th frame.",
-)
+@shown("--every", type=click.IntRange(1), default=5, help="Right eye and LPIPS on every N-th frame.")
 @lpips_option
 @click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
 @click.option(
@@ -70,10 +66,9 @@ HOLD_OUT = 8  # every so many frames, as in the literature
 @click.option(
     "--aside", is_flag=True, help="Also views from 2 to 20 mm aside (--pace step, the phantom alone)."
 )
-@click.option("--report", type=click.Path(path_type=Path), help="Folder for an HTML report.")
-@click.option(
+@path_option("--report", help="Folder for an HTML report.")
+@path_option(
     "--receipt",
-    type=click.Path(path_type=Path),
     help="File for what was compared: frames, masks, sizes, calibration and their digests. --out has it too.",
 )
 @figures_option
@@ -85,9 +80,6 @@ def evaluate(
     iterations: int | None,
     warm_up: int | None,
     hold_out: int | None,
-    every: int,
-    lpips_weights: Path | None,
-    paper_psnr: bool,
     hidden: bool,
     aside: bool,
     report: Path | None,
@@ -95,6 +87,7 @@ def evaluate(
     out: Path | None,
     verbose: bool,
     json_out: bool,
+    **what: Any,
 ) -> None:
     """Measure a recorded session: run time against error.
 
@@ -120,7 +113,7 @@ def evaluate(
         hold_out = HOLD_OUT if pace == "step" else 0
     if aside and pace != "step":
         raise click.UsageError("--aside needs --pace step: only there the model is known frame by frame")
-    options = MeasureOptions(hold_out, every, lpips_weights, paper_psnr, hidden, aside)
+    options = MeasureOptions(hold_out, hidden=hidden, aside=aside, **what)
     if report is not None:
         check_plots()
         check_report(report)
@@ -145,15 +138,12 @@ def evaluate(
 
 @click.command()
 @click.argument("dataset", nargs=-1, metavar="[DATASET | LAUNCH.yaml] [key:=value ...]")
-@click.option(
-    "-o", "--out", type=click.Path(path_type=Path), default=Path("out/fit"), show_default=True, help="Folder."
-)
+@path_option("-o", "--out", default=Path("out/fit"), show_default=True, help="Folder.")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; same settings.")
-@click.option(
+@shown(
     "--schedule",
     type=click.Choice(["online", "paper", "released"]),
     default="online",
-    show_default=True,
     help="online: one pass of the mapper, then refining; paper: random points, warm-up on the first frame, "
     "then all together; released: paper, with each number as in the authors' code.",
 )
@@ -186,14 +176,8 @@ def evaluate(
 @click.option(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Any other setting, say shape.levels=4."
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of everything random.")
-@click.option(
-    "--hold-out",
-    type=click.IntRange(0),
-    default=8,
-    show_default=True,
-    help="Test on every N-th frame; 0: none.",
-)
+@shown("--seed", type=int, default=0, help="Of everything random.")
+@shown("--hold-out", type=click.IntRange(0), default=8, help="Test on every N-th frame; 0: none.")
 @lpips_option
 @all_figures
 @as_json
@@ -202,19 +186,14 @@ def fit(
     out: Path,
     resume: bool,
     schedule: str,
-    warm_up: int | None,
-    iterations: int | None,
-    tokens: str | None,
     monocular: bool,
-    block: str | None,
     no_alias_free: bool,
-    max_gaussians: int | None,
     changes: tuple[str, ...],
-    seed: int,
     hold_out: int,
     lpips_weights: Path | None,
     verbose: bool,
     json_out: bool,
+    **asked: Any,
 ) -> None:
     """Fit the SAGS model offline to a whole recording.
 
@@ -243,21 +222,14 @@ def fit(
     if monocular and settings.schedule == "online":
         raise UsageError("--monocular needs --schedule paper: the online start measures distances")
     options = MeasureOptions(hold_out, 1, lpips_weights)
-    asked = {
-        "warm_up": warm_up,
-        "iterations": iterations,
-        "tokens": tokens,
-        "block": block,
-        "max_gaussians": max_gaussians,
-        "weights": replace(settings.weights, **MONOCULAR) if monocular else None,
-    }
-    given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-    settings = replace(settings, antialias=not no_alias_free, seed=seed, **given)
+    given = {name: value for name, value in asked.items() if value is not None}
+    if monocular:
+        given["weights"] = replace(settings.weights, **MONOCULAR)
+    settings = replace(settings, antialias=not no_alias_free, **given)
     settings = with_changes(settings, changes)
     check_fit(out)
     device = device_of(load_launch(path, overrides).device, settings.schedule)
-    fixed = [f"device:={device or 'cpu'}", "source.loop:=false", "source.pace:=step"]
-    session = open_launched(path, [*overrides, *fixed])
+    session = open_launched(path, [*overrides, f"device:={device or 'cpu'}", *STEPWISE])
     with progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance, device)
     if json_out:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, force_option, positive
+from sags_node.cli.launching import as_json, force_option, path_option, positive, shown
 from sags_node.cli.node_options import endpoint_option, node_options, ns_option
 from sags_node.terminal import text
 from sags_node.terminal.console import console, show
@@ -38,23 +37,16 @@ class Ahead(click.ParamType["float | str"]):
 @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; needed with --endpoint.")
 @ns_option
 @node_options
-@click.option(
+@path_option(
     "--scene",
     metavar="FILE.yaml",
-    type=click.Path(path_type=Path),
     help="Meshes, points and labels, and the anchors that hold them; default: a built-in target.",
 )
 @click.option(
     "--pin", type=(float, float), metavar="U V", help="Pixel of the target; default: middle of tissue."
 )
 @click.option("--repin", is_flag=True, help="Pin again where it was after the model was started anew.")
-@click.option(
-    "--max-age",
-    type=positive,
-    default=0.5,
-    show_default=True,
-    help="Seconds after which an overlay is blanked.",
-)
+@shown("--max-age", type=positive, default=0.5, help="Seconds after which an overlay is blanked.")
 @click.option(
     "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye."
 )
@@ -64,22 +56,16 @@ class Ahead(click.ParamType["float | str"]):
     default=0.0,
     help="Place it where tissue is expected so long after its frame; auto: when that is published.",
 )
-@click.option("--own-ns", default="overlay", show_default=True, help="Namespace of what is published here.")
-@click.option(
+@shown("--own-ns", default="overlay", help="Namespace of what is published here.")
+@path_option(
     "--run-dir",
-    type=click.Path(path_type=Path),
     help="Of the connection files, the node's and this overlay's; default: that of the node.",
 )
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
-@click.option(
-    *("-o", "--out", "--save", "save"),
-    type=click.Path(path_type=Path),
-    help="Write what is shown: .mp4, or .png.",
-)
-@click.option(
+@path_option("-o", "--out", "--save", "save", help="Write what is shown: .mp4, or .png.")
+@path_option(
     "--layers",
     metavar="FILE",
-    type=click.Path(path_type=Path),
     help="Keep what is drawn, without the video: costs the node nothing. sags demo makes its video of it.",
 )
 @force_option

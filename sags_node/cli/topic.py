@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from sags_node.cli.launching import as_json, positive
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.launching import as_json, positive, shown
+from sags_node.cli.node_options import data_options
 from sags_node.terminal import text
 from sags_node.terminal.console import show, tell
 
@@ -25,10 +25,8 @@ def topic() -> None:
 
 
 @topic.command("list")
-@endpoint_option
-@ns_option
-@node_options
-@click.option("--seconds", type=positive, default=3.0, show_default=True, help="How long to listen.")
+@data_options
+@shown("--seconds", type=positive, default=3.0, help="How long to listen.")
 @as_json
 def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
     """Every topic with its type, and the rate and size of what was heard.
@@ -45,9 +43,7 @@ def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
 
 @topic.command("echo")
 @click.argument("name")
-@endpoint_option
-@ns_option
-@node_options
+@data_options
 @click.option("--count", type=click.IntRange(1), help="Stop after so many messages; default: Ctrl-C.")
 @as_json
 def topic_echo(name: str, count: int | None, json_out: bool, node: NodeAddress) -> None:
@@ -63,20 +59,18 @@ def topic_echo(name: str, count: int | None, json_out: bool, node: NodeAddress) 
         show(message if json_out else text.echo_text(message))
 
 
-def _measuring(name: str, doc: str, *more: Callable[..., Any]) -> None:
+def _measuring(name: Literal["hz", "bw", "delay"], doc: str, *more: Callable[..., Any]) -> None:
     """The commands that listen to one topic for a while; `more` are options of one alone."""
 
     @topic.command(name, help=doc)
     @click.argument("topic_name", metavar="NAME")
-    @endpoint_option
-    @ns_option
-    @node_options
-    @click.option("--seconds", type=positive, default=5.0, show_default=True, help="How long to listen.")
+    @data_options
+    @shown("--seconds", type=positive, default=5.0, help="How long to listen.")
     @as_json
     def command(topic_name: str, json_out: bool, **asked: Any) -> None:
         from sags_node.messaging import introspection as tool
 
-        figures = getattr(tool, f"topic_{name}")(topic_name, **asked)
+        figures = tool.topic_figures(name, topic_name, **asked)
         show(figures if json_out else getattr(text, f"{name}_text")(figures))
 
     for option in more:

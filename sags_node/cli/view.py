@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.launching import as_json, shown
+from sags_node.cli.node_options import NICENESS, endpoint_option, node_options, ns_option
 from sags_node.errors import UsageError
 from sags_node.terminal.console import console, on_stop_signals, show
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
-
-NICENESS = 19  # the node goes first, where both want the same cores
 
 
 @click.command()
@@ -26,19 +24,11 @@ NICENESS = 19  # the node goes first, where both want the same cores
 @click.option("--control", help="Control socket of the node; default: its connection file.")
 @ns_option
 @node_options
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free one."
-)
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve on.")
+@shown("--port", type=click.IntRange(0, 65535), default=8080, help="0: any free one.")
+@shown("--host", default="127.0.0.1", help="Address to serve on.")
 @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
 @as_json
-def view(
-    port: int,
-    host: str,
-    insecure: bool,
-    json_out: bool,
-    node: NodeAddress,
-) -> None:
+def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress) -> None:
     """Show a running node in a web browser on this machine.
 
     A page with the live model in 3D (drag turns, wheel zooms, right drag moves), the left camera and its

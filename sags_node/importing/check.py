@@ -6,7 +6,6 @@ import logging
 import re
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import islice
 from logging.handlers import BufferingHandler
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 from sags_node.calibration.check import judge, rectified_before
 from sags_node.calibration.pictures import pairs_of_session
 from sags_node.calibration.rows import RECTIFIED
+from sags_node.checks import Finding, as_warnings, is_wrong, parted, refused
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import (
     EndoNerfSource,
@@ -27,7 +27,7 @@ from sags_node.importing import pictures, videos
 from sags_node.importing.folder import Contents, both_eyes, calibration_of, override, recognise
 from sags_node.importing.timing import LOOKED_AT, Timing
 from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
-from sags_node.rig import Finding, read_rig
+from sags_node.rig import read_rig
 from sags_node.sources.endonerf import is_published
 from sags_node.sources.pictures import size_text
 from sags_node.sources.rectified import as_pictures_come
@@ -36,6 +36,7 @@ from sags_node.sources.source import open_source, recorded_rig
 from sags_node.sources.videos import VideoPairs
 from sags_node.vision.rectify import Rectifier
 
+MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
 MOST_SAID = 1 << 16  # lines in the log
 
 
@@ -67,10 +68,10 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
         plays = played(config)
         apart = any("clocks_differ_ms" in each.figures for each in plays)  # then rows tell of the clocks
         judged = [] if apart else calibrated(config)
-        return plays + (judged if _refused(plays) else _as_warnings(judged))
+        return plays + (judged if is_wrong(plays) else as_warnings(judged))
 
     found = _once(found + _tried("frames", look))
-    if _refused(found):
+    if is_wrong(found):
         return [*found, Finding("ok", f"to play it: when that is fixed: sags run {_quoted(folder)}")]
     stands_for = f", which stands for {' '.join(map(_quoted, launch))}" if launch else ""
     return [*found, Finding("ok", f"to play it: sags run {_quoted(folder)}{stands_for}")]
@@ -113,15 +114,6 @@ def _once(found: list[Finding]) -> list[Finding]:
     return kept
 
 
-def _refused(found: Sequence[Finding]) -> bool:
-    return any(finding.level == "error" for finding in found)
-
-
-def _as_warnings(found: Sequence[Finding]) -> list[Finding]:
-    """What is wrong, and yet is played."""
-    return [replace(each, level="warning") if each.level == "error" else each for each in found]
-
-
 def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
     """What some pictures show, before anything plays them."""
     if contents.right is None and contents.config is None:
@@ -131,16 +123,14 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
         found = pictures.check_numbers({"left": left_folder, "right": contents.right})
         left = pictures.sample(left_folder)
         right = [] if contents.right is None else pictures.sample(contents.right)
-        found += pictures.check_eye("left", left)
-        if right:
-            found += pictures.check_eye("right", right) + pictures.check_eyes(left, right)
+        found += pictures.check_both(left, right) if right else pictures.check_eye("left", left)
         if contents.depth is not None:
             source = None if contents.config is None else contents.config.source
             clip = source if isinstance(source, EndoNerfSource) else None
             unit = None if clip is None else clip.depth_unit
             stated = clip is not None and clip.depth_unit == 1e-3 and is_published(clip)
             size = left[0][1].shape[1], left[0][1].shape[0]
-            found += _as_warnings(pictures.check_depth(contents.depth, size, unit, stated))
+            found += as_warnings(pictures.check_depth(contents.depth, size, unit, stated))
         return found
 
     return _tried("pictures", look)
@@ -152,19 +142,7 @@ def _in_one_folder(folder: Path) -> list[Finding]:
     if not apart:
         return pictures.check_eye("pictures", pictures.sample(folder))
     left, right = (pictures.read_some([pair[eye] for pair in apart]) for eye in (0, 1))
-    eyes = pictures.check_eye("left", left) + pictures.check_eye("right", right)
-    return eyes + pictures.check_eyes(left, right)
-
-
-def without_calibration() -> Finding:
-    fix = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
-    return Finding("warning", "no calibration lies beside the pictures", fix)
-
-
-def odd_or_last(found: list[Finding]) -> list[Finding]:
-    """All is well in one line; else what is not."""
-    odd = [finding for finding in found if finding.level != "ok"]
-    return odd or [Finding("ok", f"calibration: {found[-1].what}", "", found[-1].figures)]
+    return pictures.check_both(left, right)
 
 
 def played(config: LaunchConfig) -> list[Finding]:
@@ -177,7 +155,7 @@ def played(config: LaunchConfig) -> list[Finding]:
         ]
     source = source.model_copy(update={"pace": "step", "loop": False})
     found = _tried("frames", lambda: _frames(source))
-    if _refused(found):
+    if is_wrong(found):
         return found
     what = "calibration" if config.robot is None else "calibration or robot"
     return found + _tried(what, lambda: _fits(config.model_copy(update={"source": source})))
@@ -190,14 +168,17 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
         stamped, said, ends = [], [], []
         if isinstance(opened, Replay):
             stamped = list(opened.pairs.judged)
-            said = [*videos.said_of(opened.pairs.oddities), *videos.check_pixels(opened.pairs.pixel_aspect)]
+            said = [
+                *(parted("warning", each) for each in opened.pairs.oddities),
+                *videos.check_pixels(opened.pairs.pixel_aspect),
+            ]
             if isinstance(opened.pairs, VideoPairs):
                 ends = videos.check_ends(opened.pairs, (opened.first + count) * source.stride)
     if first is None:
         return [Finding("error", "not one frame can be read", "check the files")]
     found = [Finding("ok", f"{count} frames of {size_text(*first.left.shape[1::-1])} px at {rate:g} Hz")]
     found += [*said, *ends]
-    if _refused(found):
+    if is_wrong(found):
         return found
     timing, shares = Timing(), []
     middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate
@@ -228,12 +209,14 @@ def calibrated(config: LaunchConfig) -> list[Finding]:
         if config.one_camera or one_eyed or isinstance(source, LiveSource | PhantomSource):
             return []
         if lacks_rig(config):
-            return [without_calibration()]
+            return [Finding("warning", "no calibration lies beside the pictures", MAKE_ONE)]
         pairs, depths = pairs_of_session(config)
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
         rig = recorded_rig(source) if config.rig is None else read_rig(config.rig, size)
         assert rig is not None  # else it lacks one
-        return odd_or_last(judge(as_pictures_come(rig, config), pairs, depths))
+        judged = judge(as_pictures_come(rig, config), pairs, depths)
+        last = Finding("ok", f"calibration: {judged[-1].what}", "", judged[-1].figures)
+        return [each for each in judged if each.level != "ok"] or [last]  # all is well in one line
 
     return _tried("calibration", compare)
 
@@ -247,8 +230,8 @@ def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:
     try:
         found = look()
     except SagsError as error:
-        found = [pictures.refused(what, error)]
+        found = [refused(what, error)]
     finally:
         log.propagate = True
         log.removeHandler(said)
-    return [*(pictures.parted("warning", each.getMessage()) for each in said.buffer), *found]
+    return [*(parted("warning", each.getMessage()) for each in said.buffer), *found]

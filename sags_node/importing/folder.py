@@ -62,9 +62,9 @@ def recognise(folder: Path) -> Contents:
             return Contents("a session whose launch.yaml is wrong", str(error), "error")
     else:
         return _playable(folder, config)
-    for is_one, contents in _KNOWN:
+    for is_one, what, instead in _KNOWN:
         if is_one(folder):
-            return contents
+            return Contents(what, instead, "error")
     return _plain(folder)
 
 
@@ -194,41 +194,29 @@ def _is_stir(folder: Path) -> bool:
     return any(folder.glob("left*/seq*/segmentation")) or any(folder.glob("*/left*/seq*/segmentation"))
 
 
-_KNOWN: tuple[tuple[Callable[[Path], bool], Contents], ...] = (
+_KNOWN: tuple[tuple[Callable[[Path], bool], str, str], ...] = (  # data sets that are not played as they are
     (
         _is_stereomis_tracking,
-        Contents(
-            "a sequence of StereoMIS-Tracking",
-            "sags eval --protocol stereomis FOLDER follows its points (docs/evaluation.md)",
-            "error",
-        ),
+        "a sequence of StereoMIS-Tracking",
+        "sags eval --protocol stereomis FOLDER follows its points (docs/evaluation.md)",
     ),
     (
         _is_d4d,
-        Contents(
-            "clips of D4D",
-            "sags eval --protocol d4d FOLDER measures them; to play one, give its left_images_rect and "
-            "right_images_rect as source.kind folders (docs/evaluation.md)",
-            "error",
-        ),
+        "clips of D4D",
+        "sags eval --protocol d4d FOLDER measures them; to play one, give its left_images_rect and "
+        "right_images_rect as source.kind folders (docs/evaluation.md)",
     ),
     (
         _is_stereomis,
-        Contents(
-            "a sequence of StereoMIS",
-            "sags eval --protocol stereomis FOLDER measures it; to play it, write a launch file with "
-            "source.geometry.layout over_under (docs/evaluation.md)",
-            "error",
-        ),
+        "a sequence of StereoMIS",
+        "sags eval --protocol stereomis FOLDER measures it; to play it, write a launch file with "
+        "source.geometry.layout over_under (docs/evaluation.md)",
     ),
     (
         _is_stir,
-        Contents(
-            "sequences of STIR",
-            "sags eval --protocol stir FOLDER measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
-            "are source.kind videos (docs/evaluation.md)",
-            "error",
-        ),
+        "sequences of STIR",
+        "sags eval --protocol stir FOLDER measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
+        "are source.kind videos (docs/evaluation.md)",
     ),
 )
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from sags_node.calibration.matches import match_eyes
-from sags_node.errors import SagsError
-from sags_node.rig import Finding
+from sags_node.checks import Finding
 from sags_node.sources.names import numbers
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.types import U8, Bool
@@ -136,6 +134,11 @@ def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]
     return [Finding("ok" if aligned else "warning", what, fix, figures)]
 
 
+def check_both(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]) -> list[Finding]:
+    """Look at each eye, and at how they belong together."""
+    return [*check_eye("left", left), *check_eye("right", right), *check_eyes(left, right)]
+
+
 def check_shares(shares: Sequence[float]) -> list[Finding]:
     """What masks say of frames: the share of each that is instrument."""
     if not shares:
@@ -199,14 +202,3 @@ def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
         what = f"depth: {file.name} is {size_text(*depth.shape[::-1])} px, the pictures {size_text(*size)}"
         return Finding("error", what, "resize depth with nearest neighbour, never a mean")
     return None
-
-
-def refused(what: str, error: SagsError) -> Finding:
-    """An error as a finding."""
-    return parted("error", f"{what}: {error}", "fix or remove that file")
-
-
-def parted(level: Literal["warning", "error"], text: str, otherwise: str = "") -> Finding:
-    """Messages say what is wrong, and after a semicolon how to fix it."""
-    what, _, fix = text.partition("; ")
-    return Finding(level, what, fix or otherwise)

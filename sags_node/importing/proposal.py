@@ -11,13 +11,13 @@ import numpy as np
 
 from sags_node.calibration.eyes import look
 from sags_node.calibration.pictures import pairs_of_session
+from sags_node.checks import Finding, is_wrong
 from sags_node.config.launch_file import known_recording, load_launch
 from sags_node.config.schema import EndoNerfSource, FoldersSource, LaunchConfig, LiveSource
 from sags_node.errors import UsageError
 from sags_node.importing import pictures, videos
 from sags_node.importing.check import calibrated, overrides_of, played
 from sags_node.importing.folder import is_video, override
-from sags_node.rig import Finding
 from sags_node.sources.pictures import size_text
 
 DEVICES = Path("/dev")
@@ -48,7 +48,7 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
     launch = [*_launch_of(named, overrides), *overrides]
     config = load_launch(named[0], launch)
     found = _opened(config)
-    if any(finding.level == "error" for finding in found):
+    if is_wrong(found):
         return Proposal(launch, found)
     looked = [] if isinstance(config.source, EndoNerfSource) else _looked_at(config)
     fixes = list(dict.fromkeys(fix for finding in looked for fix in finding.launch))
@@ -119,8 +119,7 @@ def _looked_at(config: LaunchConfig) -> list[Finding]:
     """What some of its pictures show, spread over it."""
     pairs, _ = pairs_of_session(config)
     left, right = ([(Path(), np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
-    eyes = pictures.check_eye("left", left) + pictures.check_eye("right", right)
-    return eyes + pictures.check_eyes(left, right)
+    return pictures.check_both(left, right)
 
 
 def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str, str]]:

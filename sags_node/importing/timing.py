@@ -11,7 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.rig import Finding
+from sags_node.checks import Finding
 from sags_node.types import F32, U8
 
 LOOKED_AT = 120  # frames, one after the other

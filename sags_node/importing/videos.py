@@ -12,12 +12,12 @@ import numpy as np
 
 from sags_node.calibration.matches import match_eyes
 from sags_node.calibration.pictures import Pair
+from sags_node.checks import Finding, parted
 from sags_node.config.schema import GeometryConfig
 from sags_node.errors import UsageError
 from sags_node.importing import pictures
 from sags_node.importing.folder import override
 from sags_node.media.video import LostPictureError, Video
-from sags_node.rig import Finding
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import size_text
 from sags_node.sources.videos import VideoPairs
@@ -79,8 +79,7 @@ def look(files: tuple[Path, ...]) -> list[Finding]:
     with closing(VideoPairs(files[0], files[1], Layout(GeometryConfig()))) as pairs:
         looked = _some_pairs(pairs)
     left, right = ([(file, pair[eye]) for pair in looked] for eye, file in enumerate(files))
-    eyes = pictures.check_eye("left", left) + pictures.check_eye("right", right)
-    return [*found, *eyes, *pictures.check_eyes(left, right)]
+    return [*found, *pictures.check_both(left, right)]
 
 
 def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
@@ -125,7 +124,7 @@ def _file(file: Path) -> list[Finding]:
     with closing(Video(file)) as video:
         rate = "" if video.rate is None else f" at {video.rate:g} Hz, {video.count / video.rate:.1f} s"
         what = f"{file.name}: {video.count} frames of {size_text(*video.size)} px{rate}"
-        found = [Finding("ok", what), *said_of(video.oddities)]
+        found = [Finding("ok", what), *(parted("warning", each) for each in video.oddities)]
         if video.gaps:
             before, missing = video.gaps[0]
             many = "a gap" if len(video.gaps) == 1 else f"{len(video.gaps)} gaps, the first"
@@ -135,11 +134,6 @@ def _file(file: Path) -> list[Finding]:
             fix = "it is played by its stamps: were pictures lost, or was the recording paused?"
             found.append(Finding("warning", what, fix))
         return found
-
-
-def said_of(oddities: Sequence[str]) -> list[Finding]:
-    """What is said of a file, with its remedy after a semicolon."""
-    return [Finding("warning", what, fix) for what, _, fix in (each.partition("; ") for each in oddities)]
 
 
 def check_pixels(aspect: float) -> list[Finding]:
@@ -204,14 +198,14 @@ def _one(file: Path, shown: list[tuple[Path, U8]]) -> list[Finding]:
         return [found, *pictures.check_eye("video", shown)]
     pairs = [way.eyes(picture) for picture in whole]
     left, right = ([(file, np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
-    looked = pictures.check_eye("left", left) + pictures.check_eye("right", right)
+    looked = pictures.check_both(left, right)
     if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
     layout = Layout(GeometryConfig(layout="separate" if way.layout == "panes" else way.layout))
     with closing(Video(file)) as video:
         aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
     found = Finding("ok", f"{size} px show both eyes: {way.what}")
-    return [found, *check_pixels(aspect), *looked, *pictures.check_eyes(left, right)]
+    return [found, *check_pixels(aspect), *looked]
 
 
 def _both_needed(file: Path) -> str:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import shlex
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
@@ -12,16 +15,12 @@ from zmq.utils.monitor import recv_monitor_message
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.rundir import read_connection
 from sags_node.messaging.security import KeyPair, public_key, read_key_pair
+from sags_node.messaging.sockets import HANDSHAKES
 
 HANDSHAKE_MS = 5000
+LOOK_S = 0.1  # between looks for a node that is not there
 RETRIES = 3  # failed handshakes in a row, where one alone may be a node that is just starting anew
 
-_FAILED = (
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH,
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL,
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL,
-)
-_EVENTS = zmq.EVENT_HANDSHAKE_SUCCEEDED | _FAILED[0] | _FAILED[1] | _FAILED[2]
 _HOW = "make a key pair with sags keygen, have its .pub put into the node's publish.allow, and give --key"
 
 
@@ -54,6 +53,14 @@ class Address:
     keys: ClientKeys | None = None
 
 
+class Clock(Protocol):
+    """A clock of another machine: `node_clock.NodeClock`."""
+
+    @property
+    def problem(self) -> str | None: ...
+    def latest_ns(self) -> int: ...
+
+
 @dataclass(frozen=True, slots=True)
 class NodeAddress:
     """Where a sender is: a node, an overlay, a player. A socket that is not given is in the connection file.
@@ -63,6 +70,7 @@ class NodeAddress:
         endpoint: its data socket.
         control: its control socket.
         run_dir: of its connection file; default: the user's own.
+        clock: that stamps what it sends, where that is another machine's.
     """
 
     ns: str = "sags"
@@ -70,6 +78,11 @@ class NodeAddress:
     control: str | None = None
     run_dir: Path | None = None
     keys: ClientKeys | None = None
+    clock: Clock | None = None
+
+    def now_ns(self) -> int:
+        """What the clock that stamps what it sends shows now, at the latest."""
+        return time.time_ns() if self.clock is None else self.clock.latest_ns()
 
     def data(self) -> Address:
         """The data socket given, or the quickest one in the connection file.
@@ -101,6 +114,24 @@ class NodeAddress:
         if connection.control is None:
             raise SagsError(f"the node '{self.ns}' has no control socket; start it with publish.control set")
         return _known(connection.control, connection.public_key, self.keys)
+
+
+def found(find: Callable[[], Address], deadline: float) -> Address:
+    """Wait for a node until `deadline` (monotonic s), while there is none.
+
+    Raises:
+        UsageError: there is one, and it wants other keys.
+        SagsError: none came in time.
+    """
+    while True:
+        try:
+            return find()
+        except UsageError:
+            raise
+        except SagsError:
+            if time.monotonic() >= deadline:
+                raise
+        time.sleep(LOOK_S)
 
 
 THE_NODE = NodeAddress()  # of this machine, where nothing else is said
@@ -156,7 +187,7 @@ class HandshakeWatch:
     """Why a consumer gets nothing: without it a refused socket is merely silent."""
 
     def __init__(self, socket: zmq.Socket[bytes], address: Address) -> None:
-        self._monitor = socket.get_monitor_socket(_EVENTS)
+        self._monitor = socket.get_monitor_socket(HANDSHAKES)
         self._address = address
         self._failures = 0  # in a row
         self._last = (0, 0)  # event and value of the last one

@@ -11,18 +11,17 @@ from dataclasses import dataclass
 from functools import partial
 from math import inf
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, Self
 
 import msgspec
 import zmq
 
-from sags_node.errors import SagsError, UsageError, brief
-from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect
+from sags_node.errors import SagsError, brief
+from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect, found
 from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, RateLimitedLog
-from sags_node.messaging.sockets import receive_frames
+from sags_node.messaging.sockets import waiting
 from sags_node.messaging.wire import PROTOCOL
 
 MAX_REQUEST_BYTES = 65536  # per part
@@ -131,15 +130,11 @@ class ControlServer:
 
     def serve(self) -> None:
         """Answer what has arrived and what has been finished, without waiting."""
-        for _ in range(MAX_REQUESTS_AT_ONCE):
-            try:
-                frames = receive_frames(self._socket, MAX_REQUEST_PARTS)
-            except zmq.Again:
-                break
-            parts = [frame.bytes for frame in frames]
+        for frames in waiting(self._socket, MAX_REQUESTS_AT_ONCE, MAX_REQUEST_PARTS):
+            *envelope, body = parts = [frame.bytes for frame in frames]
             self._took(int(frames[-1].get(zmq.SRCFD)), sum(map(len, parts)))
-            if len(parts) in (2, 3):
-                self._handle(self._sender(frames[-1], parts[:-1]), parts[-1])
+            if len(envelope) in (1, 2):
+                self._handle(self._sender(frames[-1], envelope), body)
         now = time.monotonic()
         finished = [
             entry for entry in self._pending if entry[2].done() or (entry[3] < now and entry[2].cancel())
@@ -311,16 +306,7 @@ class ControlClient:
         Raises:
             SagsError: none came in time.
         """
-        while True:
-            try:
-                address = self._find()
-                break
-            except UsageError:
-                raise
-            except SagsError:
-                if time.monotonic() > deadline:
-                    raise
-            time.sleep(LOOK_MS * 1e-3)
+        address = found(self._find, deadline)
         if address != self._address:
             self._context.destroy(linger=0)
             self._connect(address)
@@ -348,7 +334,5 @@ class ControlClient:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

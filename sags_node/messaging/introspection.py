@@ -9,7 +9,7 @@ import dataclasses
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -115,62 +115,14 @@ def topic_echo(
         raise _silence(topic, node, seconds)
 
 
-def topic_hz(
-    topic: str,
-    node: NodeAddress = THE_NODE,
-    seconds: float = 5.0,
+def topic_figures(
+    kind: Literal["hz", "bw", "delay"], topic: str, node: NodeAddress = THE_NODE, seconds: float = 5.0
 ) -> Record:
-    """Rate over `seconds`; the shortest, longest and standard deviation of the intervals; freezes.
-
-    Raises:
-        UsageError: there is no such topic.
-        SagsError: no node is known, or fewer than two messages came.
-    """
-    samples = _listen_to(topic, node, seconds)
-    arrivals = [sample.arrival_ns * 1e-9 for sample in samples]
-    steps, freezes = np.diff(arrivals), freezes_of(arrivals)
-    return {
-        "average_rate": float(1 / steps.mean()),
-        "min_s": float(steps.min()),
-        "max_s": float(steps.max()),
-        "std_dev_s": float(steps.std()),
-        "freezes": freezes.count,
-        "frozen_s": freezes.seconds,
-        "window": len(samples),
-    }
-
-
-def topic_bw(
-    topic: str,
-    node: NodeAddress = THE_NODE,
-    seconds: float = 5.0,
-) -> Record:
-    """Bytes per second over `seconds`, and the mean, smallest and largest message.
-
-    Raises:
-        UsageError: there is no such topic.
-        SagsError: no node is known, or fewer than two messages came.
-    """
-    samples = _listen_to(topic, node, seconds)
-    sizes = np.array([sample.size for sample in samples])
-    span = (samples[-1].arrival_ns - samples[0].arrival_ns) * 1e-9
-    return {
-        "bytes_per_s": float(sizes[1:].sum() / span),  # the first message only starts the clock
-        "mean_bytes": float(sizes.mean()),
-        "min_bytes": int(sizes.min()),
-        "max_bytes": int(sizes.max()),
-        "window": len(samples),
-    }
-
-
-def topic_delay(
-    topic: str,
-    node: NodeAddress = THE_NODE,
-    seconds: float = 5.0,
-) -> Record:
-    """How long after their frame's capture the messages of `seconds` arrived, by the node's clock.
+    """Measure what comes on a topic in `seconds`.
 
     Args:
+        kind: hz: rate, spread of the intervals, freezes. bw: bytes per second, and the mean, smallest and
+            largest message. delay: how long after capture messages arrived, by the node's clock.
         node: without `control`, its clock is taken to be this machine's.
 
     Raises:
@@ -178,24 +130,42 @@ def topic_delay(
         SagsError: no node is known, fewer than two messages came, or the node's clock is not known.
     """
     offset = None
-    if node.control is None:
-        samples = _listen_to(topic, node, seconds)
-    else:
+    if kind == "delay" and node.control is not None:
         with NodeClock.at(node) as clock:
             samples = _listen_to(topic, node, seconds)
             offset, problem = clock.offset, clock.problem
         if offset is None:
             raise SagsError(f"{node.control}: {problem}")
-    ahead = 0.0 if offset is None else offset.seconds
-    delays = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9 + ahead
+    else:
+        samples = _listen_to(topic, node, seconds)
+    window = {"window": len(samples)}
+    if kind == "bw":
+        sizes = np.array([sample.size for sample in samples])
+        span = (samples[-1].arrival_ns - samples[0].arrival_ns) * 1e-9
+        return {
+            "bytes_per_s": float(sizes[1:].sum() / span),  # the first message only starts the clock
+            "mean_bytes": float(sizes.mean()),
+            "min_bytes": int(sizes.min()),
+            "max_bytes": int(sizes.max()),
+            **window,
+        }
+    if kind == "hz":
+        arrivals = [sample.arrival_ns * 1e-9 for sample in samples]
+        steps, freezes = np.diff(arrivals), freezes_of(arrivals)
+        frozen = {"freezes": freezes.count, "frozen_s": freezes.seconds}
+        return {"average_rate": float(1 / steps.mean()), **_spread(steps), **frozen, **window}
+    ahead, bound = (None, None) if offset is None else (offset.seconds, offset.bound)
+    delays = np.array([sample.arrival_ns - sample.stamp_ns for sample in samples]) * 1e-9 + (ahead or 0.0)
+    clock_said = {"clock_offset_s": ahead, "clock_bound_s": bound}
+    return {**clock_said, "average_delay_s": float(delays.mean()), **_spread(delays), **window}
+
+
+def _spread(values: NDArray[np.float64]) -> Record:
+    """Of intervals or delays, s."""
     return {
-        "clock_offset_s": None if offset is None else offset.seconds,
-        "clock_bound_s": None if offset is None else offset.bound,
-        "average_delay_s": float(delays.mean()),
-        "min_s": float(delays.min()),
-        "max_s": float(delays.max()),
-        "std_dev_s": float(delays.std()),
-        "window": len(samples),
+        "min_s": float(values.min()),
+        "max_s": float(values.max()),
+        "std_dev_s": float(values.std()),
     }
 
 

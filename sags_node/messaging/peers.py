@@ -17,6 +17,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from sags_node.messaging.security import RateLimitedLog
+from sags_node.messaging.sockets import HANDSHAKES
 from sags_node.workers import go_on
 
 MAX_PEERS = 64  # of one socket; ZeroMQ has no such limit of its own
@@ -25,13 +26,6 @@ QUARANTINE = 2.0  # s without new tcp peers after a flood; its sender would be b
 CHECK_MS = 20  # how soon a flood is seen
 MAX_EVENTS_AT_ONCE = 1000
 
-_FAILED = (
-    zmq.EVENT_HANDSHAKE_FAILED_AUTH,
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL,
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL,
-)
-_EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | zmq.EVENT_HANDSHAKE_SUCCEEDED
-_EVENTS |= _FAILED[0] | _FAILED[1] | _FAILED[2]
 _ADDRESS_BYTES = 16  # of sockaddr_in
 _BYTES_RECEIVED = 128  # where tcpi_bytes_received lies in Linux's struct tcp_info
 _libc = ctypes.CDLL(None)
@@ -69,7 +63,7 @@ class Peers:
         revocations: Callable[[], int] = lambda: 0,
     ) -> None:
         self._socket = socket
-        self._monitor = socket.get_monitor_socket(_EVENTS)
+        self._monitor = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED | HANDSHAKES)
         self._name = name
         self._max_untaken = max_untaken
         self._revocations, self._revoked = revocations, revocations()

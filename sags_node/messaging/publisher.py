@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -23,7 +22,7 @@ from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
 from sags_node.messaging.security import Gate, RateLimitedLog, authenticated, check_endpoint
-from sags_node.messaging.sockets import bind, limit, receive_frames
+from sags_node.messaging.sockets import bind, limit, waiting
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
 
@@ -328,11 +327,7 @@ class Publisher:
     def _serve_subscriptions(self) -> None:
         """Note who wants what, and send the last values once for all who have just asked."""
         resend: set[str] = set()
-        for _ in range(MAX_SUBSCRIPTIONS_AT_ONCE):
-            try:
-                frames = receive_frames(self._data, 1)
-            except zmq.Again:
-                break
+        for frames in waiting(self._data, MAX_SUBSCRIPTIONS_AT_ONCE, 1):
             self._subscription(frames[0].bytes, resend)
         for name in sorted(resend):
             if name in self._kept:
@@ -421,7 +416,5 @@ class Publisher:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -12,7 +12,6 @@ import logging
 import time
 import uuid
 from collections import Counter
-from types import TracebackType
 from typing import Any, Literal, Self
 
 import msgspec
@@ -112,9 +111,7 @@ class Sender:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
 
 import zmq
 
@@ -13,6 +14,12 @@ from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
 OWN_SOCKETS = "'publish.data:=[tcp://127.0.0.1:*]' 'publish.control:=tcp://127.0.0.1:*'"  # of one more node
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
 RECEIVE_BUFFER = 16384  # bytes in the kernel, which an expelled peer still gets read
+HANDSHAKES = (  # events of a socket's monitor
+    zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
 HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
 
 
@@ -59,6 +66,16 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | 
     if ipc:
         os.chmod(bound.removeprefix("ipc://"), 0o600)
     return bound
+
+
+def waiting(socket: zmq.Socket[bytes], most: int, most_parts: int) -> Iterator[list[zmq.Frame]]:
+    """The messages that have arrived, at most `most` of them, so that no peer keeps the reader; their parts
+    as in `receive_frames`."""
+    for _ in range(most):
+        try:
+            yield receive_frames(socket, most_parts)
+        except zmq.Again:
+            return
 
 
 def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:

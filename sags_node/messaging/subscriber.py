@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, overload
 
 import msgspec
@@ -24,9 +23,8 @@ import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
-from sags_node.messaging.address import Address, ClientKeys, NodeAddress
+from sags_node.messaging.address import Address, ClientKeys, Clock, NodeAddress, found
 from sags_node.messaging.freshness import Freshness, StaleError
-from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
@@ -76,7 +74,7 @@ class Receiver:
         rates: Mapping[str, float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
         keys: ClientKeys | None = None,
-        clock: NodeClock | None = None,
+        clock: Clock | None = None,
         paused: bool = False,
         patience: float | None = None,
     ) -> None:
@@ -98,7 +96,8 @@ class Receiver:
         self._asked = _ALWAYS if paused else frozenset(self._kept)
         self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
-        self._connect(self._found(self._patience if patience is None else patience))
+        patience = self._patience if patience is None else patience
+        self._connect(found(self._find, time.monotonic() + patience))
         turn = self._receive_next, self._stopping, "sags-subscriber"
         self._thread = threading.Thread(target=go_on, args=turn, name="sags-subscriber", daemon=True)
         self._thread.start()
@@ -107,7 +106,8 @@ class Receiver:
     @classmethod
     def at(cls, node: NodeAddress, names: Iterable[str], **options: Any) -> Self:
         """Subscribes to this node, which runs; see the class."""
-        return cls(names, node.endpoint, node.ns, node.run_dir, keys=node.keys, **{"patience": 0.0} | options)
+        usual = {"keys": node.keys, "clock": node.clock, "patience": 0.0}
+        return cls(names, node.endpoint, node.ns, node.run_dir, **usual | options)
 
     @property
     def endpoint(self) -> str:
@@ -238,19 +238,6 @@ class Receiver:
 
     # ---- the receiver thread ---------------------------------------------------------------------------
 
-    def _found(self, patience: float) -> Address:
-        """Where the node is, once it runs; see the class."""
-        deadline = time.monotonic() + patience
-        while True:
-            try:
-                return self._find()
-            except UsageError:  # there is one, and it wants other keys
-                raise
-            except SagsError:
-                if time.monotonic() >= deadline:
-                    raise
-            time.sleep(POLL_MS * 1e-3)
-
     def _connect(self, address: Address) -> None:
         resources, asked = ExitStack(), self._asked
         prefixes = [full for full, name in self._names.items() if name in asked]
@@ -349,7 +336,5 @@ class Subscriber(Receiver):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

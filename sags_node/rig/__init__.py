@@ -4,13 +4,11 @@ Imports config.
 """
 
 from sags_node.rig.check import (
-    Finding,
     accept_rig,
     check_eyes,
     check_intrinsics,
     check_pair,
     check_rig,
-    refuse_errors,
 )
 from sags_node.rig.read import (
     GUESSED_FOV,
@@ -38,7 +36,6 @@ from sags_node.rig.ros import MODELS, eye_files, eye_text, save_rig
 __all__ = [
     "GUESSED_FOV",
     "MODELS",
-    "Finding",
     "Form",
     "accept_rig",
     "already_rectified",
@@ -59,7 +56,6 @@ __all__ = [
     "rectified_rig",
     "rectifies",
     "rectify_eyes",
-    "refuse_errors",
     "resized_rig",
     "save_rig",
     "unknown_form",

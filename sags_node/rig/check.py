@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from sags_node import geometry
+from sags_node.checks import Finding, is_wrong, refuse_errors
 from sags_node.config.units import NAMES, UNITS, fitting_units, in_metres
-from sags_node.errors import UsageError
 from sags_node.types import F64, Eye, StereoRig
 
 log = logging.getLogger(__name__)
@@ -25,28 +24,6 @@ SAME_CENTRE = 0.12  # of the ratio of principal point to middle: how well both a
 LARGEST_RADIUS, RADII = 4.0, 4001  # at distance 1: 76 degrees from the axis
 WIDE = 90  # degrees from corner to corner: beyond it lenses are often calibrated by fisheye models
 RECALIBRATE = "run the stereo calibration again and save both files from one run"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing a calibration check looked at."""
-
-    level: Literal["ok", "warning", "error"]
-    what: str
-    fix: str = ""
-    figures: Mapping[str, float] = field(default_factory=dict)  # what was measured, for programs
-    launch: tuple[str, ...] = ()  # `key:=value` that fix it
-
-
-def refuse_errors(findings: list[Finding], where: Path | str) -> None:
-    """End with the errors among the findings on a file, folder or anything else.
-
-    Raises:
-        UsageError: there are some.
-    """
-    errors = [finding for finding in findings if finding.level == "error"]
-    if errors:
-        raise UsageError("\n".join(f"{where}: {error.what}; {error.fix}" for error in errors))
 
 
 def accept_rig(rig: StereoRig, where: Path | str) -> StereoRig:
@@ -64,37 +41,32 @@ def accept_rig(rig: StereoRig, where: Path | str) -> StereoRig:
 
 
 def check_rig(rig: StereoRig, metres: float | None = None) -> list[Finding]:
-    """What is right, odd or wrong with a calibration, each with a way to fix it.
+    """Look a calibration over: what is right, odd or wrong, each with a way to fix it.
 
     Args:
         metres: the unit that its lengths were told to be in; None: nobody said it.
     """
-    findings = check_eyes(rig)
-    if any(finding.level == "error" for finding in findings):
-        return findings
-    return findings + check_pair(rig, metres)
+    return _until_wrong(rig, (check_eyes, partial(check_pair, metres=metres)))
 
 
 def check_eyes(rig: StereoRig) -> list[Finding]:
-    """`check_rig`'s look at each eye and at what both must share: an error here leaves nothing to go on.
-
-    The first broken group ends the checks: what follows would only repeat it.
-    """
-    return _until_error(rig, (_check_numbers, _check_eyes, _check_rows))
+    """Look at each eye and at what both must share: an error here leaves nothing to go on."""
+    return _until_wrong(rig, (_check_numbers, _check_eyes, _check_rows))
 
 
 def check_pair(rig: StereoRig, metres: float | None = None) -> list[Finding]:
-    """`check_rig`'s look at which eye is which, and how far apart they are."""
-    return _check_unit(rig, metres) or _until_error(rig, (_check_order, _check_baseline))
+    """Look at which eye is which, and how far apart they are."""
+    return _check_unit(rig, metres) or _until_wrong(rig, (_check_order, _check_baseline))
 
 
-def _until_error(rig: StereoRig, checks: Sequence[Callable[[StereoRig], list[Finding]]]) -> list[Finding]:
-    findings: list[Finding] = []
-    for check in checks:
-        findings += check(rig)
-        if any(finding.level == "error" for finding in findings):
+def _until_wrong(rig: StereoRig, looks: Sequence[Callable[[StereoRig], list[Finding]]]) -> list[Finding]:
+    """Take one look after the other. The first that finds an error is the last: more would only repeat it."""
+    found: list[Finding] = []
+    for look in looks:
+        found += look(rig)
+        if is_wrong(found):
             break
-    return findings
+    return found
 
 
 def _eyes(rig: StereoRig) -> Iterator[tuple[str, Eye]]:

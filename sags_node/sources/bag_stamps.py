@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sags_node.checks import Finding
 from sags_node.config.schema import BagSource
 from sags_node.errors import UsageError
-from sags_node.rig import Finding
 from sags_node.sources.pairing import nearest, pair
 from sags_node.types import I64
 

@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 
 from sags_node import geometry
+from sags_node.checks import Finding, refuse_errors
 from sags_node.config.schema import EndoNerfSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.rig import Finding, check_intrinsics, rectified_rig, refuse_errors
+from sags_node.rig import check_intrinsics, rectified_rig
 from sags_node.sources.pictures import FolderPairs, RawPair, pair_files, read_picture, size_text
 from sags_node.sources.pose_axes import READINGS, Seen, reading_that_fits
 from sags_node.sources.truth import load_npy

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sags_node.checks import Finding
 from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole
-from sags_node.rig import Finding
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
 from sags_node.sources.names import in_order, numbers, together

@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 
 from sags_node import geometry
+from sags_node.checks import refuse_errors
 from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.media.picture_file import decode
 from sags_node.media.video import Video
-from sags_node.rig import check_intrinsics, rectified_rig, refuse_errors
+from sags_node.rig import check_intrinsics, rectified_rig
 from sags_node.rig.matrices import numbers_in, open_storage
 from sags_node.sources.layout import Layout
 from sags_node.sources.numbered import NumberedFiles, open_numbered

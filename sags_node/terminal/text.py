@@ -29,6 +29,11 @@ def rows_table(rows: Sequence[Record]) -> Table:
     return made
 
 
+def findings_table(rows: Sequence[Record]) -> Table:
+    """What was looked at, without what is for programs."""
+    return rows_table([{k: row[k] for k in row if k not in ("figures", "launch")} for row in rows])
+
+
 def topics_table(rows: Sequence[Record]) -> Table:
     """Of `topic_list`; a dash where nothing was heard, or too little to tell a rate."""
     made = table("topic", "type")

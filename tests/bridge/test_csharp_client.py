@@ -23,8 +23,8 @@ pytest.importorskip("websockets", reason="no gateway without: pip install 'sags-
 
 from websockets.sync.server import ServerConnection, serve
 
-from sags_node.bridge.feed import Place
 from sags_node.bridge.web import WebOptions, run_web
+from sags_node.messaging.address import NodeAddress
 
 pytestmark = [pytest.mark.live, pytest.mark.beside]
 
@@ -90,7 +90,7 @@ def until_line(process: subprocess.Popen[str], start: str) -> str:
 
 def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_path: Path) -> None:
     view = anchored().views["left"]
-    options = WebOptions(Place(run_dir=tmp_path), Place("overlay", run_dir=tmp_path), port=0)
+    options = WebOptions(NodeAddress(run_dir=tmp_path), NodeAddress("overlay", run_dir=tmp_path), port=0)
     with sockets(tmp_path) as node, bridged(run_web, options) as port, running(program, port) as process:
         with stream(node, anchored_at):
             found = LINE.fullmatch(until_line(process, "stamp_ns="))

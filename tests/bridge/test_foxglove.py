@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import anchored_at, bridged, sockets
+from bridging import anchored_at, bridged, senders, sockets
 from places import ROOT
 from ports import free_port, is_free
 from synthetic import HEIGHT, WIDTH, plane_result, stream
@@ -27,7 +27,6 @@ pytest.importorskip("websockets", reason="no peer without the package websockets
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from sags_node.bridge.feed import Place
 from sags_node.bridge.foxglove import CLICKED, FoxgloveOptions, clicked, outputs, run_foxglove
 from sags_node.bridge.foxglove_layout import layout_of
 from sags_node.messaging import cdr, topics
@@ -108,7 +107,7 @@ def client(port: int) -> Iterator[Client]:
 
 
 def options(run_dir: Path, **changes: Any) -> FoxgloveOptions:
-    settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
+    settings = {**senders(run_dir), "port": 0}
     return FoxgloveOptions(**{**settings, **changes})
 
 

@@ -14,9 +14,9 @@ from command_line import refused
 from gstreamer import need_gstreamer
 from waiting import repeating, until
 
-from sags_node.bridge.feed import Place
 from sags_node.bridge.gst import GstOptions, run_gst
 from sags_node.errors import SagsError
+from sags_node.messaging.address import NodeAddress
 from sags_node.overlay.draw import color_key
 from sags_node.overlay.stream import OverlayStream
 
@@ -56,7 +56,7 @@ def displays(run_dir: Path, **launches: str) -> Iterator[None]:
 
     def work() -> None:
         try:
-            run_gst(GstOptions(Place("overlay", run_dir=run_dir), **launches), lambda: None, stop)
+            run_gst(GstOptions(NodeAddress("overlay", run_dir=run_dir), **launches), lambda: None, stop)
         except SagsError as error:
             failed.append(error)
 
@@ -106,7 +106,7 @@ def test_both_eyes_come_to_the_pixel_and_what_is_old_becomes_the_key(tmp_path: P
 
 def test_a_wrong_pipeline_is_said_in_words(tmp_path: Path) -> None:
     need_gstreamer()
-    options = GstOptions(Place("overlay", run_dir=tmp_path), left="nosuchsink")
+    options = GstOptions(NodeAddress("overlay", run_dir=tmp_path), left="nosuchsink")
     stop = threading.Event()
     threading.Timer(60, stop.set).start()
     with OverlayStream("overlay", tmp_path, KEY) as stream, drawing(stream, threading.Event()):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import HIDDEN, LOST, SEEN, UNSURE, anchored, anchored_at, bridged, sockets
+from bridging import HIDDEN, LOST, SEEN, UNSURE, anchored, anchored_at, bridged, senders, sockets
 from igtl_peer import PEER, built, peer
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
@@ -22,7 +22,6 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-
 from pyigtl.messages import PointMessage
 
 from sags_node.bridge import igtl
-from sags_node.bridge.feed import Place
 from sags_node.bridge.igtl import MAX_BODY_BYTES
 from sags_node.bridge.igtl_peers import Peers
 from sags_node.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
@@ -46,7 +45,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(run_dir: Path, **changes: Any) -> IgtlOptions:
-    settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
+    settings = {**senders(run_dir), "port": 0}
     return IgtlOptions(**{**settings, **changes})
 
 
@@ -333,7 +332,7 @@ def test_strangers_are_cut_off_and_disturb_nobody(tmp_path: Path, program: Path)
 
 def test_an_answer_that_comes_after_the_end_goes_nowhere() -> None:
     """The requests' thread may still say something while the bridge ends."""
-    peers = Peers("127.0.0.1", 0, lambda _: None, lambda: None)
+    peers = Peers(socket.create_server(("127.0.0.1", 0)), lambda _: None, lambda: None)
     peers.start()
     peers.close()
     peers.send("SagsAnswer", b"late")

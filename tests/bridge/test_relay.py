@@ -13,8 +13,9 @@ from made_messages import meta
 from simulation import START_NS, World
 
 from sags_node.bridge import feed, gst, relay
-from sags_node.bridge.feed import Place
 from sags_node.bridge.relay import LEAD, LOOK, MAX_AGE, Output, Relay, Source
+from sags_node.messaging import address
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freshness import Freshness
 from sags_node.messaging.received import Frame
 
@@ -34,7 +35,7 @@ class Node:
         self.sends = True
         self._world = world
 
-    def make(self, _: Iterable[str], place: Place, max_age: float, wake: Callable[[], None]) -> Node:
+    def make(self, _: Iterable[str], place: NodeAddress, max_age: float, wake: Callable[[], None]) -> Node:
         self._max_age, self._wake = max_age, wake
         self._world.spawn(self._film, "node")
         return self
@@ -94,10 +95,10 @@ def bridged(
     world = World(seed)
     node, peer, stop = Node(world), Peer(world), world.threading.Event()
     monkeypatch.setattr(relay, "Feed", node.make)
-    for module in (relay, feed):
+    for module in (relay, feed, address):
         monkeypatch.setattr(module, "time", world)
     monkeypatch.setattr(relay, "threading", world.threading)
-    loop = Relay((Place(),), (output,), peer)
+    loop = Relay((NodeAddress(),), (output,), peer)
     world.spawn(lambda: loop.run(stop), "bridge")
     world.run(lambda: world.now >= stops_at)
     node.sends = False

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from bridging import anchored, anchored_at, bridged, sockets
+from bridging import anchored, anchored_at, bridged, senders, sockets
 from made_messages import message_of
 from ros_peers import DOMAIN, KEPT, Listener, listener
 from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
@@ -19,7 +19,6 @@ from waiting import until
 
 from sags_node.bridge import ros2
 from sags_node.bridge.compressed import LARGEST, Compressor
-from sags_node.bridge.feed import Place
 from sags_node.bridge.ros2 import PACE, Pace, Ros2Options, offers, run_ros2
 from sags_node.bridge.ros2_requests import asks
 from sags_node.config.schema import RosGraph
@@ -38,10 +37,7 @@ TEXT, TF, ARRAY = topics.STRING, topics.TF, topics.DIAGNOSTICS
 
 
 def options(run_dir: Path, **changes: Any) -> Ros2Options:
-    settings = {
-        "node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir),
-        "graph": RosGraph(domain=DOMAIN),
-    }  # fmt: skip
+    settings = {**senders(run_dir), "graph": RosGraph(domain=DOMAIN)}
     return Ros2Options(**{**settings, **changes})
 
 

@@ -16,14 +16,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bridging import anchored, bridged, sockets
+from bridging import anchored, bridged, senders, sockets
 from places import SESSION
 from ros_peers import DOMAIN, LARGE_BUFFERS, RosNode, listener, rclpy_python, ros_node
 from running_node import RunningNode
 from synthetic import at_frame, stream
 from waiting import until
 
-from sags_node.bridge.feed import Place
 from sags_node.bridge.ros2 import Ros2Options, run_ros2
 from sags_node.config.schema import RosGraph
 from sags_node.messaging import cdr, topics
@@ -45,8 +44,7 @@ def _rclpy() -> None:
 
 
 def options(run_dir: Path) -> Ros2Options:
-    places = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir)}
-    return Ros2Options(**places, graph=RosGraph(domain=DOMAIN))
+    return Ros2Options(**senders(run_dir), graph=RosGraph(domain=DOMAIN))
 
 
 def checksum(message: Received) -> int:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import anchored, anchored_at, bridged, sockets
+from bridging import anchored, anchored_at, bridged, senders, sockets
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
 from thin_sender import making, node_sockets
 from waiting import until
@@ -27,7 +27,6 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatu
 from websockets.sync.client import ClientConnection, connect
 
 from sags_node.bridge import web as gateway
-from sags_node.bridge.feed import Place
 from sags_node.bridge.relay import MAX_AGE
 from sags_node.bridge.web import LONGEST_MESSAGE, MOST_PEERS, WebOptions, run_web
 from sags_node.messaging import content
@@ -39,7 +38,7 @@ DEPTH, IMAGE = "sags/left/render/depth", "sags/left/render/image"
 
 
 def options(run_dir: Path, **changes: Any) -> WebOptions:
-    settings = {"node": Place(run_dir=run_dir), "overlay": Place("overlay", run_dir=run_dir), "port": 0}
+    settings = {**senders(run_dir), "port": 0}
     return WebOptions(**{**settings, **changes})
 
 

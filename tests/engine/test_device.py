@@ -77,7 +77,7 @@ def test_a_gpu_that_cannot_be_used_is_explained(
     said = str(raised.value)
     assert reason in said and fix in said and "\n" not in said and "device:=cpu" in said
     check = doctor.check_gpu(LaunchConfig(device="cuda"))
-    assert check.level == "error" and reason in check.found and fix in check.fix
+    assert check.level == "error" and reason in check.what and fix in check.fix
 
 
 def test_a_missing_gpu_ends_the_command_with_one_message(
@@ -102,7 +102,7 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
     assert choose_device("auto").name == choose_device("cuda").name == "NVIDIA H100"
     assert choose_device("cpu").kind == "cpu"
     check = doctor.check_gpu(LaunchConfig())
-    assert check.level == "ok" and "H100" in check.found and "CUDA 13.0" in check.found
+    assert check.level == "ok" and "H100" in check.what and "CUDA 13.0" in check.what
     cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 1280, 1024)
     gpu = mapping_devices.affordable(LaunchConfig(), 1280, 1024)
     assert gpu > cpu and mapping_devices.rungs_of(LaunchConfig()) == GPU_RUNGS

@@ -14,6 +14,7 @@ import numpy as np
 from synthetic import at_frame, plane_result
 
 from sags_node.config.schema import PublishConfig
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import AnchorStates, FrameResult
 
@@ -31,6 +32,11 @@ def sockets(
     )
     with Publisher(config, "sags", f"session-{time.time_ns()}", handlers) as running:
         yield running
+
+
+def senders(run_dir: Path) -> dict[str, Any]:
+    """The options of a bridge that say where `sockets` are, and an overlay."""
+    return {"node": NodeAddress(run_dir=run_dir), "overlay": NodeAddress("overlay", run_dir=run_dir)}
 
 
 def anchored(result: FrameResult | None = None) -> FrameResult:

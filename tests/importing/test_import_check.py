@@ -15,13 +15,13 @@ from numbered_pictures import write_video
 from places import SESSION
 from stamped_videos import write
 
+from sags_node.checks import Finding
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.importing.check import check_folder, overrides_of
 from sags_node.importing.pictures import combing, lit_box
 from sags_node.pipeline.session import open_session
-from sags_node.rig import Finding
 from sags_node.types import U8
 
 WIDTH, HEIGHT, FRAMES, DISPARITY = 160, 120, 4, 9

@@ -21,7 +21,7 @@ from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import node_clock
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.introspection import topic_delay
+from sags_node.messaging.introspection import topic_figures
 from sags_node.messaging.node_clock import DRIFT, Exchange, NodeClock, OffsetEstimate
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.subscriber import Subscriber
@@ -174,7 +174,7 @@ def test_a_drifting_clock_is_known_to_a_millisecond(tmp_path: Path) -> None:
             assert clock.latest_ns() >= before
             time.sleep(0.05)
         node = NodeAddress(endpoint=running.connection.data[0], control=clock_endpoint(running))
-        delay = topic_delay("left/depth", node, seconds=1)
+        delay = topic_figures("delay", "left/depth", node, seconds=1)
     assert delay["clock_offset_s"] == pytest.approx(true_offset(), abs=delay["clock_bound_s"] + 1e-4)
     assert -delay["clock_bound_s"] <= delay["min_s"] < 2 * AHEAD, "not stamped in the future any more"
 
@@ -217,7 +217,9 @@ def test_ages_are_by_the_nodes_clock_and_nothing_is_fresh_without_it(tmp_path: P
             assert unsure.wait(name, 30)
             assert unknown.offset is None and not unsure.ok(name)
         with pytest.raises(SagsError, match=r"not known: no answer"):
-            topic_delay(name, NodeAddress(endpoint=running.connection.data[0], control=silent), seconds=1.5)
+            topic_figures(
+                "delay", name, NodeAddress(endpoint=running.connection.data[0], control=silent), seconds=1.5
+            )
 
 
 @pytest.mark.live

@@ -13,18 +13,18 @@ import msgpack
 import pytest
 import zmq
 from independent_client import zmq_socket
+from keyed_node import error_of, make_keys, of
 from synthetic import publisher, stream
 from waiting import repeating, until
 
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import MAX_ANCHORS
-from sags_node.messaging.address import ClientKeys
 from sags_node.messaging.control import MAX_PENDING_OF_ONE, ControlClient
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.request_rate import BURST, FORGET_ABOVE, RATE, RequestRate
 from sags_node.messaging.requests import MAX_VIEW_HZ
 from sags_node.messaging.roles import ROLES, Client, needed
-from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
+from sags_node.messaging.security import read_allow_list, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.node.views import MAX_VIEWS
 
@@ -63,11 +63,7 @@ def test_an_operation_that_was_forgotten_takes_the_highest_role() -> None:
 
 @pytest.fixture
 def keys(tmp_path: Path) -> Path:
-    """node.*, and clients/ROLE/ROLE.*"""
-    write_key_pair(tmp_path / "keys", "node")
-    for role in ROLES:
-        write_key_pair(tmp_path / f"keys/clients/{role}", role)
-    return tmp_path / "keys"
+    return make_keys(tmp_path / "keys")
 
 
 @contextmanager
@@ -81,8 +77,7 @@ def answering(run_dir: Path, **config: Any) -> Iterator[Publisher]:
 
 
 def client(running: Publisher, keys: Path, role: str) -> ControlClient:
-    own = read_key_pair(keys / f"clients/{role}/{role}.key")
-    return ControlClient(running.connection.control, keys=ClientKeys(own, read_public_key(keys / "node.pub")))
+    return ControlClient(running.connection.control, keys=of(keys, f"clients/{role}/{role}"))
 
 
 @pytest.mark.live
@@ -102,9 +97,7 @@ def test_each_role_may_do_its_own_and_what_those_before_it_may(
                             SagsError, match=f"takes the role '{least}'.*into the folder '{least}'"
                         ):
                             asker.request(op)
-        own = ClientKeys(
-            read_key_pair(keys / "clients/listen/listen.key"), read_public_key(keys / "node.pub")
-        )
+        own = of(keys, "clients/listen/listen")
         with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=own) as subscriber:
             assert subscriber.wait(TOPIC, 60) is not None
         assert running.connections["control"]["requests_not_allowed"] == refused == 3
@@ -120,10 +113,10 @@ def test_a_role_changes_while_a_client_is_connected(tmp_path: Path, keys: Path) 
         with client(running, keys, "control") as asker:
             assert asker.request("pause") == "done"
             (folders / "control/control.pub").rename(folders / "listen/control.pub")
-            until(lambda: "takes the role" in _error(asker, "pause"))
+            until(lambda: "takes the role" in error_of(asker, "pause"))
             assert asker.request("get_status") == "done"
             (folders / "listen/control.pub").rename(folders / "files/control.pub")
-            until(lambda: not _error(asker, "save_model"))
+            until(lambda: not error_of(asker, "save_model"))
 
 
 @pytest.mark.live
@@ -135,14 +128,6 @@ def test_who_needs_no_key_may_do_everything(tmp_path: Path, keys: Path, with_key
     with answering(tmp_path / "run", control=control, **config) as running:
         with ControlClient(running.connection.control) as asker:
             assert asker.request("save_model") == "done"
-
-
-def _error(asker: ControlClient, op: str) -> str:
-    try:
-        asker.request(op)
-    except SagsError as error:
-        return str(error)
-    return ""
 
 
 # ---- how often -----------------------------------------------------------------------------------------

@@ -8,10 +8,7 @@ import os
 import socket
 import stat
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import hostile
 import numpy as np
@@ -20,6 +17,7 @@ import zmq
 from click.testing import CliRunner, Result
 from command_line import sags
 from independent_client import zmq_socket
+from keyed_node import error_of, make_keys, of, secured
 from running_node import RunningNode
 from synthetic import publisher, stream
 from waiting import until
@@ -31,7 +29,6 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS
-from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.roles import Client
 from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
@@ -43,22 +40,7 @@ TOPIC = "left/depth"
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """node.*, stranger.* and clients/viewer.*"""
-    folder = tmp_path_factory.mktemp("keys")
-    for name in ("node", "stranger"):
-        write_key_pair(folder, name)
-    write_key_pair(folder / "clients", "viewer")
-    return folder
-
-
-@contextmanager
-def secured(run_dir: Path, keys: Path, **config: Any) -> Iterator[Publisher]:
-    with publisher(run_dir, key=keys / "node.key", allow=(keys / "clients",), **config) as running:
-        yield running
-
-
-def of(keys: Path, client: str, node: str = "node") -> ClientKeys:
-    return ClientKeys(read_key_pair(keys / f"{client}.key"), read_public_key(keys / f"{node}.pub"))
+    return make_keys(tmp_path_factory.mktemp("keys"))
 
 
 # ---- key files -----------------------------------------------------------------------------------------
@@ -139,7 +121,7 @@ def test_one_bad_entry_in_the_allow_list_is_one_clear_error(
 
 def test_allow_lists(keys: Path, tmp_path: Path) -> None:
     viewer, stranger = (read_key_pair(keys / f"{name}.key") for name in ("clients/viewer", "stranger"))
-    listed = read_allow_list([keys / "clients", keys / "stranger.pub"])
+    listed = read_allow_list([keys / "clients/viewer.pub", keys / "stranger.pub"])
     assert listed == {viewer.public: Client("viewer"), stranger.public: Client("stranger")}
     with pytest.raises(UsageError, match=r"no \.pub file"):
         read_allow_list([tmp_path])
@@ -231,15 +213,6 @@ def test_others_are_refused_counted_and_told_why(
         other = {"data": "control", "control": "data"}[which]
         assert running.connections[other] == dict.fromkeys(running.connections[other], 0)
         assert not running.wanted(TOPIC)
-
-
-def error_of(asker: ControlClient) -> str:
-    """Why it is not answered; empty: it is."""
-    try:
-        asker.request("ping")
-    except SagsError as error:
-        return str(error)
-    return ""
 
 
 @pytest.mark.fault("keys: revoked, added and broken while it runs")

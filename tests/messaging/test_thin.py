@@ -19,7 +19,7 @@ from waiting import until
 from sags_node.errors import UsageError
 from sags_node.messaging import content, thin, topics
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.introspection import topic_echo, topic_hz
+from sags_node.messaging.introspection import topic_echo, topic_figures
 from sags_node.messaging.publisher import MAX_THIN, Publisher
 from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
@@ -146,7 +146,7 @@ def test_sags_topic_reads_them_like_the_whole(tmp_path: Path) -> None:
     with node_sockets(tmp_path) as running, making(running, plane_result()):
         node = NodeAddress(endpoint=running.connection.data[-1])
         (said,) = topic_echo("thin/half/left/depth/png", node, count=1, seconds=60)
-        assert topic_hz("thin/half/left/depth/png", node, seconds=1.0)["window"] >= 2
+        assert topic_figures("hz", "thin/half/left/depth/png", node, seconds=1.0)["window"] >= 2
     assert said["content"]["shape"] == list(depth.shape)
     assert said["content"]["max"] == pytest.approx(depth.max(), abs=DEPTH_STEP)
     assert said["content"]["unknown"] == pytest.approx(np.mean(depth == 0))

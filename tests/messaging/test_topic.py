@@ -18,7 +18,7 @@ from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.introspection import topic_bw, topic_delay, topic_echo, topic_hz, topic_list
+from sags_node.messaging.introspection import topic_echo, topic_figures, topic_list
 from sags_node.messaging.wire import Message
 from sags_node.overlay.draw import color_key
 from sags_node.overlay.stream import OverlayStream
@@ -46,14 +46,14 @@ def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> N
         for seq, (at, size) in enumerate(zip(came, sizes, strict=True))
     ]
     monkeypatch.setattr("sags_node.messaging.introspection.listen_to", lambda *_, **__: iter([*heard, None]))
-    hz = topic_hz("left/depth", NOWHERE)
+    hz = topic_figures("hz", "left/depth", NOWHERE)
     assert (hz["window"], hz["freezes"]) == (4, 0)
     steps = [0.01, 0.02, 0.07]
     expected = {"average_rate": 30.0, "min_s": 0.01, "max_s": 0.07, "std_dev_s": np.std(steps)}
     assert {key: hz[key] for key in expected} == pytest.approx(expected)
-    bw = topic_bw("left/depth", NOWHERE)  # the first one only starts the clock
+    bw = topic_figures("bw", "left/depth", NOWHERE)  # the first one only starts the clock
     assert (bw["bytes_per_s"], bw["mean_bytes"]) == (pytest.approx(600 / 0.1), 275)
-    delay = topic_delay("left/depth", NOWHERE)
+    delay = topic_figures("delay", "left/depth", NOWHERE)
     for key in ("min_s", "average_delay_s", "max_s"):
         assert delay[key] == pytest.approx(5e-3)
     (row,) = (row for row in topic_list(NOWHERE) if row["messages"])
@@ -86,8 +86,11 @@ def test_an_overlay_is_listed_and_measured(overlay: OverlayStream) -> None:
     assert rows["overlay/left/overlay/image"]["mean_bytes"] > 4 * WIDTH * HEIGHT
     assert rows["overlay/status"]["messages"] >= 1
     assert rows["overlay/right/overlay/color_key"]["type"] == topics.IMAGE
-    assert topic_hz("left/overlay/color_key", NodeAddress("overlay", endpoint), seconds=2.0)["window"] >= 2
-    bw = topic_bw("left/overlay/image", NodeAddress("overlay", endpoint), seconds=2.0)
+    hz, bw = (
+        topic_figures(kind, f"left/overlay/{name}", NodeAddress("overlay", endpoint), seconds=2.0)
+        for kind, name in (("hz", "color_key"), ("bw", "image"))
+    )
+    assert hz["window"] >= 2
     assert bw["mean_bytes"] > 4 * WIDTH * HEIGHT
     (said,) = topic_echo("status", NodeAddress("overlay", endpoint), count=1, seconds=60)
     assert said["content"]["state"] == "running"
@@ -133,9 +136,9 @@ def test_echo(node: NodeAddress, name: str) -> None:
 
 def test_silence_and_mistakes_are_named(node: NodeAddress) -> None:
     with pytest.raises(UsageError, match="did you mean 'left/depth'"):
-        topic_hz("left/dept", node)
+        topic_figures("hz", "left/dept", node)
     with pytest.raises(SagsError, match=r"no messages on sags/tf from tcp://127\.0\.0\.1:9 in 0\.2 s"):
-        topic_hz("tf", NOWHERE, seconds=0.2)
+        topic_figures("hz", "tf", NOWHERE, seconds=0.2)
     with pytest.raises(SagsError, match="no messages on other/"):
         topic_list(NodeAddress("other", node.endpoint), seconds=0.3)
     with pytest.raises(SagsError, match="no messages"):
@@ -145,4 +148,6 @@ def test_silence_and_mistakes_are_named(node: NodeAddress) -> None:
 def test_why_there_is_no_right_eye_is_said(tmp_path: Path) -> None:
     with publisher(tmp_path / "run", right=False) as running, stream(running):
         with pytest.raises(SagsError, match=r"one camera, or with publish\.right:=false, has no right eye"):
-            topic_hz("right/render/image", NodeAddress(endpoint=running.connection.data[-1]), seconds=0.2)
+            topic_figures(
+                "hz", "right/render/image", NodeAddress(endpoint=running.connection.data[-1]), seconds=0.2
+            )

@@ -296,8 +296,8 @@ def test_what_only_the_log_says_is_said() -> None:
 
 
 def test_the_doctor_knows_what_is_installed() -> None:
-    check = next(check for check in examine(LaunchConfig()) if check.name == "GStreamer")
-    assert check.level == "ok" and check.found.startswith("GStreamer 1.")
+    check = dict(examine(LaunchConfig()))["GStreamer"]
+    assert check.level == "ok" and check.what.startswith("GStreamer 1.")
 
 
 # ---- to the pixel ----------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from sags_node.errors import SagsError
 from sags_node.messaging import cdr
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
-from sags_node.messaging.introspection import topic_hz
+from sags_node.messaging.introspection import topic_figures
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
 from sags_node.messaging.stream import listen
@@ -208,7 +208,7 @@ def test_the_clock_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
     command = ["bag", "play", plane_bag, "--loop", "--clock", "--endpoint", "tcp://127.0.0.1:*"]
     process = start(command, XDG_RUNTIME_DIR=tmp_path)
     wait_for(process, (tmp_path / "sags/sags.json").exists)
-    figures = topic_hz("clock", NodeAddress(run_dir=tmp_path / "sags"), 1.5)
+    figures = topic_figures("hz", "clock", NodeAddress(run_dir=tmp_path / "sags"), 1.5)
     stopped(process)
     assert process.returncode == 0 and figures["window"] >= 2
     assert sags("bag", "play", plane_bag, "--clock", "0").exit_code == 2
