@@ -255,14 +255,14 @@ class Pipeline:
         # 6. Map: deform, refine, add and prune Gaussians.
         with clock("map"):
             mapped = self._mapped(observation, tracks, budget, still, judged.learn, right)
-        if not still:  # which tells nothing of what a moving frame costs
-            budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
         # Then draw what consumers watch: the right eye, and their anchors.
         with clock("render"):
             self._lend(mapped, pair, observation, judged)
             views = {"left": self._left_eye(mapped.view, pair, request.left)}
             if right:
                 views["right"] = self._right_eye(mapped, observation, seen, judged, by_both)
+        if not still:  # which tells nothing of what a moving frame costs
+            budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
         with clock("anchors"):
             self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
             states = self.anchors.at(pair.t_capture_ns)
