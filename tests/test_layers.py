@@ -18,6 +18,43 @@ LAYERS = [line.split("   ")[0].split() for line in reversed(PICTURE.strip().spli
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 
+# Lines of Python that a folder may have. A change that needs more raises its number, and its message says why;
+# one that needs less lowers it.
+LINES = {
+    "benchmarks": 9489,
+    "sags_lab": 4958,
+    "sags_node": 1726,
+    "sags_node/bridge": 2638,
+    "sags_node/calibration": 1846,
+    "sags_node/cli": 3087,
+    "sags_node/config": 1357,
+    "sags_node/detail": 865,
+    "sags_node/engine": 4508,
+    "sags_node/evaluation": 3571,
+    "sags_node/export": 891,
+    "sags_node/field": 1723,
+    "sags_node/fitting": 1530,
+    "sags_node/importing": 1099,
+    "sags_node/kernels": 1314,
+    "sags_node/mapping": 5683,
+    "sags_node/media": 718,
+    "sags_node/messaging": 5087,
+    "sags_node/model": 960,
+    "sags_node/node": 1425,
+    "sags_node/overlay": 2230,
+    "sags_node/phantom": 1604,
+    "sags_node/pipeline": 825,
+    "sags_node/recording": 2600,
+    "sags_node/rig": 1183,
+    "sags_node/ros": 332,
+    "sags_node/sources": 5606,
+    "sags_node/terminal": 338,
+    "sags_node/viewer": 1042,
+    "sags_node/vision": 5454,
+    "tests": 45929,
+}
+SPARE = 40  # lines between a number and what is there: beyond, it is lowered
+
 
 def name_of(file: Path) -> str:
     return ".".join(("sags_node", *file.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__")
@@ -151,3 +188,22 @@ def test_a_folder_says_which_it_imports(folder: str) -> None:
 def test_every_folder_says_in_a_line_what_it_holds() -> None:
     firsts = {init.parent: said_in(init.parent).split("\n")[0] for init in PACKAGE.rglob("__init__.py")}
     assert [str(folder) for folder, first in firsts.items() if not first.endswith((".", ":"))] == []
+
+
+def lines_of(folder: str) -> int:
+    """Of the package itself: of the files beside its folders."""
+    files = (ROOT / folder).glob("*.py") if folder == "sags_node" else (ROOT / folder).rglob("*.py")
+    return sum(len(file.read_bytes().splitlines()) for file in files)
+
+
+def test_every_folder_has_a_budget_of_lines() -> None:
+    assert {f"sags_node/{name}" for name in FOLDERS} | {"sags_node", "sags_lab", "benchmarks", "tests"} == {
+        *LINES
+    }
+
+
+@pytest.mark.parametrize("folder", LINES)
+def test_a_folder_keeps_its_budget_of_lines(folder: str) -> None:
+    there = lines_of(folder)
+    assert there <= LINES[folder], f"{folder} has {there} lines: shorten it, or raise LINES and say why"
+    assert there >= LINES[folder] - SPARE, f"{folder} has {there} lines: lower LINES"

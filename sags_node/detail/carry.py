@@ -30,6 +30,7 @@ AROUND = (9, 9)  # of the places, from which a hole is filled
 LEAST_KNOWN = 0.5  # of them, to fill it
 COVERED = 0.3  # by Gaussians whose motion is known
 NOWHERE = -1e6  # px
+LITTLE = 3.0  # px of motion from one frame to the next: depths at edges differ by more than SAME all the same
 ONE, HALF = 1 << 16, 1 << 15
 TISSUE = np.uint32(0xFF000000)
 _LANES = np.uint64(0x00FF00FF00FF00FF)
@@ -72,7 +73,7 @@ def every_fourth(depth: F32, small: Camera) -> F32:
 
 def trace(
     depth: F32, small: Camera, source: SeenFrame, lent: U8, motion: F32 | None, tiles: F32 = WHOLLY,
-    unsure: float = 0.0, holes: bool = False, wanted: U8 = EVERYWHERE,
+    unsure: float = 0.0, steady: bool = False, wanted: U8 = EVERYWHERE,
 ) -> Trace:  # fmt: skip
     """Find where the tissue of a view was in a source's picture.
 
@@ -83,7 +84,8 @@ def trace(
         motion: [4, m, n] of `SmallDrawings.motion`; None: nothing has moved.
         tiles: [rows, columns] 0..1 over the source's picture: the share that it deserves.
         unsure: of each pixel that the tissue has moved, so many are doubtful: the share falls with them.
-        holes: where the model tells no depth or motion, and the cameras are one, take the picture unmoved.
+        steady: it is a moment ago. If the cameras are one, too, the surface is the same where tissue moved
+            little, and where the model tells no depth or motion the picture is taken unmoved.
         wanted: [m, n] 0 where nothing is to be carried, nor beside it.
     """
     T = source.camera.viewmat @ small.T_world_cam
@@ -91,7 +93,7 @@ def trace(
     K = scale_intrinsics(source.camera.K, (source.camera.width, source.camera.height), size)
     rays = np.array([1 / small.K[0, 0], small.K[0, 2], 1 / small.K[1, 1], small.K[1, 2]], f4)
     eye = np.array([K[0, 0], K[0, 2], K[1, 1], K[1, 2], *size], f4)
-    unmoved = bool(holes and np.abs(T - np.eye(4)).max() < 1e-7)
+    unmoved = bool(steady and np.abs(T - np.eye(4)).max() < 1e-7)
     places = np.empty((small.height + 2, small.width + 2, 2), f4)
     share = np.empty(places.shape[:2], np.uint8)
     _trace(
@@ -149,7 +151,7 @@ def _trace_row(
             row = min(max(np.int64(down * f4(rows)), 0), rows - 1)
             column = min(max(np.int64(across * f4(columns)), 0), columns - 1)
             was = source_depth[row, column]
-            if not told or was == f4(0) or abs(was - c) < f4(SAME) * c:
+            if (unmoved and lag < f4(LITTLE)) or was == f4(0) or abs(was - c) < f4(SAME) * c:
                 doubt = unsure * lag
                 part = _between(tiles, across, down) / (f4(1) + doubt * doubt)
         else:
@@ -238,7 +240,13 @@ def _carry_row(
                 a, b, c, d = pixels[at], pixels[at + u8(1)], pixels[at + u8(wide)], pixels[at + u8(wide + 1)]
                 nearest = (b if s > u8(128) else a) if r <= u8(128) else (d if s > u8(128) else c)
                 if nearest >= TISSUE:
-                    there = _mix(_mix(_lanes(a), _lanes(b), s), _mix(_lanes(c), _lanes(d), s), r)
+                    # Weights of 256 in all, so that there is one rounding.
+                    last = (s * r + u8(128)) >> u8(8)
+                    first = u8(256) - s - r + last
+                    there = (
+                        _lanes(a) * first + _lanes(b) * (s - last) + _lanes(c) * (r - last) + _lanes(d) * last
+                    )
+                    there = ((there + _ROUND) >> u8(8)) & _LANES
                     if lit:
                         t = f4(i - EVERY * j + 2.5) * f4(1 / EVERY)
                         red = _lit(there, u8(0), gain[0], line[3, j], line[3, j + 1], t)

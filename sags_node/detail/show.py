@@ -121,7 +121,7 @@ class Detail:
             tiles = cv2.resize(tiles, ahead.shape[::-1], interpolation=cv2.INTER_LINEAR) * ahead
         motion = self._small.motion(gaussians, camera, now, lessons.moved.of_gaussians(now))
         lent, small = now.lent(float(camera.K[0, 0])), coarse_camera(camera)
-        traced = trace(every_fourth(depth, small), small, now, lent, motion, tiles, holes=True)
+        traced = trace(every_fourth(depth, small), small, now, lent, motion, tiles, steady=True)
         carry(rgb, taken, traced, lent, tint=tint)
         return Shown(rgb, taken, now.oldest_ns)
 
@@ -148,7 +148,7 @@ class Detail:
 
         def carried(trust: F32 | None) -> U8:
             motion = None if trust is None else self._small.motion(expected, camera, before, trust)
-            return _carried(drawn, depth, camera, before, motion, holes=True)
+            return _carried(drawn, depth, camera, before, motion, steady=True)
 
         moved = carried(np.ones(len(before.gaussians), f4))
         lessons.moved.learn(carried(None), moved, truth, where)
@@ -179,11 +179,11 @@ def _nothing(camera: Camera) -> U8:
 
 
 def _carried(
-    drawn: U8, depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None, holes: bool = False
+    drawn: U8, depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None, steady: bool = False
 ) -> U8:
     """A drawn picture with all that a source has for it."""
     rgb, lent, small = drawn.copy(), source.lent(np.inf), coarse_camera(camera)
-    traced = trace(every_fourth(depth, small), small, source, lent, motion, holes=holes)
+    traced = trace(every_fourth(depth, small), small, source, lent, motion, steady=steady)
     carry(rgb, _nothing(camera), traced, lent)
     return rgb
 

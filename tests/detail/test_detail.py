@@ -72,13 +72,13 @@ def twin(shown: U8, depth: F32, camera: Camera, source: SeenFrame, share: float)
 
 def carried(
     depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None = None, share: float = 1.0,
-    holes: bool = False,
+    steady: bool = False,
 ) -> tuple[U8, U8]:  # fmt: skip
     """A grey view with the picture of a source, and the share that each pixel got."""
     shown, taken = np.full((HEIGHT, WIDTH, 3), 90, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
     small, lent = coarse_camera(camera), source.lent(FOCAL)
     tiles = np.full((2, 3), share, np.float32)
-    traced = trace(every_fourth(depth, small), small, source, lent, motion, tiles, holes=holes)
+    traced = trace(every_fourth(depth, small), small, source, lent, motion, tiles, steady=steady)
     carry(shown, taken, traced, lent)
     return shown, taken
 
@@ -141,8 +141,8 @@ def test_what_is_carried_is_in_the_light_of_the_view() -> None:
 def test_it_ends_in_a_picture_whatever_it_is_given(depth: float, moved: float | None) -> None:
     odd = np.full((HEIGHT, WIDTH), depth, np.float32)
     motion = None if moved is None else np.full((4, HEIGHT // 4, WIDTH // 4), moved, np.float32)
-    for holes in (False, True):
-        shown, taken = carried(odd, CAMERA.moved_right(0.01), seen(depth=odd), motion, holes=holes)
+    for steady in (False, True):
+        shown, taken = carried(odd, CAMERA.moved_right(0.01), seen(depth=odd), motion, steady=steady)
         assert (shown[taken == 0] == 90).all()
 
 
