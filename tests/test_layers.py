@@ -18,7 +18,7 @@ LAYERS = [line.split("   ")[0].split() for line in reversed(PICTURE.strip().spli
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 
-# Lines of Python that a folder may have. A change that needs more raises its number, and its message says why;
+# Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
     "benchmarks": 9489,
