@@ -26,6 +26,7 @@ TESTS = tuple(
         "field": ("sampling", "hexplane", "decoder", "deformation"),
         "fitting": ("residuals",),
         "mapping": ("slopes",),
+        "detail": ("detail",),
         "vision": ("matching_kernels",),
         "evaluation": ("replay",),
     }.items()

@@ -51,7 +51,7 @@ LINES = {
     "sags_node/terminal": 338,
     "sags_node/viewer": 1042,
     "sags_node/vision": 5454,
-    "tests": 45929,
+    "tests": 45930,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
