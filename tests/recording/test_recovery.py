@@ -40,7 +40,7 @@ def test_recovery_after_a_cut_keeps_all_before_it(plane_bag: Path, tmp_path: Pat
     sizes = []
     for number, length in enumerate(sorted(rng.randrange(len(whole)) for _ in range(12))):
         done, kept = recovered(whole[:length], tmp_path, f"cut{number}")
-        assert done is None or done["lost"]
+        assert done is None or done["lost"] or len(kept) == len(original)  # cut off within the index
         assert content(kept) == original[: len(kept)]
         assert len(kept) >= len(original) * (length / len(whole)) * 0.9 - 40  # nearly all that is there
         sizes.append(len(kept))
