@@ -7,5 +7,5 @@ drawn model by how well such pictures did lately.
 To be read in this order: `seen` (a frame that lends its picture), `carry` (the kernel), `motion` (where the
 tissue was), `share` (how far to trust it), `memory` (what is hidden now), `show` (all of it together).
 
-Imports engine, kernels and mapping.
+Imports engine, kernels, mapping and model.
 """

@@ -30,6 +30,7 @@ AROUND = (9, 9)  # of the places, from which a hole is filled
 LEAST_KNOWN = 0.5  # of them, to fill it
 COVERED = 0.3  # by Gaussians whose motion is known
 NOWHERE = -1e6  # px
+FINDINGS = 3  # of a ray's place in the source, each from where the last one met its surface
 LITTLE = 3.0  # px of motion from one frame to the next: depths at edges differ by more than SAME all the same
 ONE, HALF = 1 << 16, 1 << 15
 TISSUE = np.uint32(0xFF000000)
@@ -96,9 +97,10 @@ def trace(
     unmoved = bool(steady and np.abs(T - np.eye(4)).max() < 1e-7)
     places = np.empty((small.height + 2, small.width + 2, 2), f4)
     share = np.empty(places.shape[:2], np.uint8)
+    surface = source.depth if unmoved else source.surface
     _trace(
         read_only(depth), rays, T.astype(f4), eye, _STILL if motion is None else motion, motion is not None,
-        unmoved, read_only(source.depth), read_only(tiles), f4(unsure), read_only(wanted), places, share,
+        unmoved, read_only(surface), read_only(tiles), f4(unsure), read_only(wanted), places, share,
     )  # fmt: skip
     return Trace(places, share)
 
@@ -131,31 +133,38 @@ def _trace_row(
             places[x, 0], places[x, 1] = eye[0] * ray_x + eye[1], eye[2] * ray_y + eye[3]
             share[x] = np.uint8(0)
             continue
-        a = z * (T[0, 0] * ray_x + T[0, 1] * ray_y + T[0, 2]) + T[0, 3]
-        b = z * (T[1, 0] * ray_x + T[1, 1] * ray_y + T[1, 2]) + T[1, 3]
-        c = z * (T[2, 0] * ray_x + T[2, 1] * ray_y + T[2, 2]) + T[2, 3]
-        told, lag = z > f4(0) and c > f4(NEAREST), f4(0)
-        u, v = eye[0] * a / c + eye[1], eye[2] * b / c + eye[3]
-        if told and moved:
-            told = motion[3, i, j] > f4(COVERED) and c - motion[2, i, j] > f4(NEAREST)
-            c -= motion[2, i, j]
-            was_u = eye[0] * (a - motion[0, i, j]) / c + eye[1]
-            was_v = eye[2] * (b - motion[1, i, j]) / c + eye[3]
-            lag = max(abs(was_u - u), abs(was_v - v))
-            u, v = was_u, was_v
-        if not told:
-            u, v = eye[0] * ray_x + eye[1], eye[2] * ray_y + eye[3]
-        part = f4(0)
-        if (told or unmoved) and abs(u) < f4(-NOWHERE) and abs(v) < f4(-NOWHERE):
+        part, lag, told, near = f4(0), f4(0), True, False
+        across, down, was, c = f4(0), f4(0), f4(0), f4(0)
+        for _ in range(1 if unmoved else FINDINGS):
+            a = z * (T[0, 0] * ray_x + T[0, 1] * ray_y + T[0, 2]) + T[0, 3]
+            b = z * (T[1, 0] * ray_x + T[1, 1] * ray_y + T[1, 2]) + T[1, 3]
+            c = z * (T[2, 0] * ray_x + T[2, 1] * ray_y + T[2, 2]) + T[2, 3]
+            told = z > f4(0) and c > f4(NEAREST)
+            u, v = eye[0] * a / c + eye[1], eye[2] * b / c + eye[3]
+            if told and moved:
+                told = motion[3, i, j] > f4(COVERED) and c - motion[2, i, j] > f4(NEAREST)
+                c -= motion[2, i, j]
+                was_u = eye[0] * (a - motion[0, i, j]) / c + eye[1]
+                was_v = eye[2] * (b - motion[1, i, j]) / c + eye[3]
+                lag = max(abs(was_u - u), abs(was_v - v))
+                u, v = was_u, was_v
+            if not told:
+                u, v = eye[0] * ray_x + eye[1], eye[2] * ray_y + eye[3]
+            near = (told or unmoved) and abs(u) < f4(-NOWHERE) and abs(v) < f4(-NOWHERE)
+            if not near:
+                break
             across, down = (u + f4(0.5)) / wide, (v + f4(0.5)) / high
             row = min(max(np.int64(down * f4(rows)), 0), rows - 1)
             column = min(max(np.int64(across * f4(columns)), 0), columns - 1)
             was = source_depth[row, column]
-            if (unmoved and lag < f4(LITTLE)) or was == f4(0) or abs(was - c) < f4(SAME) * c:
-                doubt = unsure * lag
-                part = _between(tiles, across, down) / (f4(1) + doubt * doubt)
-        else:
+            if was == f4(0) or abs(was - c) >= f4(SAME) * c:
+                break
+            z += was - c  # the source knows its surface finer: look again where the ray meets that
+        if not near:
             u = v = f4(NOWHERE)
+        elif (unmoved and lag < f4(LITTLE)) or was == f4(0) or abs(was - c) < f4(SAME) * c:
+            doubt = unsure * lag
+            part = _between(tiles, across, down) / (f4(1) + doubt * doubt)
         places[x, 0], places[x, 1] = u, v
         share[x] = np.uint8(np.int64(f4(255) * part + f4(0.5)))
 

@@ -15,6 +15,7 @@ MOST = 10  # frames kept
 OLDEST = 10.0  # s: what nobody has seen for longer is drawn as the model has it
 NEARLY = 0.5  # of what the best of them saw: a newer one is taken that saw more
 WORTH = 0.05  # of the hidden Gaussians: with fewer, a frame is not worth its drawing
+MATCHED = 0.2  # s that the model's error of depth is taken for the same
 BRIGHTER = 2.0  # at most, between a source's light and that of the view
 
 
@@ -39,12 +40,30 @@ class Memory:
         if kept and now - kept[0].t_capture_ns < EVERY * 1e9:
             return
         picture = frame.picture()  # now: it is made of a frame of which nothing else is needed
-        kept.insert(0, replace(frame, picture=lambda: picture))
+        kept.insert(0, replace(frame, picture=lambda: picture, matched=None))
         if len(kept) > MOST:
             ages = [EVERY + (now - one.t_capture_ns) * 1e-9 for one in kept]
             # The one whose neighbours in time are nearest to each other, by their ages, is missed least.
             del kept[min(range(1, len(kept) - 1), key=lambda i: ages[i + 1] / ages[i - 1])]
         self.frames = tuple(kept)
+
+
+class Matched:
+    """Keeps what stereo measured last, beside what the model had there: not every frame is matched."""
+
+    def __init__(self) -> None:
+        self._last: tuple[F32, F32] | None = None
+        self._when_ns = 0
+
+    def __call__(self, now_ns: int, drawn: F32, measured: F32) -> tuple[F32, F32] | None:
+        """The newest pair of both, for `SeenFrame.matched`; None: there is none of a moment ago.
+
+        Args:
+            drawn, measured: [h, w] m of this frame, 0 unknown.
+        """
+        if measured.any():
+            self._last, self._when_ns = (drawn, measured), now_ns
+        return self._last if 0 <= now_ns - self._when_ns <= MATCHED * 1e9 else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from sags_node.types import F32, I64, U8, Bool, Camera, Gaussians, Shown
 
 MARGIN = np.ones((5, 5), np.uint8)  # px of the working size: nearer to a mask's edge an instrument may shine
 SAME = 0.04  # of the depth: nearer to each other, two depths are of one surface
+AROUND = (9, 9)  # px of the working size, over which the model's error of depth is averaged
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class SeenFrame:
     picture: Callable[[], U8]  # [H, W, 3] RGB of the left eye as it is published; made when it is asked for
     mask: Bool  # [h, w] tissue
     depth: F32  # [h, w] m, of the model drawn for it; 0 unknown
+    matched: tuple[F32, F32] | None = None  # that depth, and the measured one, of a moment ago
     whole: Shown | None = None  # its left view: lends what is hidden, too
     _lent: dict[tuple[int, bool], U8] = field(default_factory=dict, init=False, repr=False)
 
@@ -39,6 +41,21 @@ class SeenFrame:
         """[h, w] 1: tissue, and no edge of an instrument beside it."""
         eroded: U8 = cv2.erode(self.tissue, MARGIN, borderType=cv2.BORDER_REPLICATE)
         return eroded
+
+    @cached_property
+    def surface(self) -> F32:
+        """[h, w] m, the depth with what stereo saw finer than the model; 0 unknown. Few Gaussians are flat
+        where tissue is not, and from aside a millimetre of depth is a pixel."""
+        if self.matched is None:
+            return self.depth
+        size = self.depth.shape[::-1]
+        drawn, measured = (cv2.resize(d, size, interpolation=cv2.INTER_NEAREST) for d in self.matched)
+        error = measured - drawn
+        known = ((drawn > 0) & (measured > 0) & (np.abs(error) < np.float32(SAME) * drawn)).astype(np.float32)
+        part = np.divide(error * known, drawn, out=np.zeros_like(drawn), where=drawn > 0)
+        part, around = cv2.blur(part, AROUND), cv2.blur(known, AROUND)
+        finer: F32 = self.depth * (1 + np.divide(part, around, out=np.zeros_like(part), where=around > 0))
+        return finer
 
     @cached_property
     def pixels(self) -> F32:

@@ -17,13 +17,14 @@ from sags_node.detail.share import Share
 from sags_node.engine.rasterizer.views import to_view
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.model.gaussians import for_right_eye
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 
 LESSON_EVERY = 4  # frames: what lessons teach changes slowly, and each costs a small view
 LOOKED_AT = 4  # px: every so many along both axes tell how well pictures are carried
 AROUND = np.ones((5, 5), np.uint8)  # px of the working size: what is seen there is made as if hidden, too
 UNSURE = 0.2  # of the way that hidden tissue has moved: so much of it nobody saw
-DOUBTED = 1.0  # px: so unsure, a hidden place is half the model's
+ANOTHER_EYE = 0.5  # of what the right eye taught: it has a light of its own, which no other view has
 f4 = np.float32
 u8 = np.uint64
 
@@ -60,17 +61,17 @@ class Detail:
         rgb, size = drawn.copy(), (camera.width, camera.height)
         hidden = cv2.dilate(1 - now.tissue, AROUND)
         taken = np.asarray(cv2.resize(255 - 255 * hidden, size, interpolation=cv2.INTER_NEAREST))
-        oldest = self._from_memory(rgb, taken, depth, now.gaussians, camera, now.t_capture_ns, older)
+        oldest = self._from_memory(rgb, taken, depth, camera, now, older)
         seen = cv2.blur(now.sure_tissue * np.uint8(255), (5, 5))  # seams over five pixels
         seen = cv2.resize(seen, size, interpolation=cv2.INTER_LINEAR)
         _paste(now.picture(), read_only(seen), rgb)
         return Shown(rgb, np.maximum(taken, seen), oldest)
 
     def _from_memory(
-        self, rgb: U8, taken: U8, depth: F32, gaussians: Gaussians, camera: Camera, now_ns: int,
-        older: Sequence[SeenFrame],
-    ) -> int:  # fmt: skip
-        """Carry what an older frame saw to where nothing is taken yet; returns when that was, or `now_ns`."""
+        self, rgb: U8, taken: U8, depth: F32, camera: Camera, now: SeenFrame, older: Sequence[SeenFrame]
+    ) -> int:
+        """Carry what an older frame saw to where nothing is taken yet; returns when that was, or now."""
+        now_ns = now.t_capture_ns
         small = coarse_camera(camera)
         free = cv2.resize(
             cv2.compare(taken, 0, cv2.CMP_EQ), (small.width, small.height), interpolation=cv2.INTER_AREA
@@ -78,14 +79,15 @@ class Detail:
         if not len(older) or not free.any():
             return now_ns
         wanted = cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3])  # pixels lie between two places
-        there = gaussians_at(gaussians, small, wanted)
+        there = gaussians_at(now.gaussians, small, wanted)
         source = hidden_source(there, now_ns, older)
         if source is None:
             return now_ns
         frame, lent = source.frame, source.frame.lent(float(camera.K[0, 0]), sure=True)
         motion = self._small.motion(there, camera, frame)
         depth = every_fourth(depth, small)
-        traced = trace(depth, small, frame, lent, motion, unsure=UNSURE / DOUBTED, wanted=wanted)
+        unsure = UNSURE * _loss_by_pixel(now, rgb)
+        traced = trace(depth, small, frame, lent, motion, unsure=unsure, wanted=wanted)
         carry(rgb, taken, traced, lent, source.gain)
         return frame.t_capture_ns if traced.share.any() else now_ns
 
@@ -115,7 +117,7 @@ class Detail:
         rgb, taken = drawn.copy(), _nothing(camera)
         aside = float(np.linalg.norm(camera.T_world_cam[:3, 3] - now.camera.T_world_cam[:3, 3])) / baseline
         lessons = self._lessons
-        tiles = lessons.aside.tiles() ** f4(aside)
+        tiles = lessons.aside.tiles() ** f4(ANOTHER_EYE * np.sqrt(aside))
         if frames_ahead > 0:
             ahead = lessons.ahead.tiles() ** f4(frames_ahead)
             tiles = cv2.resize(tiles, ahead.shape[::-1], interpolation=cv2.INTER_LINEAR) * ahead
@@ -154,18 +156,19 @@ class Detail:
         lessons.moved.learn(carried(None), moved, truth, where)
         lessons.ahead.learn(drawn, carried(lessons.moved.of_gaussians(before)), truth, where)
 
-    def learn_aside(self, now: SeenFrame, right: U8, baseline: float) -> None:
+    def learn_aside(self, now: SeenFrame, snapshot: Snapshot, right: U8, baseline: float) -> None:
         """Learn from the right eye how well the left picture says what another eye sees.
 
         Args:
+            snapshot: of that frame.
             right: [H, W, 3] the right picture, as it is published.
             baseline: m.
         """
         known = now.depth[now.mask & (now.depth > 0)]
         where = right_eye_mask(now.mask, known, float(now.camera.K[0, 0]), baseline)
         camera, truth, where = _sampled(now.camera.moved_right(baseline), right, where)
-        drawn, depth = self._drawn(now.gaussians, camera)
-        carried = _carried(drawn, depth, camera, now, None)
+        drawn, depth = self._drawn(for_right_eye(now.gaussians, snapshot), camera)
+        carried = _carried(drawn, depth, camera, now, None, tint=self.tint(snapshot, now.gaussians, camera))
         self._lessons.aside.learn(drawn, carried, _in_light_of(drawn, truth, where), where)
 
     def _drawn(self, gaussians: Gaussians, camera: Camera) -> tuple[U8, F32]:
@@ -179,12 +182,13 @@ def _nothing(camera: Camera) -> U8:
 
 
 def _carried(
-    drawn: U8, depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None, steady: bool = False
-) -> U8:
+    drawn: U8, depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None, steady: bool = False,
+    tint: F32 | None = None,
+) -> U8:  # fmt: skip
     """A drawn picture with all that a source has for it."""
     rgb, lent, small = drawn.copy(), source.lent(np.inf), coarse_camera(camera)
     traced = trace(every_fourth(depth, small), small, source, lent, motion, steady=steady)
-    carry(rgb, _nothing(camera), traced, lent)
+    carry(rgb, _nothing(camera), traced, lent, tint=tint)
     return rgb
 
 
@@ -204,6 +208,20 @@ def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool
     )
     columns = ((np.arange(truth.shape[1]) * LOOKED_AT + first) * where.shape[1]) // width
     return Camera(truth.shape[1], truth.shape[0], K, camera.T_world_cam), truth, where[rows[:, None], columns]
+
+
+def _loss_by_pixel(frame: SeenFrame, drawn: U8) -> float:
+    """How much worse than the model a picture is one pixel out of place: its change by pixel over the model's
+    error, root mean squares over tissue. Squared, it is the ratio of what either adds to the error."""
+    _, picture, where = _sampled(frame.camera, frame.picture(), frame.sure_tissue > 0)
+    beside = frame.picture()[LOOKED_AT // 2 :: LOOKED_AT, LOOKED_AT // 2 + 1 :: LOOKED_AT]
+    _, model, _ = _sampled(frame.camera, drawn, frame.mask)
+    where = where[:, : beside.shape[1]]
+    change, error = (
+        np.square(picture[:, : where.shape[1]][where].astype(f4) - other[:, : where.shape[1]][where]).sum()
+        for other in (beside, model)
+    )
+    return float(np.sqrt(change / max(error, f4(1))))
 
 
 def _in_light_of(drawn: U8, picture: U8, where: Bool) -> U8:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.config.schema import Box, PoseWay
-from sags_node.detail.memory import Memory
+from sags_node.detail.memory import Matched, Memory
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
@@ -172,7 +172,8 @@ class Measurer:
         self._on_picture = on_picture
         self._rigid = RigidOdometry()
         self._earlier: deque[_Before] = deque(maxlen=PREDICTED)  # the latest first
-        self._detail, self._memory = Detail(Lessons()) if detail else None, Memory()
+        self._detail = Detail(Lessons()) if detail else None
+        self._memory, self._matched = Memory(), Matched()
         self._held: _HeldOut | None = None
         self._aside = aside
 
@@ -259,7 +260,7 @@ class Measurer:
         if self._detail is None or len(self.rows) % LESSON_EVERY:
             return
         if now.right is not None:
-            self._detail.learn_aside(now.lent, now.right, now.shown.baseline)
+            self._detail.learn_aside(now.lent, now.shown.snapshot, now.right, now.shown.baseline)
         if self._earlier:
             before = self._earlier[0]
             expected = extrapolated(before.shown.snapshot, now.seconds - before.seconds)
@@ -269,8 +270,9 @@ class Measurer:
         """A frame as it lends its picture to views of other moments."""
         snapshot, left, camera = shown.snapshot, pair.left, shown.snapshot.camera
         lent = SeenFrame(
-            pair.t_capture_ns, camera, snapshot.gaussians, lambda: left, shown.tissue, shown.depth
-        )
+            pair.t_capture_ns, camera, snapshot.gaussians, lambda: left, shown.tissue, shown.depth,
+            self._matched(pair.t_capture_ns, shown.depth, shown.measured_depth),
+        )  # fmt: skip
         if self._detail is None:
             return lent
         whole = self._detail.left(shown.rgb, shown.depth, camera, lent, self._memory.frames)

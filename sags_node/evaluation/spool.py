@@ -17,6 +17,7 @@ import numpy as np
 
 from sags_node.errors import SagsError
 from sags_node.findings import NOTHING, Findings, by_code
+from sags_node.messaging import published
 from sags_node.processes import resident_mb
 from sags_node.types import (
     F32,
@@ -144,7 +145,9 @@ class Spool:
             view.rgb,
             view.depth,
             np.full_like(view.depth, np.nan) if view.confidence is None else view.confidence,
-            result.views["right"].rgb if "right" in result.views else np.empty(0, np.uint8),
+            published.colours(result.pair, result.views["right"])
+            if "right" in result.views
+            else np.empty(0, np.uint8),
             *(_NO_FORECAST if forecast is None else _forecast_arrays(forecast)),
         )
         try:

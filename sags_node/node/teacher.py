@@ -44,7 +44,7 @@ class Teacher:
                 self._detail.learn_ahead(seen, gaussians_ahead(snapshot, seconds), now)
         pair = scene.pair
         if aside and pair.right is not None and self._scenes % LESSON_EVERY == 2:
-            self._detail.learn_aside(now, published.picture(pair, "right"), pair.baseline)
+            self._detail.learn_aside(now, scene.snapshot, published.picture(pair, "right"), pair.baseline)
 
     def detail(
         self, scene: FrameResult, seen: Sequence[SeenFrame], gaussians: Gaussians, view: RenderedView,

@@ -11,13 +11,14 @@ from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 
 from sags_node.confidence import HALVING, confidence_of
 from sags_node.config.schema import LaunchConfig
-from sags_node.detail.memory import Memory
+from sags_node.detail.memory import Matched, Memory
 from sags_node.detail.seen import SeenFrame
-from sags_node.detail.show import Detail, Lessons
+from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
 from sags_node.mapping.anchors import Anchors
@@ -127,8 +128,8 @@ class Pipeline:
             self.mapper = Mapper(self._refiner, self.map, unhurried=unhurried)
         self._surface = SurfaceTracker(unhurried)
         self._detail = Detail(Lessons()) if config.publish.detail else None
-        self._memory = Memory()
-        self._right = RightView()
+        self._memory, self._matched = Memory(), Matched()
+        self._right, self._right_views = RightView(), 0
         self._camera: CameraTracker | PoseRefiner | None = None  # None: its pose is given, or fixed
         if vision.pose == "estimate":
             self._camera = CameraTracker(self.map, self._surface, self._draw_model)
@@ -258,9 +259,9 @@ class Pipeline:
         # Then draw what consumers watch: the right eye, and their anchors.
         with clock("render"):
             self._lend(mapped, pair, observation, judged)
-            views = {"left": self._left_eye(mapped.view, pair, request.left)}
+            views = {"left": self._left_eye(mapped.view, pair, request.left or right)}
             if right:
-                views["right"] = self._right_eye(mapped, observation, seen, judged, by_both)
+                views["right"] = self._right_eye(mapped, observation, pair, seen, judged, by_both)
         if not still:  # which tells nothing of what a moving frame costs
             budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
         with clock("anchors"):
@@ -392,6 +393,7 @@ class Pipeline:
         now = SeenFrame(
             pair.t_capture_ns, observation.camera, mapped.snapshot.gaussians,
             partial(published.picture, pair, "left"), observation.tissue, mapped.view.depth,
+            self._matched(pair.t_capture_ns, mapped.view.depth, observation.depth),
         )  # fmt: skip
         self.seen = now, *self._memory.frames
         self._memory.add(now)
@@ -408,17 +410,30 @@ class Pipeline:
         return replace(view, shown=shown)
 
     def _right_eye(
-        self, mapped: Mapped, observation: Observation, seen: RectifiedPair, judged: Judgement, by_both: Bool
-    ) -> RenderedView:
+        self, mapped: Mapped, observation: Observation, pair: RectifiedPair, seen: RectifiedPair,
+        judged: Judgement, by_both: Bool,
+    ) -> RenderedView:  # fmt: skip
         """The model drawn for the right eye, which is learnt from where both see tissue."""
         last, stamp = self.newest, mapped.view.t_capture_ns
         if last is not None and "right" in last.views and last.views["left"].colours is mapped.view.colours:
             return replace(last.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
-        drawn = self._right.draw(mapped, observation, seen.left, self._refiner.show, judged.learn)
+        view, baseline = self._right.draw(mapped, observation.baseline, self._refiner.show), pair.baseline
+        rgb = view.rgb
+        if self._detail is not None and self.seen:
+            now, gaussians = self.seen[0], mapped.snapshot.gaussians
+            camera = replace(published.camera_of(pair), T_world_cam=view.camera.T_world_cam)
+            drawn = view.colours.at(camera.width, camera.height)
+            tint = self._detail.tint(mapped.snapshot, gaussians, camera)
+            shown = self._detail.view(drawn, view.depth, camera, gaussians, now, baseline, tint=tint)
+            view = replace(view, shown=shown)
+            rgb = cv2.resize(shown.rgb, rgb.shape[1::-1], interpolation=cv2.INTER_AREA)
+            self._right_views += 1
+            if self._right_views % LESSON_EVERY == 0:
+                self._detail.learn_aside(now, mapped.snapshot, published.picture(pair, "right"), baseline)
         assert seen.right is not None  # else nothing is drawn for it
         sure = by_both if judged.learn and not judged.no_stereo else np.zeros_like(by_both)
-        self._right.learn(drawn, self.map.model, seen.right, sure, observation.baseline)
-        return drawn.view
+        self._right.learn(view, rgb, mapped, self.map.model, seen.right, sure, baseline)
+        return view
 
     def _skipped(self, measured: Measured) -> dict[str, str]:
         """What was left out of a frame that was mapped, and why."""

@@ -9,7 +9,7 @@ import pytest
 from places import SESSION
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
-from sags_node.detail.memory import EVERY, MOST, OLDEST, Memory, hidden_source
+from sags_node.detail.memory import EVERY, MATCHED, MOST, OLDEST, Matched, Memory, hidden_source
 from sags_node.detail.motion import gaussians_at
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.detail.share import Share
@@ -124,6 +124,26 @@ def test_moved_tissue_is_looked_up_where_it_was() -> None:
     shown, taken = carried(source.depth, CAMERA, source, motion)
     assert np.abs(shown[:, 4:].astype(int) - source.picture()[:, 1:-3]).max() <= 1
     assert not taken[:, :2].any()
+
+
+def test_from_aside_the_surface_is_where_stereo_saw_it() -> None:
+    """The model has the tissue at 100 mm, stereo at 102, but for a column of which it says nothing."""
+    drawn, measured = np.full((HEIGHT, WIDTH), 0.1, np.float32), np.full((HEIGHT, WIDTH), 0.102, np.float32)
+    measured[:, 30] = 0
+    source, camera = replace(seen(), matched=(drawn, measured)), CAMERA.moved_right(10 * 0.102 / FOCAL)
+    shown, taken = carried(drawn, camera, source)
+    assert np.abs(shown[:, :-14].astype(int) - source.picture()[:, 10:-4]).max() <= 1
+    assert (taken[:, :-14] == 255).all()
+
+
+def test_what_stereo_saw_counts_for_a_moment() -> None:
+    matched, drawn = Matched(), np.ones((2, 2), np.float32)
+    assert matched(0, drawn, 0 * drawn) is None
+    for later_ns in (0, int(0.9e9 * MATCHED)):
+        found = matched(later_ns, drawn * (1 + later_ns), 1.01 * drawn * (later_ns == 0))
+        assert found is not None and (found[0] == 1).all() and (found[1] > 1).all()
+    assert matched(int(1.1e9 * MATCHED), drawn, 0 * drawn) is None
+    assert matched(-1, drawn, 0 * drawn) is None  # clocks are set back
 
 
 def test_what_is_carried_is_in_the_light_of_the_view() -> None:
