@@ -58,14 +58,15 @@ def measure_peak(threads: int) -> Peak:
     before = numba.get_num_threads()
     configure_threads(threads)
     try:
-        return Peak(threads, _multiply_adds_per_second(threads), {size: _bytes_per_second(size, threads) for size in TRIAD_BYTES})
+        operations = _multiply_adds_per_second(threads)
+        return Peak(threads, operations, {size: _bytes_per_second(size, threads) for size in TRIAD_BYTES})
     finally:
         numba.set_num_threads(before)
 
 
 @kernel
 def run_chains(first: float, rounds: int) -> float:
-    """CHAINS chains x -> x / 2 + `first`, chain k from k on, so many rounds; the first lane's sum over them."""
+    """Compute rounds of CHAINS chains x -> x / 2 + `first`, chain k from k on; the sum of one lane."""
     half, addend = spread(f4(0.5)), spread(f4(first))
     a, b, c, d = spread(f4(0)), spread(f4(1)), spread(f4(2)), spread(f4(3))
     e, f, g, h = spread(f4(4)), spread(f4(5)), spread(f4(6)), spread(f4(7))
