@@ -131,10 +131,10 @@ def find_in_both(board: Board, name: str, left: U8, right: U8) -> StereoView | N
     ids, of_left, of_right = np.intersect1d(in_left.ids, in_right.ids, return_indices=True)
     if len(ids) < FEWEST_CORNERS:
         return None
-    right = in_right.corners[of_right]
+    first, second = in_left.corners[of_left], in_right.corners[of_right]
     if isinstance(board, Chessboard):
-        right = turned_like(right, in_left.corners)
-    return StereoView(name, ids, in_left.corners[of_left], right)
+        second = turned_like(second, first)
+    return StereoView(name, ids, first, second)
 
 
 def turned_like(corners: F32, others: F32) -> F32:

@@ -65,7 +65,7 @@ def measure_peak(threads: int) -> Peak:
 
 
 @kernel
-def run_chains(first: float, rounds: int) -> float:
+def run_chains(first: Any, rounds: int) -> Any:
     """Compute rounds of CHAINS chains x -> x / 2 + `first`, chain k from k on; the sum of one lane."""
     half, addend = spread(f4(0.5)), spread(f4(first))
     a, b, c, d = spread(f4(0)), spread(f4(1)), spread(f4(2)), spread(f4(3))
