@@ -75,7 +75,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
                 if stop.is_set():
                     raise KeyboardInterrupt
             except BaseException:
-                _end(overlay)
+                end(overlay, grace=OVERLAY_STOP)  # it closes its video, and is not waited for until its end
                 raise
             finally:
                 node.stop()
@@ -126,11 +126,6 @@ def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str], stop: t
     while not ready.exists() and overlay.poll() is None and time.monotonic() < deadline:
         if stop.wait(0.02):
             return
-
-
-def _end(overlay: subprocess.Popen[str]) -> None:
-    """Let it close its video, but do not wait until it has played to its end."""
-    end(overlay, grace=OVERLAY_STOP)
 
 
 def _finish_overlay(overlay: subprocess.Popen[str]) -> dict[str, Any]:

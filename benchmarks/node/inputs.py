@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.node.processes import children, cpu_seconds
 from sags_node.client import FrameSender
 from sags_node.config.schema import GeometryConfig, GstSource, PushSource, Ros2Source, RosGraph
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE
-from sags_node.processes import children, cpu_seconds
 from sags_node.ros.graph import Graph
 from sags_node.sources.push import PushedPictures
 from sags_node.sources.source import Source, open_source

@@ -30,6 +30,7 @@ from rich.table import Table
 from benchmarks.node import neighbours
 from benchmarks.node.crowd import Advance, node_beside
 from benchmarks.node.endurance import SIGNIFICANT, slope, trends
+from benchmarks.node.processes import descriptors, threads
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import psnr
 from sags_node.evaluation.provenance import machine_name
@@ -38,7 +39,7 @@ from sags_node.messaging.received import ReceivedImage, TopicName
 from sags_node.messaging.stream import listen
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, Meta
-from sags_node.processes import descriptors, end, resident_mb, threads
+from sags_node.processes import end, resident_mb
 
 EACH_FRAME = "tf"  # the smallest topic that is sent with every frame
 HIGH_WATER = 1000  # frames may wait while a picture is compared

@@ -131,21 +131,17 @@ def find_in_both(board: Board, name: str, left: U8, right: U8) -> StereoView | N
     ids, of_left, of_right = np.intersect1d(in_left.ids, in_right.ids, return_indices=True)
     if len(ids) < FEWEST_CORNERS:
         return None
-    view = StereoView(name, ids, in_left.corners[of_left], in_right.corners[of_right])
-    return _same_way_up(view) if isinstance(board, Chessboard) else view
+    first, second = in_left.corners[of_left], in_right.corners[of_right]
+    if isinstance(board, Chessboard):
+        second = turned_like(second, first)
+    return StereoView(name, ids, first, second)
 
 
-def _same_way_up(view: StereoView) -> StereoView:
-    """A chessboard may look the same upside down: the right eye's corners run as the left eye's do."""
-    diagonals = view.left[-1] - view.left[0], view.right[-1] - view.right[0]
-    if float(diagonals[0] @ diagonals[1]) > 0:
-        return view
-    return StereoView(view.name, view.ids, view.left, view.right[::-1])
-
-
-def turned(view: StereoView) -> StereoView:
-    """A chessboard seen whole, its corners counted from the other end."""
-    return StereoView(view.name, view.ids, view.left[::-1], view.right[::-1])
+def turned_like(corners: F32, others: F32) -> F32:
+    """The corners [n, 2] of a chessboard seen whole, counted from that end from which the others are: it may
+    look the same upside down."""
+    alike = float((corners[-1] - corners[0]) @ (others[-1] - others[0])) > 0
+    return corners if alike else corners[::-1]
 
 
 def _grid(inner: tuple[int, int], square: float) -> F32:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from sags_node.calibration.boards import Board, Chessboard, StereoView, find_in_both, turned
+from sags_node.calibration.boards import Board, Chessboard, StereoView, find_in_both, turned_like
 from sags_node.calibration.hand_eye_solve import HandEyeSolution, solve_hand_eye
 from sags_node.config.schema import BagRobot, LaunchConfig, RecordedSource
 from sags_node.errors import SagsError, UsageError
@@ -59,19 +60,15 @@ def calibrate_hand_eye(
                 raise UsageError("the session has no right eye; hand-eye calibration uses both")
             view = find_in_both(board, str(frame.frame_id), frame.left, frame.right)
             if view is not None:
-                upside_down = isinstance(board, Chessboard) and views and not _alike(view, views[0])
-                views.append(turned(view) if upside_down else view)
+                if views and isinstance(board, Chessboard):
+                    left = turned_like(view.left, views[0].left)
+                    view = replace(view, left=left, right=turned_like(view.right, left))
+                views.append(view)
                 stamps.append(frame.t_device_ns)
             progress(number + 1, opened.frame_count or number + 1)
     if not views:
         raise SagsError("the board is seen in no frame; check --board, --squares, light and focus")
     return solve_hand_eye(views, stamps, board.points, rig, pose_at)
-
-
-def _alike(view: StereoView, other: StereoView) -> bool:
-    """Whether the corners of a chessboard run the same way: the scope is not turned by half a turn."""
-    diagonals = view.left[-1] - view.left[0], other.left[-1] - other.left[0]
-    return float(diagonals[0] @ diagonals[1]) > 0
 
 
 def summarise_hand_eye(solution: HandEyeSolution) -> dict[str, Any]:

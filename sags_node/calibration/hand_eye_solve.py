@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -25,9 +26,8 @@ FEWEST_VIEWS = 10
 LARGEST_OFFSET_NS = 500_000_000
 OFFSET_STEP_NS = 10_000_000
 MOST_PAIRS = 400  # of views, whose relative turns are compared
-SEPARATED = 12  # parameters besides the offset
-STEP = 1e-6  # m and rad, of a numeric derivative
-TIME_STEP = 1e-3  # s, of a numeric derivative: between two poses motion is straight
+# Of a numeric derivative: m and rad; and s, between two poses motion is straight.
+STEPS = np.array([1e-6] * 12 + [1e-3])
 ROUNDS = 30
 UNSURE = (0.005, np.radians(1.0))  # m, rad: beyond it the motion does not tell enough
 LEAST_TURN = np.radians(0.5)  # root mean square: a board's turn is seen to a tenth of it
@@ -60,6 +60,7 @@ def solve_hand_eye(
     Raises:
         SagsError: there are too few views with poses, the scope was not turned enough, or nothing fits.
     """
+    pose_at = cache(pose_at)  # steps that leave the offset ask again
     boards = np.stack([_board_pose(view, points, rig) for view in views])
     offset = _coarse_offset(boards, stamps, pose_at)
     known = [i for i, stamp in enumerate(stamps) if _around(pose_at, stamp + offset)]
@@ -185,6 +186,7 @@ def _linear(hands: F64, boards: F64) -> F64:
     return X
 
 
+@dataclass(frozen=True, slots=True)
 class _Residuals:
     """How far all corners are from where the parameters put them, px, left eye and right eye.
 
@@ -192,35 +194,31 @@ class _Residuals:
     offset's difference from the first one, s.
     """
 
-    def __init__(
-        self, views: Sequence[StereoView], stamps: Sequence[int], points: F32, rig: StereoRig,
-        pose_at: PoseAt, X: F64, Z: F64, offset: int,
-    ) -> None:  # fmt: skip
-        self._views, self._stamps, self._points, self._rig = views, stamps, points, rig
-        self._pose_at, self._X, self._Z, self._offset = pose_at, X, Z, offset
-        self._hands: tuple[int, list[F64 | None]] = offset, self._hands_at(offset)  # most calls share them
-
-    def _hands_at(self, offset: int) -> list[F64 | None]:
-        return [self._pose_at(stamp + offset) for stamp in self._stamps]
+    views: Sequence[StereoView]
+    stamps: Sequence[int]
+    points: F32
+    rig: StereoRig
+    pose_at: PoseAt
+    X: F64  # where the search begins: camera to hand, board to base, and the offset, ns
+    Z: F64
+    offset: int
 
     def unpacked(self, parameters: F64) -> tuple[F64, F64, int]:
-        X, Z = self._X @ _rigid(parameters[:6]), self._Z @ _rigid(parameters[6:12])
-        return X, Z, self._offset + round(parameters[12] * 1e9)
+        X, Z = self.X @ _rigid(parameters[:6]), self.Z @ _rigid(parameters[6:12])
+        return X, Z, self.offset + round(parameters[12] * 1e9)
 
     def __call__(self, parameters: F64) -> F64:
         X, Z, offset = self.unpacked(parameters)
         eye_base, parts = invert(X), []
-        if self._hands[0] != offset:
-            self._hands = offset, self._hands_at(offset)
-        T_right_left = self._rig.T_right_left
-        for view, hand in zip(self._views, self._hands[1], strict=True):
+        for view, stamp in zip(self.views, self.stamps, strict=True):
+            hand = self.pose_at(stamp + offset)
             if hand is None:  # the search has left what is known: no place for it
-                return np.full(sum(4 * len(view.ids) for view in self._views), 1e3)
+                return np.full(sum(4 * len(view.ids) for view in self.views), 1e3)
             left = eye_base @ invert(hand) @ Z
-            points = self._points[view.ids].astype(np.float64)
+            points = self.points[view.ids].astype(np.float64)
             for eye, T, seen in (
-                (self._rig.left, left, view.left),
-                (self._rig.right, T_right_left @ left, view.right),
+                (self.rig.left, left, view.left),
+                (self.rig.right, self.rig.T_right_left @ left, view.right),
             ):
                 drawn, _ = cv2.projectPoints(points, T[:3, :3], T[:3, 3], eye.K, eye.distortion)
                 parts.append((drawn.reshape(-1, 2) - seen).ravel())
@@ -229,25 +227,24 @@ class _Residuals:
 
 def _least_squares(residuals: _Residuals) -> tuple[F64, F64, float]:
     """Levenberg and Marquardt: parameters [13], their covariance for residuals of 1 px, residuals' spread."""
-    parameters, damping = np.zeros(SEPARATED + 1), 1e-3
+    parameters, damping = np.zeros(len(STEPS)), 1e-3
     now = residuals(parameters)
-    steps = np.full(SEPARATED + 1, STEP)
-    steps[12] = TIME_STEP
     for _ in range(ROUNDS):
         J = np.stack(
-            [(residuals(parameters + d) - residuals(parameters - d)) / (2 * d.sum()) for d in np.diag(steps)],
+            [(residuals(parameters + d) - residuals(parameters - d)) / (2 * d.sum()) for d in np.diag(STEPS)],
             1,
         )
-        normal, gradient = J.T @ J, J.T @ now
+        normal = J.T @ J
         while damping < 1e9:
-            change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -gradient)
+            change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -J.T @ now)
             then = residuals(parameters + change)
-            if then @ then <= now @ now:
+            gain = now @ now - then @ then
+            if gain >= 0:
                 break
             damping *= 10
-        if damping >= 1e9:
+        else:
             break
-        converged = now @ now - then @ then < 1e-9 * (now @ now)
+        converged = gain < 1e-9 * (now @ now)
         parameters, now, damping = parameters + change, then, damping * 0.1
         if converged:
             break

@@ -58,8 +58,9 @@ reading_options = group_of(  # for forms of calibration that leave something out
         help="Picture size, for forms that do not say it; default: the pictures'.",
     ),
     click.option(
-        "--unit",
+        *("--unit", "metres"),
         type=click.Choice(list(UNITS)),
+        callback=lambda ctx, option, unit: UNITS.get(unit or ""),
         help="Of lengths in the files; default: mm for text matrices, else m.",
     ),
 )
@@ -104,7 +105,7 @@ def check(
     session: Path | None,
     images: tuple[tuple[Path, Path], ...],
     size: tuple[int, int] | None,
-    unit: str | None,
+    metres: float | None,
     json_out: bool,
 ) -> None:
     """Look over a calibration for what usually goes wrong.
@@ -128,7 +129,6 @@ def check(
     if stray is not None:
         raise UsageError(f"'{stray}': one calibration at a time; pictures come after --images or --session")
     with progress("comparing") as advance:
-        metres = UNITS.get(unit or "")
         findings = check_calibration(path, session, images, overrides_only, size, metres, advance)
     rows = [asdict(finding) for finding in findings]
     show_findings(rows, json_out, f"{path} cannot be used as it is")
@@ -141,7 +141,7 @@ def check(
 @click.option("--scale", type=positive, default=1.0, help="Of pictures that are resized after calibration.")
 @force_option
 def convert(
-    path: Path, out: Path, size: tuple[int, int] | None, unit: str | None, scale: float, force: bool
+    path: Path, out: Path, size: tuple[int, int] | None, metres: float | None, scale: float, force: bool
 ) -> None:
     """Write any known calibration as left.yaml and right.yaml.
 
@@ -157,7 +157,6 @@ def convert(
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
-    metres = UNITS.get(unit or "")
     rig = resized_rig(read_calibration(path, size, metres), scale)
     refuse_errors(check_rig(rig, metres), path)
     check_files(*eye_files(out), force=force)

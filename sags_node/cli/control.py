@@ -160,13 +160,10 @@ def set_parameters(overrides: tuple[str, ...], json_out: bool, node: NodeAddress
     for word in overrides:
         if ":=" not in word:
             raise UsageError(f"'{word}' is not an override; write key:=value, e.g. mapping.budget_ms:=25")
-    said = {key: parse_yaml(value, f"the value of {key}:=") for key, _, value in map(_parts, overrides)}
+    pairs = (word.split(":=", 1) for word in overrides)
+    said = {key: parse_yaml(value, f"the value of {key}:=") for key, value in pairs}
     ask(node, "set_parameters", said)
     show(said if json_out else ", ".join(word.replace(":=", " is ", 1) for word in overrides))
-
-
-def _parts(override: str) -> tuple[str, str, str]:
-    return override.partition(":=")
 
 
 # ---- pause, resume, reset --------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any, TypeVar, get_args
@@ -85,8 +85,7 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         if recording is not None:
             tree = recording
         else:
-            tree = _read_yaml(file)
-            _resolve_paths(tree, file.parent)
+            tree = _resolved(_read_yaml(file), file.parent)
     for override in overrides:
         _apply_override(tree, override)
     try:
@@ -127,26 +126,34 @@ def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
     return tree
 
 
-def written_in(
-    folder: Path, tree: Mapping[str, Any], path_keys: frozenset[str] = _PATH_KEYS
-) -> dict[str, Any]:
+def written_in(folder: Path, tree: Mapping[str, Any]) -> dict[str, Any]:
     """What a launch file in this folder must say to be read as this tree: paths from there if they lie below
     it, else from the root, and $$ for each $."""
+    here = folder.resolve()
 
-    def said(key: str, value: Any) -> Any:
+    def written(key: str, text: str, is_path: bool) -> str:
+        if is_path:
+            path = Path(text).resolve()
+            text = str(path.relative_to(here) if path.is_relative_to(here) else path)
+        return text.replace("$", "$$")
+
+    return _with_texts(tree, written)
+
+
+def _with_texts(
+    tree: Mapping[str, Any], change: Callable[[str, str, bool], str], path_keys: frozenset[str] = _PATH_KEYS
+) -> dict[str, Any]:
+    """A tree with every text in it changed: `change` gets its key, the text, and whether it is a path."""
+
+    def changed(key: str, value: Any) -> Any:
         if isinstance(value, dict):
-            is_live = key == "source" and value.get("kind") in _LIVE_PATHS
-            return written_in(folder, value, _LIVE_PATHS[value["kind"]] if is_live else path_keys)
+            live = _LIVE_PATHS.get(str(value.get("kind"))) if key == "source" else None
+            return _with_texts(value, change, path_keys if live is None else live)
         if isinstance(value, list):
-            return [said(key, item) for item in value]
-        if not isinstance(value, str):
-            return value
-        if key in path_keys:
-            path, here = Path(value).resolve(), folder.resolve()
-            value = str(path.relative_to(here) if path.is_relative_to(here) else path)
-        return value.replace("$", "$$")
+            return [changed(key, item) for item in value]
+        return change(key, value, key in path_keys) if isinstance(value, str) else value
 
-    return {key: said(key, value) for key, value in tree.items()}
+    return {key: changed(key, value) for key, value in tree.items()}
 
 
 def section_of(kind: type[S], overrides: Sequence[str]) -> S:
@@ -230,34 +237,22 @@ def _read_yaml(file: Path) -> dict[str, Any]:
     return tree
 
 
-def _resolve_paths(tree: dict[str, Any], folder: Path, path_keys: frozenset[str] = _PATH_KEYS) -> None:
-    """Expand variables in every string and make `path_keys` relative to the launch file."""
+def _resolved(tree: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The tree with variables in every text expanded, and paths relative to the launch file."""
     variables = {"SAGS_DATA": str((folder / ".." / DEFAULT_DATA).resolve()), **os.environ}
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            is_live = key == "source" and value.get("kind") in _LIVE_PATHS
-            _resolve_paths(value, folder, _LIVE_PATHS[value["kind"]] if is_live else path_keys)
-        elif isinstance(value, str):
-            tree[key] = _resolve(key, value, folder, variables, path_keys)
-        elif isinstance(value, list):
-            tree[key] = [
-                _resolve(key, item, folder, variables, path_keys) if isinstance(item, str) else item
-                for item in value
-            ]
 
+    def resolved(key: str, text: str, is_path: bool) -> str:
+        template = Template(text)
+        unset = [name for name in template.get_identifiers() if name not in variables]
+        if unset and is_path:
+            raise UsageError(
+                f"{key}: {text} uses a variable that is not set; export {unset[0]} first, or write $$ where "
+                "a name has a $"
+            )
+        expanded = template.safe_substitute(variables)
+        return str(folder / expanded) if is_path else expanded
 
-def _resolve(
-    key: str, value: str, folder: Path, variables: Mapping[str, str], path_keys: frozenset[str]
-) -> str:
-    template = Template(value)
-    unset = [name for name in template.get_identifiers() if name not in variables]
-    if unset and key in path_keys:
-        raise UsageError(
-            f"{key}: {value} uses a variable that is not set; export {unset[0]} first, or write $$ where a "
-            "name has a $"
-        )
-    expanded = template.safe_substitute(variables)
-    return str(folder / expanded) if key in path_keys else expanded
+    return _with_texts(tree, resolved)
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:

@@ -29,11 +29,12 @@ from sags_node.importing.timing import LOOKED_AT, Timing
 from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
 from sags_node.rig import read_rig
 from sags_node.sources.endonerf import is_published
-from sags_node.sources.pictures import size_text
+from sags_node.sources.pictures import list_pictures, size_text
 from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source, recorded_rig
 from sags_node.sources.videos import VideoPairs
+from sags_node.types import U8
 from sags_node.vision.rectify import Rectifier
 
 MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
@@ -121,15 +122,15 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
 
     def look() -> list[Finding]:
         found = pictures.check_numbers({"left": left_folder, "right": contents.right})
-        left = pictures.sample(left_folder)
-        right = [] if contents.right is None else pictures.sample(contents.right)
+        left = _some(left_folder)
+        right = [] if contents.right is None else _some(contents.right)
         found += pictures.check_both(left, right) if right else pictures.check_eye("left", left)
         if contents.depth is not None:
             source = None if contents.config is None else contents.config.source
             clip = source if isinstance(source, EndoNerfSource) else None
             unit = None if clip is None else clip.depth_unit
             stated = clip is not None and clip.depth_unit == 1e-3 and is_published(clip)
-            size = left[0][1].shape[1], left[0][1].shape[0]
+            size = left[0].shape[1], left[0].shape[0]
             found += as_warnings(pictures.check_depth(contents.depth, size, unit, stated))
         return found
 
@@ -140,9 +141,13 @@ def _in_one_folder(folder: Path) -> list[Finding]:
     """Where the names tell the eyes both are looked at, else what there is."""
     apart = both_eyes(folder)
     if not apart:
-        return pictures.check_eye("pictures", pictures.sample(folder))
-    left, right = (pictures.read_some([pair[eye] for pair in apart]) for eye in (0, 1))
+        return pictures.check_eye("pictures", _some(folder))
+    left, right = (pictures.read_some([pair[eye] for pair in apart]).values() for eye in (0, 1))
     return pictures.check_both(left, right)
+
+
+def _some(folder: Path) -> list[U8]:
+    return list(pictures.read_some(list_pictures(folder)).values())
 
 
 def played(config: LaunchConfig) -> list[Finding]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,8 +62,8 @@ def recognise(folder: Path) -> Contents:
             return Contents("a session whose launch.yaml is wrong", str(error), "error")
     else:
         return _playable(folder, config)
-    for is_one, what, instead in _KNOWN:
-        if is_one(folder):
+    for needed, what, instead in _KNOWN:
+        if all(any(any(folder.glob(pattern)) for pattern in one_of) for one_of in needed):
             return Contents(what, instead, "error")
     return _plain(folder)
 
@@ -175,45 +175,27 @@ def override(key: str, path: Path | str) -> str:
     return f"{key}:={json.dumps(str(path))}"
 
 
-def _is_stereomis(folder: Path) -> bool:
-    return (folder / "groundtruth.txt").is_file() and (folder / "StereoCalibration.ini").is_file()
-
-
-def _is_stereomis_tracking(folder: Path) -> bool:
-    return any(folder.glob("track_pts.*"))
-
-
-def _is_d4d(folder: Path) -> bool:
-    depths = ("", "*/", "*/*/")
-    return (folder / "left_images_rect").is_dir() or any(
-        any(folder.glob(f"{depth}clips/*/left_images_rect")) for depth in depths
-    )
-
-
-def _is_stir(folder: Path) -> bool:
-    return any(folder.glob("left*/seq*/segmentation")) or any(folder.glob("*/left*/seq*/segmentation"))
-
-
-_KNOWN: tuple[tuple[Callable[[Path], bool], str, str], ...] = (  # data sets that are not played as they are
+_KNOWN: tuple[tuple[tuple[tuple[str, ...], ...], str, str], ...] = (
+    # Data sets that are not played as they are: of each group of patterns one is there.
     (
-        _is_stereomis_tracking,
+        (("track_pts.*",),),
         "a sequence of StereoMIS-Tracking",
         "sags eval --protocol stereomis FOLDER follows its points (docs/evaluation.md)",
     ),
     (
-        _is_d4d,
+        (("left_images_rect", *(f"{depth}clips/*/left_images_rect" for depth in ("", "*/", "*/*/"))),),
         "clips of D4D",
         "sags eval --protocol d4d FOLDER measures them; to play one, give its left_images_rect and "
         "right_images_rect as source.kind folders (docs/evaluation.md)",
     ),
     (
-        _is_stereomis,
+        (("groundtruth.txt",), ("StereoCalibration.ini",)),
         "a sequence of StereoMIS",
         "sags eval --protocol stereomis FOLDER measures it; to play it, write a launch file with "
         "source.geometry.layout over_under (docs/evaluation.md)",
     ),
     (
-        _is_stir,
+        (("left*/seq*/segmentation", "*/left*/seq*/segmentation"),),
         "sequences of STIR",
         "sags eval --protocol stir FOLDER measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
         "are source.kind videos (docs/evaluation.md)",

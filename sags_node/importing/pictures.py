@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -44,17 +44,8 @@ def check_numbers(named: Mapping[str, Path | None]) -> list[Finding]:
     return found or [Finding("ok", f"{said} pictures each, numbered without gaps")]
 
 
-def sample(folder: Path, flags: int = cv2.IMREAD_COLOR) -> list[tuple[Path, U8]]:
-    """Some pictures of a folder, see `read_some`.
-
-    Raises:
-        SagsError: one cannot be read.
-    """
-    return read_some(list_pictures(folder), flags)
-
-
-def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> list[tuple[Path, U8]]:
-    """Pictures spread over the files. The last and the smallest one are read too: there copies break off.
+def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path, U8]:
+    """Read pictures spread over the files, also the last and the smallest one: there copies break off.
 
     Raises:
         SagsError: one cannot be read.
@@ -63,16 +54,16 @@ def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> list[tupl
     suspects = {files[-1], min(files, key=lambda file: file.stat().st_size)} - chosen
     for file in suspects:
         read_picture(file, flags)
-    return [(file, read_picture(file, flags)) for file in files if file in chosen]
+    return {file: read_picture(file, flags) for file in files if file in chosen}
 
 
-def check_eye(what: str, pictures: Sequence[tuple[Path, U8]]) -> list[Finding]:
-    """Of one eye's pictures: sizes, black borders, interlacing."""
-    sizes = {picture.shape[1::-1] for _, picture in pictures}
+def check_eye(what: str, pictures: Collection[U8]) -> list[Finding]:
+    """Look at one eye's pictures [H, W, 3] RGB: sizes, black borders, interlacing."""
+    sizes = {picture.shape[1::-1] for picture in pictures}
     if len(sizes) > 1:
         said = " and ".join(size_text(*size) for size in sorted(sizes))
         return [Finding("error", f"{what}: pictures of {said} px", "all pictures must have one size")]
-    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for _, picture in pictures]
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
     found = []
     x, y, width, height = lit_box(np.max(gray, axis=0))
     if (width, height) != gray[0].shape[::-1]:
@@ -110,9 +101,9 @@ def lit_box(brightest: U8) -> tuple[int, int, int, int]:
     return int(left), int(top), int(width - left - right), int(height - top - bottom)
 
 
-def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]) -> list[Finding]:
+def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
     """Of both eyes without a calibration: are they in order, and are rows aligned?"""
-    pairs = [(a, b) for (_, a), (_, b) in zip(left, right, strict=False) if a.shape == b.shape]
+    pairs = [(a, b) for a, b in zip(left, right, strict=False) if a.shape == b.shape]
     if not pairs:
         return [Finding("error", "the eyes' pictures have not one size", "resize both eyes alike")]
     matches = np.concatenate([match_eyes(a, b) for a, b in pairs])
@@ -134,7 +125,7 @@ def check_eyes(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]
     return [Finding("ok" if aligned else "warning", what, fix, figures)]
 
 
-def check_both(left: Sequence[tuple[Path, U8]], right: Sequence[tuple[Path, U8]]) -> list[Finding]:
+def check_both(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
     """Look at each eye, and at how they belong together."""
     return [*check_eye("left", left), *check_eye("right", right), *check_eyes(left, right)]
 
@@ -154,7 +145,7 @@ def check_depth(
 ) -> list[Finding]:
     """Kind, size and unit (m per count) of depth pictures; `stated`: whoever made them says that unit."""
     medians = []
-    for file, depth in sample(folder, cv2.IMREAD_UNCHANGED):
+    for file, depth in read_some(list_pictures(folder), cv2.IMREAD_UNCHANGED).items():
         if (wrong := _no_depth(file, depth, size)) is not None:
             return [wrong]
         known: Bool = depth > 0

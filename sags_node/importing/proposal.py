@@ -118,8 +118,7 @@ def _opened(config: LaunchConfig) -> list[Finding]:
 def _looked_at(config: LaunchConfig) -> list[Finding]:
     """What some of its pictures show, spread over it."""
     pairs, _ = pairs_of_session(config)
-    left, right = ([(Path(), np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
-    return pictures.check_both(left, right)
+    return pictures.check_both(*zip(*pairs, strict=True))
 
 
 def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str, str]]:

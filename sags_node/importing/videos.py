@@ -44,7 +44,8 @@ class Way(NamedTuple):
 
 
 def _halves(picture: U8, axis: int = 1) -> tuple[U8, U8]:
-    first, second = np.array_split(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2], 2, axis)
+    even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+    first, second = map(np.ascontiguousarray, np.array_split(even, 2, axis))
     return first, second
 
 
@@ -55,7 +56,7 @@ def _quarters(picture: U8) -> tuple[tuple[U8, U8], tuple[U8, U8]]:
 
 def _fields(picture: U8) -> tuple[U8, U8]:
     rows = picture.shape[0] // 2 * 2
-    return picture[0:rows:2], picture[1:rows:2]
+    return np.ascontiguousarray(picture[0:rows:2]), np.ascontiguousarray(picture[1:rows:2])
 
 
 _WAYS = (  # a part before the whole: what is found in the one is found in the other, too
@@ -77,9 +78,7 @@ def look(files: tuple[Path, ...]) -> list[Finding]:
     if len(files) == 1:
         return found + _one(files[0], _some(files[0]))
     with closing(VideoPairs(files[0], files[1], Layout(GeometryConfig()))) as pairs:
-        looked = _some_pairs(pairs)
-    left, right = ([(file, pair[eye]) for pair in looked] for eye, file in enumerate(files))
-    return [*found, *pictures.check_both(left, right)]
+        return [*found, *pictures.check_both(*zip(*_some_pairs(pairs), strict=True))]
 
 
 def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
@@ -92,7 +91,7 @@ def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
     launch = "source.kind:=videos", override("source.left", files[0])
     if len(files) == 2:
         return *launch, override("source.right", files[1])
-    shown = [picture for _, picture in _some(files[0])]
+    shown = _some(files[0])
     way = way_of(shown)
     if way is None:
         raise UsageError(f"{files[0]}: {ONE_EYE}; {_both_needed(files[0])}")
@@ -114,9 +113,8 @@ def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
     height, width = shown[0].shape[:2]
     if way.layout == "panes":
         return f"{LAYOUT}panes", *(box.format(w=width // 2, h=height // 2) for box in PANES)
-    pairs = [way.eyes(picture) for picture in shown]
-    left, right = ([(Path(), np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
-    fixes = [fix for finding in pictures.check_eyes(left, right) for fix in finding.launch]
+    eyes = zip(*map(way.eyes, shown), strict=True)
+    fixes = [fix for finding in pictures.check_eyes(*eyes) for fix in finding.launch]
     return f"{LAYOUT}{way.layout}", *fixes
 
 
@@ -160,7 +158,7 @@ def check_ends(pairs: VideoPairs, needed: int) -> list[Finding]:
     return [Finding("warning", what, fix)]
 
 
-def _some(file: Path) -> list[tuple[Path, U8]]:
+def _some(file: Path) -> list[U8]:
     """Pictures spread over a video, RGB."""
     with closing(Video(file)) as video:
         found = []
@@ -168,7 +166,7 @@ def _some(file: Path) -> list[tuple[Path, U8]]:
             with suppress(LostPictureError):  # it is left out while playing, too
                 picture = video.read(number)
                 if picture is not None:  # else it is said where the video ends, as while it is played
-                    found.append((file, picture))
+                    found.append(picture)
         return found
 
 
@@ -189,16 +187,13 @@ def _spread(count: int) -> list[int]:
     return sorted({round(at) for at in np.linspace(0, count - 1, LOOKED_AT)})
 
 
-def _one(file: Path, shown: list[tuple[Path, U8]]) -> list[Finding]:
-    whole = [picture for _, picture in shown]
-    size = size_text(*whole[0].shape[1::-1])
-    way = way_of(whole)
+def _one(file: Path, shown: list[U8]) -> list[Finding]:
+    size = size_text(*shown[0].shape[1::-1])
+    way = way_of(shown)
     if way is None:
         found = Finding("error", f"{size} px: {ONE_EYE}", _both_needed(file))
         return [found, *pictures.check_eye("video", shown)]
-    pairs = [way.eyes(picture) for picture in whole]
-    left, right = ([(file, np.ascontiguousarray(pair[eye])) for pair in pairs] for eye in (0, 1))
-    looked = pictures.check_both(left, right)
+    looked = pictures.check_both(*zip(*map(way.eyes, shown), strict=True))
     if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
     layout = Layout(GeometryConfig(layout="separate" if way.layout == "panes" else way.layout))
@@ -219,7 +214,7 @@ def _both_needed(file: Path) -> str:
 
 def _are_eyes(pairs: Sequence[tuple[U8, U8]]) -> bool:
     """Whether pictures match as two eyes do: in the same rows, and in other columns."""
-    matches = np.concatenate([match_eyes(*(np.ascontiguousarray(eye) for eye in pair)) for pair in pairs])
+    matches = np.concatenate([match_eyes(*pair) for pair in pairs])
     if len(matches) < pictures.FEWEST_MATCHES:
         return False
     along = np.abs(matches[:, 1] - matches[:, 3]) <= ROWS * pairs[0][0].shape[1]

@@ -14,25 +14,19 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from sags_node.kernels.jit import aligned, kernel, parallel_kernel
 from sags_node.kernels.threads import configure_threads
+from sags_node.kernels.vectors import LANES, multiply_add, smallest_lane, spread
 
 F32 = NDArray[np.float32]
 f4 = np.float32
 CHAINS = 12  # independent sums: more than latency times issue width, and they fit into 16 registers
-STEPS = 8  # multiply-adds per chain and round
-ROUNDS = 100_000
+ROUNDS = 800_000
 MIB = 1 << 20
 TRIAD_BYTES = (6 * MIB, 24 * MIB, 192 * MIB)  # of three arrays together; the last is beyond the caches
 REPEATS = 15
-
-_I64, _I32, _FLOAT = ir.IntType(64), ir.IntType(32), ir.FloatType()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,85 +58,38 @@ def measure_peak(threads: int) -> Peak:
     before = numba.get_num_threads()
     configure_threads(threads)
     try:
-        operations = max(_multiply_adds_per_second(lanes, run, threads) for lanes, run in RUNS.items())
+        operations = _multiply_adds_per_second(threads)
         return Peak(threads, operations, {size: _bytes_per_second(size, threads) for size in TRIAD_BYTES})
     finally:
         numba.set_num_threads(before)
 
 
-def _make_chains(lanes: int) -> Any:
-    """`chains(seed, rounds)`: CHAINS * STEPS vector multiply-adds of `lanes` floats per round.
-
-    Written as LLVM vectors, so that the width does not hang on what the vectoriser decides.
-    """
-    vector = ir.VectorType(_FLOAT, lanes)
-
-    def chains(typing_context: Any, seed: Any, rounds: Any) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            undefined = ir.Constant(vector, ir.Undefined)
-            first = builder.insert_element(undefined, args[0], ir.Constant(_I32, 0))
-            addend = builder.shuffle_vector(
-                first, undefined, ir.Constant(ir.VectorType(_I32, lanes), [0] * lanes)
-            )
-            factor = ir.Constant(vector, [0.5] * lanes)
-            fma_type = ir.FunctionType(vector, [vector] * 3)
-            fma = cgutils.get_or_insert_function(builder.module, fma_type, f"llvm.fma.v{lanes}f32")
-            before = builder.block
-            body, after = builder.append_basic_block("round"), builder.append_basic_block("finished")
-            builder.branch(body)
-            builder.position_at_end(body)
-            counter = builder.phi(_I64)
-            sums = [builder.phi(vector) for _ in range(CHAINS)]
-            values = sums
-            for _ in range(STEPS):
-                values = [builder.call(fma, [value, factor, addend]) for value in values]
-            counted = builder.add(counter, ir.Constant(_I64, 1))
-            builder.cbranch(builder.icmp_signed("<", counted, args[1]), body, after)
-            counter.add_incoming(ir.Constant(_I64, 0), before)
-            counter.add_incoming(counted, body)
-            for start, (entering, leaving) in enumerate(zip(sums, values, strict=True)):
-                entering.add_incoming(ir.Constant(vector, [float(start)] * lanes), before)
-                entering.add_incoming(leaving, body)
-            builder.position_at_end(after)
-            total = values[0]
-            for value in values[1:]:
-                total = builder.fadd(total, value)
-            return builder.extract_element(total, ir.Constant(_I32, 0))
-
-        return types.float32(types.float32, types.int64), generate
-
-    return intrinsic(chains)
-
-
-_chains_of_4, _chains_of_8, _chains_of_16 = (_make_chains(lanes) for lanes in (4, 8, 16))
+@kernel
+def run_chains(first: Any, rounds: int) -> Any:
+    """Compute rounds of CHAINS chains x -> x / 2 + `first`, chain k from k on; the sum of one lane."""
+    half, addend = spread(f4(0.5)), spread(f4(first))
+    a, b, c, d = spread(f4(0)), spread(f4(1)), spread(f4(2)), spread(f4(3))
+    e, f, g, h = spread(f4(4)), spread(f4(5)), spread(f4(6)), spread(f4(7))
+    i, j, k, m = spread(f4(8)), spread(f4(9)), spread(f4(10)), spread(f4(11))
+    for _ in range(rounds):
+        a, b = multiply_add(a, half, addend), multiply_add(b, half, addend)
+        c, d = multiply_add(c, half, addend), multiply_add(d, half, addend)
+        e, f = multiply_add(e, half, addend), multiply_add(f, half, addend)
+        g, h = multiply_add(g, half, addend), multiply_add(h, half, addend)
+        i, j = multiply_add(i, half, addend), multiply_add(j, half, addend)
+        k, m = multiply_add(k, half, addend), multiply_add(m, half, addend)
+    return smallest_lane(a + b + c + d + e + f + g + h + i + j + k + m)
 
 
 @parallel_kernel
-def _run_chains_of_4(results: F32, rounds: int) -> None:
+def _run_chains(results: F32, rounds: int) -> None:
     for worker in numba.prange(results.size):
-        results[worker] = _chains_of_4(f4(worker), rounds)
+        results[worker] = run_chains(f4(worker), rounds)
 
 
-@parallel_kernel
-def _run_chains_of_8(results: F32, rounds: int) -> None:
-    for worker in numba.prange(results.size):
-        results[worker] = _chains_of_8(f4(worker), rounds)
-
-
-@parallel_kernel
-def _run_chains_of_16(results: F32, rounds: int) -> None:
-    for worker in numba.prange(results.size):
-        results[worker] = _chains_of_16(f4(worker), rounds)
-
-
-# By lanes. A processor's own vector width is the fastest; a wider one is cut into pieces.
-RUNS = {4: _run_chains_of_4, 8: _run_chains_of_8, 16: _run_chains_of_16}
-
-
-def _multiply_adds_per_second(lanes: int, run: Callable[[F32, int], None], threads: int) -> float:
+def _multiply_adds_per_second(threads: int) -> float:
     results = np.empty(threads, np.float32)
-    seconds = _shortest(lambda: run(results, ROUNDS))
-    return threads * ROUNDS * CHAINS * STEPS * lanes / seconds
+    return threads * ROUNDS * CHAINS * LANES / _shortest(lambda: _run_chains(results, ROUNDS))
 
 
 @kernel

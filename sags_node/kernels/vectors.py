@@ -99,28 +99,26 @@ def _spread(builder: Any, value: Any) -> Any:
 
 def _vectors(builder: Any, kinds: Sequence[Any], values: Sequence[Any]) -> list[Any]:
     pairs = zip(kinds, values, strict=True)
-    return [value if kind is vector else _spread(builder, value) for kind, value in pairs]
+    return [_spread(builder, value) if kind == types.float32 else value for kind, value in pairs]
 
 
-def _define(function: Any, result: Any, generate: Generate) -> None:
-    """Let kernels apply an operator of Python to two vectors, or to a vector and a float32."""
+def _define(function: Any, result: Any, operands: Sequence[tuple[Any, ...]], generate: Generate) -> None:
+    """Let kernels apply an operator of Python to operands of these types."""
 
     @infer_global(function)
     class _Typing(AbstractTemplate):  # type: ignore[misc]  # Numba has no types
         def generic(self, args: Any, kws: Any) -> Any:
-            if len(args) == 2 and vector in args and all(a in (vector, types.float32) for a in args):
-                return signature(result, *args)
-            return None
+            return signature(result, *args) if tuple(args) in operands else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return generate(builder, _vectors(builder, sig.args, args))
 
-    for kinds in ((Vector, Vector), (Vector, types.Float), (types.Float, Vector)):
+    for kinds in operands:
         lower_builtin(function, *kinds)(lower)
 
 
-def _arithmetic(name: str) -> Generate:
-    return lambda builder, values: getattr(builder, name)(*values, flags=_FLAGS)
+def _arithmetic(name: str, **flags: Any) -> Generate:
+    return lambda builder, values: getattr(builder, name)(*values, **flags)
 
 
 def _comparison(sign: str) -> Generate:
@@ -129,47 +127,25 @@ def _comparison(sign: str) -> Generate:
     return lambda builder, values: getattr(builder, ordered)(sign, *values, flags=_FLAGS)
 
 
+_TWO = ((vector, vector), (vector, types.float32), (types.float32, vector))
 for _function, _in_place, _name in (
     (operator.add, operator.iadd, "fadd"),
     (operator.sub, operator.isub, "fsub"),
     (operator.mul, operator.imul, "fmul"),
     (operator.truediv, operator.itruediv, "fdiv"),
 ):
-    _define(_function, vector, _arithmetic(_name))
-    _define(_in_place, vector, _arithmetic(_name))
+    for _either in (_function, _in_place):
+        _define(_either, vector, _TWO, _arithmetic(_name, flags=_FLAGS))
 for _function, _sign in (
     (operator.gt, ">"), (operator.ge, ">="), (operator.lt, "<"), (operator.le, "<="), (operator.eq, "=="),
     (operator.ne, "!="),
 ):  # fmt: skip
-    _define(_function, mask, _comparison(_sign))
-
-
-def _define_on_masks(function: Any, name: str) -> None:
-    @infer_global(function)
-    class _Typing(AbstractTemplate):  # type: ignore[misc]  # Numba has no types
-        def generic(self, args: Any, kws: Any) -> Any:
-            return signature(mask, mask, mask) if tuple(args) == (mask, mask) else None
-
-    @lower_builtin(function, Mask, Mask)
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return getattr(builder, name)(*args)
-
-
+    _define(_function, mask, _TWO, _comparison(_sign))
 for _function, _name in (
     (operator.and_, "and_"), (operator.iand, "and_"), (operator.or_, "or_"), (operator.ior, "or_"),
 ):  # fmt: skip
-    _define_on_masks(_function, _name)
-
-
-@infer_global(operator.neg)
-class _NegationTyping(AbstractTemplate):  # type: ignore[misc]  # Numba has no types
-    def generic(self, args: Any, kws: Any) -> Any:
-        return signature(vector, vector) if tuple(args) == (vector,) else None
-
-
-@lower_builtin(operator.neg, Vector)
-def _negate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.fneg(args[0])
+    _define(_function, mask, ((mask, mask),), _arithmetic(_name))
+_define(operator.neg, vector, ((vector,),), _arithmetic("fneg"))
 
 
 @intrinsic
@@ -308,46 +284,31 @@ def _address(context: Any, builder: Any, sig: Any, args: Any, k: int, kind: Any 
     return builder.bitcast(builder.gep(data, [index]), kind.as_pointer())
 
 
-@intrinsic
-def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """The vector at array[index] of a flat float32 array; both must be aligned to a whole vector."""
+def _make_load(align: int) -> Any:
+    def load(typing_context: Any, array: Any, index: Any) -> Any:
+        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return builder.load(_address(context, builder, sig, args, 0, _FLOATS), align=align)
 
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_address(context, builder, sig, args, 0, _FLOATS), align=4 * LANES)
+        return vector(array, index), generate
 
-    return vector(array, index), generate
-
-
-@intrinsic
-def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write a vector to array[index]; aligned as for `load`."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _address(context, builder, sig, args, 0, _FLOATS), align=4 * LANES)
-        return context.get_dummy_value()
-
-    return types.void(array, index, vector), generate
+    return intrinsic(load)
 
 
-@intrinsic
-def load_anywhere(typing_context: Any, array: Any, index: Any) -> Any:
-    """The vector that starts at array[index], counted through all dimensions, without regard to alignment."""
+def _make_store(align: int) -> Any:
+    def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
+        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            builder.store(args[2], _address(context, builder, sig, args, 0, _FLOATS), align=align)
+            return context.get_dummy_value()
 
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_address(context, builder, sig, args, 0, _FLOATS), align=4)
+        return types.void(array, index, vector), generate
 
-    return vector(array, index), generate
+    return intrinsic(store)
 
 
-@intrinsic
-def store_anywhere(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write a vector to where `load_anywhere` reads it."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        builder.store(args[2], _address(context, builder, sig, args, 0, _FLOATS), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, index, vector), generate
+# The vector at array[index] of a flat float32 array, read and written; both aligned to a whole vector.
+load, store = _make_load(4 * LANES), _make_store(4 * LANES)
+# The vector that starts at array[index], counted through all dimensions, without regard to alignment.
+load_anywhere, store_anywhere = _make_load(4), _make_store(4)
 
 
 @intrinsic

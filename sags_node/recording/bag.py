@@ -9,11 +9,10 @@ from __future__ import annotations
 import shlex
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
@@ -274,10 +273,7 @@ def _damage_as_one_error() -> Iterator[None]:
 
 def _unpacked(message: BagMessage) -> BagMessage:
     """The message of a bag whose messages are compressed one by one."""
-    try:
-        data = zstandard.ZstdDecompressor().stream_reader(message.data).read(MAX_RECORD_BYTES + 1)
-    except zstandard.ZstdError as error:
-        raise DamagedError(0, f"a message on {message.topic} cannot be unpacked: {error}") from None
+    data = mcap_file.unpack(message.data, b"zstd", MAX_RECORD_BYTES, 0)
     if len(data) > MAX_RECORD_BYTES:
         raise DamagedError(0, f"a message on {message.topic} unpacks to more than 256 MB")
-    return BagMessage(message.topic, message.type, message.log_ns, message.publish_ns, message.sequence, data)
+    return replace(message, data=data)

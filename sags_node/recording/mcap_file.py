@@ -6,6 +6,7 @@ Format: https://mcap.dev/spec. A file is magic, records, magic; a record is an o
 
 from __future__ import annotations
 
+import bz2
 import struct
 import zlib
 from collections.abc import Iterator
@@ -164,6 +165,33 @@ def chunk_is_consistent(content: bytes | memoryview) -> bool:
     return bool(struct.unpack_from("<Q", content, data)[0] == len(content) - data - 8)
 
 
+def unpack(packed: bytes | memoryview, compression: bytes, size: int, position: int) -> bytes:
+    """The data of a chunk, and at most one byte more than the `size` that it says.
+
+    Args:
+        compression: lz4, zstd, bz2 (of ROS 1), or nothing.
+        position: of the chunk in the file, for messages.
+
+    Raises:
+        DamagedError: it says more than any chunk may hold, or cannot be unpacked.
+    """
+    if size > MAX_CHUNK_BYTES:
+        raise DamagedError(position, f"a chunk says that it unpacks to {size} bytes; at most 256 MB is read")
+    try:
+        match compression:
+            case b"":
+                return bytes(packed)
+            case b"zstd":
+                return bytes(zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1))
+            case b"lz4":
+                return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
+            case b"bz2":
+                return bz2.BZ2Decompressor().decompress(packed, max_length=size + 1)
+    except (zstandard.ZstdError, RuntimeError, OSError, EOFError) as error:
+        raise DamagedError(position, f"a chunk cannot be unpacked: {error}") from None
+    raise DamagedError(position, f"a chunk of unknown compression {compression!r}")
+
+
 def unpack_chunk(content: bytes, position: int, whole: bool = True) -> bytes:
     """The records of a chunk, decompressed and checked.
 
@@ -179,19 +207,7 @@ def unpack_chunk(content: bytes, position: int, whole: bool = True) -> bytes:
     _, _, size, crc, named = _CHUNK.unpack_from(content)
     compression = content[_CHUNK.size : _CHUNK.size + named]
     packed = memoryview(content)[_CHUNK.size + named + 8 :]
-    if size > MAX_CHUNK_BYTES:
-        raise DamagedError(position, f"a chunk says that it unpacks to {size} bytes; at most 256 MB is read")
-    try:
-        if compression == b"":
-            data = bytes(packed)
-        elif compression == b"zstd":
-            data = zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1)
-        elif compression == b"lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-        else:
-            raise DamagedError(position, f"a chunk of unknown compression {compression!r}")
-    except (zstandard.ZstdError, RuntimeError) as error:
-        raise DamagedError(position, f"a chunk cannot be unpacked: {error}") from None
+    data = unpack(packed, bytes(compression), size, position)
     if whole and len(data) != size:
         raise DamagedError(position, f"a chunk does not unpack to the {size} bytes it says")
     if whole and crc and zlib.crc32(data) != crc:

@@ -27,6 +27,12 @@ JPEG_QUALITY = 92
 _COMPRESSIBLE = ("rgb8", "rgba8", "mono8")
 
 
+def is_latched(name: str, ns: str) -> bool:
+    """Whether late subscribers of a node `ns` get the last message of a topic, too."""
+    known = topics.BY_NAME.get(name.removeprefix(f"{ns}/"))
+    return known is not None and known.cached
+
+
 class MessageWriter:
     """Writes messages as they came into a new bag.
 
@@ -74,9 +80,8 @@ class MessageWriter:
         self.bag.write(self._channels[key], arrived.received_ns, meta.stamp_ns, meta.seq, data)
 
     def _announce(self, name: str, kind: str, relative: bool) -> int:
-        known = topics.BY_NAME.get(name.removeprefix(f"{self._ns}/"))
         schema = Schema(id=0, name=kind, encoding="ros2msg", data=cdr.definition(kind).encode())
-        latched = known is not None and known.cached
+        latched = is_latched(name, self._ns)
         return self.bag.add_topic(f"/{name}", kind, schema, cdr.type_hash(kind), latched, relative)
 
     def _attach(self, arrived: Arrived) -> None:

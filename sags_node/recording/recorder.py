@@ -26,7 +26,7 @@ from sags_node.messaging.freshness import Freshness
 from sags_node.messaging.stream import listen_to
 from sags_node.recording.backlog import Arrived, Backlog, Ring
 from sags_node.recording.bag_writer import NO_LIMITS, Limits
-from sags_node.recording.message_writer import Compression, MessageWriter
+from sags_node.recording.message_writer import Compression, MessageWriter, is_latched
 
 log = logging.getLogger(__name__)
 
@@ -226,7 +226,8 @@ class Recorder:
             tell({"recording": str(self._options.folder)})
             for arrived in chain((first,), messages):
                 if arrived is not None:
-                    for pushed_out in ring.add(arrived, self._is_latched(arrived)):
+                    latched = is_latched(arrived.message.topic, self._options.node.ns)
+                    for pushed_out in ring.add(arrived, latched):
                         self._topics[pushed_out.message.topic].dropped += 1
                 if self._snapshot_wanted.is_set():
                     self._snapshot_wanted.clear()
@@ -240,10 +241,6 @@ class Recorder:
 
     def _snapshot(self, number: int) -> Path:
         return self._options.folder / f"snapshot_{number:03d}"
-
-    def _is_latched(self, arrived: Arrived) -> bool:
-        known = topics.BY_NAME.get(arrived.message.topic.removeprefix(f"{self._options.node.ns}/"))
-        return known is not None and known.cached
 
     def _save(self, folder: Path, messages: list[Arrived], tell: Tell) -> None:
         """A thread for each snapshot, so that receiving goes on. One that fails ends nothing: what the ring

@@ -5,16 +5,13 @@ Format: http://wiki.ros.org/Bags/Format/2.0. A record is header length, header f
 
 from __future__ import annotations
 
-import bz2
 import struct
 from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame
-
 from sags_node.files import open_file
-from sags_node.recording.mcap_file import MAX_CHUNK_BYTES, MAX_RECORD_BYTES, DamagedError
+from sags_node.recording.mcap_file import MAX_RECORD_BYTES, DamagedError, unpack
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES = 1 << 20
@@ -77,22 +74,11 @@ def _fields(header: bytes, position: int) -> dict[bytes, bytes]:
 
 def check_chunk(bag: BinaryIO, length: int, fields: dict[bytes, bytes], position: int) -> None:
     """The packed data is unpacked once here, with a limit that the reader itself does not have."""
-    said = fields.get(b"size", b"")
-    size = int(_LENGTH.unpack(said)[0]) if len(said) == _LENGTH.size else MAX_CHUNK_BYTES + 1
-    if size > MAX_CHUNK_BYTES:
-        raise DamagedError(position, "a chunk says that it unpacks to more than 256 MB, or does not say")
-    compression = fields.get(b"compression")
-    if compression == b"none":
-        return
-    packed = bag.read(length)
-    try:
-        if compression == b"bz2":
-            data = bz2.BZ2Decompressor().decompress(packed, max_length=size + 1)
-        elif compression == b"lz4":
-            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-        else:
-            raise DamagedError(position, f"a chunk of unknown compression {compression!r}")
-    except (OSError, RuntimeError, EOFError) as error:
-        raise DamagedError(position, f"a chunk cannot be unpacked: {error}") from None
-    if len(data) != size:
+    said, compression = fields.get(b"size", b""), fields.get(b"compression", b"")
+    if len(said) != _LENGTH.size:
+        raise DamagedError(position, "a chunk does not say its size")
+    (size,) = _LENGTH.unpack(said)
+    packed = bag.read(0 if compression == b"none" else length)
+    data = unpack(packed, compression.replace(b"none", b""), size, position)
+    if compression != b"none" and len(data) != size:
         raise DamagedError(position, f"a chunk does not unpack to the {size} bytes it says")

@@ -1,24 +1,65 @@
-"""One door for every form of stereo calibration."""
+"""One door for every form of stereo calibration: ROS files (`ros`), OpenCV's own, folders of scikit-surgery.
+
+OpenCV's (`cv2.FileStorage`, YAML or XML) are `intrinsics.yml` and `extrinsics.yml` as its sample stereo_calib
+writes them, or one file with all matrices under the names that are in use. They do not say the unit of T.
+
+Scikit-surgery's are text: `<prefix>.left.intrinsics.txt`, `.left.distortion.txt`, the same for the right eye,
+and `<prefix>.l2r.txt` [4, 4] from left to right camera coordinates, mm.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
+from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from sags_node.config.yaml_reader import check_dialect
 from sags_node.errors import UsageError
-from sags_node.files import near
-from sags_node.rig import matrices, ros
+from sags_node.files import near, open_file
+from sags_node.rig import ros
 from sags_node.rig.check import accept_rig
-from sags_node.rig.rig import rectified_rig
-from sags_node.types import StereoRig
+from sags_node.rig.rig import fit_distortion, rectified_rig, rectify_eyes
+from sags_node.types import F64, StereoRig
 
 NOMINAL_BASELINE = 0.005  # m, of one camera alone, and of eyes that nobody has calibrated
 GUESSED_FOV = 60.0  # degrees across a picture: D4D has 58, the Hamlyn heart 44, da Vinci's scopes 60 to 70
 ARCHIVE = "calibrationdata.tar.gz"
 ARCHIVE_SUFFIXES = (".tar.gz", ".tgz")
+LARGEST_MATRIX = 64  # numbers
+DISTORTION = (4, 5, 8, 12, 14)
+COUNTS = {  # numbers of each matrix
+    "M1": (9,), "M2": (9,), "D1": DISTORTION, "D2": DISTORTION, "R": (9,), "T": (3,), "l2r": (16,),
+    "R1": (9,), "R2": (9,), "P1": (12,), "P2": (12,),
+}  # fmt: skip
+STARTS = (b"%YAML:", b"%YAML 1", b"<?xml", b"<opencv_storage")
+SUFFIXES = (".yml", ".yaml", ".xml")
+NAMES = {  # in OpenCV's files
+    "M1": ("M1", "K1", "KL", "cameraMatrix1", "cameraMatrixL", "camera_matrix_1", "left_camera_matrix"),
+    "M2": ("M2", "K2", "KR", "cameraMatrix2", "cameraMatrixR", "camera_matrix_2", "right_camera_matrix"),
+    "D1": ("D1", "DL", "distCoeffs1", "distCoeffsL", "dist_coeffs_1", "left_distortion_coefficients"),
+    "D2": ("D2", "DR", "distCoeffs2", "distCoeffsR", "dist_coeffs_2", "right_distortion_coefficients"),
+    "T": ("T", "t"),
+}
+OTHER_MODELS = ("fisheye", "equidist", "kannala", "omni", "unified", "doublesphere", "scaramuzza", "ocam")
+SHORT_MODELS = ("mei", "kb", "kb4", "kb8", "ucm", "eucm", "ds", "fov", "ftheta")
+MEI = ("xi", "xi1", "xi2")  # what only that model has
+DEEPEST = 3  # sections within sections that are looked through
+SIZES = (("image_width", "image_height"), ("imageWidth", "imageHeight"), ("width", "height"))
+SIZE_LISTS = ("imageSize", "image_size")
+MILLIMETRE = 1e-3
+PATTERNS = {  # of text files
+    "M1": "*left.intrinsic*.txt",
+    "D1": "*left.distortion*.txt",
+    "M2": "*right.intrinsic*.txt",
+    "D2": "*right.distortion*.txt",
+    "l2r": "*l2r*",
+}
 
 
 class Form(Enum):
@@ -80,11 +121,11 @@ def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | No
     if form is Form.ROS_ARCHIVE:
         return with_unit(ros.read_archive(path / ARCHIVE if path.is_dir() else path), metres)
     if form is Form.OPENCV_PAIR:
-        return matrices.read_files(matrices.pair_in(folder), folder.resolve().name, size, metres)
+        return read_files(pair_in(folder), folder.resolve().name, size, metres)
     if form is Form.OPENCV_FILE:
-        return matrices.read_files([path], path.stem, size, metres)
+        return read_files([path], path.stem, size, metres)
     if form is Form.TEXT_FOLDER:
-        return matrices.read_text_folder(folder, size, metres)
+        return read_text_folder(folder, size, metres)
     raise UsageError(unknown_form(path))
 
 
@@ -103,12 +144,12 @@ def find_form(path: Path) -> Form | None:
         return Form.ROS_FOLDER
     if path.name.endswith(ARCHIVE_SUFFIXES) or (is_folder and (folder / ARCHIVE).is_file()):
         return Form.ROS_ARCHIVE
-    pair = matrices.pair_in(folder)
+    pair = pair_in(folder)
     if path in pair or (is_folder and pair):
         return Form.OPENCV_PAIR
-    if matrices.is_opencv(path):
+    if is_opencv(path):
         return Form.OPENCV_FILE
-    if is_folder and matrices.is_text_folder(folder):
+    if is_folder and is_text_folder(folder):
         return Form.TEXT_FOLDER
     return None
 
@@ -120,3 +161,211 @@ def unknown_form(path: Path) -> str:
         return f"{what}; {near(path)}"
     looked_for = "; ".join(form.value for form in Form)
     return f"{path} is no calibration; looked for: {looked_for}"
+
+
+# ---- two cameras and how they stand to each other ---------------------------------------------------------
+
+
+def _rig(
+    matrix: Callable[[str], F64], name: str, where: str, size: tuple[int, int] | None, R: F64, T: F64
+) -> StereoRig:
+    """The rig of M1 D1 M2 D2, which `matrix` reads, and of R [3, 3] and T [3] m."""
+    K = matrix("M1").reshape(3, 3), matrix("M2").reshape(3, 3)
+    left, right = (fit_distortion(matrix(key), f"{where}: {key}") for key in ("D1", "D2"))
+    if size is None:
+        raise UsageError(
+            f"{where} does not say the size of the pictures: give --size WxH; for a launch file "
+            "convert it first (sags calib convert)"
+        )
+    return rectify_eyes(name, size, K, (left, right), R, T)
+
+
+# ---- text ------------------------------------------------------------------------------------------------
+
+
+def is_text_folder(folder: Path) -> bool:
+    return any(folder.glob(PATTERNS["M1"]))
+
+
+def read_text_folder(folder: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+    """The rig in a folder of text matrices, named after the folder.
+
+    Args:
+        size: width and height of the pictures, px: the files do not say it.
+        metres: per unit of the translation; default: millimetres.
+
+    Raises:
+        UsageError: a file is missing, double or malformed, or the size is not given.
+    """
+    l2r = _text_matrix(folder, "l2r").reshape(4, 4)
+    T = l2r[:3, 3] * (metres or MILLIMETRE)
+    matrix = partial(_text_matrix, folder)
+    return _rig(matrix, folder.resolve().name, str(folder), size, l2r[:3, :3], T)
+
+
+def _text_matrix(folder: Path, key: str) -> F64:
+    """The numbers of one file, as one row."""
+    files = sorted(folder.glob(PATTERNS[key]))
+    if len(files) != 1:
+        found = ", ".join(file.name for file in files) or "none"
+        raise UsageError(f"{folder}: one file {PATTERNS[key]} is needed, found: {found}")
+    file = files[0]
+    try:
+        text = ros.content_of(file).decode("utf-8")
+        numbers = np.array(text.replace(",", " ").split(), np.float64)
+    except ValueError:  # also of what is not UTF-8
+        raise UsageError(f"{file} holds something else than numbers; save it again") from None
+    if len(numbers) not in COUNTS[key]:
+        raise UsageError(f"{file} holds {len(numbers)} numbers, not {_needed(key)}; save it again")
+    return numbers
+
+
+def _needed(key: str) -> str:
+    return " or ".join(map(str, COUNTS[key]))
+
+
+# ---- OpenCV ----------------------------------------------------------------------------------------------
+
+
+def is_opencv(file: Path) -> bool:
+    """Whether a file looks like one of `cv2.FileStorage`."""
+    if file.suffix.lower() not in SUFFIXES or not file.is_file():
+        return False
+    with open_file(file) as opened:
+        return opened.read(64).lstrip().startswith(STARTS)
+
+
+def pair_in(folder: Path) -> list[Path]:
+    """The sample's `intrinsics` and `extrinsics` files of a folder, those that are there."""
+    names = [folder / f"{stem}{suffix}" for stem in ("intrinsics", "extrinsics") for suffix in SUFFIXES]
+    return [file for file in names if file.is_file()]
+
+
+def read_files(
+    files: Sequence[Path], name: str, size: tuple[int, int] | None, metres: float | None
+) -> StereoRig:
+    """The rig in files that together hold M1 D1 M2 D2 R T, or these under other usual names.
+
+    R1 R2 P1 P2, if they are there, are kept: what was rectified with them elsewhere looks the same here.
+
+    Args:
+        size: width and height of the pictures, px, where the files do not say it.
+        metres: per unit of T; default 1.
+
+    Raises:
+        UsageError: a file cannot be read, a matrix is missing or malformed, or the size is not known.
+    """
+    storages = [(file, open_storage(file)) for file in files]
+    for file, storage in storages:
+        _refuse_other_models(file, storage.root())
+    where = " and ".join(map(str, files))
+    matrix = partial(_matrix, storages)
+    size, T = _size(storages) or size, matrix("T") * (metres or 1.0)
+    rig = _rig(matrix, name, where, size, matrix("R").reshape(3, 3), T)
+    if not all(_find(storages, key) for key in ("R1", "R2", "P1", "P2")):
+        return rig
+    eyes = []
+    for eye, R_key, P_key in ((rig.left, "R1", "P1"), (rig.right, "R2", "P2")):
+        P = matrix(P_key).reshape(3, 4) * [1.0, 1.0, 1.0, metres or 1.0]
+        eyes.append(replace(eye, R=matrix(R_key).reshape(3, 3), P=P))
+    return StereoRig(name, *eyes)
+
+
+def _refuse_other_models(file: Path, node: cv2.FileNode, depth: int = 0) -> None:
+    """Raises UsageError for a file that says that it is of another lens model: its matrices look the same."""
+    for key in node.keys() if node.isMap() and depth < DEEPEST else ():
+        value, name = node.getNode(key), _plain(key)
+        said = value.string() if value.isString() else f"{value.real():g}"
+        other = any(word in _plain(said) for word in OTHER_MODELS) or _plain(said) in SHORT_MODELS
+        flag = ("fisheye" in name or name in MEI) and _plain(said) not in ("", "0", "false", "no")
+        if flag or (other and any(word in name for word in ("model", "type"))):
+            fix = "calibrate with 'plumb_bob' or 'rational_polynomial' (sags calib stereo)"
+            raise UsageError(f"{file}: {key}: {said} is not supported; {fix}")
+        _refuse_other_models(file, value, depth + 1)
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[^a-z0-9.]", "", text.lower())
+
+
+Storages = Sequence[tuple[Path, cv2.FileStorage]]
+
+
+def open_storage(file: Path) -> cv2.FileStorage:
+    """A file of matrices.
+
+    Raises:
+        UsageError: it is missing, too large, or not written by OpenCV.
+    """
+    try:
+        text = ros.content_of(file).decode("utf-8")
+        directive, _, document = text.partition("\n")
+        if directive.startswith("%YAML"):  # of two keys OpenCV takes the first
+            check_dialect(document, str(file))
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        has_names = storage.root().isMap()
+    except (UnicodeDecodeError, cv2.error, SystemError):
+        raise UsageError(f"{file} is not a YAML or XML file as OpenCV writes it; save it again") from None
+    if not has_names:
+        raise UsageError(f"{file} holds no matrices with names; save it again")
+    return storage
+
+
+def _find(storages: Storages, key: str) -> tuple[Path, cv2.FileNode] | None:
+    for name in NAMES.get(key, (key,)):
+        for file, storage in storages:
+            node = storage.getNode(name)
+            if not node.empty():
+                return file, node
+    return None
+
+
+def _matrix(storages: Storages, key: str) -> F64:
+    """The numbers of one matrix, as one row."""
+    found = _find(storages, key)
+    if found is None:
+        names = ", ".join(NAMES.get(key, (key,)))
+        where = " and ".join(str(file) for file, _ in storages)
+        raise UsageError(f"{where}: looked for a matrix named {names}; a stereo calibration needs it")
+    file, node = found
+    numbers = numbers_in(node)
+    if numbers is None or numbers.size not in COUNTS[key]:
+        what = f"{node.name()} is not a matrix of {_needed(key)} numbers"
+        raise UsageError(f"{file}: {what}; save the file again")
+    return numbers
+
+
+def numbers_in(node: cv2.FileNode) -> F64 | None:
+    """The numbers of a matrix or list, as one row; None: it is neither, or too large for a calibration."""
+    if node.isSeq():
+        return np.array([node.at(index).real() for index in range(min(node.size(), LARGEST_MATRIX))])
+    if not node.isMap():
+        return None
+    sizes = node.getNode("sizes")  # of one dimension, since OpenCV 5
+    of_one = sizes.at(0).real() if sizes.isSeq() and sizes.size() == 1 else 0.0
+    claimed = of_one or node.getNode("rows").real() * node.getNode("cols").real()
+    if not 0 < claimed <= LARGEST_MATRIX:  # what is claimed is what OpenCV makes room for
+        return None
+    try:
+        matrix = node.mat()
+    except cv2.error:  # fewer numbers than it has rows and columns
+        return None
+    return None if matrix is None else np.asarray(matrix, np.float64).ravel()
+
+
+def _size(storages: Storages) -> tuple[int, int] | None:
+    for key in SIZE_LISTS:
+        found = _find(storages, key)
+        numbers = None if found is None else numbers_in(found[1])
+        if numbers is not None and len(numbers) == 2:
+            return _pixels(numbers[0]), _pixels(numbers[1])
+    for names in SIZES:
+        width, height = (_find(storages, name) for name in names)
+        if width is not None and height is not None:
+            return _pixels(width[1].real()), _pixels(height[1].real())
+    return None
+
+
+def _pixels(number: float) -> int:
+    """0 for what is no number; it is refused with the size."""
+    return int(number) if np.isfinite(number) else 0

@@ -152,6 +152,5 @@ def _resized(eye: Eye, factor: float) -> Eye:
 
 def rectified_camera(rig: StereoRig, width: int, height: int) -> Camera:
     """The left rectified camera resized to a working size, at the world's origin."""
-    size = rig.left.width, rig.left.height
-    K = geometry.scale_intrinsics(rig.left.P[:, :3], size, (width, height))
-    return Camera(width, height, K, np.eye(4))
+    eye = rig.left
+    return geometry.resized_camera(Camera(eye.width, eye.height, eye.P[:, :3], np.eye(4)), width, height)

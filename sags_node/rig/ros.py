@@ -37,20 +37,26 @@ MATRICES = (
 SIDES = ("left.yaml", "right.yaml")
 
 
+def content_of(file: Path, fix: str = "check the path") -> bytes:
+    """The bytes of a file of a calibration.
+
+    Raises:
+        UsageError: it is missing, no plain file or too large; `fix` says what to do.
+    """
+    try:
+        return read_file(file, LARGEST_FILE)
+    except OSError as error:
+        raise UsageError(f"cannot read calibration {file}: {error.strerror}; {fix}") from None
+
+
 def read_folder(folder: Path) -> StereoRig:
     """The rig in `left.yaml` and `right.yaml`, named after the folder.
 
     Raises:
         UsageError: a file is missing or malformed.
     """
-    eyes = []
-    for side in SIDES:
-        file = folder / side
-        try:
-            eyes.append(_read_eye(read_file(file, LARGEST_FILE), str(file)))
-        except OSError as error:
-            fix = "a rig is a folder with left.yaml and right.yaml"
-            raise UsageError(f"cannot read calibration {file}: {error.strerror}; {fix}") from None
+    fix = "a rig is a folder with left.yaml and right.yaml"
+    eyes = (_read_eye(content_of(file, fix), str(file)) for file in eye_files(folder))
     return StereoRig(folder.resolve().name, *eyes)
 
 
@@ -63,10 +69,7 @@ def read_one(file: Path, baseline: float) -> StereoRig:
     Raises:
         UsageError: the file is missing or malformed.
     """
-    try:
-        eye = _read_eye(read_file(file, LARGEST_FILE), str(file))
-    except OSError as error:
-        raise UsageError(f"cannot read calibration {file}: {error.strerror}; check the path") from None
+    eye = _read_eye(content_of(file), str(file))
     P = eye.P.copy()
     P[0, 3] = -P[0, 0] * baseline
     return StereoRig(file.stem, eye, replace(eye, P=P))

@@ -22,7 +22,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.media.picture_file import decode
 from sags_node.media.video import Video
 from sags_node.rig import check_intrinsics, rectified_rig
-from sags_node.rig.matrices import numbers_in, open_storage
+from sags_node.rig.read import numbers_in, open_storage
 from sags_node.sources.layout import Layout
 from sags_node.sources.numbered import NumberedFiles, open_numbered
 from sags_node.sources.pictures import FolderPairs, Pairs, RawPair

@@ -113,11 +113,8 @@ def byte_text(count: float) -> str:
 
 
 def _spread(figures: Record) -> str:
-    spread = "  ".join(f"{name}: {_ms(figures[f'{key}_s'])}" for key, name in _SPREAD.items())
-    return f"{spread}  window: {figures['window']} messages"
-
-
-_SPREAD = {"min": "min", "max": "max", "std_dev": "std dev"}
+    smallest, largest, deviation = (_ms(figures[f"{which}_s"]) for which in ("min", "max", "std_dev"))
+    return f"min: {smallest}  max: {largest}  std dev: {deviation}  window: {figures['window']} messages"
 
 
 def _ms(seconds: float) -> str:

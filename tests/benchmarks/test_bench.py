@@ -121,12 +121,10 @@ def test_chains_compute_every_multiply_add() -> None:
     """Nothing was left out by the compiler: y = y / 2 + s, so many times, from the numbers of the chains."""
     before = thread_count()
     chains = np.arange(peak.CHAINS, dtype=np.float64)
-    for run in peak.RUNS.values():
-        results = np.zeros(2, np.float32)
-        run(results, 1)
-        left = 0.5**peak.STEPS
+    for rounds, left in ((1, 0.5), (8, 0.5**8)):
         expected = [(chains * left + 2 * s * (1 - left)).sum() for s in (0, 1)]
-        np.testing.assert_allclose(results, expected, rtol=1e-6)
+        found = [peak.run_chains(np.float32(s), rounds) for s in (0, 1)]
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
     measured = peak.measure_peak(1)
     assert thread_count() == before
     assert 1e8 < measured.operations < 1e13

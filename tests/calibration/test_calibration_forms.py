@@ -6,7 +6,6 @@ import gzip
 import io
 import re
 import tarfile
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -72,25 +71,18 @@ def refusal(path: Path, size: tuple[int, int] | None = None) -> str:
 # ---- ROS -------------------------------------------------------------------------------------------------
 
 
-def test_rational_polynomial_in_ros_files(tmp_path: Path) -> None:
-    save_rig(make_rig(RATIONAL), tmp_path / "rig")
+@pytest.mark.parametrize(
+    ("model", "distortion"), [("plumb_bob", PLUMB_BOB), ("rational_polynomial", RATIONAL)]
+)
+def test_ros_files_and_one_that_stands_for_both(
+    model: str, distortion: tuple[F64, F64], tmp_path: Path
+) -> None:
+    save_rig(make_rig(distortion), tmp_path / "rig")
     tree = yaml.safe_load((tmp_path / "rig/left.yaml").read_text())
-    assert tree["distortion_model"] == "rational_polynomial"
-    assert_same(load_rig(tmp_path / "rig"), make_rig(RATIONAL), 0)
-
-
-def test_a_file_of_the_folder_stands_for_it(tmp_path: Path) -> None:
-    save_rig(make_rig(), tmp_path / "rig")
-    assert_same(load_rig(tmp_path / "rig/right.yaml"), make_rig(), 0)
-
-
-def test_ros_files_in_millimetres(tmp_path: Path) -> None:
-    rig = make_rig()
-    in_mm = replace(rig.right, P=rig.right.P * [1, 1, 1, 1000])
-    save_rig(StereoRig("rig", rig.left, in_mm), tmp_path)
-    (error,) = [finding for finding in check_rig(read_rig(tmp_path)) if finding.level == "error"]
-    assert "--unit mm" in error.fix
-    assert_same(read_rig(tmp_path, metres=1e-3), rig)
+    assert tree["distortion_model"] == model
+    for path in (tmp_path / "rig", tmp_path / "rig/right.yaml"):
+        assert load_rig(path).name == "rig"
+        assert_same(load_rig(path), make_rig(distortion), 0)
 
 
 @pytest.mark.parametrize("model", ["equidistant", "thin_prism", 7])
@@ -229,13 +221,6 @@ def test_four_coefficients_of_a_wide_view_are_asked_about(focal: float, asked: b
         assert bool(said) is fits
 
 
-def test_millimetres_must_be_said(tmp_path: Path) -> None:
-    folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T * 1000)
-    findings = check_rig(read_rig(folder, SIZE))
-    assert findings[-1].level == "error"
-    assert "looks like millimetres" in findings[-1].what and "--unit mm" in findings[-1].fix
-
-
 @pytest.mark.parametrize(
     ("unit", "said"), [("cm", "mm"), ("cm", "um"), ("mm", "m"), ("inch", "mm"), ("um", "mm")]
 )
@@ -285,12 +270,6 @@ def test_a_unit_that_no_other_one_betters_is_taken(tmp_path: Path) -> None:
         "calib", "convert", folder, "-o", tmp_path / "out", "--size", "640x480", "--unit", "mm"
     )
     assert code == 0 and "baseline 20 mm" in text
-
-
-def test_the_size_must_be_said(tmp_path: Path) -> None:
-    folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T)
-    message = refusal(folder)
-    assert "does not say the size" in message and "--size" in message
 
 
 @pytest.mark.parametrize(
@@ -404,7 +383,8 @@ def test_text_matrices_are_millimetres(tmp_path: Path, prefix: str, plural: str,
 
 def test_text_matrices_that_are_refused(tmp_path: Path) -> None:
     folder = write_text(tmp_path / "rig")
-    assert "--size" in refusal(folder)
+    for unsized in (folder, write_pair(tmp_path / "pair", ".yml", PLUMB_BOB, T)):
+        assert "does not say the size of the pictures: give --size WxH" in refusal(unsized)
     (folder / "calib.left.distortion.txt").write_text("a b c d e")
     assert "calib.left.distortion.txt holds something else than numbers" in refusal(folder, SIZE)
     (folder / "calib.left.distortion.txt").unlink()
@@ -425,14 +405,6 @@ def test_what_was_looked_for_is_said(tmp_path: Path) -> None:
     assert "gone/left.yaml" in refusal(tmp_path / "gone")
 
 
-def test_resized() -> None:
-    rig, half = make_rig(), resized_rig(make_rig(), 0.5)
-    assert (half.left.width, half.left.height) == (320, 240)
-    assert half.baseline == pytest.approx(rig.baseline)
-    np.testing.assert_allclose(half.right.K, scale_intrinsics(rig.right.K, (640, 480), (320, 240)))
-    np.testing.assert_allclose(half.T_right_left, rig.T_right_left)
-
-
 def test_convert(tmp_path: Path) -> None:
     folder = write_pair(tmp_path / "scope", ".yml", PLUMB_BOB, T * 1000)
     size = ("--size", "640x480")
@@ -444,4 +416,8 @@ def test_convert(tmp_path: Path) -> None:
     code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640")
     assert code == 2 and "'640' is not like 720x576" in said
     code, _, _ = ran("calib", "convert", tmp_path / "out", "-o", tmp_path / "double", "--scale", "2")
-    assert code == 0 and load_rig(tmp_path / "double").left.width == 1280
+    double, rig = load_rig(tmp_path / "double"), make_rig()
+    assert code == 0 and (double.left.width, double.left.height) == (1280, 960)
+    assert double.baseline == pytest.approx(rig.baseline)
+    np.testing.assert_allclose(double.right.K, scale_intrinsics(rig.right.K, SIZE, (1280, 960)))
+    np.testing.assert_allclose(double.T_right_left, rig.T_right_left, atol=1e-12)

@@ -469,12 +469,10 @@ def test_a_broken_calibration_is_checked_against_a_session(phantom_session: Path
 
 def test_check_with_files_and_folders(phantom_session: Path) -> None:
     first = phantom_session / "left/0000.jpg", phantom_session / "right/0000.jpg"
-    code, out, _ = sags(phantom_session / "calib", "--images", *first, "--images", *first)
-    assert code == 0 and "rows agree" in out
-    code, out, _ = sags(
-        phantom_session / "calib", "--images", phantom_session / "left", phantom_session / "right"
-    )
-    assert code == 0 and "rows agree" in out
+    folders = phantom_session / "left", phantom_session / "right"
+    for images in (("--images", *first, "--images", *first), ("--images", *folders)):
+        code, out, _ = sags(phantom_session / "calib", *images)
+        assert code == 0 and "rows agree" in out
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,12 @@ def test_a_mistake_is_named_with_its_fix(override: str, said: str) -> None:
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [("- a\n- b\n", "map of sections"), ("a: [", "not valid YAML"), ("a: \xff", "unknown key")],
+    [
+        ("- a\n- b\n", "map of sections"),
+        ("a: [", "not valid YAML"),
+        ("a: \xff", "unknown key"),
+        ("source: {kind: [videos]}", "source.kind: should be one of"),
+    ],
 )
 def test_files_that_are_no_launch_files(tmp_path: Path, content: str, said: str) -> None:
     file = tmp_path / "launch.yaml"

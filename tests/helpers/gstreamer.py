@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from waiting import until
 
+from benchmarks.node.processes import children
 from sags_node.errors import SagsError
-from sags_node.processes import children
 from sags_node.sources.gst_process import installed
 
 NEEDED = ("appsink", "videoconvert", "videotestsrc", "deinterlace")
