@@ -40,7 +40,7 @@ def test_no_way_to_start_a_thread_or_a_process_goes_unseen(source: str) -> None:
 
 
 def test_rows_of_warnings_and_of_faults_are_read() -> None:
-    words = "| what causes it | what helps |"
+    words = "| what causes it | what helps then |"
     page = f"| `a` `b` {words}\n| `c` | | |\n| `a` {words}"
     assert check_docs.explained(page) == {"a": 2, "b": 1}
     assert len(faults_page.marks()) > 100
