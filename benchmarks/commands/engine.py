@@ -169,9 +169,7 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool
 )
 @click.option("--rung", type=click.IntRange(0), default=7, show_default=True, help="Of the ladder, as well.")
 @measures
-def bench_methods(
-    launch: tuple[str, ...], iterations: int, rung: int, out: Path | None, json_out: bool
-) -> Measured:
+def bench_methods(launch: tuple[str, ...], iterations: int, rung: int) -> Measured:
     """Control nodes or the paper's field: mapping.method nodes and sags on a recording, at two sizes.
 
     Live: rate, latency and PSNR. Step by step: PSNR of the newest frame, the next and held-out ones, depth,
