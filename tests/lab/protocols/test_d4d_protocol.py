@@ -10,13 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from command_line import figures_of
+from command_line import figures_of, refused
 
 from sags_lab.protocols.d4d_files import d4d_clips, instruments_are_white
 from sags_lab.protocols.d4d_population import LEFT_OUT, in_population
 from sags_lab.protocols.d4d_scan import check_scan, read_surface, scan_depth
-from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform, unproject
 from sags_node.rig import eye_text
@@ -112,19 +110,12 @@ def test_d4d_end_to_end(d4d: Path) -> None:
     assert population["start"]["visible"] == found["start"]["visible"]
 
 
-def test_one_scan_that_is_elsewhere_stops_no_other(d4d: Path, tmp_path: Path) -> None:
+def test_a_recording_of_which_no_scan_fits_is_refused(d4d: Path, tmp_path: Path) -> None:
+    """Of the frames that are played: one scan that is elsewhere stops no other."""
     clip = copied(d4d, tmp_path / "wrong")
     np.savetxt(clip / "curated_camera_pose_start.txt", invert(scanner_pose()))
-    command = ["eval", "--protocol", "d4d", str(clip), "--iterations", "1", "--json"]
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    assert (found["scans"], found["refused"]) == (1, 1) and found["start"] == {}
-    (of_clip,) = found["of_each"].values()
-    assert "the other way round" in of_clip["start"]["refused"]
-    assert found["end"]["visible"]["measured"] == of_clip["end"]["visible"]["measured"]
-    result = CliRunner().invoke(main, [*command, "source.frames:=1"])
-    assert result.exit_code == 1 and "the other way round" in result.stderr
+    command = ("eval", "--protocol", "d4d", clip, "--iterations", 1, "source.frames:=1")
+    refused(1, *command, said=("the other way round",))
 
 
 def test_the_public_population() -> None:
