@@ -18,7 +18,7 @@ unexport PYTHONDONTWRITEBYTECODE
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-all bench gpu-check test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs clean
+.PHONY: setup run test test-all bench gpu-check test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs check-docs clean
 
 setup: $(STAMP)
 
@@ -100,11 +100,16 @@ golden: setup
 	$(BIN)/python -m pytest tests/evaluation/test_replay.py --update-golden -s
 
 # Rewrite what is made: docs/launch.md from the configuration, docs/dev/faults.md from the tests' marks, tables of figures
-# in both READMEs from benchmarks/results.
+# in README.md and other pages from benchmarks/results.
 docs: setup
 	$(BIN)/python docs/dev/launch_page.py
 	$(BIN)/python docs/dev/faults_page.py
 	$(BIN)/python docs/dev/figures_page.py
+
+# All that is stale at once: in documents, then layers, imports that a folder names, budgets of lines.
+check-docs: setup
+	@status=0; $(BIN)/python docs/dev/check_docs.py || status=1; \
+	$(BIN)/python -m pytest tests/test_layers.py --tb=line || status=1; exit $$status
 
 # The wheel in an empty environment, and its demo: some minutes, 2 GB in out/wheel.
 wheel-test: setup

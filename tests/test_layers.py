@@ -21,7 +21,7 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9539,
+    "benchmarks": 8893,
     "sags_lab": 4958,
     "sags_node": 1680,
     "sags_node/bridge": 2638,
@@ -51,7 +51,7 @@ LINES = {
     "sags_node/terminal": 335,
     "sags_node/viewer": 1042,
     "sags_node/vision": 5454,
-    "tests": 45916,
+    "tests": 45017,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import click
 
+from benchmarks.commands.measuring import (
+    STEP,
+    split,
+)
 from sags_node.cli.launching import (
     as_json,
     check_files,
@@ -15,7 +19,6 @@ from sags_node.cli.launching import (
     launch_argument,
     open_launched,
     positive,
-    split_recording,
     write_json,
 )
 from sags_node.errors import UsageError
@@ -95,9 +98,7 @@ def bench_disturbances(
         near = difflib.get_close_matches(name, DISTURBANCES, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(DISTURBANCES)}"
         raise UsageError(f"--only: unknown disturbance '{name}'; {hint}")
-    no_cameras = "benchmarks disturbances plays recordings; record the cameras first"
-    found = "vision.tissue.method:=classical"
-    path, overrides = split_recording(launch, no_cameras)
+    path, overrides = split(launch, "disturbances")
     names = only or tuple(DISTURBANCES)
     drawn = [] if pictures is None else [pictures / f"{name}.png" for name in ("clean", *names)]
     check_files(out, *drawn, force=force)
@@ -107,7 +108,7 @@ def bench_disturbances(
             with whole(pictures / f"{name}.png") as file:
                 file.write_bytes(disturbances_report.strip(shots))
 
-    session = open_launched(path, [found, *overrides, "source.loop:=false", "source.pace:=step"])
+    session = open_launched(path, ["vision.tissue.method:=classical", *overrides, *STEP])
     with progress("playing") as advance:
         measured = disturbances.measure_disturbances(session, names, start, seconds, advance, draw)
     show(measured if json_out else disturbances_report.table(measured))

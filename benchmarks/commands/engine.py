@@ -9,6 +9,12 @@ from typing import Any
 
 import click
 
+from benchmarks.commands.measuring import (
+    Measured,
+    measures,
+    split,
+    step_by_step,
+)
 from sags_node.cli.launching import (
     as_json,
     check_files,
@@ -17,8 +23,6 @@ from sags_node.cli.launching import (
     force_option,
     launch_argument,
     lpips_option,
-    open_launched,
-    split_recording,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
@@ -28,13 +32,6 @@ from sags_node.terminal.console import progress, show
 
 
 @click.command("kernels")
-@click.option(
-    "--device",
-    type=click.Choice(["cpu", "cuda"]),
-    default="cpu",
-    show_default=True,
-    help="cuda: only compare the mapper's refinement on a GPU with that on the CPU.",
-)
 @click.option("--quick", is_flag=True, help="A tiny scene and few runs: does it work, not how fast is it.")
 @click.option("--large", is_flag=True, help="Also a million Gaussians.")
 @click.option("--contention", is_flag=True, help="Also beside another process that burns one core.")
@@ -52,14 +49,8 @@ from sags_node.terminal.console import progress, show
     show_default=True,
     help="How many times slower than in --check's table is too slow.",
 )
-@file_option(
-    "--yardstick",
-    metavar="FILE.cpp",
-    help="Only compare the rasteriser with this C++ program, call by call; needs g++.",
-)
 @as_json
 def bench_kernels(
-    device: str,
     quick: bool,
     large: bool,
     contention: bool,
@@ -67,7 +58,6 @@ def bench_kernels(
     out: Path | None,
     check: Path | None,
     tolerance: float,
-    yardstick: Path | None,
     json_out: bool,
 ) -> None:
     """Time every kernel of the engine beside the machine's peak.
@@ -85,21 +75,10 @@ def bench_kernels(
     \b
     python -m benchmarks kernels --out benchmarks/results/kernels.json
     python -m benchmarks kernels --check benchmarks/results/kernels.json
-    python -m benchmarks kernels --device cuda --out gpu.json
-    python -m benchmarks kernels --yardstick splat.cpp
     """
     from benchmarks.kernels import check as guard
     from benchmarks.kernels import report
 
-    if yardstick is not None or device == "cuda":
-        both = yardstick is not None and device == "cuda"
-        if both or large or contention or no_twin or check is not None:
-            raise UsageError("with --yardstick or --device cuda give --quick, --out and --json only")
-        if yardstick is None:
-            _compare_gpu(quick, out, json_out)
-        else:
-            _compare_with(yardstick, quick, out, json_out)
-        return
     if check is not None and out is not None:
         raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
     checks = check is not None
@@ -149,29 +128,6 @@ def _kernels(quick: bool, large: bool, contention: bool, no_twin: bool, checks: 
     return lambda advance: kernels.measure_kernels(settings, advance)
 
 
-def _compare_gpu(quick: bool, out: Path | None, json_out: bool) -> None:
-    from benchmarks.gpu.refining import QUICK, GpuSettings, gpu_table, measure_gpu
-
-    check_files(out)
-    with progress("measuring") as advance:
-        measured = measure_gpu(QUICK if quick else GpuSettings(), advance)
-    show(measured if json_out else gpu_table(measured))
-    write_json(out, measured)
-
-
-def _compare_with(yardstick: Path, quick: bool, out: Path | None, json_out: bool) -> None:
-    from benchmarks.kernels import report
-    from benchmarks.kernels.yardstick import QUICK, YardstickSettings, measure_yardstick
-
-    if not yardstick.is_file():
-        raise UsageError(f"there is no file {yardstick}; --yardstick takes the C++ program to compare with")
-    check_files(out)
-    with progress("measuring") as advance:
-        measured = measure_yardstick(yardstick, QUICK if quick else YardstickSettings(), advance)
-    show(measured if json_out else report.yardstick_table(measured))
-    write_json(out, measured)
-
-
 @click.command("alias")
 @click.option("--quick", is_flag=True, help="A tiny scene and few steps: does it work, not how good is it.")
 @figures_option
@@ -212,11 +168,8 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool
     help="Steps per frame, step by step.",
 )
 @click.option("--rung", type=click.IntRange(0), default=7, show_default=True, help="Of the ladder, as well.")
-@figures_option
-@as_json
-def bench_methods(
-    launch: tuple[str, ...], iterations: int, rung: int, out: Path | None, json_out: bool
-) -> None:
+@measures
+def bench_methods(launch: tuple[str, ...], iterations: int, rung: int) -> Measured:
     """Control nodes or the paper's field: mapping.method nodes and sags on a recording, at two sizes.
 
     Live: rate, latency and PSNR. Step by step: PSNR of the newest frame, the next and held-out ones, depth,
@@ -227,12 +180,10 @@ def bench_methods(
     """
     from benchmarks.quality import methods
 
-    path, overrides = split_recording(launch, "benchmarks methods plays recordings, not live cameras")
-    check_files(out)
+    path, overrides = split(launch, "methods")
     with progress("measuring") as advance:
         measured = methods.measure_methods(path, overrides, iterations, rung, advance)
-    show(measured if json_out else methods.table(measured))
-    write_json(out, measured)
+    return measured, [methods.table(measured)]
 
 
 @click.command("ablation")
@@ -252,8 +203,7 @@ def bench_methods(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="A setting of every variant, as in sags fit."
 )
 @lpips_option
-@figures_option
-@as_json
+@measures
 def bench_ablation(
     launch: tuple[str, ...],
     warm_up: int,
@@ -263,9 +213,7 @@ def bench_ablation(
     only: tuple[str, ...],
     changes: tuple[str, ...],
     lpips_weights: Path | None,
-    out: Path | None,
-    json_out: bool,
-) -> None:
+) -> Measured:
     """What each part of the SAGS model brings, offline.
 
     Fits a recording, by default the built-in phantom, with and without the self-adaptive decoder (an MLP of
@@ -279,18 +227,13 @@ def bench_ablation(
     from benchmarks.quality import ablation
     from sags_node.evaluation.measure import MeasureOptions
 
-    no_cameras = "benchmarks ablation plays recordings; record the cameras first"
-    path, overrides = split_recording(launch, no_cameras)
     options = MeasureOptions(hold_out, lpips_weights=lpips_weights)
-    check_files(out)
-    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    session = step_by_step(launch, "ablation")
     with progress("measuring") as advance:
         measured = ablation.measure_ablation(
             session, warm_up, iterations, options, advance, seeds, only, changes
         )
-    for table in [measured] if json_out else ablation.tables(measured):
-        show(table)
-    write_json(out, measured)
+    return measured, ablation.tables(measured)
 
 
 @click.command("gpu")
@@ -303,9 +246,8 @@ def bench_ablation(
     show_default=True,
     help="After which no part begins.",
 )
-@figures_option
-@as_json
-def bench_gpu(small: bool, fit: bool, seconds: float, out: Path | None, json_out: bool) -> None:
+@measures
+def bench_gpu(small: bool, fit: bool, seconds: float) -> Measured:
     """All that a GPU should do: parity, times, live runs. `make gpu-check` calls it.
 
     \b
@@ -313,8 +255,4 @@ def bench_gpu(small: bool, fit: bool, seconds: float, out: Path | None, json_out
     """
     from benchmarks.gpu.check import gpu_check
 
-    check_files(out)
-    measured = gpu_check(small, fit, lambda line: click.echo(line, err=True), seconds)
-    if json_out:
-        show([measured])
-    write_json(out, measured)
+    return gpu_check(small, fit, lambda line: click.echo(line, err=True), seconds), []

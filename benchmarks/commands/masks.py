@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
-from sags_node.cli.launching import (
-    as_json,
-    check_files,
-    figures_option,
-    open_launched,
-    split_recording,
-    write_json,
+from benchmarks.commands.measuring import (
+    STEP,
+    Measured,
+    each_recording,
+    measures,
 )
-from sags_node.terminal.console import progress, show
+from sags_node.cli.launching import (
+    open_launched,
+)
+from sags_node.terminal.console import progress
 
 
 @click.command("masks")
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
-@figures_option
-@as_json
-def bench_masks(launch: tuple[str, ...], out: Path | None, json_out: bool) -> None:
+@measures
+def bench_masks(launch: tuple[str, ...]) -> Measured:
     """How right masks are that were found, and what they bring.
 
     Plays recordings that have masks of their own, by default the built-in phantom, once with these, once with
@@ -35,20 +33,14 @@ def bench_masks(launch: tuple[str, ...], out: Path | None, json_out: bool) -> No
     """
     from benchmarks.quality import masks
 
-    overrides = [argument for argument in launch if ":=" in argument]
-    alone = [[path, *overrides] for path in launch if ":=" not in path] or [overrides]
-    no_cameras = "benchmarks masks plays recordings; record the cameras first"
-    paths = [split_recording(arguments, no_cameras)[0] for arguments in alone]
+    paths, overrides = each_recording(launch, "masks")
     methods = ["session", "classical", "none"]
     if any(override.startswith("vision.tissue.path:=") for override in overrides):
         methods.append("onnx")
-    check_files(out)
     rows = []
     for path in paths:
         for method in methods:
-            forced = ["source.loop:=false", "source.pace:=step", f"vision.tissue.method:={method}"]
-            session = open_launched(path, [*overrides, *forced])
+            session = open_launched(path, [*overrides, *STEP, f"vision.tissue.method:={method}"])
             with progress("playing") as advance:
                 rows.append(masks.measure_masks(session, advance))
-    show(rows if json_out else masks.table(rows))
-    write_json(out, rows)
+    return rows, [masks.table(rows)]

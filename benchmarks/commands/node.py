@@ -7,6 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from benchmarks.commands.measuring import (
+    Measured,
+    each_recording,
+    measures,
+    split,
+    step_by_step,
+)
 from sags_node.cli.launching import (
     as_json,
     check_files,
@@ -16,7 +23,6 @@ from sags_node.cli.launching import (
     launch_argument,
     open_launched,
     positive,
-    split_recording,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
@@ -92,12 +98,9 @@ def bench_pareto(
     from benchmarks.pareto.measure import measure_pareto
     from benchmarks.pareto.settings import PARTS, Sweep
 
-    overrides = [argument for argument in launch if ":=" in argument]
+    paths, overrides = each_recording(launch, "pareto")
     if frames is not None:
         overrides.append(f"source.frames:={frames}")
-    alone = [[path, *overrides] for path in launch if ":=" not in path] or [overrides]
-    no_cameras = "benchmarks pareto plays recordings; live cameras do not come twice alike"
-    paths = [split_recording(arguments, no_cameras)[0] for arguments in alone]
     sweep = Sweep(PARTS if only is None else tuple(only.split(",")), repeat)
     known_fits = read_fits(fits or sorted(Path("benchmarks/results").glob("fit_*.json")))
     check_files(out, plot, force=force)
@@ -127,17 +130,8 @@ def bench_pareto(
     help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the walk and the camera's noise.")
-@figures_option
-@as_json
-def bench_endurance(
-    launch: tuple[str, ...],
-    frames: int,
-    window: int,
-    order: Order,
-    seed: int,
-    out: Path | None,
-    json_out: bool,
-) -> None:
+@measures
+def bench_endurance(launch: tuple[str, ...], frames: int, window: int, order: Order, seed: int) -> Measured:
     """Whether the node lasts: thousands of frames in a row.
 
     Plays a recording, by default the built-in phantom, over and over, with the launch file's time budget and
@@ -150,18 +144,10 @@ def bench_endurance(
     """
     from benchmarks.node import endurance
 
-    no_cameras = "benchmarks endurance plays recordings; record the cameras first"
-    path, overrides = split_recording(launch, no_cameras)
-    check_files(out)
-    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    session = step_by_step(launch, "endurance")
     with progress("playing") as advance:
         measured = endurance.measure_endurance(session, frames, window, order, advance, seed)
-    if json_out:
-        show(measured)
-    else:
-        show(endurance.table(measured))
-        show(endurance.statement(measured))
-    write_json(out, measured)
+    return measured, [endurance.table(measured), endurance.statement(measured)]
 
 
 @click.command("soak")
@@ -200,7 +186,7 @@ def bench_soak(
     from benchmarks.node import soak
 
     check_files(out)
-    path, overrides = split_recording(launch, "benchmarks soak plays recordings; record the cameras first")
+    path, overrides = split(launch, "soak")
     open_launched(path, overrides)  # what takes long is not part of the node's start
     with progress("running") as advance:
         measured = soak.measure_soak(launch, frames, window, advance)
@@ -223,9 +209,8 @@ def bench_soak(
     show_default=True,
     help="After how many frames to measure.",
 )
-@figures_option
-@as_json
-def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json_out: bool) -> None:
+@measures
+def bench_tracking(launch: tuple[str, ...], numbers: str) -> Measured:
     """How well anchors stay on the tissue.
 
     Pins anchors all over the first frame of a recording, follows them with one step of the mapper a frame,
@@ -240,24 +225,17 @@ def bench_tracking(launch: tuple[str, ...], numbers: str, out: Path | None, json
 
     if not all(number.strip().isdigit() and int(number) > 0 for number in numbers.split(",")):
         raise UsageError(f"--frames {numbers}: give numbers above 0 with commas between, e.g. 10,40")
-    path, overrides = split_recording(
-        launch, "benchmarks tracking plays recordings; record the cameras first"
-    )
-    check_files(out)
-    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    session = step_by_step(launch, "tracking")
     with progress("following") as advance:
         measured = tracking.measure_tracking(session, [int(n) for n in numbers.split(",")], advance)
-    for table in [measured] if json_out else tracking_report.tables(measured):
-        show(table)
-    write_json(out, measured)
+    return measured, tracking_report.tables(measured)
 
 
 @click.command("recall")
 @launch_argument
 @click.option("--seconds", type=positive, default=10.0, show_default=True, help="Out of sight.")
-@figures_option
-@as_json
-def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
+@measures
+def bench_recall(launch: tuple[str, ...], seconds: float) -> Measured:
     """Whether anchors come back after a long time out of sight.
 
     Pins anchors to the phantom's tissue. Then a cloth covers it, or it is dark and the scope moves, or the
@@ -270,14 +248,11 @@ def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json
     """
     from benchmarks.quality import recall
 
-    path, overrides = split_recording(launch, "benchmarks recall needs the phantom")
-    check_files(out)
+    path, overrides = split(launch, "recall", "needs the phantom")
     session = open_launched(path, [*overrides, "source.pace:=step"])
     with progress("following") as advance:
         measured = recall.measure_recall(session, seconds, advance)
-    for table in [measured] if json_out else recall.tables(measured):
-        show(table)
-    write_json(out, measured)
+    return measured, recall.tables(measured)
 
 
 @click.command("scope")
@@ -290,15 +265,8 @@ def bench_recall(launch: tuple[str, ...], seconds: float, out: Path | None, json
     help="This one alone; may be given several times. Default: all.",
 )
 @click.option("--seconds", type=positive, default=120.0, show_default=True, help="Of each motion.")
-@figures_option
-@as_json
-def bench_scope(
-    launch: tuple[str, ...],
-    motions: tuple[Motion, ...],
-    seconds: float,
-    out: Path | None,
-    json_out: bool,
-) -> None:
+@measures
+def bench_scope(launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: float) -> Measured:
     """How true the pose of a moving scope stays.
 
     The phantom's scope sways, zooms and orbits over breathing, pulled tissue, at 10 Hz. Its pose is given,
@@ -312,14 +280,12 @@ def bench_scope(
     from benchmarks.quality import scope
     from sags_node.config.launch_file import load_launch
 
-    path, overrides = split_recording(launch, "benchmarks scope needs the phantom")
-    check_files(out)
+    path, overrides = split(launch, "scope", "needs the phantom")
     with progress("following") as advance:
         measured = scope.measure_scope(
             load_launch(path, overrides), motions or scope.MOTIONS, seconds, advance
         )
-    show(measured if json_out else scope.table(measured))
-    write_json(out, measured)
+    return measured, [scope.table(measured)]
 
 
 @click.command("crowd")
@@ -334,9 +300,8 @@ def bench_scope(
 @click.option(
     "--many", type=click.IntRange(0, 50), default=20, show_default=True, help="Further subscribers."
 )
-@figures_option
-@as_json
-def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | None, json_out: bool) -> None:
+@measures
+def bench_crowd(launch: tuple[str, ...], seconds: float, many: int) -> Measured:
     """Whether subscribers disturb the node.
 
     Runs a node, by default of the built-in phantom, in a process of its own: alone; with one reader of
@@ -349,21 +314,18 @@ def bench_crowd(launch: tuple[str, ...], seconds: float, many: int, out: Path | 
     """
     from benchmarks.node import crowd
 
-    check_files(out)
-    path, overrides = split_recording(launch, "benchmarks crowd plays recordings; record the cameras first")
+    path, overrides = split(launch, "crowd")
     open_launched(path, overrides)  # what takes long is not part of the node's start
     with progress("listening") as advance:
         measured = crowd.measure_crowd(launch, seconds / 4, seconds, many, advance)
-    show(measured if json_out else crowd.table(measured))
-    write_json(out, measured)
+    return measured, [crowd.table(measured)]
 
 
 @click.command("bridges")
 @launch_argument
 @click.option("--seconds", type=positive, default=30.0, show_default=True, help="Of each bridge.")
-@figures_option
-@as_json
-def bench_bridges(launch: tuple[str, ...], seconds: float, out: Path | None, json_out: bool) -> None:
+@measures
+def bench_bridges(launch: tuple[str, ...], seconds: float) -> Measured:
     """What each bridge gives and costs.
 
     Runs a node, by default of the built-in phantom, in a process of its own: alone, and beside each bridge of
@@ -375,13 +337,11 @@ def bench_bridges(launch: tuple[str, ...], seconds: float, out: Path | None, jso
     """
     from benchmarks.node import bridges
 
-    check_files(out)
-    path, overrides = split_recording(launch, "benchmarks bridges plays recordings; record the cameras first")
+    path, overrides = split(launch, "bridges")
     open_launched(path, overrides)  # what takes long is not part of the node's start
     with progress("listening") as advance:
         rows = bridges.measure_bridges(launch, seconds, advance)
-    show(rows if json_out else bridges.table(rows))
-    write_json(out, rows)
+    return rows, [bridges.table(rows)]
 
 
 @click.command("transport")
@@ -403,9 +363,8 @@ def bench_transport(frames: int, json_out: bool) -> None:
 @click.command("thin")
 @launch_argument
 @click.option("--frames", type=click.IntRange(1), default=60, show_default=True, help="To measure.")
-@figures_option
-@as_json
-def bench_thin(launch: tuple[str, ...], frames: int, out: Path | None, json_out: bool) -> None:
+@measures
+def bench_thin(launch: tuple[str, ...], frames: int) -> Measured:
     """What thin pictures cost.
 
     Plays a recording, by default the built-in phantom, and makes each kind of thin picture of every frame
@@ -417,21 +376,17 @@ def bench_thin(launch: tuple[str, ...], frames: int, out: Path | None, json_out:
     from benchmarks.node.thin import measure_thin
     from sags_node.terminal.text import rows_table
 
-    check_files(out)
-    path, overrides = split_recording(launch, "benchmarks thin plays recordings; record the cameras first")
-    session = open_launched(path, [*overrides, "source.loop:=false", "source.pace:=step"])
+    session = step_by_step(launch, "thin")
     with progress("making") as advance:
         rows = measure_thin(session, frames, advance)
-    show(rows if json_out else rows_table(rows))
-    write_json(out, rows)
+    return rows, [rows_table(rows)]
 
 
 @click.command("inputs")
 @click.option("--seconds", type=positive, default=10.0, show_default=True, help="Of each way.")
 @click.option("--only", metavar="NAME", help="Ways that begin so, e.g. gst; default: all.")
-@figures_option
-@as_json
-def bench_inputs(seconds: float, only: str | None, out: Path | None, json_out: bool) -> None:
+@measures
+def bench_inputs(seconds: float, only: str | None) -> Measured:
     """What a live pair costs until the mapper has it.
 
     Two pictures of 1280x1024 px, 30 times a second, by each way into the node (docs/inputs.md). CPU time of a
@@ -444,8 +399,6 @@ def bench_inputs(seconds: float, only: str | None, out: Path | None, json_out: b
     from benchmarks.node.inputs import measure_inputs
     from sags_node.terminal.text import rows_table
 
-    check_files(out)
     with progress("listening") as advance:
         rows = measure_inputs(seconds, only, advance)
-    show(rows if json_out else rows_table(rows))
-    write_json(out, rows)
+    return rows, [rows_table(rows)]

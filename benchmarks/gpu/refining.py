@@ -1,24 +1,17 @@
-"""The table of `benchmarks kernels --device cuda`: the mapper's refinement of a frame, GPU beside CPU."""
+"""The mapper's refinement of a frame: a GPU beside the CPU."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from functools import partial
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
-from benchmarks.kernels.report import new_table
 from benchmarks.kernels.scenes import surface
 from benchmarks.kernels.timing import median_ms
-from sags_node.engine.device import choose_device
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError
-from sags_node.evaluation.provenance import machine_name
 from sags_node.mapping.mapper import CONTROL_NODES
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
@@ -32,47 +25,15 @@ OPACITY = 0.8
 DARKER = 0.9  # what is to be shown, against what is drawn
 STEPS = 4  # that are timed together: a GPU is waited for at their end
 
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
-
-
-@dataclass(frozen=True, slots=True)
-class GpuSettings:
-    """What is measured."""
-
-    counts: tuple[int, ...] = (10_000, 30_000, 100_000, 300_000)  # Gaussians
-    sizes: tuple[tuple[int, int], ...] = ((640, 512), (1280, 1024))  # px
-    runs: int = 31  # per median
-
-
-QUICK = GpuSettings(counts=(8,), sizes=((32, 16),), runs=1)
-
-
-def measure_gpu(settings: GpuSettings, advance: Advance) -> dict[str, Any]:
-    """Everything that `settings` ask for; keys as benchmarks/gpu.md lists them.
-
-    Raises:
-        UsageError: there is no GPU that can be used.
-        SagsError: it failed.
-    """
-    device = choose_device("cuda")
-    cases = [(count, *size) for size in settings.sizes for count in settings.counts]
-    rows = []
-    for done, (count, width, height) in enumerate(cases):
-        advance(done, len(cases), f"{count} Gaussians at {width}x{height}")
-        rows.append(measure_case(count, width, height, settings.runs))
-    return {
-        "machine": machine_name(),
-        "device": device.name,
-        "warp": version("warp-lang"),
-        "settings": asdict(settings),
-        "refine": rows,
-    }
-
 
 def measure_case(
     count: int, width: int, height: int, runs: int, cpu_runs: int | None = None
 ) -> dict[str, Any]:
-    """A row of the table. `cpu_runs`: fewer, of the CPU."""
+    """Times, and how far both are apart. `cpu_runs`: fewer, of the CPU.
+
+    Raises:
+        SagsError: the GPU failed.
+    """
     from sags_node.mapping.gpu.refiner import GpuRefiner  # Warp takes a second to import
 
     def on_cpu() -> CpuRefiner:
@@ -130,19 +91,3 @@ class Refining:
             self.refiner.draw()
             self.refiner.refine(STILL)
         self.refiner.touched()
-
-
-def gpu_table(measured: dict[str, Any]) -> Table:
-    """`measured` as `measure_gpu` returns it."""
-    made = new_table(
-        f"{measured['device']}, Warp {measured['warp']}", "frame ms", "CPU", "faster", "step ms", "CPU",
-        "faster", "planes apart", "colours apart",
-    )  # fmt: skip
-    for row in measured["refine"]:
-        cells = []
-        for what in ("frame", "step"):
-            gpu, cpu = row[f"gpu_{what}_ms"], row[f"cpu_{what}_ms"]
-            cells += [f"{gpu:.2f}", f"{cpu:.2f}", f"{cpu / gpu:.2f}x"]
-        apart = (f"{row[key]:.1e}" for key in ("planes_apart", "colors_apart"))
-        made.add_row(f"{row['n']} at {row['width']}x{row['height']}", *cells, *apart)
-    return made

@@ -32,25 +32,6 @@ def check_table(compared: Sequence[Compared], tolerance: float) -> Table:
     return made
 
 
-def yardstick_table(measured: Row) -> Table:
-    """`measured` as `measure_yardstick` returns it; milliseconds, and ours as a multiple."""
-    made = new_table(
-        "Gaussians", "size", "forward", "yardstick", "ratio", "and backward", "yardstick", "ratio"
-    )
-    for row in measured["yardstick"]:
-        made.add_row(
-            _count(row["n"]),
-            f"{row['width']}x{row['height']}",
-            f"{row['forward_ms']:.2f}",
-            f"{row['yardstick_forward_ms']:.2f}",
-            f"{row['forward_ratio']:.2f}",
-            f"{row['forward_backward_ms']:.2f}",
-            f"{row['yardstick_forward_backward_ms']:.2f}",
-            f"{row['forward_backward_ratio']:.2f}",
-        )
-    return made
-
-
 def plot(measured: Row) -> str:
     """Where the time goes, as SVG."""
     drawings: list[Bar] = [

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.kernels.peak import Peak
@@ -36,13 +35,6 @@ class Work:
 
 def bytes_of(*arrays: NDArray[Any]) -> int:
     return sum(array.nbytes for array in arrays)
-
-
-def touched_bytes(arguments: Mapping[str, Any]) -> int:
-    """Of a kernel's arguments by name: all arrays but its scratch, which stays in the innermost cache."""
-    return bytes_of(
-        *(value for name, value in arguments.items() if isinstance(value, np.ndarray) and name != "scratch")
-    )
 
 
 def stage_rows(times_ms: Mapping[str, float], work: Mapping[str, Work], peak: Peak) -> list[dict[str, Any]]:

@@ -11,14 +11,9 @@ Row = Mapping[str, Any]
 
 
 def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
-    """`measured` as `measure_recording`, `measure_faults`, `measure_ct` or `measure_eyes` returns it."""
+    """`measured` as `measure_recording`, `measure_faults` or `measure_ct` returns it."""
     if "faults" in measured:
         yield from _fault_tables(measured["faults"])
-        return
-    if "median_px" in measured["settings"][0]:
-        yield _eyes_table(
-            f"{measured['session']}, depth of one eye against the other's", measured["settings"]
-        )
         return
     title = f"{measured['session']}, depth against truth: {measured['truth'].replace('_', ' ')}"
     yield _settings_table(title, measured["settings"])
@@ -40,20 +35,6 @@ def _settings_table(title: str, rows: Sequence[Row]) -> Table:
             beside = _two(there["median_mm"], there["p90_mm"])
         coverage = "-" if row["coverage"] is None else f"{row['coverage']:.1%}"
         made.add_row(row["name"], *_errors(row), coverage, beside, _number(row["ms"], ".1f"))
-    return made
-
-
-def _eyes_table(title: str, rows: Sequence[Row]) -> Table:
-    made = Table("setting", "differ by, px", "p90", "within 1 px", "coverage", "ms", title=title)
-    for row in rows:
-        made.add_row(
-            row["name"],
-            _number(row["median_px"], ".2f"),
-            _number(row["p90_px"], ".2f"),
-            f"{row['agree']:.1%}",
-            f"{row['coverage']:.1%}",
-            _number(row["ms"], ".1f"),
-        )
     return made
 
 

@@ -9,7 +9,6 @@ from typing import Any
 from unittest.mock import ANY
 
 import pytest
-from click.testing import CliRunner
 from command_line import figures_of
 
 from benchmarks.__main__ import main
@@ -66,22 +65,3 @@ def test_all_variants_are_measured_on_the_same_frames(
     assert filters["paper_db"] == 0.9
     assert filters["heldout"]["lowest"] == pytest.approx(min(gains), abs=1e-3)
     assert filters["heldout"]["mean"] == pytest.approx(sum(gains) / 2, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        (["source.frames:=2"], 1, ("2 frames", "0 are left to learn from and 0 to test on", "source.frames")),
-        (["source.frames:=4"], 1, ("4 frames", "1 are left to learn from and 0 to test on", "source.frames")),
-        (["source.start:=0.2", "source.frames:=9"], 1, ("6 are left", "0 to test on", "--hold-out")),
-        (["--lpips-weights", "gone.npz"], 2, ("gone.npz", "check the path")),
-        (["--variant", "fuller"], 2, ("fuller", "full, no_block")),
-    ],
-)
-def test_an_ablation_that_cannot_be_says_why(
-    phantom_session: Path, arguments: list[str], code: int, said: tuple[str, ...]
-) -> None:
-    result = CliRunner().invoke(main, ["ablation", str(phantom_session), *arguments])
-    assert result.exit_code == code, result.output
-    for part in said:
-        assert part in result.stderr

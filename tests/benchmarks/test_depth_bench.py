@@ -5,40 +5,28 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from onnx_networks import save_matcher
-from places import SESSION
 
-from benchmarks.__main__ import main
-from benchmarks.quality import depth_plot, depth_report
+from benchmarks.quality import depth_report
 from benchmarks.quality.depth import (
-    MODEL,
     Comparison,
     Tally,
     by_confidence,
     error_figures,
     measure_faults,
-    measure_recording,
 )
 from benchmarks.quality.depth_ct import (
     CTPair,
     distances_to_surface,
     errors_along_z,
-    measure_ct,
-    picture,
     read_ct_pair,
 )
-from benchmarks.quality.depth_eyes import differences, measure_eyes, mirrored
 from benchmarks.quality.depth_regions import regions_of
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config.schema import StereoConfig
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.geometry import unproject
-from sags_node.pipeline.session import open_session
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
-from sags_node.vision.dense_depth import SMOOTHING_VARIANCE
-from sags_node.vision.smoothing import guided
-from sags_node.vision.stereo import StereoDepth
 
 WIDTH, HEIGHT, BASELINE, FOCAL = 320, 256, 0.0043, 285.0
 CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 159.5], [0, FOCAL, 127.5], [0, 0, 1]]), np.eye(4))
@@ -76,51 +64,7 @@ def slanted() -> F32:
     return (16.0 + 0.010 * columns - 0.012 * rows).astype(np.float32)
 
 
-def stepped() -> F32:
-    return np.where(np.arange(WIDTH) < WIDTH // 2, np.float32(14), np.float32(22)) * np.ones(
-        (HEIGHT, 1), "f4"
-    )
-
-
 # ---- the smoothing of the stereo stage -------------------------------------------------------------------
-
-
-def smoothed(disparity: F32) -> F32:
-    result = np.empty_like(disparity)
-    guided(np.ascontiguousarray(disparity), 3, SMOOTHING_VARIANCE, result)
-    return result
-
-
-def test_smoothing_is_the_guided_filter() -> None:
-    disparity = (slanted() + np.random.default_rng(0).normal(size=(HEIGHT, WIDTH))).astype(np.float32)
-    windows = np.lib.stride_tricks.sliding_window_view
-    patches = windows(disparity.astype(np.float64), (7, 7))
-    mean, variance = patches.mean((-1, -2)), patches.var((-1, -2))
-    kept = variance / (variance + SMOOTHING_VARIANCE)
-    slope, offset = (windows(part, (7, 7)).mean((-1, -2)) for part in (kept, mean * (1 - kept)))
-    expected = slope * disparity[6:-6, 6:-6] + offset
-    np.testing.assert_allclose(smoothed(disparity)[6:-6, 6:-6], expected, atol=2e-3)
-
-
-def test_smoothing_keeps_planes_and_steps_and_takes_noise() -> None:
-    inner = np.s_[8:-8, 8:-8]
-    np.testing.assert_allclose(smoothed(slanted())[inner], slanted()[inner], atol=2e-3)
-    assert np.abs(smoothed(stepped()) - stepped()).max() < 0.2  # of 8 px
-    noise = np.random.default_rng(1).normal(scale=0.2, size=(HEIGHT, WIDTH)).astype(np.float32)
-    assert (smoothed(slanted() + noise) - slanted())[inner].std() < 0.4 * noise.std()
-
-
-@pytest.mark.parametrize(
-    ("disparity", "noise", "median_mm", "p90_mm"), [(slanted(), 6.0, 0.6, 1.8), (stepped(), 0.0, 0.05, 0.4)]
-)
-def test_the_stage_on_exact_scenes(disparity: F32, noise: float, median_mm: float, p90_mm: float) -> None:
-    pair, truth = shown_pair(disparity, noise)
-    depth, _ = StereoDepth(StereoConfig(), CAMERA, BASELINE)(pair, ALL)
-    known = (depth > 0) & (truth > 0)
-    error_mm = np.abs(depth - truth)[known] * 1e3
-    assert known[:, 40:].mean() > 0.85
-    assert np.median(error_mm) < median_mm
-    assert np.percentile(error_mm, 90) < p90_mm
 
 
 # ---- figures ---------------------------------------------------------------------------------------------
@@ -158,12 +102,6 @@ def test_sgbm_is_metric(baseline: type[PlainSGBM | JudgedSGBM]) -> None:
         assert depth.max() <= StereoConfig().max_depth * 1.2
 
 
-def test_sgbm_in_the_stage_finds_nothing_where_there_is_nothing() -> None:
-    left = shown_pair(slanted())[0].left
-    blank = RectifiedPair(0, 0, CAMERA, BASELINE, np.zeros_like(left), np.full_like(left, 200))
-    assert not JudgedSGBM(StereoConfig(), CAMERA, BASELINE, 1)(blank, ALL)[0].any()
-
-
 def test_matchers_are_compared_where_the_first_knows() -> None:
     truth = np.full((HEIGHT, WIDTH), 0.05, np.float32)
 
@@ -188,34 +126,6 @@ def test_matchers_are_compared_where_the_first_knows() -> None:
 # ---- recordings ------------------------------------------------------------------------------------------
 
 
-def test_a_recording_with_exact_depth() -> None:
-    overrides = [
-        "source.pace:=step",
-        "source.loop:=false",
-        "source.frames:=21",
-        "vision.stereo.max_depth:=0.2",
-    ]
-    measured = measure_recording(open_session(SESSION, overrides), silent)
-    rows = {row["name"]: row for row in measured["settings"]}
-    assert measured["frames"] == 2 and measured["truth"] == "exact"
-    assert measured["receipt"]["frames"]["ids"] == "0, 16"  # every eighth has a reference
-    ours, plain = rows["as configured"], rows["plain SGBM, scale 1"]
-    assert ours["median_mm"] < 0.5 and ours["coverage"] > 0.75
-    assert ours["where_configured_knows"]["median_mm"] < plain["where_configured_knows"]["median_mm"]
-    assert rows[MODEL]["coverage"] > 0.95 and rows[MODEL]["median_mm"] < 1.0
-    medians = [row["median_mm"] for row in measured["confidence"]]
-    assert medians == sorted(medians, reverse=True)
-    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows), 4, 6]
-    regions = {row["region"]: row for row in measured["regions"]}
-    assert (
-        regions["not seen by the right eye"]["stage"]["coverage"] < 0.2
-    )  # what cannot be measured is not given
-    assert regions["not seen by the right eye"]["drawn"]["coverage"] > 0.9
-    assert regions["at edges"]["stage"]["p90_mm"] > 1.5 * regions["elsewhere"]["stage"]["p90_mm"]
-    drawn = cv2.imdecode(np.frombuffer(depth_plot.picture(measured), np.uint8), cv2.IMREAD_COLOR)
-    assert drawn is not None and drawn.std() > 5
-
-
 def test_regions_of_a_step_beside_an_instrument() -> None:
     """By hand: 20 px of disparity on the left half, 10 px on the right one, an instrument at the bottom."""
     disparity = np.where(np.arange(WIDTH) < 160, np.float32(20), np.float32(10)) * np.ones((HEIGHT, 1), "f4")
@@ -230,12 +140,6 @@ def test_regions_of_a_step_beside_an_instrument() -> None:
     assert columns["elsewhere"].tolist() == [*range(20, 150), *range(170, 300)]
     assert np.flatnonzero(found["beside instruments"][:, 50]).tolist() == list(range(185, 200))
     assert regions_of(np.zeros_like(truth), tissue, FOCAL * BASELINE) == {}
-
-
-def test_a_recording_without_truth_is_named() -> None:
-    overrides = ["source.pace:=step", "source.frames:=2", "source.reference.depth:=null"]
-    with pytest.raises(SagsError, match="has no reference depth"):
-        measure_recording(open_session(SESSION, overrides), silent)
 
 
 def test_faults_make_depth_worse(tmp_path: Path) -> None:
@@ -256,35 +160,6 @@ def test_faults_make_depth_worse(tmp_path: Path) -> None:
 
 
 # ---- both eyes against each other ------------------------------------------------------------------------
-
-
-def test_eyes_that_see_one_surface_agree() -> None:
-    plane = np.full((HEIGHT, WIDTH), 12.0, np.float32)
-    assert np.nanmax(differences(plane, plane)) == 0
-    assert np.isnan(differences(plane, plane)[:, :12]).all()  # what the right eye does not see
-    np.testing.assert_allclose(differences(plane, plane + 1.5)[:, 12:], 1.5)
-    assert np.isnan(differences(plane, 0 * plane)).all()
-
-
-def test_a_pair_in_a_mirror_has_the_right_eyes_depth() -> None:
-    """The left disparity d of a point at x is that of the right picture at x - d."""
-    pair, _ = shown_pair(slanted())
-    everywhere = StereoDepth(StereoConfig(), CAMERA, BASELINE)
-    depth, _ = everywhere(mirrored(pair), ALL)
-    found = np.divide(FOCAL * BASELINE, depth, where=depth > 0, out=0 * depth)[:, ::-1]
-    known = (found > 0) & (np.arange(WIDTH) < WIDTH - 40)
-    assert known.mean() > 0.7
-    assert np.median(np.abs(found - slanted())[known]) < 0.1
-
-
-def test_a_recording_without_truth_is_measured_by_both_eyes() -> None:
-    overrides = ["source.pace:=step", "source.loop:=false", "source.frames:=1"]
-    measured = measure_eyes(open_session(SESSION, overrides), silent)
-    rows = {row["name"]: row for row in measured["settings"]}
-    assert measured["frames"] == 1
-    assert rows["as configured"]["median_px"] < 0.25  # of what was matched at half size
-    assert rows["as configured"]["agree"] > 0.7
-    assert [table.row_count for table in depth_report.tables(measured)] == [len(rows)]
 
 
 # ---- a CT surface ----------------------------------------------------------------------------------------
@@ -351,34 +226,3 @@ def test_a_wrong_ct_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "a_CT_cut.xyz").unlink()
     with pytest.raises(UsageError, match=r"0 files \*_CT_cut.xyz"):
         read_ct_pair(tmp_path)
-
-
-def test_real_tissue_against_its_ct_surface(data_folder: Path) -> None:
-    folder = data_folder / "tmi_ct_pair"
-    if not folder.is_dir():
-        pytest.skip(f"recording tmi_ct_pair is not under SAGS_DATA ({data_folder})")
-    ct = read_ct_pair(folder)
-    measured = measure_ct(ct, silent)
-    assert measured["points"] > 2000
-    assert measured["median_abs_mm"] < 0.75 and measured["p90_abs_mm"] < 1.65
-    assert measured["coverage"] > 0.91
-    rows = {row["name"]: row for row in measured["settings"]}
-    assert measured["median_abs_mm"] < 0.85 * rows["plain SGBM, scale 2"]["median_mm"]
-    assert rows["as configured"]["nearest_median_mm"] < 0.5
-    shown = cv2.imdecode(np.frombuffer(picture(ct), np.uint8), cv2.IMREAD_COLOR)
-    assert shown is not None and shown.shape[1] > 3 * shown.shape[0] // 2
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--picture", "a.jpg"], "add --ct FOLDER"),
-        (["launch/phantom.yaml", "--faults"], "give one of them"),
-        (["--faults", "--eyes"], "leave --ct and --faults out"),
-        (["--faults", "--plot", "a.png"], "leave --faults and --eyes out"),
-        (["launch/v4l2.yaml"], "live cameras have no reference depth"),
-    ],
-)
-def test_wrong_calls(arguments: list[str], says: str) -> None:
-    result = CliRunner().invoke(main, ["depth", *arguments])
-    assert result.exit_code == 2 and says in result.output

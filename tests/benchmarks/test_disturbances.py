@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 from places import ROOT
 
-from benchmarks.__main__ import main
 from benchmarks.disturbances import DISTURBANCES, Scene, disturbed
 from benchmarks.disturbances.light import GRAIN, to_linear
 from benchmarks.disturbances.tissue import SMOKE_VEIL
@@ -115,15 +111,6 @@ def test_faults_of_the_right_eye(session: Session, frames: list[StereoFrame]) ->
         assert not black[number].right.any()
 
 
-def test_a_feed_that_freezes_is_live(session: Session, frames: list[StereoFrame]) -> None:
-    """Else the node takes it for a recording, which may repeat pictures."""
-    before, given = frames[DURING.start - 1], play("frozen", frames, scene_of(session, frames))
-    for number in DURING:
-        frozen = given[number]
-        assert frozen is not None and frozen.t_arrival_ns > 0
-        assert np.array_equal(frozen.left, before.left) and np.array_equal(frozen.right, before.right)
-
-
 def test_how_long_each_lasts() -> None:
     lengths = {name: each.length(30, 30.0) for name, each in DISTURBANCES.items()}
     assert (lengths.pop("dark"), lengths.pop("flash"), lengths.pop("cut")) == (15, 2, 10)
@@ -170,14 +157,6 @@ def test_smoke_thickens_with_depth_and_in_time() -> None:
     assert grown[-1] < 0.5 * max(grown)
     veils = 1 - np.exp(-stripes[:, 1::2])
     assert np.median(veils) == pytest.approx(SMOKE_VEIL, abs=0.15)  # clouds differ by about a half
-
-
-def test_smoke_drifts() -> None:
-    scene = on_plane(np.full((HEIGHT, WIDTH), np.float32(0.08)))
-    pictures = [frame.left for frame in changed("smoke", made(np.zeros((HEIGHT, WIDTH, 3), np.uint8)), scene)]
-    thick = slice(18, 25)  # as thick in the first as in the last
-    first, last = (picture.astype(np.float32) for picture in (pictures[thick][0], pictures[thick][-1]))
-    assert np.abs(first - last).mean() > 3 * GRAIN
 
 
 def test_blood_lies_on_the_tissue() -> None:
@@ -265,66 +244,3 @@ def test_warning_times() -> None:
     assert warning_times(quiet | dict.fromkeys(range(13, 16), eyes), during, 10.0) == (0.3, 0.0)
     assert warning_times(quiet | dict.fromkeys(range(21, 40), eyes), during, 10.0) == (1.1, None)
     assert warning_times(quiet | {3: eyes}, during, 10.0) == (None, None)
-
-
-def bench(*arguments: object) -> Result:
-    return CliRunner().invoke(
-        main, ["disturbances", *(str(argument) for argument in arguments)], catch_exceptions=False
-    )
-
-
-KEYS = {
-    "name", "frames", "psnr_before", "psnr_during", "psnr_after", "confident_depth_p90_mm", "depth_median_mm",
-    "coverage", "confident_coverage", "borrowed_share", "confident_borrowed_share", "warned_after_s",
-    "cleared_after_s", "warned_of", "frames_to_recover", "restarts", "anchors", "anchors_back",
-    "anchors_wrong",
-}  # fmt: skip
-
-
-def test_the_bench_measures_the_phantom(tmp_path: Path) -> None:
-    file, pictures = tmp_path / "table.json", tmp_path / "pictures"
-    asked = ["--only", "clean", "--only", "black_right", "--from", 12]
-    result = bench(SESSION, "source.frames:=36", *asked, "--out", file, "--pictures", pictures)
-    assert result.exit_code == 0, result.output
-    assert "black_right" in result.stdout
-    table = json.loads(file.read_text())
-    assert table["provenance"]["revision"] and table["settings"]["from"] == 12
-    assert table["receipt"]["frames"]["count"] == 36
-    clean, black = table["rows"]
-    assert set(clean) == set(black) == KEYS
-    assert (clean["name"], black["name"]) == ("clean", "black_right")
-    assert clean["psnr_before"] == black["psnr_before"]  # the same until then
-    assert clean["frames_to_recover"] == 0 and clean["warned_after_s"] is None and clean["anchors"] >= 12
-    assert clean["anchors_back"] >= 0.5 and clean["anchors_wrong"] <= 0.1
-    assert black["warned_after_s"] is not None and black["warned_of"] == ["right_eye_black"]
-    assert black["borrowed_share"] > clean["borrowed_share"] + 0.2  # nothing is measured after half a second
-    assert black["depth_median_mm"] is not None and 0 < black["coverage"] <= 1
-    for name in ("clean", "black_right"):
-        drawn = cv2.imread(str(pictures / f"{name}.png"))
-        assert drawn.shape == (3 * 288, 4 * 360, 3)
-    row = drawn[288 : 2 * 288]
-    assert not row[:, 360:720].any() and row[:, :360].mean() > 20  # amid, the right eye is black
-
-
-def test_a_feed_that_freezes_is_warned_of_within_half_a_second(tmp_path: Path) -> None:
-    file = tmp_path / "table.json"
-    result = bench(SESSION, "source.frames:=36", "--only", "frozen", "--from", 12, "--out", file)
-    assert result.exit_code == 0, result.output
-    (row,) = json.loads(file.read_text())["rows"]
-    assert row["warned_of"] == ["picture_frozen"]
-    assert row["warned_after_s"] <= 0.5 and row["cleared_after_s"] == 0.0
-    assert row["restarts"] == 0 and row["anchors_wrong"] == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ([SESSION, "--from", 3], "choose another --from"),
-        ([SESSION, "--from", 38], "choose another --from"),
-        ([SESSION, "--only", "earthquake"], "earthquake"),
-        ([ROOT / "launch/v4l2.yaml"], "record the cameras first"),
-    ],
-)
-def test_mistakes_are_named(arguments: list[object], says: str) -> None:
-    result = bench(*arguments)
-    assert result.exit_code == 2 and says in result.output + str(result.exception)

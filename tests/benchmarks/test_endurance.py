@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import itertools
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
-from unittest.mock import ANY
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from command_line import figures_of
 from places import SESSION
 
 from benchmarks.__main__ import main
 from benchmarks.node import endurance
-from benchmarks.node.endurance import FIGURES, STILL_FRAMES, Window, measure_endurance, slope, statement
+from benchmarks.node.endurance import FIGURES, Window, measure_endurance, slope, statement
 from benchmarks.node.soak import worsening
 from sags_node.errors import SagsError
 from sags_node.pipeline.session import Session, open_session
@@ -113,21 +109,6 @@ def test_the_statement_names_a_leak_and_leaves_noise_alone() -> None:
 # ---- the run ---------------------------------------------------------------------------------------------
 
 
-def test_windows_cover_the_run_and_the_still_scene_is_recognised() -> None:
-    found = measure_endurance(opened(), 130, 30, "there-and-back", ignore)
-    assert [window["frames"] for window in found["windows"]] == [30, 60, 90, 120]
-    assert found["receipt"]["frames"]["count"] == 130 + STILL_FRAMES
-    for window in found["windows"]:
-        assert 0 < window["ms_p50"] <= window["ms_p99"]
-        assert 25 < window["psnr"] < 60
-        assert 500 < window["gaussians"] <= 2000 and 0 < window["nodes"] <= 2048
-        assert window["restarts"] == 0 and window["rss_mb"] > 50
-    assert all(found["per_1000_frames"][figure] is not None for figure in FIGURES)
-    still = found["still"]
-    assert still["recognised"] >= STILL_FRAMES - 1 and still["settled"] < still["recognised"]
-    assert still["cpu_ratio"] == still["cpu_ms"] / still["moving_cpu_ms"]
-
-
 def test_ctrl_c_keeps_what_is_known_so_far() -> None:
     def stop(done: int, total: int, what: str) -> None:
         if done == 25:
@@ -143,26 +124,6 @@ def test_a_recording_that_does_not_fit_into_memory_is_refused(monkeypatch: pytes
     monkeypatch.setattr(endurance, "MOST_BYTES", 2_000_000)
     result = bench(SESSION, "--frames", 5)
     assert result.exit_code == 1 and "source.frames:=" in result.output and "Traceback" not in result.output
-
-
-def test_the_command_prints_and_writes_the_same_table(tmp_path: Path) -> None:
-    out = tmp_path / "new" / "endurance.json"
-    arguments = ("mapping.max_gaussians:=2000", "source.frames:=12", "--frames", 24, "--window", 6)
-    asked = (*arguments, "--order", "wrap", "--json", "--out", out)
-    found = figures_of("endurance", SESSION, *asked, command=main)
-    assert json.loads(out.read_text()) == {"provenance": ANY} | found
-    assert found["recorded_frames"] == 12 and found["order"] == "wrap" and len(found["windows"]) == 4
-    shown = bench(SESSION, *arguments)
-    assert shown.exit_code == 0 and "Gaussians" in shown.stdout and "per 1000 frames" in shown.stdout
-
-
-def test_what_cannot_be_played_over_and_over_says_why(tmp_path: Path) -> None:
-    live = tmp_path / "live.yaml"
-    live.write_text("source: {kind: v4l2}\n")
-    result = bench(live)
-    assert result.exit_code == 2 and "record" in result.output
-    assert bench("nothing.yaml").exit_code == 2
-    assert bench(SESSION, "--order", "sideways").exit_code == 2
 
 
 # ---- when `python -m benchmarks soak --check` fails ----------------------------------------------------

@@ -2,38 +2,14 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from unittest.mock import ANY
-
 import pytest
 import warp as wp
-from command_line import refused, sags
 from warp_on_cpu import use_warp_on_cpu
 
-from benchmarks.__main__ import main
 from benchmarks.gpu import refining
 from benchmarks.gpu.check import GpuCheck, gpu_check
-from sags_node.engine import device
 from sags_node.engine.gpu.rasterizer import DeviceRasterizer
 from sags_node.errors import SagsError
-
-COMMAND = ("kernels", "--device", "cuda")
-
-
-def test_a_gpu_is_compared_with_the_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use_warp_on_cpu(monkeypatch)
-    file = tmp_path / "gpu.json"
-    result = sags(*COMMAND, "--quick", "--json", "--out", file, command=main)
-    assert result.exit_code == 0, result.output
-    table = json.loads(result.stdout)
-    assert json.loads(file.read_text()) == {"provenance": ANY} | table
-    (row,) = table["refine"]
-    assert row["n"] == 8 and (row["width"], row["height"]) == (32, 16)
-    assert all(row[f"{where}_{what}_ms"] > 0 for where in ("cpu", "gpu") for what in ("frame", "step"))
-    assert row["planes_apart"] < 1e-5 and row["colors_apart"] < 1e-3
-    shown = str(refining.gpu_table(table).columns[0].header)
-    assert table["device"] in shown and table["warp"] in shown
 
 
 def test_a_wrong_drawing_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,13 +31,6 @@ def test_a_gpu_that_fails_gives_no_figures(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(DeviceRasterizer, "backward", fails)
     with pytest.raises(SagsError, match="CUDA error"):
         refining.measure_case(8, 32, 16, 1)
-
-
-def test_what_cannot_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    refused(2, *COMMAND, "--large", said=("--device cuda give --quick",), command=main)
-    monkeypatch.setattr(device, "has_gpu", lambda: False)
-    device.find_gpu.cache_clear()
-    refused(2, *COMMAND, "--quick", said=("no NVIDIA GPU", "nvidia-smi"), command=main)
 
 
 def test_the_check_tries_everything_and_goes_on_after_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

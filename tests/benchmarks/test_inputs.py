@@ -6,7 +6,6 @@ import pytest
 from gstreamer import need_gstreamer
 
 from benchmarks.node.inputs import RATE, measure_inputs
-from sags_node.errors import UsageError
 
 pytestmark = pytest.mark.live
 
@@ -22,8 +21,3 @@ def test_what_a_pair_costs_is_measured(way: str) -> None:
     assert 0 < row["pairs"] <= 0.5 * RATE + 8  # more than come in that time only where some waited
     assert row["node_ms"] > 0 and row["sender_ms"] > 0
     assert 0 < row["latency_ms_p50"] <= row["latency_ms_p99"]
-
-
-def test_a_way_that_there_is_not_is_refused() -> None:
-    with pytest.raises(UsageError, match="the ways are gst, two branches, "):
-        measure_inputs(0.5, "telepathy", lambda done, total: None)

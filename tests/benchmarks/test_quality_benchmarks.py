@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,8 +15,8 @@ from benchmarks.quality.followers import Csrt, Follower, dense_flow, lucas_kanad
 from benchmarks.quality.tracking import measure_tracking
 from benchmarks.quality.tracking_report import tables
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import FoldersSource, PhantomSource
-from sags_node.errors import SagsError, UsageError
+from sags_node.config.schema import PhantomSource
+from sags_node.errors import SagsError
 from sags_node.mapping.anchors import Anchors
 from sags_node.phantom import PhantomScene
 from sags_node.pipeline.session import Session, open_session
@@ -50,15 +48,6 @@ def test_most_anchors_come_back_after_the_scope_looked_elsewhere(monkeypatch: py
     assert row["anchors"] > 30 and row["found"] > max(0.5, row["unmoved"]) and row["wrong"] < 0.1
 
 
-def test_only_the_phantom_knows_its_points() -> None:
-    session = open_session("launch/phantom.yaml", SMALL)
-    other = session.config.model_copy(
-        update={"source": FoldersSource(left=Path("left"), right=Path("right"))}
-    )
-    with pytest.raises(UsageError, match="phantom"):
-        recall.measure_recall(replace(session, config=other), 2.0, lambda done, of, what: None)
-
-
 # ---- `benchmarks scope`: two breaths of a small phantom ------------------------------------------------
 
 
@@ -79,15 +68,6 @@ def test_what_is_told_is_exact_and_what_a_robot_is_off_by_is_what_was_planted() 
     assert rows["robot"]["max_mm"] > 15 * np.sin(np.linalg.norm(scope.HAND_EYE))
     assert scope.table(measured).row_count == len(rows)
     assert measured["receipts"]["zoom"]["frames"]["count"] == 20
-
-
-def test_only_the_phantom_knows_its_scope() -> None:
-    config = load_launch(None, BREATHS)
-    other = config.model_copy(update={"source": FoldersSource(left=Path("left"), right=Path("right"))})
-    with pytest.raises(UsageError, match="phantom"):
-        scope.measure_scope(other, ["zoom"], 8.0, lambda done, of, what: None)
-    with pytest.raises(UsageError, match="breaths"):
-        scope.measure_scope(config, ["zoom"], 5.0, lambda done, of, what: None)
 
 
 # ---- `benchmarks tracking`: its truths, and what it says of the node on the phantom --------------------

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -138,17 +136,6 @@ def test_no_thread_gives_way_to_others(node: RunningNode) -> None:
     assert {os.sched_getscheduler(thread) for thread in threads} == {os.SCHED_OTHER}
     own = os.getpriority(os.PRIO_PROCESS, node.process.pid)
     assert {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads} == {own}
-
-
-@pytest.mark.fault("process: Ctrl-C, SIGTERM or SIGHUP to the node")
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_stopping_is_clean(phantom_session: Path, tmp_path: Path, stop: signal.Signals) -> None:
-    running = RunningNode(phantom_session, tmp_path)
-    time.sleep(1.0)
-    running.process.send_signal(stop)
-    assert running.process.wait(30) == 0
-    assert not (running.run_dir / "sags.json").exists()
-    assert "Traceback" not in running.said()
 
 
 @pytest.mark.fault("process: the node is killed")

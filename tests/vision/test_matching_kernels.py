@@ -13,6 +13,7 @@ from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.inverse_search import PATCH, at_pixels, centres, grid_shape, search, start
 from sags_node.vision.margin import clear_of_instruments
 from sags_node.vision.pyramid import BORDER, gray_pyramid, inner, level, level_count, with_border
+from sags_node.vision.smoothing import guided
 
 WIDTH, HEIGHT = 90, 70  # no multiple of the patches' distance, nor of a vector
 PX = np.float64
@@ -203,3 +204,23 @@ def test_the_guess_is_right_to_a_pixel(disparity: int) -> None:
 def test_a_whole_picture_in_the_form_of_a_half() -> None:
     picture = texture().astype(np.uint8)
     np.testing.assert_array_equal(with_border(picture), bordered(picture.astype(np.float32)))
+
+
+# ---- smoothing -------------------------------------------------------------------------------------------
+
+
+def test_smoothing_is_the_guided_filter() -> None:
+    """On its own definition, of every window of 7x7 px; so planes stay, and steps larger than the noise."""
+    variance, rows, columns = 0.2, np.arange(HEIGHT)[:, None], np.arange(WIDTH)
+    field = 16 + 0.01 * columns - 0.012 * rows + 8 * (columns > WIDTH // 2)
+    noisy = (field + np.random.default_rng(0).normal(size=field.shape)).astype(np.float32)
+    smooth, of_field = np.empty_like(noisy), np.empty_like(noisy)
+    guided(noisy, 3, np.float32(variance), smooth)
+    windows = np.lib.stride_tricks.sliding_window_view
+    patches = windows(noisy.astype(np.float64), (7, 7))
+    mean, spread = patches.mean((-1, -2)), patches.var((-1, -2))
+    kept = spread / (spread + variance)
+    slope, offset = (windows(part, (7, 7)).mean((-1, -2)) for part in (kept, mean * (1 - kept)))
+    np.testing.assert_allclose(smooth[6:-6, 6:-6], slope * noisy[6:-6, 6:-6] + offset, atol=2e-3)
+    guided(field.astype(np.float32), 3, np.float32(variance), of_field)
+    assert np.abs(of_field - field)[8:-8, 8:-8].max() < 0.2  # px, of a step of 8

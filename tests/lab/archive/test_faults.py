@@ -9,8 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from typing import Any
 import pytest
 from small_disk import small_disk
 from tiny_archive import quick_plan, quick_work, table, write_quick_recordings
+from waiting import until
 
 from sags_lab.archive.cluster import connected
 from sags_lab.archive.manifest import Recording, as_csv
@@ -58,14 +58,6 @@ def gone_through(
 def change(recording: Recording, **said: Any) -> None:
     file = Path(recording.place)
     file.write_text(json.dumps(json.loads(file.read_text()) | said))
-
-
-def until(there: Callable[[], Any]) -> Any:
-    deadline = time.monotonic() + PATIENCE
-    while not (found := there()):
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.05)
-    return found
 
 
 def begun(signs: Path, recording: Recording) -> int:

@@ -10,20 +10,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from command_line import figures_of
-from places import SESSION
+from command_line import figures_of, refused
 
 from sags_lab.protocols.d4d_files import d4d_clips, instruments_are_white
 from sags_lab.protocols.d4d_population import LEFT_OUT, in_population
 from sags_lab.protocols.d4d_scan import check_scan, read_surface, scan_depth
-from sags_node.cli.main import main
-from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform, unproject
-from sags_node.rig import eye_text, load_rig
-from sags_node.sources.source import open_source
-from sags_node.types import F32, F64, Camera, Eye, StereoFrame
+from sags_node.rig import eye_text
+from sags_node.types import F32, F64, Camera, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
 FRAMES = 9  # the first and the last of them have depth
@@ -54,7 +49,7 @@ def write_cloud(file: Path, points: F64) -> None:
 
 
 @pytest.fixture(scope="module")
-def d4d(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def d4d(tmp_path_factory: pytest.TempPathFactory, rig: StereoRig, played: list[StereoFrame]) -> Path:
     root = tmp_path_factory.mktemp("d4d")
     session = root / "specimen_1/2025_03_06-16_49_40"
     clip = session / "clips/Clip_1"
@@ -62,27 +57,24 @@ def d4d(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (clip / name).mkdir(parents=True)
     for name in ("camera_info", "clips/Clip_1/camera_info", "clips/Clip_1/zivid_masks", "pointcloud"):
         (session / name).mkdir(exist_ok=True)
-    rig = load_rig(SESSION / "calib")
     rectifier = Rectifier(rig, rig.left.width, rig.left.height)
     for side, eye in (("left", rig.left), ("right", rig.right)):
         rectified = Eye(eye.width, eye.height, eye.P[:, :3], np.zeros(5), np.eye(3), eye.P)
         (clip / f"camera_info/{side}_rect.yaml").write_text(eye_text(rectified, side))
     (session / "camera_info/color_camera_info.yaml").write_text(json.dumps({"K": SCANNER.ravel().tolist()}))
-    source = load_launch(SESSION, ["source.pace:=step", f"source.frames:={FRAMES}"]).source
     truths: list[F32] = []
-    with open_source(source) as frames:
-        for number, frame in enumerate(frames):
-            pair, name = rectifier(frame), f"{1741275000 + number // 15}_{number % 15 * 66666666:09d}"
-            assert frame.reference is not None and pair.right is not None
-            if frame.reference.depth is not None:
-                truths.append(frame.reference.depth)
-            cv2.imwrite(str(clip / f"left_images_rect/{name}.png"), pair.left[..., ::-1])
-            cv2.imwrite(str(clip / f"right_images_rect/{name}.png"), pair.right[..., ::-1])
-            mask = np.zeros(pair.left.shape[:2], np.uint8)
-            mask[HIDDEN] = 255
-            cv2.imwrite(str(clip / f"left_images_rect_masks/{name}.png"), mask)
-            theirs = np.where(truths[-1] > 0, truths[-1] + THEIRS, np.nan)
-            np.save(clip / f"stereo_depth/{name}.npy", theirs)
+    for number, frame in enumerate(played[:FRAMES]):
+        pair, name = rectifier(frame), f"{1741275000 + number // 15}_{number % 15 * 66666666:09d}"
+        assert frame.reference is not None and pair.right is not None
+        if frame.reference.depth is not None:
+            truths.append(frame.reference.depth)
+        cv2.imwrite(str(clip / f"left_images_rect/{name}.png"), pair.left[..., ::-1])
+        cv2.imwrite(str(clip / f"right_images_rect/{name}.png"), pair.right[..., ::-1])
+        mask = np.zeros(pair.left.shape[:2], np.uint8)
+        mask[HIDDEN] = 255
+        cv2.imwrite(str(clip / f"left_images_rect_masks/{name}.png"), mask)
+        theirs = np.where(truths[-1] > 0, truths[-1] + THEIRS, np.nan)
+        np.save(clip / f"stereo_depth/{name}.npy", theirs)
     said: dict[str, Any] = {"name": "Clip_1"}
     for when, truth in (("start", truths[0]), ("end", truths[-1])):
         rows, columns = np.nonzero(truth)
@@ -118,19 +110,12 @@ def test_d4d_end_to_end(d4d: Path) -> None:
     assert population["start"]["visible"] == found["start"]["visible"]
 
 
-def test_one_scan_that_is_elsewhere_stops_no_other(d4d: Path, tmp_path: Path) -> None:
+def test_a_recording_of_which_no_scan_fits_is_refused(d4d: Path, tmp_path: Path) -> None:
+    """Of the frames that are played: one scan that is elsewhere stops no other."""
     clip = copied(d4d, tmp_path / "wrong")
     np.savetxt(clip / "curated_camera_pose_start.txt", invert(scanner_pose()))
-    command = ["eval", "--protocol", "d4d", str(clip), "--iterations", "1", "--json"]
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    assert (found["scans"], found["refused"]) == (1, 1) and found["start"] == {}
-    (of_clip,) = found["of_each"].values()
-    assert "the other way round" in of_clip["start"]["refused"]
-    assert found["end"]["visible"]["measured"] == of_clip["end"]["visible"]["measured"]
-    result = CliRunner().invoke(main, [*command, "source.frames:=1"])
-    assert result.exit_code == 1 and "the other way round" in result.stderr
+    command = ("eval", "--protocol", "d4d", clip, "--iterations", 1, "source.frames:=1")
+    refused(1, *command, said=("the other way round",))
 
 
 def test_the_public_population() -> None:
@@ -166,8 +151,7 @@ def test_the_population_asks_no_stereo(d4d: Path, tmp_path: Path) -> None:
     assert population["end"]["visible"]["measured"]["median_mm"] > 0.1 * nearest * 1e3
 
 
-def test_clips_of_d4d(d4d: Path) -> None:
-    rig = load_rig(SESSION / "calib")
+def test_clips_of_d4d(d4d: Path, rig: StereoRig) -> None:
     session = d4d / "specimen_1/2025_03_06-16_49_40"
     for folder in (d4d, d4d / "specimen_1", session, session / "clips/Clip_1"):
         (clip,) = d4d_clips(folder)
@@ -281,13 +265,13 @@ def test_which_colour_is_instrument(tmp_path: Path) -> None:
     assert instruments_are_white([]) is None
 
 
-def test_wrong_files_are_named(d4d: Path, tmp_path: Path) -> None:
+def test_wrong_files_are_named(d4d: Path, tmp_path: Path, rig: StereoRig) -> None:
     clip = copied(d4d, tmp_path / "wrong")
     good = (clip / "camera_info/right_rect.yaml").read_text()
     (clip / "camera_info/right_rect.yaml").write_text(good.replace("projection_matrix", "P3"))
     with pytest.raises(UsageError, match=r"right_rect\.yaml is no camera_info"):
         d4d_clips(clip)
-    P = load_rig(SESSION / "calib").right.P[0, 3]
+    P = rig.right.P[0, 3]
     (clip / "camera_info/right_rect.yaml").write_text(good.replace(str(float(P)), str(float(P) * 1e3)))
     with pytest.raises(UsageError, match="P is in metres times pixels"):
         d4d_clips(clip)

@@ -13,7 +13,6 @@ import pytest
 from click.testing import CliRunner
 from command_line import figures_of
 from numbered_pictures import write_video
-from places import SESSION
 
 from sags_lab.protocols.layouts import (
     as_stir_counts,
@@ -24,11 +23,9 @@ from sags_lab.protocols.layouts import (
 )
 from sags_lab.protocols.point_tracker import raw_pair, to_raw, to_working
 from sags_node.cli.main import main
-from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
-from sags_node.rig import load_rig, rectify_eyes
-from sags_node.sources.source import open_source
+from sags_node.rig import rectify_eyes
 from sags_node.types import F64, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
@@ -38,10 +35,8 @@ FAST = ["--iterations", "1"]
 
 
 @pytest.fixture(scope="module")
-def recorded() -> tuple[StereoRig, list[StereoFrame]]:
-    source = load_launch(SESSION, ["source.pace:=step", f"source.frames:={FRAMES}"]).source
-    with open_source(source) as frames:
-        return load_rig(SESSION / "calib"), list(frames)
+def recorded(rig: StereoRig, played: list[StereoFrame]) -> tuple[StereoRig, list[StereoFrame]]:
+    return rig, played[:FRAMES]
 
 
 def matrices(rig: StereoRig) -> tuple[list[F64], list[F64], F64, F64]:

@@ -14,29 +14,23 @@ from numbered_pictures import write_video
 from places import SESSION
 
 from sags_lab.protocols.stir_2026 import stir_2026_sequences
-from sags_node.config.launch_file import load_launch
 from sags_node.errors import UsageError
 from sags_node.geometry import project
 from sags_node.rig import load_rig
-from sags_node.sources.source import open_source
+from sags_node.types import StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
-FRAMES = 13  # the latency of the first eleven does not count
+# Of thirteen frames; the latency of the first eleven does not count.
 KNOWN = (0, 4, 12)
 BORDER = 40  # px
 
 
 @pytest.fixture(scope="module")
-def stir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    rig = load_rig(SESSION / "calib")
+def stir(tmp_path_factory: pytest.TempPathFactory, rig: StereoRig, played: list[StereoFrame]) -> Path:
     rectifier, size = Rectifier(rig, rig.left.width, rig.left.height), (rig.left.width, rig.left.height)
     folder = tmp_path_factory.mktemp("stir") / "test/00"
     folder.mkdir(parents=True)
-    with open_source(
-        load_launch(SESSION, ["source.pace:=step", f"source.frames:={FRAMES}"]).source
-    ) as source:
-        frames = list(source)
-    pairs = [rectifier(frame) for frame in frames]
+    pairs = [rectifier(frame) for frame in played]
     write_video(folder / "left.mp4", [pair.left for pair in pairs])
     write_video(folder / "right.mp4", [pair.right for pair in pairs if pair.right is not None])
     K = rectifier.camera.K.tolist()
@@ -47,7 +41,7 @@ def stir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "calib.json").write_text(json.dumps(said))
     truth = {}
     for number in KNOWN:
-        reference, camera = frames[number].reference, rectifier.camera
+        reference, camera = played[number].reference, rectifier.camera
         assert reference is not None and reference.points is not None and reference.points_visible is not None
         left, right = (
             project(eye, reference.points)[0] for eye in (camera, camera.moved_right(rig.baseline))

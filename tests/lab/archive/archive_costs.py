@@ -1,47 +1,38 @@
-"""Forty recordings as one archive, with and without faults, and what the archive itself costs.
+"""What an archive itself costs.
 
-    python tests/lab/archive/forty.py whole FOLDER        # without faults
-    python tests/lab/archive/forty.py faults FOLDER       # the same with faults; mounts a disk
-    python tests/lab/archive/forty.py efficiency FOLDER
-    python tests/lab/archive/forty.py tiny FOLDER         # 2000 recordings that do next to nothing
-    python tests/lab/archive/forty.py large FOLDER        # 100,000 that are done
+    python tests/lab/archive/archive_costs.py efficiency FOLDER
+    python tests/lab/archive/archive_costs.py tiny FOLDER         # 2000 recordings that do next to nothing
+    python tests/lab/archive/archive_costs.py large FOLDER        # 100,000 that are done
 
-Each takes some minutes of two cores; FOLDER must be new, but for `faults`. benchmarks/archive.md has
-what came out.
+Each takes some minutes of two cores; FOLDER must be new. benchmarks/archive.md has what came out.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
-import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[3]
 HELPERS = ROOT / "tests/helpers"
 sys.path.insert(0, str(HELPERS))
-from small_disk import small_disk  # noqa: E402
 from tiny_archive import quick_plan, quick_work, write_quick_recordings  # noqa: E402
 
 from sags_lab.archive.cluster import connected  # noqa: E402
 from sags_lab.archive.inputs import key_of  # noqa: E402
 from sags_lab.archive.manifest import Recording, write_manifest  # noqa: E402
 from sags_lab.archive.process import Limits  # noqa: E402
-from sags_lab.archive.results import failed, read_results, write_results  # noqa: E402
+from sags_lab.archive.results import write_results  # noqa: E402
 from sags_lab.archive.run import Tally, about, run  # noqa: E402
-from sags_lab.archive.store import RECORDINGS, Store  # noqa: E402
+from sags_lab.archive.store import Store  # noqa: E402
 from sags_lab.archive.work import Plan, work  # noqa: E402
-from sags_node.evaluation.golden import TIMING_KEYS  # noqa: E402
 from sags_node.evaluation.provenance import revision  # noqa: E402
 from sags_node.phantom import PhantomScene, write_session  # noqa: E402
 
@@ -50,7 +41,6 @@ KINDS: tuple[dict[str, Any], ...] = (
     {}, {"smoke": 0.4}, {"noise": 0.05}, {"blur": 1.5}, {"camera_motion": "sway"}, {"blackout": (0.2, 0.3)},
     {"gloss": 10.0},
 )  # fmt: skip
-REAL = (("d4d_pull", 0.0), ("d4d_pull", 3.0), ("hamlyn_heart", 0.0), ("hamlyn_heart", 2.0))
 OVERRIDES = ("mapping.max_gaussians:=2000",)
 OPTIONS = ("--iterations", "1", "--hold-out", "2", "--every", "2")
 TIMEOUT = 40  # s; what takes longest takes 10
@@ -70,82 +60,12 @@ def phantoms(folder: Path, count: int) -> list[Recording]:
     ]
 
 
-def forty(folder: Path) -> list[Recording]:
-    """34 phantoms, four real ones, one that is damaged and one that will hang."""
-    recordings = phantoms(folder, 34)
-    for name, start in REAL:
-        said = (f"source.start:={start}", "source.frames:=6")
-        recordings.append(Recording(str(ROOT / f"launch/{name}.yaml"), str(folder), None, said, 50.0))
-    for name in ("poison", "hangs"):
-        shutil.copytree(folder / "phantom00", folder / name)
-        recordings.append(Recording(name, str(folder), weight=9.0))
-    sorted((folder / "poison/left").iterdir())[1].write_bytes(b"no picture")
-    return recordings
-
-
-def hang(recording: str) -> None:
-    """Stop whatever works on a recording, as a disk that no longer answers would; does not return."""
-    while True:
-        for entry in Path("/proc").glob("[0-9]*"):
-            if "archive.child" in (said := name_of(int(entry.name))) and f"eval {recording} " in said:
-                with suppress(ProcessLookupError):
-                    os.kill(int(entry.name), signal.SIGSTOP)
-        time.sleep(0.2)
-
-
 def command(folder: Path, out: Path) -> list[str]:
     return [
         *(sys.executable, "-m", "sags_node", "archive", "run", str(folder / "forty.csv"), "--job", "eval"),
         *("--out", str(out), "--timeout", str(TIMEOUT), "--attempts", str(ATTEMPTS)),
         *("--options", " ".join(OPTIONS), *OVERRIDES),
     ]
-
-
-def whole(folder: Path) -> None:
-    write_manifest(str(folder / "forty.csv"), forty(folder))
-    threading.Thread(target=hang, args=(str(folder / "hangs"),), daemon=True).start()
-    began = time.monotonic()
-    subprocess.run(command(folder, folder / "whole"), check=False, timeout=2 * PATIENCE)
-    say(f"{time.monotonic() - began:.0f} s")
-
-
-def faults(folder: Path) -> None:
-    threading.Thread(target=hang, args=(str(folder / "hangs"),), daemon=True).start()
-    whole = folder / "whole"
-    size = sum(file.stat().st_size for file in (whole / RECORDINGS).rglob("*") if file.is_file())
-    with small_disk(folder / "disk", size * 2 // 3) as disk:
-        out = disk / "out"
-        driver = subprocess.Popen(command(folder, out), start_new_session=True)
-        until(lambda: len(markers(out)) >= 6, driver)
-        worker = next(each for each in below(driver.pid) if name_of(each).startswith("ray::work"))
-        os.kill(worker, signal.SIGKILL)
-        say(f"worker {worker} killed with {len(markers(out))} done")
-        until(lambda: len(markers(out)) >= 14, driver)
-        ours = below(driver.pid)
-        driver.kill()
-        driver.wait(PATIENCE)
-        until(lambda: not [each for each in ours if alive(each)])
-        done = [markers(out)]
-        say(f"command killed with {len(done[0])} done; all that it started has ended")
-        ended = subprocess.run(
-            command(folder, out), check=False, capture_output=True, text=True, timeout=2 * PATIENCE
-        )
-        done.append(markers(out))
-        say(f"disk full with {len(done[1])} done: {ended.stderr.strip().splitlines()[-1]}")
-        assert ended.returncode == 1 and "no space left" in ended.stderr
-        subprocess.run(["mount", "-o", f"remount,size={4 * size}", str(disk)], check=True, timeout=10)
-        subprocess.run(command(folder, out), check=False, timeout=2 * PATIENCE)
-        done.append(markers(out))
-        assert all(earlier.items() <= later.items() for earlier, later in pairwise(done))
-        say(f"done after each: {[len(each) for each in done]}, none twice")
-        tables = [[without_times(row) for row in read_results(Store(str(each)))] for each in (whole, out)]
-        assert tables[0] == tables[1], "the tables differ"
-        states = [row["state"] for row in tables[0]]
-        say(f"tables equal in {len(states)} rows, {len(tables[0][0])} columns: {states.count('done')} done")
-        quarantined = {record["recording"]: record for record in failed(Store(str(out)))}
-        assert quarantined.keys() == {"poison", "hangs"}
-        for name, record in quarantined.items():
-            say(f"{name}: {[attempt['reason'] for attempt in record['attempts']]}")
 
 
 def efficiency(folder: Path) -> None:
@@ -226,15 +146,6 @@ def timed(what: str, count: int) -> Iterator[None]:
     say(f"{what}: {seconds:.1f} s, {seconds / count * 1e3:.2f} ms each")
 
 
-def without_times(row: dict[str, Any]) -> dict[str, Any]:
-    """A row without what differs from run to run, and the version."""
-    return {
-        key: value
-        for key, value in row.items()
-        if key.partition(".")[0] not in TIMING_KEYS | {"seconds", "finished", "version"}
-    }
-
-
 def markers(out: Path) -> dict[str, int]:
     """What is done, and when it was."""
     return {file.name: file.stat().st_mtime_ns for file in (out / "done").glob("[!.]*")}
@@ -254,13 +165,6 @@ def below(process: int) -> list[int]:
     return found[1:]
 
 
-def alive(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 def name_of(process: int) -> str:
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
@@ -276,19 +180,11 @@ def megabytes(process: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") * 1e-6
 
 
-def until(there: Callable[[], Any], driver: subprocess.Popen[bytes] | None = None) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not there():
-        assert time.monotonic() < deadline, "it did not happen"
-        assert driver is None or driver.poll() is None, "the command has ended"
-        time.sleep(0.1)
-
-
 def say(line: str) -> None:
     print(line, flush=True)
 
 
 if __name__ == "__main__":
     what, place = sys.argv[1], Path(sys.argv[2]).resolve()
-    place.mkdir(parents=True, exist_ok=what == "faults")
-    {"whole": whole, "faults": faults, "efficiency": efficiency, "tiny": tiny, "large": large}[what](place)
+    place.mkdir(parents=True)
+    {"efficiency": efficiency, "tiny": tiny, "large": large}[what](place)
