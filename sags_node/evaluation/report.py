@@ -16,7 +16,7 @@ from sags_node.evaluation.measure import FrameRow
 from sags_node.evaluation.page import encoded, page, picture_uri, svg_uri
 from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.provenance import provenance
-from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.run import RunFacts
 from sags_node.evaluation.tiles import ERROR_AT_TOP, depth_range, tiles
 from sags_node.evaluation.verdict import flat, verdict
 from sags_node.files import check_folder, check_results, whole

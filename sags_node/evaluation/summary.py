@@ -15,7 +15,7 @@ from sags_node.evaluation.lpips import BACKBONE
 from sags_node.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.evaluation.metrics import percentiles
 from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.run import RunFacts
 from sags_node.evaluation.trajectory import trajectory_errors
 
 GROUPS = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.evaluation.carried import Seen, carried
+from sags_node.evaluation.moments import Seen, carried
 from sags_node.types import F32, Camera, Gaussians
 
 WIDTH, HEIGHT, DEPTH, FOCAL = 96, 64, 0.1, 100.0

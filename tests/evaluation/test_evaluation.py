@@ -1,4 +1,4 @@
-"""The spool, the measuring of a run with known answers, golden comparison and the report."""
+"""What is kept, the measuring of a run with known answers, golden comparison and the report."""
 
 import json
 import tempfile
@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from places import ROOT
 
 from sags_node.cli.main import main
+from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
@@ -25,8 +26,8 @@ from sags_node.evaluation.measure import MeasureOptions, Measurer
 from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.report import write_report
+from sags_node.evaluation.run import MappedFrame, Run
 from sags_node.evaluation.session import evaluate
-from sags_node.evaluation.spool import Spool
 from sags_node.evaluation.summary import GROUPS, STAGES, summarise
 from sags_node.rig import save_rig
 from sags_node.types import (
@@ -51,6 +52,7 @@ PERIOD_NS = 33_333_333
 SPEED = np.array([0.015, 0.006, 0.0], np.float32)  # m/s: 1.25 and 0.5 px a frame
 FRAMES = 20
 DEFAULTS = MeasureOptions()
+CONFIG = load_launch(None, ["device:=cpu", "publish.detail:=false", "vision.tissue.dilate:=0"])
 
 
 def rig() -> StereoRig:
@@ -138,16 +140,16 @@ def measured_run(
     dropped: int | None = None,
     right: bool = False,
 ) -> Measurer:
-    """Spool a run that plays `frames`, and measure it."""
-    with Spool() as spool:
+    """Keep a run that plays `frames`, and measure it."""
+    with Run() as run:
         for frame in frames:
             if options.holds_out(frame.frame_id) or frame.frame_id == dropped:
                 continue
             result = frame_result(frame, velocity, late)
-            spool.add(with_right_eye(result) if right else result, 21.0, frame.t_capture_ns)
+            run.add(with_right_eye(result) if right else result, 21.0, frame.t_capture_ns)
         receipt = Receipt(rig(), (WIDTH, HEIGHT), options.lpips_weights)
         rectifier = Rectifier(rig(), WIDTH, HEIGHT)
-        measurer = Measurer(spool, rectifier, lambda frame, pair: frame.tissue, options, receipt)
+        measurer = Measurer(run, rectifier, CONFIG, options, receipt)
         measurer.run(frames, lambda what, done: None)
     return measurer
 
@@ -163,24 +165,26 @@ def frames() -> list[StereoFrame]:
     return [stereo_frame(frame_id) for frame_id in range(FRAMES)]
 
 
-# ---- spool -----------------------------------------------------------------------------------------------
+# ---- what is kept -------------------------------------------------------------------------------------------
 
 
-def test_spool_gives_back_every_bit_and_leaves_nothing(frames: list[StereoFrame]) -> None:
+def test_a_run_gives_back_every_bit_and_leaves_nothing(frames: list[StereoFrame]) -> None:
     rng = np.random.default_rng(0)
     kept = []
-    with Spool() as spool:
-        folder = spool.folder
+    with Run() as run:
+        folder = run.folder
         for frame in frames[:3]:
             result = frame_result(frame, SPEED)
             tissue = rng.random((HEIGHT, WIDTH)) < 0.5
             depth = rng.random((HEIGHT, WIDTH), np.float32)
             seen = replace(result.observation, tissue=tissue, depth=depth)
             kept.append(replace(result, observation=seen))
-            spool.add(kept[-1], 12.5, 99, 40.25)
-        assert spool.frame_ids == [0, 1, 2]
-        for result, back in zip(kept, spool, strict=True):
-            view = result.views["left"]
+            run.add(kept[-1], 12.5, 99, 40.25)
+        assert run.frame_ids == [0, 1, 2]
+        assert run.read(3) is None
+        for frame_id, result in enumerate(kept):
+            view, back = result.views["left"], run.read(frame_id)
+            assert isinstance(back, MappedFrame)
             np.testing.assert_array_equal(back.rgb, view.rgb)
             for got, given in (
                 (back.depth, view.depth),
@@ -203,20 +207,20 @@ def test_spool_gives_back_every_bit_and_leaves_nothing(frames: list[StereoFrame]
     assert not folder.exists()
 
 
-def test_spool_is_gone_after_ctrl_c(frames: list[StereoFrame]) -> None:
-    with pytest.raises(KeyboardInterrupt), Spool() as spool:
-        folder = spool.folder
-        spool.add(frame_result(frames[0], SPEED), 1.0, 0)
+def test_a_run_is_gone_after_ctrl_c(frames: list[StereoFrame]) -> None:
+    with pytest.raises(KeyboardInterrupt), Run() as run:
+        folder = run.folder
+        run.add(frame_result(frames[0], SPEED), 1.0, 0)
         raise KeyboardInterrupt
     assert not folder.exists()
 
 
 @pytest.mark.fault("disk: what a measurement keeps cannot be written")
-def test_spool_says_what_to_do_when_it_cannot_write(frames: list[StereoFrame]) -> None:
-    with Spool() as spool:
-        spool.folder.rmdir()
+def test_a_run_says_what_to_do_when_it_cannot_write(frames: list[StereoFrame]) -> None:
+    with Run() as run:
+        run.folder.rmdir()
         with pytest.raises(SagsError, match="set TMPDIR"):
-            spool.add(frame_result(frames[0], SPEED), 1.0, 0)
+            run.add(frame_result(frames[0], SPEED), 1.0, 0)
 
 
 # ---- a run with known answers ----------------------------------------------------------------------------

@@ -13,11 +13,11 @@ from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.flicker import FRAMES, Flicker
 from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.moments import VELOCITY_SHARE, extrapolated
 from sags_node.evaluation.point_tracks import average_jaccard, calibration_error, reliability
-from sags_node.evaluation.spool import RunFacts, SpooledFrame
+from sags_node.evaluation.run import MappedFrame, RunFacts
 from sags_node.evaluation.tracking import PointTracks
 from sags_node.evaluation.trajectory import drift
-from sags_node.evaluation.views import VELOCITY_SHARE, extrapolated
 from sags_node.mapping.camera_pose import exponential
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import Camera, Gaussians, Snapshot
@@ -401,7 +401,7 @@ def test_reliability_tells_what_was_said_from_what_was_right() -> None:
 HEIGHT, WIDTH = 64, 96
 
 
-def frame() -> SpooledFrame:
+def frame() -> MappedFrame:
     """All tissue, gray, 100 mm away."""
     nothing = np.zeros((0, 3), np.float32)
     gaussians = Gaussians(
@@ -409,7 +409,7 @@ def frame() -> SpooledFrame:
     )
     camera = Camera(WIDTH, HEIGHT, np.diag([100.0, 100, 1]), np.eye(4))  # 5 px of disparity
     depth = np.full((HEIGHT, WIDTH), 0.1, np.float32)
-    return SpooledFrame(
+    return MappedFrame(
         facts=RunFacts(0, 0, None, 0, {}, {}, 0, {}),
         snapshot=Snapshot(0, 0, 0, gaussians, nothing, camera, 0.0, {}),
         baseline=0.005,
