@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sags_node.evaluation.plotting import as_png, new_figure
+from sags_node.evaluation.plots import as_png, new_figure
 
 WIDTH, HEIGHT = 900, 420  # px
 BESIDE, ABOVE, BELOW = 8, 4, -11  # px, of a name to its point

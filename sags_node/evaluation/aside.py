@@ -7,11 +7,11 @@ from collections.abc import Callable
 from sags_node.config.schema import LaunchConfig, PhantomSource
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
+from sags_node.evaluation.figures import AWAY
 from sags_node.evaluation.run import MappedFrame
 from sags_node.evaluation.warp import warp_to_right
 from sags_node.types import F32, U8, Camera
 
-AWAY = (2, 5, 10, 20)  # mm to the right of the left eye
 TIMES = 5  # of the recording that are looked at: a ray-cast view takes a second
 SAMPLES = 2  # rays along each side of a pixel
 

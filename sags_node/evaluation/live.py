@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from sags_node.errors import SagsError
@@ -35,7 +34,6 @@ def play(
     progress: Progress,
     topics: Sequence[str] = TOPICS,
     cores: int | None = None,
-    root: Path | None = None,
 ) -> dict[str, Any]:
     """Run a node until its recording has ended, and copy what it publishes.
 
@@ -45,7 +43,6 @@ def play(
         progress: called with the frames that were shown so far.
         topics: that are read.
         cores: that it may use; None: all.
-        root: of another checkout, whose node is run.
 
     Returns:
         The node's own account: `NodeHealth`.
@@ -58,7 +55,7 @@ def play(
     with (run.folder / "problems").open("w+") as problems:
         os.sched_setaffinity(0, sorted(mine)[:cores])  # the process inherits it before it counts its cores
         try:
-            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=problems, cwd=root)
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=problems)
         finally:
             os.sched_setaffinity(0, mine)
         try:

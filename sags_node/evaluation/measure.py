@@ -85,7 +85,7 @@ class FrameRow:
 
     frame_id: int
     seconds: float  # on the recording's clock
-    figures: dict[str, Figures]  # those of `summary.GROUPS` that apply
+    figures: dict[str, Figures]  # those of `figures.MEANS` that apply
     facts: RunFacts | None = None  # None: held out, or dropped by the run
     track: TrackErrors | None = None
     poses: Poses | None = None  # None: the session has none, or the run was given them

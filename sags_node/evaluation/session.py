@@ -13,12 +13,13 @@ from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import live
 from sags_node.evaluation.aside import Aside
+from sags_node.evaluation.figures import MEANS
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.hidden import measure_hidden
 from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, OnPicture, Progress
 from sags_node.evaluation.receipt import Receipt
 from sags_node.evaluation.run import Run
-from sags_node.evaluation.summary import GROUPS, summarise
+from sags_node.evaluation.summary import summarise
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, backend_of, device_of
 from sags_node.messaging.address import NodeAddress
@@ -196,7 +197,7 @@ def again(session: Session) -> Source:
 
 
 def _check_segments(config: LaunchConfig) -> None:
-    figures = {key for keys in GROUPS.values() for key in keys}
+    figures = {key for keys in MEANS.values() for key in keys}
     for name in config.segments:
         if name in figures:
             raise UsageError(f"segments.{name}: a segment cannot be named like a figure; rename it")

@@ -30,6 +30,7 @@ from typing import Any
 ROOT = Path(__file__).parents[3]
 HELPERS = ROOT / "tests/helpers"
 sys.path.insert(0, str(HELPERS))
+from golden import TIMING_KEYS  # noqa: E402
 from small_disk import small_disk  # noqa: E402
 from tiny_archive import quick_plan, quick_work, write_quick_recordings  # noqa: E402
 
@@ -41,7 +42,6 @@ from sags_lab.archive.results import failed, read_results, write_results  # noqa
 from sags_lab.archive.run import Tally, about, run  # noqa: E402
 from sags_lab.archive.store import RECORDINGS, Store  # noqa: E402
 from sags_lab.archive.work import Plan, work  # noqa: E402
-from sags_node.evaluation.golden import TIMING_KEYS  # noqa: E402
 from sags_node.evaluation.provenance import revision  # noqa: E402
 from sags_node.phantom import PhantomScene, write_session  # noqa: E402
 
