@@ -150,11 +150,8 @@ TABLE: dict[str, list[Figure]] = {
     ],
 }
 
-POOLED = (
-    "depth_confidence",
-    "track",
-    "pose",
-)  # over points and frames; the other groups are means over frames
+# Over points and frames; the other groups are means over frames.
+POOLED = ("depth_confidence", "track", "pose")
 
 
 def _means() -> dict[str, list[str]]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from engine_scenes import round_gaussians, rows
 
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
@@ -203,23 +204,12 @@ def cloud(count: int = 4000, seed: int = 0) -> Gaussians:
     """A slab of small Gaussians 0.1 m before the camera."""
     rng = np.random.default_rng(seed)
     means = rng.uniform([-0.03, -0.022, 0.099], [0.03, 0.022, 0.101], (count, 3)).astype(np.float32)
-    return Gaussians(
-        means=means,
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=np.full((count, 3), 4e-4, np.float32),
-        opacities=np.full(count, 0.9, np.float32),
-        colors=rng.random((count, 3), np.float32),
-        ids=np.arange(100, 100 + count),
-    )
+    made = round_gaussians(means, 4e-4, rng.random((count, 3), np.float32))
+    return replace(made, ids=np.arange(100, 100 + count))
 
 
 def moved(gaussians: Gaussians, by: np.ndarray) -> Gaussians:
     return replace(gaussians, means=gaussians.means + by.astype(np.float32))
-
-
-def some_of(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    known = {key: values for key, values in asdict(gaussians).items() if values is not None}
-    return Gaussians(**{key: values[rows] for key, values in known.items()})
 
 
 def test_constant_velocity_is_predicted_by_its_stated_share() -> None:
@@ -307,9 +297,9 @@ def test_points_survive_as_long_as_one_neighbour_does() -> None:
     rng = np.random.default_rng(1)
     order = rng.permutation(len(start))[:3000]  # rows shuffled, a quarter pruned: ids must do the work
     step = np.array([0.001, 0, 0])
-    errors = tracks.update(some_of(moved(start, step), order), points + step, visible, CAMERA)
+    errors = tracks.update(rows(moved(start, step), order), points + step, visible, CAMERA)
     assert errors.lost == 0 and errors.errors_mm.max() < 1e-4
-    nothing_left = tracks.update(some_of(start, np.zeros(0, int)), points, visible, CAMERA)
+    nothing_left = tracks.update(rows(start, np.zeros(0, int)), points, visible, CAMERA)
     assert nothing_left.lost == 40 and len(nothing_left.errors_mm) == 0
 
 
@@ -336,14 +326,11 @@ HEIGHT, WIDTH = 64, 96
 def frame() -> MappedFrame:
     """All tissue, gray, 100 mm away."""
     nothing = np.zeros((0, 3), np.float32)
-    gaussians = Gaussians(
-        nothing, np.zeros((0, 4), np.float32), nothing, nothing[:, 0], nothing, np.zeros(0, np.int64)
-    )
     camera = Camera(WIDTH, HEIGHT, np.diag([100.0, 100, 1]), np.eye(4))  # 5 px of disparity
     depth = np.full((HEIGHT, WIDTH), 0.1, np.float32)
     return MappedFrame(
         facts=RunFacts(0, 0, None, 0, {}, {}, 0, {}),
-        snapshot=Snapshot(0, 0, 0, gaussians, nothing, camera, 0.0, {}),
+        snapshot=Snapshot(0, 0, 0, round_gaussians(nothing, 1), nothing, camera, 0.0, {}),
         baseline=0.005,
         rgb=np.full((HEIGHT, WIDTH, 3), 100, np.uint8),
         depth=depth,
