@@ -17,7 +17,7 @@ import numpy as np
 
 from sags_node.errors import SagsError
 from sags_node.findings import NOTHING, Findings, by_code
-from sags_node.messaging.received import ReceivedImage, interpret
+from sags_node.messaging.received import ReceivedImage, ReceivedText, interpret
 from sags_node.messaging.wire import Message, Meta
 from sags_node.processes import resident_mb
 from sags_node.types import F32, U8, Bool, FrameResult, Snapshot
@@ -139,8 +139,9 @@ class Run:
         """
         name = next(name for name in TOPICS if message.topic.endswith(f"/{name}"))  # after the namespace
         if name == STATUS:
-            text = interpret(message, 0)
-            self._statuses.append((message.meta.publish_ns, json.loads(text.text)))
+            status = interpret(message, 0)
+            assert isinstance(status, ReceivedText)
+            self._statuses.append((message.meta.publish_ns, json.loads(status.text)))
             return
         self._keep(message.meta.frame_id, name, (message.topic, message.meta, message.parts))
         if name == IMAGE:
