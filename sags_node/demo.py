@@ -16,8 +16,8 @@ from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.report import write_report
+from sags_node.evaluation.run import Run
 from sags_node.evaluation.session import measure
-from sags_node.evaluation.spool import Spool
 from sags_node.files import whole
 from sags_node.media.video_file import VideoFile
 from sags_node.messaging.rundir import connection_path, default_run_dir
@@ -58,20 +58,20 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
     out.mkdir(parents=True, exist_ok=True)
     frames = session.source.frame_count
     seconds = (frames or 0) / session.source.rate
-    with Spool() as spool:
+    with Run() as run:
 
         def keep(result: FrameResult, latency_ms: float) -> None:
             frame_ms, warnings = sum(result.timings_ms.values()), node.health().warnings
-            spool.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
+            run.add(result, frame_ms, time.monotonic_ns(), latency_ms, warnings)
 
         with stop_signals() as stop:
             node = Node(session.config, session.rig, session.source, on_result=keep)
-            overlay = _start_overlay(session.config, seconds, spool.folder / LAYERS)
+            overlay = _start_overlay(session.config, seconds, run.folder / LAYERS)
             try:
                 _await_overlay(session.config, overlay, stop)
                 node.start()
                 while not (stop.is_set() or node.wait(0.25)):
-                    progress(len(spool), frames, "playing")
+                    progress(len(run), frames, "playing")
                 if stop.is_set():
                     raise KeyboardInterrupt
             except BaseException:
@@ -82,9 +82,9 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
         consumed = _finish_overlay(overlay)
         with whole(out / VIDEO) as partial:
             video = VideoFile(partial, session.source.rate, session.published_size)
-            shown = Shown(video, read_layers(spool.folder / LAYERS))
+            shown = Shown(video, read_layers(run.folder / LAYERS))
             outcome = measure(
-                session, spool, _OPTIONS, (), lambda what, done: progress(done, frames, what), shown.add
+                session, run, _OPTIONS, (), lambda what, done: progress(done, frames, what), shown.add
             )
             video.finish()
     outcome.summary["overlay"] = consumed | {"saved": str(out / VIDEO)}

@@ -21,16 +21,16 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 8893,
-    "sags_lab": 4958,
+    "benchmarks": 8884,
+    "sags_lab": 5032,
     "sags_node": 1680,
     "sags_node/bridge": 2638,
     "sags_node/calibration": 1836,
-    "sags_node/cli": 3083,
+    "sags_node/cli": 3082,
     "sags_node/config": 1352,
     "sags_node/detail": 928,
     "sags_node/engine": 4508,
-    "sags_node/evaluation": 3576,
+    "sags_node/evaluation": 3085,
     "sags_node/export": 891,
     "sags_node/field": 1723,
     "sags_node/fitting": 1530,
@@ -49,9 +49,9 @@ LINES = {
     "sags_node/ros": 332,
     "sags_node/sources": 5606,
     "sags_node/terminal": 335,
-    "sags_node/viewer": 1042,
+    "sags_node/viewer": 1041,
     "sags_node/vision": 5454,
-    "tests": 45017,
+    "tests": 45058,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

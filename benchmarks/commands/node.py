@@ -26,7 +26,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.plotting import check_plots
+from sags_node.evaluation.plots import check_plots
 from sags_node.files import whole
 from sags_node.terminal.console import progress, show
 

@@ -16,8 +16,9 @@ from typing import Any
 from benchmarks.kernels.contention import burning_core
 from benchmarks.node.neighbours import NS, find_browser, overlay, reader, viewer
 from sags_node.evaluation import live
-from sags_node.evaluation.measure import MeasureOptions
+from sags_node.evaluation.measure import MeasureOptions, Measurer
 from sags_node.evaluation.receipt import Receipt
+from sags_node.evaluation.run import STATUS, TOPICS, Run
 from sags_node.evaluation.session import again
 from sags_node.evaluation.summary import summarise
 from sags_node.messaging.address import NodeAddress
@@ -78,18 +79,18 @@ def _played(
     warm_up(session.config)
     arguments = [*([] if launch is None else [launch]), *overrides, *forced]
     options, node = MeasureOptions(hold_out=0), NodeAddress(NS, run_dir=run_dir)
-    with live.Copies() as copies:
-        topics = live.TOPICS if read else [live.STATUS]
-        account = live.play(arguments, node, copies, lambda what, frames: None, topics, cores)
+    with Run() as run:
+        topics = TOPICS if read else [STATUS]
+        account = live.play(arguments, node, run, lambda what, frames: None, topics, cores)
         own = {key: account[key] for key in ("frame_ms", "latency_ms", "gaussians", "dropped")}
         if not read:
             return own
         full = session.working_size
         receipt = Receipt(session.rig, full, None)
-        judge = live.Judge(copies, Rectifier(session.rig, *full), options, receipt, detail=False)
+        judge = Measurer(run, Rectifier(session.rig, *full), session.config, options, receipt)
         with again(session) as frames:
             judge.run(frames, lambda what, frames: None)
-        size = list(copies.size())
+        size = list(run.size())
     after = judge.rows[round(session.source.rate) :]
     summary = summarise(session.name, judge.rows, options, session.config.segments, None)
     kept = ("first_render_ms", "latency_ms", "gaussians", "rungs", "depth")

@@ -5,41 +5,40 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.quality.sgbm import JudgedSGBM
-from sags_node.config.schema import Box
-from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
-from sags_node.engine.rasterizer.views import colours_of
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.measure import FrameRow, MeasureOptions, Progress
-from sags_node.evaluation.spool import Spool, SpooledFrame
+from sags_node.evaluation.run import MappedFrame, Run
 from sags_node.evaluation.summary import summarise
-from sags_node.evaluation.warp import warp_to_right
-from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.evaluation.warp import right_figures, right_pixels
 from sags_node.pipeline.session import Session
 from sags_node.sources.source import open_source
-from sags_node.types import U8, Bool, StereoRig
+from sags_node.types import Bool
 from sags_node.vision.rectify import Rectifier
 
 SGBM_SCALES = (1, 2)
+NO_RIGHT = {"warp_psnr": float("nan"), "model_psnr": float("nan"), "coverage": 0.0}  # no warp is known
 
 Row = dict[str, Any]  # with the keys of `sags eval` that apply
 
 
 def measured_baselines(
-    session: Session, spool: Spool, size: tuple[int, int], options: MeasureOptions, progress: Progress
+    session: Session, run: Run, size: tuple[int, int], options: MeasureOptions, progress: Progress
 ) -> list[Row]:
     """Baselines that need the recording, over the frames of a run and with its masks.
 
     Args:
         session: what was run.
-        spool: what the run showed.
+        run: what the run showed.
         size: of the run's pictures, width and height, px.
 
     Returns:
@@ -51,12 +50,12 @@ def measured_baselines(
     """
     config = session.config
     rectifier = Rectifier(session.rig, *size)
-    usable = right_pixels(session.rig, size, config.vision.tissue.exclude)
+    usable: Bool | None = None
     rasterizer = make_rasterizer("numba", *size)
     matchers = [
         JudgedSGBM(config.vision.stereo, rectifier.camera, rectifier.baseline, scale) for scale in SGBM_SCALES
     ]
-    places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
+    places = count()
     warped: list[FrameRow] = []
     drawn: list[FrameRow] = []
     matched: list[list[FrameRow]] = [[] for _ in matchers]
@@ -65,15 +64,16 @@ def measured_baselines(
     with open_source(config.source.model_copy(update={"pace": "step"})) as frames:
         for done, frame in enumerate(frames):
             progress("baselines", done)
-            place, pair = places.get(frame.frame_id), rectifier(frame)
-            if place is None or pair.right is None:
+            pair, shown = rectifier(frame), run.read(frame.frame_id)
+            if not isinstance(shown, MappedFrame) or pair.right is None:
                 continue
-            shown = spool.read(place)
-            if place % options.every == 0:
-                warp, model, share = _right_views(shown, pair.left, pair.right, usable, rasterizer)
-                warped.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": warp}}))
-                drawn.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": model}}))
-                covered.append(share)
+            if next(places) % options.every == 0:
+                if usable is None:
+                    usable = right_pixels(rectifier, frame, config.vision.tissue.exclude)
+                right = right_figures(shown, pair, usable, rasterizer).get("right", NO_RIGHT)
+                warped.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": right["warp_psnr"]}}))
+                drawn.append(FrameRow(frame.frame_id, 0.0, {"novel": {"psnr": right["model_psnr"]}}))
+                covered.append(right["coverage"])
             for matcher, rows, times_ms in zip(matchers, matched, matching_ms, strict=True):
                 started = time.perf_counter()
                 depth, _ = matcher(pair, shown.tissue)
@@ -146,33 +146,3 @@ def read_fits(files: Sequence[Path]) -> list[Row]:
         }
         rows.append(row)
     return rows
-
-
-def right_pixels(rig: StereoRig, size: tuple[int, int], exclude: Sequence[Box]) -> Bool:
-    """Where the rectified right picture of `size` shows the raw one outside the boxes, [H, W]."""
-    shown = np.ones((rig.right.height, rig.right.width), np.bool_)
-    for x, y, width, height in exclude:
-        shown[y : y + height, x : x + width] = False
-    # A rectifier looks masks up in the left eye: the right one takes its place, under the common projection.
-    swapped = StereoRig(rig.name, replace(rig.right, P=rig.left.P), rig.left)
-    return Rectifier(swapped, *size).mask(shown)
-
-
-def _right_views(
-    shown: SpooledFrame, left: U8, right: U8, usable: Bool, rasterizer: Rasterizer
-) -> tuple[float, float, float]:
-    """PSNR of the warp and of the model against the right picture, both where the warp is known, as `novel`
-    is measured; and the share of `novel`'s pixels that is."""
-    camera = shown.snapshot.camera
-    focal_px = float(camera.K[0, 0])
-    depths = shown.depth[shown.tissue & (shown.depth > 0)]
-    mask = right_eye_mask(shown.tissue, depths, focal_px, shown.baseline) & usable
-    warp, known = warp_to_right(metrics.as_float(left), shown.measured_depth, focal_px, shown.baseline)
-    right_camera = camera.moved_right(shown.baseline)
-    planes = rasterizer.forward(shown.snapshot.gaussians, right_camera)
-    model = colours_of(planes)
-    truth, both = metrics.as_float(right), mask & known
-    warp_psnr, model_psnr = (
-        metrics.psnr(metrics.fit_gain_offset(picture, truth, both), truth, both) for picture in (warp, model)
-    )
-    return warp_psnr, model_psnr, float(both.sum() / max(1, mask.sum()))

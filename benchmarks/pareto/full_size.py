@@ -7,7 +7,7 @@ from typing import Any
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.evaluation import metrics
 from sags_node.evaluation.measure import FrameRow, MeasureOptions, Progress
-from sags_node.evaluation.spool import Spool
+from sags_node.evaluation.run import MappedFrame, Run
 from sags_node.evaluation.summary import summarise
 from sags_node.pipeline.session import Session
 from sags_node.sources.source import open_source
@@ -16,7 +16,7 @@ from sags_node.vision.tissue import TissueMask
 
 
 def online_at(
-    size: tuple[int, int], session: Session, spool: Spool, options: MeasureOptions, progress: Progress
+    size: tuple[int, int], session: Session, run: Run, options: MeasureOptions, progress: Progress
 ) -> dict[str, Any]:
     """The figures `online` of a finished run, with its Gaussians drawn at `size` (width, height, px) and
     compared with pictures of that size.
@@ -28,15 +28,14 @@ def online_at(
     rectifier = Rectifier(session.rig, *size)
     tissue_of = TissueMask(config.vision.tissue, rectifier)
     rasterizer = make_rasterizer("numba", *size)
-    places = {frame_id: place for place, frame_id in enumerate(spool.frame_ids)}
     rows = []
     with open_source(config.source.model_copy(update={"pace": "step"}), references=False) as frames:
         for frame in frames:
-            place = places.get(frame.frame_id)
-            if place is None:
+            mapped = run.read(frame.frame_id)
+            if not isinstance(mapped, MappedFrame):
                 continue
             pair = rectifier(frame)
-            planes = rasterizer.forward(spool.read(place).snapshot.gaussians, pair.camera)
+            planes = rasterizer.forward(mapped.snapshot.gaussians, pair.camera)
             view = to_view(planes, pair.camera, 0, 0)
             shown = metrics.as_float(view.rgb)
             quality = metrics.psnr(shown, metrics.as_float(pair.left), tissue_of(frame, pair))

@@ -25,8 +25,8 @@ from benchmarks.pareto.settings import (
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import Progress
 from sags_node.evaluation.provenance import machine_name
+from sags_node.evaluation.run import Run
 from sags_node.evaluation.session import measure, run_step
-from sags_node.evaluation.spool import Spool
 from sags_node.pipeline.session import Session, open_session
 from sags_node.pipeline.warm_up import warm_up
 
@@ -123,13 +123,13 @@ class _Comparison:
         compared: Row = {}
         for place, setting in enumerate(turns, 1):
             progress = self._progress(f"{setting.name} ({place} of {len(turns)})")
-            with self._played(setting, progress) as (played, spool):
-                row, receipt = self._measured(setting, played, spool, progress)
+            with self._played(setting, progress) as (played, run):
+                row, receipt = self._measured(setting, played, run, progress)
                 runs[setting].append(row)
                 if place == 1:  # the default
                     compared = receipt
                     baselines = baselines_of_run(runs[setting][0])
-                    baselines += measured_baselines(played, spool, self._size, self._sweep.options, progress)
+                    baselines += measured_baselines(played, run, self._size, self._sweep.options, progress)
         baselines += [fit for fit in fits if fit["session"] == session.name]
         rows = [_middle(runs[setting]) for setting in timed]
         for row, best in zip(rows, non_dominated([_place(row) for row in rows]), strict=True):
@@ -156,26 +156,24 @@ class _Comparison:
         return measure_hosts(self._launch, self._overrides, lambda what: self._progress(what)("", 0))
 
     @contextmanager
-    def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Spool]]:
+    def _played(self, setting: Setting, progress: Progress) -> Iterator[tuple[Session, Run]]:
         session = self._open(setting.overrides)
-        with Spool() as spool:
-            run_step(session, self._sweep.options, spool, progress, setting.skips)
-            if len(spool) < SHORTEST:
+        with Run() as run:
+            run_step(session, self._sweep.options, run, progress, setting.skips)
+            if len(run) < SHORTEST:
                 raise SagsError(
-                    f"{session.name}: {len(spool)} frames were processed and {SHORTEST} are needed to tell "
+                    f"{session.name}: {len(run)} frames were processed and {SHORTEST} are needed to tell "
                     "a time; play more (--frames, source.frames, source.start)"
                 )
-            yield session, spool
+            yield session, run
 
-    def _measured(
-        self, setting: Setting, session: Session, spool: Spool, progress: Progress
-    ) -> tuple[Row, Row]:
+    def _measured(self, setting: Setting, session: Session, run: Run, progress: Progress) -> tuple[Row, Row]:
         """The setting's row, and its receipt."""
-        found = measure(session, spool, self._sweep.options, setting.overrides, progress)
+        found = measure(session, run, self._sweep.options, setting.overrides, progress)
         summary = found.summary
         at_full_size = summary["online"]
         if session.working_size != self._size:
-            at_full_size = online_at(self._size, session, spool, self._sweep.options, progress)
+            at_full_size = online_at(self._size, session, run, self._sweep.options, progress)
         if at_full_size["psnr"] is None:
             raise SagsError(
                 f"{session.name}: no frame shows tissue, so there is nothing to compare; see vision.tissue"

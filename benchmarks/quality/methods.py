@@ -19,8 +19,8 @@ from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.metrics import as_float, psnr
+from sags_node.evaluation.run import MappedFrame, Run
 from sags_node.evaluation.session import evaluate, measure, run_step
-from sags_node.evaluation.spool import Spool
 from sags_node.mapping.mapper import Mapper
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
@@ -75,24 +75,25 @@ def _step_by_step(launch: Path | str | None, overrides: Sequence[str]) -> dict[s
     session = open_session(launch, [*overrides, *forced])
     warm_up(session.config)
     pictures: dict[int, U8] = {}
-    with Spool() as spool:
-        pipeline = run_step(session, MeasureOptions(), spool, lambda what, frames: None)
-        found = measure(session, spool, MeasureOptions(), on_picture=pictures.__setitem__)
+    with Run() as run:
+        pipeline = run_step(session, MeasureOptions(), run, lambda what, frames: None)
+        found = measure(session, run, MeasureOptions(), on_picture=pictures.__setitem__)
         summary = found.summary
-        window = _window_psnr(pipeline, spool, pictures)
+        window = _window_psnr(pipeline, run, pictures)
     step = {group: summary[group][key] for group, key in SHOWN.items() if summary.get(group)}
     more = {"window": window, "frame_ms": summary["frame_ms"], "receipt": found.receipt}
     return {"step": step | more}
 
 
-def _window_psnr(pipeline: Pipeline, spool: Spool, pictures: dict[int, U8]) -> float:
+def _window_psnr(pipeline: Pipeline, run: Run, pictures: dict[int, U8]) -> float:
     """dB over tissue, mean over the frames of the last two seconds: the model as it is at the end, asked for
     the time of each."""
     mapper, camera, found = pipeline.mapper, pipeline.rectifier.camera, []
     rasterizer = make_rasterizer("numba", camera.width, camera.height)
-    last_ns = spool.read(len(spool) - 1).snapshot.t_capture_ns
-    for place in reversed(range(len(spool))):
-        shown = spool.read(place)
+    last_ns = 0
+    for shown in map(run.read, reversed(run.frame_ids)):
+        assert isinstance(shown, MappedFrame)
+        last_ns = last_ns or shown.snapshot.t_capture_ns
         frame_id, t_ns, seen_by = shown.snapshot.frame_id, shown.snapshot.t_capture_ns, shown.snapshot.camera
         if t_ns <= last_ns - WINDOW_NS:
             break

@@ -16,9 +16,9 @@ from rich.table import Table
 
 from benchmarks.quality.tracking import RIGHT, RIGHT_MM, reliability_rows
 from benchmarks.quality.tracking_report import reliability_tables
+from sags_lab.protocols.point_tracks import SURE
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.point_tracks import SURE
 from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads

@@ -19,7 +19,7 @@ from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.receipt import Receipt
-from sags_node.evaluation.trajectory import RigidOdometry, drift, trajectory_errors
+from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -237,3 +237,26 @@ def table(measured: dict[str, Any]) -> Table:
             str(row["held"]) if shown else "",
         )
     return made
+
+
+def drift(estimated: F64, known: F64, period: int) -> dict[str, float]:
+    """How the error of poses `T_world_cam` [T, 4, 4] grows with time.
+
+    `end_...`: the error of the last pose, worlds aligned at the first frame. `drift_...`: the mean error over
+    the last `period` frames less that over the first ones; `worst_drift_...`: over any so many. Where the
+    scene repeats itself with that period, what its motion does to a pose is in all these means alike.
+    """
+    ours = np.linalg.inv(estimated[0]) @ estimated
+    true = np.linalg.inv(known[0]) @ known
+    errors = np.linalg.inv(true) @ ours
+    places = errors[:, :3, 3] * 1e3
+    turns = np.degrees([cv2.Rodrigues(error[:3, :3])[0][:, 0] for error in errors])
+    found = {}
+    for unit, values in (("mm", places), ("deg", turns)):
+        whole = len(values) // period
+        means = values[len(values) - whole * period :].reshape(whole, period, 3).mean(1)
+        drifts = np.linalg.norm(means - means[0], axis=1)
+        found[f"end_{unit}"] = float(np.linalg.norm(values[-1]))
+        found[f"drift_{unit}"] = float(drifts[-1])
+        found[f"worst_drift_{unit}"] = float(drifts.max())
+    return found

@@ -17,15 +17,15 @@ from benchmarks.quality.followers import (
     dis_flow,
     sample,
 )
-from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import percentiles
-from sags_node.evaluation.point_tracks import (
+from sags_lab.protocols.point_tracks import (
     average_jaccard,
     calibration_error,
     reliability,
     shares_within,
     surely_seen,
 )
+from sags_node.errors import SagsError
+from sags_node.evaluation.metrics import percentiles
 from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project, transform
 from sags_node.kernels.threads import configure_threads

@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from benchmarks.quality.tracking import RIGHT, RIGHT_MM
-from sags_node.evaluation.point_tracks import Bin
+from sags_lab.protocols.point_tracks import Bin
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:

@@ -28,7 +28,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.plotting import check_plots, has_plots
+from sags_node.evaluation.plots import check_plots, has_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
 
@@ -310,7 +310,7 @@ def show_one(out: str, id: str, verbose: bool, json_out: bool) -> None:
     check_installed()
     from sags_lab.archive.results import of_one
     from sags_lab.archive.store import Store
-    from sags_node.evaluation.verdict import verdict
+    from sags_node.evaluation.figures import verdict
 
     found = of_one(Store(out), id)
     if json_out:

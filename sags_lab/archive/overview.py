@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sags_lab.archive.store import RECORDINGS, REPORT, Store
-from sags_node.evaluation.page import page, picture_uri, svg_uri
+from sags_node.evaluation.page import page, picture_uri, plot_grid
 from sags_node.evaluation.plots import Series, line_plot
 
 BLUE = "#2166ac"
@@ -47,8 +47,8 @@ def write_overview(store: Store, rows: Sequence[Mapping[str, Any]]) -> None:
     jobs = {str(row.get("job")) for row in done}
     said = f"{len(rows)} recordings: {len(done)} done; {', '.join(sorted(jobs)) or 'nothing'}"
     parts = [f'<p class="quiet">{escape(said)}</p>', _failures(rows)]
-    parts += ["<h2>How the figures are spread</h2>", _plots([*_spreads(done)])]
-    parts += ["<h2>Run time against error</h2>", _plots([*_scatters(done)])]
+    parts += ["<h2>How the figures are spread</h2>", _grid(_spreads(done))]
+    parts += ["<h2>Run time against error</h2>", _grid(_scatters(done))]
     parts += ["<h2>The worst</h2>", *_worst(store, done)]
     store.write(REPORT, page(f"Archive {store.url}", parts).encode())
 
@@ -97,9 +97,8 @@ def _number(row: Mapping[str, Any], column: str) -> float | None:
     return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
 
 
-def _plots(plots: Sequence[str]) -> str:
-    shown = [f'<img alt="plot" src="{svg_uri(plot)}">' for plot in plots if plot]
-    return f'<div class="plots">{"".join(shown)}</div>' if shown else '<p class="quiet">no such figures</p>'
+def _grid(plots: Sequence[str]) -> str:
+    return plot_grid(plots) if any(plots) else '<p class="quiet">no such figures</p>'
 
 
 def _worst(store: Store, rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sags_node.evaluation.point_tracks import average_jaccard
+from sags_lab.protocols.point_tracks import average_jaccard
 from sags_node.types import F32, F64, Bool
 
 STIR_PX = (4, 8, 16, 32, 64)  # of the 2D ranking (stir-challenge.github.io, evaluation)

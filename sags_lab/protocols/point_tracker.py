@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sags_lab.protocols.point_tracks import surely_seen
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
-from sags_node.evaluation.point_tracks import surely_seen
 from sags_node.geometry import transform
 from sags_node.mapping.anchors import MAX_ANCHORS
 from sags_node.pipeline.pipeline import Pipeline

@@ -21,6 +21,7 @@ from sags_lab.protocols.layouts import (
 )
 from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
 from sags_lab.protocols.point_tracker import Followed, PointTracker, raw_pair
+from sags_lab.protocols.point_tracks import shares_within
 from sags_lab.protocols.stir_2026 import is_stir_2026, measure_stir_2026
 from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.config.launch_file import load_launch
@@ -28,7 +29,6 @@ from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.metrics import resample_nearest
-from sags_node.evaluation.point_tracks import shares_within
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
 from sags_node.media.video import Video

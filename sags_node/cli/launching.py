@@ -190,8 +190,7 @@ def check_files(*files: Path | None, force: bool | None = None) -> None:
 
 def show_outcome(summary: Mapping[str, Any], report: Path | None, verbose: bool, json_out: bool) -> None:
     """Print what a measured run was worth, where its report is, and if asked for all of its figures."""
-    from sags_node.evaluation.figure_table import groups, headings
-    from sags_node.evaluation.verdict import flat, verdict
+    from sags_node.evaluation.figures import flat, groups, headings, verdict
 
     if json_out:
         show(dict(summary))

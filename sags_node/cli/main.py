@@ -42,7 +42,7 @@ from sags_node.cli.overlay import overlay
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.plotting import check_plots
+from sags_node.evaluation.plots import check_plots
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
 
 if TYPE_CHECKING:

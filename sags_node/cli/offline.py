@@ -27,7 +27,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
-from sags_node.evaluation.plotting import check_plots
+from sags_node.evaluation.plots import check_plots
 from sags_node.terminal.console import console, progress, show
 
 HOLD_OUT = 8  # every so many frames, as in the literature

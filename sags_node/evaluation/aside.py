@@ -7,11 +7,11 @@ from collections.abc import Callable
 from sags_node.config.schema import LaunchConfig, PhantomSource
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
-from sags_node.evaluation.spool import SpooledFrame
+from sags_node.evaluation.figures import AWAY
+from sags_node.evaluation.run import MappedFrame
 from sags_node.evaluation.warp import warp_to_right
 from sags_node.types import F32, U8, Camera
 
-AWAY = (2, 5, 10, 20)  # mm to the right of the left eye
 TIMES = 5  # of the recording that are looked at: a ray-cast view takes a second
 SAMPLES = 2  # rays along each side of a pixel
 
@@ -39,7 +39,7 @@ class Aside:
         self._frames = frames
         self._next = frames // TIMES // 2
 
-    def due(self, shown: SpooledFrame) -> bool:
+    def due(self, shown: MappedFrame) -> bool:
         """Whether a frame is one of those that are looked at: it needs a measured depth."""
         number = shown.snapshot.frame_id
         if number < self._next or not shown.measured_depth.any():
@@ -47,7 +47,7 @@ class Aside:
         self._next = number + self._frames // TIMES
         return True
 
-    def __call__(self, shown: SpooledFrame, left: U8, draw: Draw) -> dict[str, dict[str, float]]:
+    def __call__(self, shown: MappedFrame, left: U8, draw: Draw) -> dict[str, dict[str, float]]:
         """`view_2` to `view_20`, by the distance in mm: dB after a fit of gain and offset, where the left eye
         sees the place too. `psnr` of what is shown, `model_psnr` of the model alone, `warp_psnr` of the left
         picture, warped by the frame's own stereo depth.
@@ -70,7 +70,7 @@ class Aside:
                 pictures = *draw(moved), warped
                 names = "psnr", "model_psnr", "warp_psnr"
                 figures[f"view_{millimetres}"] = {
-                    name: metrics.psnr(metrics.fit_gain_offset(picture, truth, where), truth, where)
+                    name: metrics.fitted_psnr(picture, truth, where)
                     for name, picture in zip(names, pictures, strict=True)
                 }
         return figures

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.evaluation.spool import SpooledFrame
+from sags_node.evaluation.run import MappedFrame
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import F32, U8, Bool
 
@@ -31,7 +31,7 @@ class Flicker:
         self._blocks = _Spread()
         self._tissue: Bool | None = None
 
-    def __call__(self, picture: U8, shown: SpooledFrame) -> dict[str, float] | None:
+    def __call__(self, picture: U8, shown: MappedFrame) -> dict[str, float] | None:
         """Take in the next frame.
 
         Args:
@@ -62,7 +62,7 @@ class Flicker:
         self._begin()
         return figures
 
-    def _figures(self, tissue: Bool, shown: SpooledFrame) -> dict[str, float] | None:
+    def _figures(self, tissue: Bool, shown: MappedFrame) -> dict[str, float] | None:
         still = (self._blocks.deviation() <= STILL).all(-1).astype(np.uint8)
         where = tissue & (cv2.resize(still, tissue.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
         if where.mean() < LEAST:

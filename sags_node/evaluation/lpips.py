@@ -71,19 +71,19 @@ class Lpips:
         import torch
         from torch.nn.functional import conv2d, max_pool2d
 
-        w = self._weights
-        x = (pictures - torch.tensor(_SHIFT)[:, None, None]) / torch.tensor(_SCALE)[:, None, None]
-        x = conv2d(x, w["net.0.weight"], w["net.0.bias"], stride=2).relu()
+        def conv(x: Tensor, name: str, **how: int) -> Tensor:
+            return conv2d(x, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"], **how).relu()
+
+        shift, scale = (torch.tensor(each)[:, None, None] for each in (_SHIFT, _SCALE))
+        x = conv((pictures - shift) / scale, "net.0", stride=2)
         taps = [x]
         for layer in range(2, 13):
             if layer in _POOL_LAYERS:
                 x = max_pool2d(x, 3, stride=2, ceil_mode=True)
                 continue
-            name = f"net.{layer}"
-            narrow = conv2d(x, w[f"{name}.squeeze.weight"], w[f"{name}.squeeze.bias"]).relu()
-            small = conv2d(narrow, w[f"{name}.expand1x1.weight"], w[f"{name}.expand1x1.bias"]).relu()
-            wide = conv2d(narrow, w[f"{name}.expand3x3.weight"], w[f"{name}.expand3x3.bias"], padding=1)
-            x = torch.cat([small, wide.relu()], 1)
+            narrow = conv(x, f"net.{layer}.squeeze")
+            wide = conv(narrow, f"net.{layer}.expand3x3", padding=1)
+            x = torch.cat([conv(narrow, f"net.{layer}.expand1x1"), wide], 1)
             if layer in _TAPS:
                 taps.append(x)
         return taps

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
 
 from sags_node.types import F32, F64, I64, U8, Bool
 
+Plane = TypeVar("Plane", F32, Bool)
 BEST_PSNR = 100.0  # dB, of identical pictures: the mean over frames stays a number
 
 
@@ -86,6 +88,11 @@ def fit_gain_offset(picture: F32, truth: F32, mask: Bool) -> F32:
     return fitted
 
 
+def fitted_psnr(picture: F32, truth: F32, mask: Bool) -> float:
+    """`psnr` (dB) over `mask` of a picture of another exposure, after `fit_gain_offset`."""
+    return psnr(fit_gain_offset(picture, truth, mask), truth, mask)
+
+
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
     """How far a depth picture is from its reference, over tissue; NaN where nothing could be compared."""
@@ -112,7 +119,7 @@ def depth_errors(depth: F32, reference: F32, tissue: Bool) -> DepthErrors:
     )
 
 
-def resample_nearest(picture: F32, width: int, height: int) -> F32:
+def resample_nearest(picture: Plane, width: int, height: int) -> Plane:
     """`picture` [h, w] looked up at the pixel centres of a `height` x `width` grid over the same view.
 
     Pixel centres are integers, so centre u of the new grid lies at (u + 0.5) * w / width - 0.5 of the old
@@ -120,7 +127,7 @@ def resample_nearest(picture: F32, width: int, height: int) -> F32:
     """
     rows = _nearest_centres(height, picture.shape[0])
     columns = _nearest_centres(width, picture.shape[1])
-    resampled: F32 = picture[rows[:, None], columns[None, :]]
+    resampled: Plane = picture[rows[:, None], columns[None, :]]
     return resampled
 
 

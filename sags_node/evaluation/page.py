@@ -52,9 +52,11 @@ def picture_uri(tile: U8) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(encoded(".jpg", tile)).decode()
 
 
-def svg_uri(plot: str) -> str:
-    """An SVG file for `src`."""
-    return "data:image/svg+xml;base64," + base64.b64encode(plot.encode()).decode()
+def plot_grid(plots: Sequence[str]) -> str:
+    """HTML of SVG files side by side; those without text are left out."""
+    uris = ["data:image/svg+xml;base64," + base64.b64encode(plot.encode()).decode() for plot in plots if plot]
+    shown = [f'<img alt="plot" src="{uri}">' for uri in uris]
+    return f'<div class="plots">{"".join(shown)}</div>'
 
 
 def encoded(suffix: str, picture: U8) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 
 from sags_node.evaluation import calibration
-from sags_node.evaluation.figure_table import groups, headings
-from sags_node.evaluation.gallery import Picture
+from sags_node.evaluation.figures import flat, groups, headings, verdict
+from sags_node.evaluation.gallery import ERROR_AT_TOP, Picture, depth_range, tiles
 from sags_node.evaluation.measure import FrameRow
-from sags_node.evaluation.page import encoded, page, picture_uri, svg_uri
+from sags_node.evaluation.page import encoded, page, picture_uri, plot_grid
 from sags_node.evaluation.plots import Series, line_plot
 from sags_node.evaluation.provenance import provenance
-from sags_node.evaluation.spool import RunFacts
-from sags_node.evaluation.tiles import ERROR_AT_TOP, depth_range, tiles
-from sags_node.evaluation.verdict import flat, verdict
 from sags_node.files import check_folder, check_results, whole
 from sags_node.types import U8
 
@@ -65,7 +62,7 @@ def write_report(
     text = page(
         f"{TITLE}{summary['session']}",
         [
-            f'<p class="quiet">{escape(_origin())}</p>',
+            f'<p class="quiet">{escape("{command}; {date}; revision {revision}".format(**provenance()))}</p>',
             f'<div class="first">{_video(video)}{_verdict(summary)}</div>',
             warning_table(rows),
             "<h2>Pictures</h2>",
@@ -86,11 +83,6 @@ def write_report(
         with whole(folder / SHEET) as file:
             file.write_bytes(encoded(".png", grid))
     return report
-
-
-def _origin() -> str:
-    known = provenance()
-    return f"{known['command']}; {known['date']}; revision {known['revision']}"
 
 
 def _video(name: str | None) -> str:
@@ -135,45 +127,43 @@ def warning_table(rows: Sequence[FrameRow]) -> str:
 
 
 def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> str:
-    def figure(label: str, colour: str, key: str, dots: bool = False) -> Series:
+    def series(label: str, colour: str, key: str, dots: bool = False) -> Series:
+        """Of a figure (`depth.p90_mm`), or of what the run says itself (`frame_ms`)."""
         group, _, name = key.partition(".")
-        found = ((row.frame_id, row.figures.get(group, {}).get(name)) for row in rows)
-        points = [(frame, value) for frame, value in found if value is not None]
+        points = []
+        for row in rows if name else ran[1:]:  # the first frame takes long
+            value = row.figures.get(group, {}).get(name) if name else getattr(row.facts, key)
+            if value is not None:
+                points.append((row.frame_id, value))
         return Series(label, colour, points, dots)
 
-    def run(label: str, colour: str, value: Callable[[RunFacts], float | None]) -> Series:
-        """Without the first frame, which takes long."""
-        found = [(row.frame_id, value(row.facts)) for row in rows if row.facts is not None]
-        return Series(label, colour, [(frame, each) for frame, each in found[1:] if each is not None])
-
+    ran = [row for row in rows if row.facts is not None]
+    missed = [row.frame_id for row in rows if row.facts is None]
     tallies = [row.calibration for row in rows if row.calibration is not None]
     sure = calibration.points(tallies, 0.9)
     plots = [
         line_plot(
             "How near the picture is to the camera's: PSNR, dB; higher is better",
             [
-                figure("a frame ahead", ORANGE, "predict.psnr"),
-                figure("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
-                figure("the picture before, again", GREY, "predict.copy_psnr"),
-                figure("kept back, never seen", GREEN, "heldout.psnr", dots=True),
+                series("a frame ahead", ORANGE, "predict.psnr"),
+                series("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
+                series("the picture before, again", GREY, "predict.copy_psnr"),
+                series("kept back, never seen", GREEN, "heldout.psnr", dots=True),
             ],
             spans,
         ),
         line_plot(
             "How long a frame took: ms (grey: missed)",
-            [
-                run("stamp to sending", BLUE, lambda facts: facts.latency_ms),
-                run("work", ORANGE, lambda facts: facts.frame_ms),
-            ],
+            [series("stamp to sending", BLUE, "latency_ms"), series("work", ORANGE, "frame_ms")],
             spans,
-            gaps=[row.frame_id for row in rows if row.facts is None],
+            gaps=missed,
         ),
         line_plot(
             "How far the depth is off: mm, lower is better",
             [
-                figure("nine of ten below", ORANGE, "depth.p90_mm"),
-                figure("half below", BLUE, "depth.median_mm"),
-                figure("half below, stereo alone", GREY, "measured_depth.median_mm"),
+                series("nine of ten below", ORANGE, "depth.p90_mm"),
+                series("half below", BLUE, "depth.median_mm"),
+                series("half below, stereo alone", GREY, "measured_depth.median_mm"),
             ],
             spans,
         ),
@@ -189,10 +179,9 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
         ),
     ]
     if not tallies:  # no true depth
-        gaussians = run("Gaussians", BLUE, lambda facts: facts.gaussians)
+        gaussians = series("Gaussians", BLUE, "gaussians")
         plots.append(line_plot("How many Gaussians the model has", [gaussians], spans))
-    shown = [f'<img alt="plot" src="{svg_uri(plot)}">' for plot in plots if plot]
-    return f'<div class="plots">{"".join(shown)}</div>'
+    return plot_grid(plots)
 
 
 def _figure_table(summary: Mapping[str, Any]) -> str:

@@ -13,12 +13,13 @@ from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation import live
 from sags_node.evaluation.aside import Aside
+from sags_node.evaluation.figures import MEANS
 from sags_node.evaluation.gallery import Picture
 from sags_node.evaluation.hidden import measure_hidden
 from sags_node.evaluation.measure import FrameRow, MeasureOptions, Measurer, OnPicture, Progress
 from sags_node.evaluation.receipt import Receipt
-from sags_node.evaluation.spool import Spool
-from sags_node.evaluation.summary import GROUPS, summarise
+from sags_node.evaluation.run import Run
+from sags_node.evaluation.summary import summarise
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, backend_of, device_of
 from sags_node.messaging.address import NodeAddress
@@ -27,7 +28,6 @@ from sags_node.pipeline.session import Session, at_best_scale, open_posed, open_
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.sources.source import Source
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.tissue import TissueMask
 
 Pace = Literal["realtime", "step"]
 DEFAULT_OPTIONS = MeasureOptions()
@@ -69,6 +69,8 @@ def evaluate(
     asked = load_launch(launch, overrides)
     if isinstance(asked.source, LiveSource):
         raise UsageError("live cameras cannot be measured; record them first, then evaluate the recording")
+    if pace == "realtime" and options.hold_out:
+        raise UsageError("a live node sees every frame: leave --hold-out out, or add --pace step")
     _check_segments(asked)
     forced = ["source.loop:=false", f"source.pace:={pace}"]
     if asked.publish.right == "auto":
@@ -80,47 +82,31 @@ def evaluate(
     )
     progress("loading kernels", 0)
     warm_up(session.config)
-    if pace == "realtime":
-        return _live(launch, overrides, forced, session, options, progress)
-    with Spool() as spool:
-        run_step(at_best_scale(session), options, spool, progress)
-        return measure(session, spool, options, overrides, progress)
-
-
-def _live(
-    launch: Path | str | None,
-    overrides: Sequence[str],
-    forced: Sequence[str],
-    session: Session,
-    options: MeasureOptions,
-    progress: Progress,
-) -> Evaluation:
-    """Of a node in a process of its own."""
-    if options.hold_out:
-        raise UsageError("a live node sees every frame: leave --hold-out out, or add --pace step")
-    with live.Copies() as copies:
+    with Run() as run:
+        if pace == "step":
+            run_step(at_best_scale(session), options, run, progress)
+            return measure(session, run, options, overrides, progress)
         # Its own sockets, away from those of a node that may be running on this machine.
-        run_dir = copies.folder / "run"
+        run_dir = run.folder / "run"
         sockets = ["publish.data:=[]", "publish.ipc:=true", "publish.control:=null"]
         arguments = [*overrides, *forced, *sockets, f"publish.run_dir:={run_dir}"]
         node = NodeAddress(session.config.ns, run_dir=run_dir)
-        account = live.play([*([] if launch is None else [str(launch)]), *arguments], node, copies, progress)
-        size = copies.size()
-        vision = session.config.vision.model_copy(update={"width": size[0], "height": size[1], "scale": 1.0})
-        session = replace(session, config=session.config.model_copy(update={"vision": vision}))
-        receipt = Receipt(session.rig, size, options.lpips_weights)
-        detail = session.config.publish.detail
-        judge = live.Judge(copies, Rectifier(session.rig, *size), options, receipt, detail)
-        with again(session) as frames:
-            judge.run(frames, progress)
-    summary = _summary(session, judge.rows, options, overrides, judge.depth_kind)
-    summary |= {key: account[key] for key in ("frame_ms", "stage_ms", "skipped")}  # only the node knows
-    return Evaluation(summary, judge.rows, judge.gallery.pictures, receipt.as_json())
+        account = live.play([*([] if launch is None else [str(launch)]), *arguments], node, run, progress)
+        found = measure(_as_shown(session, run), run, options, overrides, progress)
+        found.summary.update({key: account[key] for key in ("frame_ms", "stage_ms", "skipped")})
+        return found  # those figures only the node knows
+
+
+def _as_shown(session: Session, run: Run) -> Session:
+    """The session at the size in which a live node showed it."""
+    width, height = run.size()
+    vision = session.config.vision.model_copy(update={"width": width, "height": height, "scale": 1.0})
+    return replace(session, config=session.config.model_copy(update={"vision": vision}))
 
 
 def measure(
     session: Session,
-    spool: Spool,
+    run: Run,
     options: MeasureOptions,
     overrides: Sequence[str] = (),
     progress: Progress = lambda what, frames: None,
@@ -134,15 +120,20 @@ def measure(
     Raises:
         SagsError: nothing was processed, or the recording cannot be read again.
     """
-    if len(spool) == 0:
+    if len(run) == 0:
         raise SagsError(
             "no frame was processed; check source.start, source.frames, source.warm_up and the hold-out"
         )
+    config = session.config
     receipt = Receipt(session.rig, session.working_size, options.lpips_weights)
-    measurer = _measured(session, spool, options, receipt, progress, on_picture)
+    rectifier = Rectifier(session.rig, *session.working_size, session.published_size)
+    aside = Aside(config, session.source.frame_count or 0) if options.aside else None
+    measurer = Measurer(run, rectifier, config, options, receipt, on_picture, aside)
+    with again(session) as frames:
+        measurer.run(frames, progress)
     if options.hidden:
         rows = {row.frame_id: row for row in measurer.rows}
-        found = measure_hidden(session.config, session.rig, again(session), len(rows), progress)
+        found = measure_hidden(config, session.rig, again(session), len(rows), progress)
         for frame_id, figures in found.items():
             rows[frame_id].figures["hidden"] = figures
     summary = _summary(session, measurer.rows, options, overrides, measurer.depth_kind)
@@ -179,7 +170,7 @@ def _summary(
 
 
 def run_step(
-    session: Session, options: MeasureOptions, spool: Spool, progress: Progress, skips: Skips = ALL_SKIPS
+    session: Session, options: MeasureOptions, run: Run, progress: Progress, skips: Skips = ALL_SKIPS
 ) -> Pipeline:
     """Every frame in turn, none lost; only the pipeline's own work is timed. Returns it as it is then."""
     configure_threads(session.config.engine.threads)
@@ -194,37 +185,9 @@ def run_step(
             if frame.warm_up:
                 continue
             frame_ms, cpu_ms = (time.perf_counter() - started) * 1e3, (time.process_time() - before) * 1e3
-            spool.add(result, frame_ms, time.monotonic_ns(), warnings=pipeline.warnings, cpu_ms=cpu_ms)
-            progress("playing", len(spool))
+            run.add(result, frame_ms, time.monotonic_ns(), warnings=pipeline.warnings, cpu_ms=cpu_ms)
+            progress("playing", len(run))
     return pipeline
-
-
-def _measured(
-    session: Session, spool: Spool, options: MeasureOptions, receipt: Receipt, progress: Progress,
-    on_picture: OnPicture,
-) -> Measurer:  # fmt: skip
-    """Read the recording again, with its truth, and measure every frame."""
-    config = session.config
-    rectifier = Rectifier(session.rig, *session.working_size, session.published_size)
-    tissue = TissueMask(config.vision.tissue, rectifier)
-    exclude = config.vision.tissue.exclude
-    backend = backend_of(config)
-    measurer = Measurer(
-        spool,
-        rectifier,
-        tissue,
-        options,
-        receipt,
-        exclude,
-        config.vision.pose,
-        on_picture,
-        backend,
-        config.publish.detail,
-        Aside(config, session.source.frame_count or 0) if options.aside else None,
-    )
-    with again(session) as frames:
-        measurer.run(frames, progress)
-    return measurer
 
 
 def again(session: Session) -> Source:
@@ -234,7 +197,7 @@ def again(session: Session) -> Source:
 
 
 def _check_segments(config: LaunchConfig) -> None:
-    figures = {key for keys in GROUPS.values() for key in keys}
+    figures = {key for keys in MEANS.values() for key in keys}
     for name in config.segments:
         if name in figures:
             raise UsageError(f"segments.{name}: a segment cannot be named like a figure; rename it")

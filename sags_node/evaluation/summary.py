@@ -10,30 +10,14 @@ from typing import Any
 import numpy as np
 
 from sags_node.evaluation import calibration
-from sags_node.evaluation.aside import AWAY
+from sags_node.evaluation.figures import MEANS
 from sags_node.evaluation.lpips import BACKBONE
 from sags_node.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.evaluation.metrics import percentiles
 from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.run import RunFacts
 from sags_node.evaluation.trajectory import trajectory_errors
 
-GROUPS = {
-    "online": ("psnr", "ssim", "lpips"),
-    "shown": ("psnr", "ssim", "lpips"),
-    "predict": ("psnr", "model_psnr", "copy_psnr"),
-    "predict_2": ("psnr", "model_psnr", "copy_psnr"),
-    "predict_3": ("psnr", "model_psnr", "copy_psnr"),
-    "hidden": ("psnr", "model_psnr", "copy_psnr"),
-    **{f"view_{millimetres}": ("psnr", "model_psnr", "warp_psnr") for millimetres in AWAY},
-    "heldout": ("psnr", "ssim", "lpips", "copy_psnr"),
-    "between": ("psnr", "carried_psnr", "mean_psnr"),
-    "novel": ("psnr",),
-    "right": ("psnr", "warp_psnr", "model_psnr", "copy_psnr", "coverage"),
-    "flicker": ("picture", "input", "right", "depth_mm", "measured_depth_mm", "share"),
-    "depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
-    "measured_depth": ("median_mm", "p90_mm", "rmse_mm", "coverage"),
-}
 STAGES = ("rectify", "mask", "depth", "map", "render", "publish")
 
 
@@ -48,25 +32,10 @@ def summarise(
 
     A figure of quality is the mean over the frames that have it, and again over each named segment
     (`online.motion.psnr`; first and last frame belong to it). Track errors are pooled over points and frames.
-    `online` is the model's own picture of a frame that it has learnt from, as who draws its splats sees it.
-    `shown` is the left render of a live run with `publish.detail`: where tissue is seen, its own picture.
-    `predict` is a frame said by the one before, `predict_2` and `predict_3` by the second and third before:
-    `psnr` as it is shown, with the older picture's detail where `publish.detail` is set, `model_psnr` by the
-    model alone, `copy_psnr` by that picture, shown again: on tissue that hardly moves it is hard to beat.
-    `hidden` is the same for boxes of tissue that were hidden from a second run, `copy_psnr` by the last
-    picture that showed them.
-    `view_2` to `view_20` are views of the phantom from so many mm aside, see `Aside`.
-    `between` is `heldout` once the next frame is known; `between.mean_psnr` the mean of the pictures around,
-    `between.carried_psnr` the same with both carried along the model's motion, see `carried`.
-    `right` is the right view as it was shown, with `publish.right:=true`; `right.warp_psnr` the left picture
-    warped by the frame's own stereo depth, `right.model_psnr` the model alone, `right.copy_psnr` the right
-    picture of the frame before, shown again; all where the warp is known: the share `right.coverage` of the
-    pixels of `novel`.
-    `flicker` is the standard deviation in time over thirty frames, where nothing moves, see `Flicker`.
-    `pose` compares with the session's poses those of a run that was not given them; `pose.rigid_...` are
-    those of the baseline, see `RigidOdometry`.
+    docs/evaluation.md says what each of them is, and what it is compared with.
     """
     facts = [row.facts for row in rows if row.facts is not None]
+    counts, memory = [run.gaussians for run in facts], [run.rss_mb for run in facts]
     held_out = sum(options.holds_out(row.frame_id) for row in rows)
     summary: dict[str, Any] = {
         "session": session,
@@ -78,8 +47,8 @@ def summarise(
         "budget_ms": budget_ms,
         "iterations_per_frame": _mean([run.counts.get("iterations", 0) for run in facts[1:]]),
         **_quality(rows, options),
-        "gaussians": _mean_and_max([run.gaussians for run in facts]),
-        "rss_mb": _memory(facts),
+        "gaussians": {"mean": float(np.mean(counts)), "max": max(counts)} if counts else None,
+        "rss_mb": {"start": memory[0], "end": memory[-1], "max": max(memory)} if memory else None,
         "skipped": dict(Counter(what for run in facts for what in run.skipped)),
         "warnings": dict(Counter(code for run in facts for code in run.warnings)),
         "rungs": dict(sorted(Counter(run.rung for run in facts if run.rung is not None).items())),
@@ -108,8 +77,9 @@ def _timings(facts: Sequence[RunFacts]) -> dict[str, Any]:
         "frame_ms": percentiles(frame_ms),
         "cpu_ms": percentiles([run.cpu_ms for run in facts if run.cpu_ms is not None]),
         "stage_ms": {
-            stage: _median([run.timings_ms[stage] for run in facts if stage in run.timings_ms])
+            stage: float(np.median(times)) if times else None
             for stage in dict.fromkeys(stages)
+            for times in [[run.timings_ms[stage] for run in facts if stage in run.timings_ms]]
         },
     }
 
@@ -123,25 +93,16 @@ def _rate(facts: Sequence[RunFacts]) -> float | None:
     return (len(facts) - 1) / ((facts[-1].t_shown_ns - facts[0].t_shown_ns) * 1e-9)
 
 
-def _memory(facts: Sequence[RunFacts]) -> dict[str, float] | None:
-    if not facts:
-        return None
-    return {
-        "start": facts[0].rss_mb,
-        "end": facts[-1].rss_mb,
-        "max": max(run.rss_mb for run in facts),
-    }
-
-
 def _quality(rows: Sequence[FrameRow], options: MeasureOptions) -> dict[str, dict[str, Any] | None]:
     groups: dict[str, dict[str, Any] | None] = {}
-    for group, keys in GROUPS.items():
+    for group, keys in MEANS.items():
         figures = [row.figures[group] for row in rows if group in row.figures]
-        extra = ("paper_psnr", "paper_ssim") if options.paper_psnr and "ssim" in keys else ()
         groups[group] = None
         if figures:
             groups[group] = {
-                key: _mean([each[key] for each in figures if key in each]) for key in (*keys, *extra)
+                key: _mean([each[key] for each in figures if key in each])
+                for key in keys
+                if options.paper_psnr or not key.startswith("paper_")
             }
     tallies = [row.calibration for row in rows if row.calibration is not None]
     groups["depth_confidence"] = calibration.figures(tallies) if tallies else None
@@ -180,22 +141,10 @@ def _track(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
     }
 
 
-def _known(values: Sequence[float]) -> list[float]:
-    return [value for value in values if not math.isnan(value)]
-
-
 def _mean(values: Sequence[float]) -> float | None:
-    known = _known(values)
+    """Of those that are no NaN."""
+    known = [value for value in values if not math.isnan(value)]
     return float(np.mean(known)) if known else None
-
-
-def _median(values: Sequence[float]) -> float | None:
-    known = _known(values)
-    return float(np.median(known)) if known else None
-
-
-def _mean_and_max(values: Sequence[int]) -> dict[str, float] | None:
-    return {"mean": float(np.mean(values)), "max": max(values)} if values else None
 
 
 def _rounded(value: Any) -> Any:

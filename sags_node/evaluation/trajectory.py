@@ -34,29 +34,6 @@ def trajectory_errors(estimated: F64, known: F64) -> dict[str, float]:
     }
 
 
-def drift(estimated: F64, known: F64, period: int) -> dict[str, float]:
-    """How the error of poses `T_world_cam` [T, 4, 4] grows with time.
-
-    `end_...`: the error of the last pose, worlds aligned at the first frame. `drift_...`: the mean error over
-    the last `period` frames less that over the first ones; `worst_drift_...`: over any so many. Where the
-    scene repeats itself with that period, what its motion does to a pose is in all these means alike.
-    """
-    ours = np.linalg.inv(estimated[0]) @ estimated
-    true = np.linalg.inv(known[0]) @ known
-    errors = np.linalg.inv(true) @ ours
-    places = errors[:, :3, 3] * 1e3
-    turns = np.degrees([cv2.Rodrigues(error[:3, :3])[0][:, 0] for error in errors])
-    found = {}
-    for unit, values in (("mm", places), ("deg", turns)):
-        whole = len(values) // period
-        means = values[len(values) - whole * period :].reshape(whole, period, 3).mean(1)
-        drifts = np.linalg.norm(means - means[0], axis=1)
-        found[f"end_{unit}"] = float(np.linalg.norm(values[-1]))
-        found[f"drift_{unit}"] = float(drifts[-1])
-        found[f"worst_drift_{unit}"] = float(drifts.max())
-    return found
-
-
 def _steps(poses: F64) -> F64:
     return np.asarray(np.linalg.inv(poses[:-1]) @ poses[1:])
 

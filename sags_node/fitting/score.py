@@ -12,8 +12,8 @@ import numpy as np
 
 from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.evaluation import metrics
-from sags_node.evaluation.carried import Seen, carried
 from sags_node.evaluation.lpips import Lpips
+from sags_node.evaluation.moments import Seen, carried
 from sags_node.evaluation.tracking import PointTracks
 from sags_node.files import whole
 from sags_node.fitting.clip import ClipFrame

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.evaluation.gallery import Picture
-from sags_node.evaluation.tiles import TILE_WIDTH, depth_range, tiles
+from sags_node.evaluation.gallery import TILE_WIDTH, Picture, depth_range, tiles
 from sags_node.types import U8
 from sags_node.viewer.feed import Moment
 

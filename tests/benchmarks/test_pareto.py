@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from benchmarks.pareto import settings as pareto_settings
-from benchmarks.pareto.baselines import right_pixels
 from benchmarks.pareto.measure import non_dominated, why_default
 from benchmarks.pareto.settings import HURRIED_RULES, skip_settings, time_settings
 from sags_node.config.launch_file import load_launch
 from sags_node.evaluation import metrics
-from sags_node.evaluation.warp import warp_to_right
+from sags_node.evaluation.warp import right_pixels, warp_to_right
 from sags_node.mapping.devices import Skips
 from sags_node.mapping.ladder import RUNGS
 from sags_node.rig import load_rig
@@ -85,10 +84,10 @@ def test_warp_by_the_exact_depth_is_the_right_picture(phantom_session: Path) -> 
     assert config.rig is not None
     rig = load_rig(config.rig)
     rectifier = Rectifier(rig, 320, 256)
-    camera, usable = rectifier.camera, right_pixels(rig, (320, 256), ((0, 0, 60, 30),))
-    assert not usable[:25, :55].any() and usable[40:200, 40:280].all()
     with open_source(config.source.model_copy(update={"pace": "step"})) as frames:
         frame = next(iter(frames))
+    camera, usable = rectifier.camera, right_pixels(rectifier, frame, ((0, 0, 60, 30),))
+    assert not usable[:25, :55].any() and usable[40:200, 40:280].all()
     pair = rectifier(frame)
     assert pair.right is not None and frame.reference is not None and frame.reference.depth is not None
     left, right, depth = metrics.as_float(pair.left), metrics.as_float(pair.right), frame.reference.depth

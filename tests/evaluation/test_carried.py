@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from engine_scenes import round_gaussians
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.evaluation.carried import Seen, carried
+from sags_node.evaluation.moments import Seen, carried
 from sags_node.types import F32, Camera, Gaussians
 
 WIDTH, HEIGHT, DEPTH, FOCAL = 96, 64, 0.1, 100.0
@@ -22,15 +23,7 @@ def sheet(shift_px: float) -> Gaussians:
     x, y = np.meshgrid(np.arange(-24, WIDTH + 24, 4.0), np.arange(-24, HEIGHT + 24, 4.0))
     across, down = x.ravel() + shift_px - (WIDTH - 1) / 2, y.ravel() - (HEIGHT - 1) / 2
     means = np.stack([across, down, np.full(x.size, FOCAL)], 1).astype(np.float32) * np.float32(DEPTH / FOCAL)
-    count = len(means)
-    return Gaussians(
-        means,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.full((count, 3), 3 * DEPTH / FOCAL, np.float32),
-        np.full(count, 0.9, np.float32),
-        np.full((count, 3), 0.5, np.float32),
-        np.arange(count),
-    )
+    return round_gaussians(means, 3 * DEPTH / FOCAL)
 
 
 def stripes(shift_px: float) -> F32:

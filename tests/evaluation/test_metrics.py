@@ -8,17 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from engine_scenes import round_gaussians, rows
 
 from sags_node.errors import UsageError
 from sags_node.evaluation import metrics
 from sags_node.evaluation.flicker import FRAMES, Flicker
 from sags_node.evaluation.lpips import Lpips
-from sags_node.evaluation.point_tracks import average_jaccard, calibration_error, reliability
-from sags_node.evaluation.spool import RunFacts, SpooledFrame
+from sags_node.evaluation.moments import VELOCITY_SHARE, extrapolated
+from sags_node.evaluation.run import MappedFrame, RunFacts
 from sags_node.evaluation.tracking import PointTracks
-from sags_node.evaluation.trajectory import drift
-from sags_node.evaluation.views import VELOCITY_SHARE, extrapolated
-from sags_node.mapping.camera_pose import exponential
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.types import Camera, Gaussians, Snapshot
 
@@ -206,25 +204,12 @@ def cloud(count: int = 4000, seed: int = 0) -> Gaussians:
     """A slab of small Gaussians 0.1 m before the camera."""
     rng = np.random.default_rng(seed)
     means = rng.uniform([-0.03, -0.022, 0.099], [0.03, 0.022, 0.101], (count, 3)).astype(np.float32)
-    return Gaussians(
-        means=means,
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=np.full((count, 3), 4e-4, np.float32),
-        opacities=np.full(count, 0.9, np.float32),
-        colors=rng.random((count, 3), np.float32),
-        ids=np.arange(100, 100 + count),
-    )
+    made = round_gaussians(means, 4e-4, rng.random((count, 3), np.float32))
+    return replace(made, ids=np.arange(100, 100 + count))
 
 
 def moved(gaussians: Gaussians, by: np.ndarray) -> Gaussians:
-    return Gaussians(
-        gaussians.means + by.astype(np.float32),
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.colors,
-        gaussians.ids,
-    )
+    return replace(gaussians, means=gaussians.means + by.astype(np.float32))
 
 
 def test_constant_velocity_is_predicted_by_its_stated_share() -> None:
@@ -311,15 +296,6 @@ def test_points_survive_as_long_as_one_neighbour_does() -> None:
     tracks.update(start, points, visible, CAMERA)
     rng = np.random.default_rng(1)
     order = rng.permutation(len(start))[:3000]  # rows shuffled, a quarter pruned: ids must do the work
-
-    def rows(cloud_now: Gaussians, keep: np.ndarray) -> Gaussians:
-        return Gaussians(
-            *(
-                getattr(cloud_now, name)[keep]
-                for name in ("means", "quats", "scales", "opacities", "colors", "ids")
-            )
-        )
-
     step = np.array([0.001, 0, 0])
     errors = tracks.update(rows(moved(start, step), order), points + step, visible, CAMERA)
     assert errors.lost == 0 and errors.errors_mm.max() < 1e-4
@@ -341,77 +317,20 @@ def test_a_point_is_bound_when_it_is_first_seen_near_the_model() -> None:
     assert len(tracks.update(start, points, visible, CAMERA).errors_mm) == 39
 
 
-# ---- how the drift of a trajectory is told from what its scene does again and again --------------------
-
-
-PERIOD, ROUNDS = 40, 5
-
-
-def test_a_drift_is_told_from_a_swing() -> None:
-    """1 mm and 0.2 degrees in all; the means of first and last period are four fifths of that apart."""
-    count = PERIOD * ROUNDS
-    known = np.tile(np.eye(4), (count + 1, 1, 1))
-    estimated = []
-    for k in range(count + 1):
-        gone, swing = k / count, np.sin(2 * np.pi * k / PERIOD)
-        twist = [1e-3 * gone, 1.2e-3 * swing, 0, 0, 0, np.radians(0.2) * gone]
-        estimated.append(exponential(np.array(twist)))
-    found = drift(np.stack(estimated), known, PERIOD)
-    assert found["drift_mm"] == pytest.approx(0.8, abs=1e-6) == found["worst_drift_mm"]
-    assert found["drift_deg"] == pytest.approx(0.16, abs=1e-6)
-    assert found["end_mm"] == pytest.approx(1.0, abs=1e-6)
-    assert found["end_deg"] == pytest.approx(0.2, abs=1e-6)
-
-
-# ---- figures of followed points, by hand ---------------------------------------------------------------
-
-
-def test_average_jaccard_counts_places_and_visibility() -> None:
-    """Four points: near; 5 px off; seen but not said to be; hidden but said to be seen. Three are seen.
-
-    Within 2 and 4 px one is right, and two of those said are not: 1 / (3 + 2). Within 8, 16 and 32 px two are
-    right, and one is not: 2 / (3 + 1).
-    """
-    distances = np.array([1.0, 5.0, 40.0, 1.0])
-    visible, said = np.array([1, 1, 1, 0], bool), np.array([1, 1, 0, 1], bool)
-    assert average_jaccard(distances, visible, said) == pytest.approx((2 / 5 + 3 * 2 / 4) / 5)
-    assert average_jaccard(np.zeros(4), visible, visible) == 1
-    assert average_jaccard(np.zeros(4), visible, ~visible) == 0
-    assert average_jaccard(np.array([2.0]), np.array([True]), np.array([True]), [2]) == 0  # TAP-Vid: below it
-    assert average_jaccard(np.full(4, np.inf), visible, said) == 0
-
-
-def test_reliability_tells_what_was_said_from_what_was_right() -> None:
-    confidence = np.array([0.0, 0.1, 0.55, 0.95, 1.0, 0.9, 0.99])
-    bins = reliability(confidence, np.array([0, 1, 1, 1, 1, 0, 1], bool))
-    assert [(each.least, each.most, each.count) for each in bins] == [
-        (0, 0.02, 1),
-        (0.1, 0.2, 1),
-        (0.5, 0.6, 1),
-        (0.9, 1, 4),
-    ]
-    assert [each.right for each in bins] == [0, 1, 1, 0.75]
-    assert bins[3].said == pytest.approx(0.96)
-    assert calibration_error(bins) == pytest.approx((0.9 + 0.45 + 4 * 0.21) / 7)
-
-
 # ---- flicker, by hand ----------------------------------------------------------------------------------
 
 
 HEIGHT, WIDTH = 64, 96
 
 
-def frame() -> SpooledFrame:
+def frame() -> MappedFrame:
     """All tissue, gray, 100 mm away."""
     nothing = np.zeros((0, 3), np.float32)
-    gaussians = Gaussians(
-        nothing, np.zeros((0, 4), np.float32), nothing, nothing[:, 0], nothing, np.zeros(0, np.int64)
-    )
     camera = Camera(WIDTH, HEIGHT, np.diag([100.0, 100, 1]), np.eye(4))  # 5 px of disparity
     depth = np.full((HEIGHT, WIDTH), 0.1, np.float32)
-    return SpooledFrame(
+    return MappedFrame(
         facts=RunFacts(0, 0, None, 0, {}, {}, 0, {}),
-        snapshot=Snapshot(0, 0, 0, gaussians, nothing, camera, 0.0, {}),
+        snapshot=Snapshot(0, 0, 0, round_gaussians(nothing, 1), nothing, camera, 0.0, {}),
         baseline=0.005,
         rgb=np.full((HEIGHT, WIDTH, 3), 100, np.uint8),
         depth=depth,

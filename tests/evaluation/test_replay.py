@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from golden import Golden, Tolerance, compare, read_golden, write_golden
 from places import ROOT, SESSION
 
 from sags_node.evaluation.calibration import STEP_MM
-from sags_node.evaluation.golden import Golden, Tolerance, compare, read_golden, write_golden
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads, thread_count

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from sags_node.evaluation.figure_table import GROUPS, groups, headings
+from sags_node.evaluation.figures import TABLE, flat, groups, headings, verdict
 from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.summary import GROUPS as QUALITY
 from sags_node.evaluation.summary import STAGES, summarise
-from sags_node.evaluation.verdict import flat, verdict
 
 TIMES = {"p50": 38.6, "p90": 60.0, "p99": 96.9, "max": 313.8}
 
@@ -74,7 +72,7 @@ def test_what_is_not_known_is_not_said() -> None:
 
 def test_figures_stand_in_groups_beside_their_baselines() -> None:
     found = groups(live())
-    assert list(found) == list(GROUPS) and headings(live()) == ["all frames", "motion"]
+    assert list(found) == list(TABLE) and headings(live()) == ["all frames", "motion"]
     shown = {(group, row[0]): row for group, rows in found.items() for row in rows}
     what = ("Picture", "the model, PSNR over tissue")
     assert shown[what] == (what[1], ["34.6 dB", "31.0 dB"], "the picture before, shown again: 35.8 dB")
@@ -87,9 +85,8 @@ def test_figures_stand_in_groups_beside_their_baselines() -> None:
 
 
 def test_no_figure_of_a_summary_is_left_out() -> None:
-    given = {f"{group}.{key}" for group, keys in QUALITY.items() for key in keys}
-    given |= {f"stage_ms.{stage}" for stage in STAGES}
+    given = {f"stage_ms.{stage}" for stage in STAGES}
     given |= {key for key, value in flat(live()).items() if value is not None and ".motion." not in key}
-    shown = {key for rows in GROUPS.values() for figure in rows for key in (figure.key, figure.baseline_key)}
+    shown = {key for rows in TABLE.values() for figure in rows for key in (figure.key, figure.baseline_key)}
     prefixes = (*(key[:-1] for key in shown if key.endswith(".*")), "settings.")
     assert {key for key in given - shown if not key.startswith(prefixes)} == {"session", "machine"}

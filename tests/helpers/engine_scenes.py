@@ -66,14 +66,21 @@ def random_gaussians(seed: int, count: int, view: Camera, spread: float = 1.0) -
 
 
 def one_gaussian(mean: NDArray[np.floating], scale: float, opacity: float = 0.9) -> Gaussians:
+    colour = np.array([0.8, 0.5, 0.2], np.float32)
+    one = round_gaussians(np.asarray(mean, np.float32).reshape(1, 3), scale, colour, opacity)
+    return dataclasses.replace(one, slopes=np.zeros((1, 3), np.float32))
+
+
+def round_gaussians(means: F32, scale: float, colours: F32 | float = 0.5, opacity: float = 0.9) -> Gaussians:
+    """Of one size, at `means` [N, 3]."""
+    count = len(means)
     return Gaussians(
-        means=np.asarray(mean, np.float32).reshape(1, 3),
-        quats=np.array([[1, 0, 0, 0]], np.float32),
-        scales=np.full((1, 3), scale, np.float32),
-        opacities=np.full(1, opacity, np.float32),
-        colors=np.array([[0.8, 0.5, 0.2]], np.float32),
-        ids=np.zeros(1, np.int64),
-        slopes=np.zeros((1, 3), np.float32),
+        means=means,
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), scale, np.float32),
+        opacities=np.full(count, opacity, np.float32),
+        colors=np.broadcast_to(np.asarray(colours, np.float32), (count, 3)).copy(),
+        ids=np.arange(count),
     )
 
 

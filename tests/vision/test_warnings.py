@@ -20,7 +20,7 @@ from synthetic import health, plane_result, publisher, stream
 from sags_node.cli.foreground import run_node
 from sags_node.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.evaluation.report import warning_table
-from sags_node.evaluation.spool import RunFacts
+from sags_node.evaluation.run import RunFacts
 from sags_node.evaluation.summary import summarise
 from sags_node.findings import STAGES, by_code, by_stage, in_words
 from sags_node.messaging.address import NodeAddress

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from sags_node.errors import UsageError
+from pydantic import BaseModel, ConfigDict, Field
 
 # These differ from machine to machine and from run to run.
 TIMING_KEYS = frozenset(
@@ -24,8 +22,10 @@ class Tolerance(BaseModel):
     absolute: float = Field(0.0, ge=0)
     relative: float = Field(0.0, ge=0)
 
-    def allows(self, value: float, golden: float) -> bool:
-        return abs(value - golden) <= max(self.absolute, self.relative * abs(golden))
+    def allows(self, value: Any, golden: Any) -> bool:
+        if any(isinstance(each, bool) or not isinstance(each, int | float) for each in (value, golden)):
+            return bool(value == golden)
+        return bool(abs(value - golden) <= max(self.absolute, self.relative * abs(golden)))
 
 
 class Golden(BaseModel):
@@ -47,19 +47,7 @@ class Golden(BaseModel):
 
 
 def read_golden(file: Path) -> Golden:
-    """Read a golden file.
-
-    Raises:
-        UsageError: it is missing or not what `write_golden` writes.
-    """
-    try:
-        return Golden.model_validate_json(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"cannot read golden file {file}: {error.strerror}; check the path") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "file"
-        raise UsageError(f"{file} is not a golden file: {where}: {first['msg']}") from None
+    return Golden.model_validate_json(file.read_text(encoding="utf-8"))
 
 
 def write_golden(file: Path, golden: Golden, summary: Mapping[str, Any]) -> None:
@@ -74,42 +62,27 @@ def compare(summary: Mapping[str, Any], golden: Golden) -> list[str]:
 
     The last line then names the command that makes new golden figures.
     """
-    now, then = dict(_fields(summary)), dict(_fields(golden.figures))
+    now, then = _fields(summary), _fields(golden.figures)
     differences = []
     for key in sorted(now.keys() | then.keys()):
+        allowed = golden.tolerance(key)
         if key not in now:
             differences.append(f"{key}: missing, golden {then[key]!r}")
         elif key not in then:
             differences.append(f"{key}: {now[key]!r} is new, the golden file has no such figure")
-        elif not _same(now[key], then[key], golden.tolerance(key)):
-            differences.append(f"{key}: {now[key]!r}, golden {then[key]!r}{_allowed(golden.tolerance(key))}")
+        elif not allowed.allows(now[key], then[key]):
+            bound = f"allowed {allowed.absolute:g} or {allowed.relative:.1%}"
+            differences.append(f"{key}: {now[key]!r}, golden {then[key]!r}, {bound}")
     if differences:
         differences.append(f"if this is meant, update the golden file: {golden.command}")
     return differences
 
 
-def _fields(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _fields(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """The leaves of nested maps under their dotted keys, without timings."""
-    for key, value in tree.items():
-        if key in TIMING_KEYS:
-            continue
-        if isinstance(value, Mapping) and value:
-            yield from _fields(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _same(value: Any, golden: Any, tolerance: Tolerance) -> bool:
-    if _is_number(value) and _is_number(golden):
-        return tolerance.allows(value, golden)
-    return bool(value == golden)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _allowed(tolerance: Tolerance) -> str:
-    if tolerance == Tolerance():
-        return ", must be equal"
-    return f", allowed {tolerance.absolute:g} or {tolerance.relative:.1%}"
+    found: dict[str, Any] = {}
+    for key, value in figures.items():
+        if key not in TIMING_KEYS:
+            nested = isinstance(value, Mapping) and value
+            found |= _fields(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
+    return found

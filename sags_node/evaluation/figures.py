@@ -1,0 +1,329 @@
+"""Every figure of a run once, with its key, its unit and what it is compared with.
+
+`summarise` makes them, and the terminal and the page of a report show them: in words (`verdict`) and in
+tables (`groups`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+Flat = Mapping[str, Any]
+
+
+def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """All numbers and words of nested figures in one row, named by their way: `online.psnr`."""
+    row: dict[str, Any] = {}
+    for key, value in figures.items():
+        if isinstance(value, Mapping):
+            row |= flat(value, f"{prefix}{key}.")
+        elif not isinstance(value, list):
+            row[f"{prefix}{key}"] = value
+    return row
+
+
+def below(figures: Flat, prefix: str) -> dict[str, Any]:
+    """The figures below a key, named by the rest of their way: counts by reason, by rung, by warning."""
+    return {key[len(prefix) + 1 :]: value for key, value in figures.items() if key.startswith(prefix + ".")}
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure; a key that ends in `.*` is one for each key below it."""
+
+    what: str
+    key: str
+    unit: str = ""  # %: of a share
+    digits: int = 0
+    baseline: str = ""  # what it is compared with
+    baseline_key: str = ""
+
+
+def _times(what: str, key: str, baseline: str = "", baseline_key: str = "") -> list[Figure]:
+    names = {"p50": "median", "p90": "nine of ten below", "p99": "99 of 100 below", "max": "longest"}
+    figures = [Figure(f"{what}, {name}", f"{key}.{part}", "ms", 1) for part, name in names.items()]
+    return [Figure(figures[0].what, figures[0].key, "ms", 1, baseline, baseline_key), *figures[1:]]
+
+
+def _psnr(what: str, key: str, baseline: str = "", baseline_key: str = "") -> Figure:
+    return Figure(what, key, "dB", 1, baseline, baseline_key)
+
+
+def _paper(what: str, group: str) -> tuple[Figure, Figure]:
+    ssim = Figure(f"{what}, SSIM, masked pixels counted as equal", f"{group}.paper_ssim", "", 3)
+    return _psnr(f"{what}, masked pixels counted as equal", f"{group}.paper_psnr"), ssim
+
+
+_COPY = "the picture before, shown again"
+_BEFORE = f"{_COPY}: {{:.1f}} dB"
+_STEREO = "stereo alone"
+_WARP = "left picture, warped"
+_AHEAD = (
+    ("predict", "one frame ahead"),
+    ("predict_2", "two frames ahead"),
+    ("predict_3", "three frames ahead"),
+)
+AWAY = (2, 5, 10, 20)  # mm to the right of the left eye
+
+TABLE: dict[str, list[Figure]] = {
+    "Speed": [
+        Figure("frames of the recording", "frames"),
+        Figure("shown", "processed"),
+        Figure("missed", "dropped"),
+        Figure("kept back for testing", "held_out"),
+        Figure("rate", "rate_hz", "frames/s", 1),
+        Figure("first frame", "first_render_ms", "ms", 1),
+        *_times("camera's stamp to sending", "latency_ms"),
+        *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
+        Figure("of that, median of", "stage_ms.*", "ms", 2),
+        *_times("processor time for a frame", "cpu_ms"),
+        Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
+        Figure("Gaussians, mean", "gaussians.mean"),
+        Figure("Gaussians, at most", "gaussians.max"),
+        Figure("memory at the start", "rss_mb.start", "MB"),
+        Figure("memory at the end", "rss_mb.end", "MB"),
+        Figure("memory, at most", "rss_mb.max", "MB"),
+        Figure("frames on rung", "rungs.*"),
+        Figure("frames that left out", "skipped.*"),
+        Figure("frames with the warning", "warnings.*"),
+    ],
+    "Picture": [
+        _psnr("the model, PSNR over tissue", "online.psnr", _COPY, "predict.copy_psnr"),
+        Figure("the model, SSIM (1: equal)", "online.ssim", "", 3),
+        Figure("the model, LPIPS (0: equal)", "online.lpips", "", 3),
+        _psnr("left render, mostly the frame's own picture", "shown.psnr", _COPY, "predict.copy_psnr"),
+        Figure("left render, SSIM", "shown.ssim", "", 3),
+        Figure("left render, LPIPS", "shown.lpips", "", 3),
+        *(_psnr(f"predicted {ahead}", f"{key}.psnr", _COPY, f"{key}.copy_psnr") for key, ahead in _AHEAD),
+        *(_psnr(f"{ahead}, the model alone", f"{key}.model_psnr") for key, ahead in _AHEAD),
+        _psnr("hidden tissue", "hidden.psnr", "last seen", "hidden.copy_psnr"),
+        _psnr("hidden tissue, the model alone", "hidden.model_psnr"),
+        *(_psnr(f"from {mm} mm aside", f"view_{mm}.psnr", _WARP, f"view_{mm}.warp_psnr") for mm in AWAY),
+        *(_psnr(f"from {mm} mm aside, the model alone", f"view_{mm}.model_psnr") for mm in AWAY),
+        _psnr("kept back, drawn from the frame before", "heldout.psnr", _COPY, "heldout.copy_psnr"),
+        Figure("kept back, SSIM", "heldout.ssim", "", 3),
+        Figure("kept back, LPIPS", "heldout.lpips", "", 3),
+        _psnr("kept back, once the next is known", "between.psnr", "mean of both", "between.mean_psnr"),
+        _psnr("both carried along the motion", "between.carried_psnr", "mean of both", "between.mean_psnr"),
+        _psnr("right eye, from the model", "novel.psnr"),
+        _psnr("right eye, as it was shown", "right.psnr", _WARP, "right.warp_psnr"),
+        _psnr("right eye, the model alone", "right.model_psnr", _COPY, "right.copy_psnr"),
+        Figure("right eye, share that is compared", "right.coverage", "%"),
+        Figure("flicker where nothing moves", "flicker.picture", "grey levels", 2, "input", "flicker.input"),
+        Figure("flicker of the right eye", "flicker.right", "grey levels", 2, "input", "flicker.input"),
+        Figure("share of the tissue that stands still", "flicker.share", "%"),
+        *_paper("the model", "online"),
+        *_paper("left render", "shown"),
+        *_paper("kept back", "heldout"),
+    ],
+    "Depth": [
+        Figure("error, median", "depth.median_mm", "mm", 2, _STEREO, "measured_depth.median_mm"),
+        Figure("error, nine of ten below", "depth.p90_mm", "mm", 2, _STEREO, "measured_depth.p90_mm"),
+        Figure("error, root mean square", "depth.rmse_mm", "mm", 2, _STEREO, "measured_depth.rmse_mm"),
+        Figure("share of the tissue", "depth.coverage", "%", 0, _STEREO, "measured_depth.coverage"),
+        Figure("share that calls itself sure", "depth_confidence.sure_share", "%"),
+        Figure("error of that, nine of ten below", "depth_confidence.sure_p90_mm", "mm", 2),
+        Figure("flicker", "flicker.depth_mm", "mm", 2, _STEREO, "flicker.measured_depth_mm"),
+        Figure("camera, error of position", "pose.ate_mm", "mm", 2, "a rigid scene", "pose.rigid_ate_mm"),
+        Figure("camera, largest", "pose.max_mm", "mm", 2, "a rigid scene", "pose.rigid_max_mm"),
+        Figure("camera, frame to frame", "pose.rpe_mm", "mm", 2, "a rigid scene", "pose.rigid_rpe_mm"),
+        Figure("camera, turn", "pose.rpe_deg", "degrees", 3, "a rigid scene", "pose.rigid_rpe_deg"),
+    ],
+    "Points": [
+        Figure("off, median", "track.median_mm", "mm", 2),
+        Figure("off, nine of ten below", "track.p90_mm", "mm", 2),
+        Figure("off, median", "track.median_px", "px", 1),
+        Figure("lost", "track.lost", "%"),
+    ],
+    "Overlay": [
+        Figure("frames that came", "overlay.frames"),
+        Figure("shown on", "overlay.overlay"),
+        Figure("not shown", "overlay.blanked.*"),
+        *_times("camera's stamp to sending", "overlay.latency_ms"),
+        *_times("drawing", "overlay.draw_ms"),
+        Figure("times it stood still", "overlay.freezes.count"),
+        Figure("seconds it stood still", "overlay.freezes.seconds", "s", 1),
+        Figure("messages lost", "overlay.lost"),
+    ],
+}
+
+# Over points and frames; the other groups are means over frames.
+POOLED = ("depth_confidence", "track", "pose")
+
+
+def _means() -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for figure in (*TABLE["Picture"], *TABLE["Depth"]):
+        for whole in (figure.key, figure.baseline_key):
+            group, _, key = whole.partition(".")
+            if key and group not in POOLED and key not in found.setdefault(group, []):
+                found[group].append(key)
+    return found
+
+
+MEANS = _means()  # keys of each group of figures of a frame, of which a run has the mean
+
+Row = tuple[str, list[str], str]  # what, its values, what the first is compared with
+
+
+def headings(summary: Mapping[str, Any]) -> list[str]:
+    """Of the values of a row."""
+    segments = list(summary.get("segments") or {})
+    return ["all frames", *segments] if segments else ["value"]
+
+
+def groups(summary: Mapping[str, Any]) -> dict[str, list[Row]]:
+    """Rows of each group; a row has a value of the whole run and one of each segment. What is not known in
+    any has no row, and a group without rows is left out."""
+    figures = flat(summary)
+    segments = list(summary.get("segments") or {})
+    made = {group: _rows(figures, each, segments) for group, each in TABLE.items()}
+    return {group: rows for group, rows in made.items() if rows}
+
+
+def _rows(figures: Flat, asked: Sequence[Figure], segments: Sequence[str]) -> list[Row]:
+    rows = []
+    for figure in asked:
+        if figure.key.endswith(".*"):
+            each = below(figures, figure.key[:-2])
+            found = [(f"{figure.what}: {name}", [value], "") for name, value in each.items()]
+        else:
+            group, _, key = figure.key.partition(".")
+            values = [figures.get(figure.key), *(figures.get(f"{group}.{name}.{key}") for name in segments)]
+            compared = figures.get(figure.baseline_key)
+            said = "" if compared is None else f"{figure.baseline}: {_number(compared, figure)}"
+            found = [(figure.what, values, said)]
+        rows += [
+            (what, [_number(value, figure) for value in values], said)
+            for what, values, said in found
+            if any(value is not None for value in values)
+        ]
+    return rows
+
+
+def _number(value: float | None, figure: Figure) -> str:
+    if value is None:
+        return ""
+    if figure.unit == "%":
+        return f"{100 * value:.{figure.digits}f} %"
+    return f"{value:,.{figure.digits}f} {figure.unit}".strip()
+
+
+AGAINST = {  # `settings.depth_reference`
+    "exact": "exact truth",
+    "structured_light": "a structured-light scan",
+    "ct": "a CT scan",
+    "stereo_network": "the depth of a stereo network",
+}
+
+
+def verdict(figures: Flat) -> list[tuple[str, str]]:
+    """What, and how good: at most eleven lines.
+
+    Args:
+        figures: of `summarise`, and of an overlay under `overlay`, made `flat`. What is missing or None is
+            left out.
+    """
+    followed = _said(figures, *_off("track"), ("track.lost", "; {:.0%} lost"))
+    overlay = (("overlay.overlay", "on {}"), ("overlay.frames", " of {} frames"))
+    blanked = (f"; {count} without: {why}" for why, count in below(figures, "overlay.blanked").items())
+    warned = below(figures, "warnings").items()
+    lines = {
+        "speed": _speed(figures),
+        "latency": _latency(figures),
+        "picture": _picture(figures),
+        "unseen": _said(figures, ("heldout.psnr", "{:.1f} dB PSNR on frames kept back"), _copied("heldout")),
+        "depth": _depth(figures),
+        "points": followed or _said(figures, ("track.lost", "all lost")),
+        "overlay": "".join((_said(figures, *overlay), *blanked)),
+        "quality": _quality(figures),
+        "warnings": ", ".join(f"{code} ({count} frames)" for code, count in warned),
+        "machine": _machine(figures),
+    }
+    return [(name, said) for name, said in lines.items() if said]
+
+
+def _said(figures: Flat, *pieces: tuple[str, str]) -> str:
+    """Pieces of text with their figures, of those that are known; nothing where the first is not."""
+    if figures.get(pieces[0][0]) is None:
+        return ""
+    return "".join(text.format(figures[key]) for key, text in pieces if figures.get(key) is not None)
+
+
+def _copied(group: str) -> tuple[str, str]:
+    return f"{group}.copy_psnr", f" ({_BEFORE})"
+
+
+def _off(group: str) -> tuple[tuple[str, str], ...]:
+    nine = f"{group}.p90_mm", ", nine of ten within {:.2f} mm"
+    return (f"{group}.median_mm", "{:.2f} mm off (median)"), nine
+
+
+def _middle(key: str) -> tuple[tuple[str, str], ...]:
+    return (f"{key}.p50", "{:.0f} ms (p50)"), (f"{key}.p99", ", {:.0f} ms (p99)")
+
+
+def _speed(figures: Flat) -> str:
+    if figures.get("processed") is None:
+        return ""
+    shown = f"{figures['processed']} of {figures['frames'] - figures['held_out']} frames shown"
+    kept = f"; {figures['held_out']} others kept back for testing" if figures["held_out"] else ""
+    if figures.get("latency_ms.p50") is not None:
+        speed = _said(figures, ("rate_hz", " at {:.1f} frames/s"))
+        return f"{shown}{speed}, {figures['dropped']} missed{kept}"
+    speed = _said(figures, ("rate_hz", "{:.1f} frames/s would be possible; "))
+    return f"{speed}frame by frame, {shown}{kept}"
+
+
+def _latency(figures: Flat) -> str:
+    first = "first_render_ms", " from the camera's stamp to sending; {:.0f} ms for the first frame"
+    worked = _said(figures, *_middle("frame_ms"))
+    return _said(figures, *_middle("latency_ms"), first) or (worked and f"{worked} of work on a frame")
+
+
+def _picture(figures: Flat) -> str:
+    """What a view shows of the next frame, as the left render of a frame is mostly its own picture; of a live
+    run, whose views are not known, that render."""
+    shown = {
+        "predict.psnr": "of the next frame",
+        "shown.psnr": "of the frame itself, mostly its own picture",
+        "online.psnr": "by the model",
+    }
+    for key, name in shown.items():
+        if figures.get(key) is not None:
+            beside = [_said(figures, ("predict.copy_psnr", _BEFORE))]
+            if key == "predict.psnr" and figures.get("predict.model_psnr") != figures[key]:
+                beside.append(_said(figures, ("predict.model_psnr", "the model alone: {:.1f} dB")))
+            said = "; ".join(filter(None, beside))
+            return f"{figures[key]:.1f} dB PSNR {name}" + (f" ({said})" if said else "")
+    return ""
+
+
+def _depth(figures: Flat) -> str:
+    reference = AGAINST.get(str(figures.get("settings.depth_reference")), "the recording's")
+    covered = "depth.coverage", ", on {:.0%} of the tissue"
+    said = _said(figures, *_off("depth"), covered)
+    return said and f"{said}, against {reference}"
+
+
+def _quality(figures: Flat) -> str:
+    from sags_node.mapping.ladder import GPU_RUNGS, RUNGS  # only here: all load this file; numpy is slow
+
+    rungs = Counter({int(rung): count for rung, count in below(figures, "rungs").items() if count})
+    said = []
+    if rungs:
+        most = rungs.most_common(1)[0][0]
+        highest = len(GPU_RUNGS if figures.get("settings.device") == "cuda" else RUNGS) - 1
+        said.append(f"rung {most} of 0 to {highest} for most frames ({min(rungs)} to {max(rungs)})")
+    said.append(_said(figures, ("gaussians.mean", "{:,.0f} Gaussians on average")))
+    said.append(_said(figures, ("settings.width", "{}"), ("settings.height", "x{} px")))
+    return ", ".join(filter(None, said))
+
+
+def _machine(figures: Flat) -> str:
+    device = figures.get("settings.device")
+    refined = "" if device is None else f"; the model on the {'CPU' if device == 'cpu' else 'GPU'}"
+    return f"{figures.get('machine') or ''}{refined}"
