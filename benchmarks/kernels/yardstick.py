@@ -25,7 +25,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from benchmarks.kernels.rasterizing import Drawing, RasterCase, make_cotangents, make_scene
 from benchmarks.kernels.timing import WARM_UP_CALLS
-from sags_node.engine.rasterizer.rasterize import as_pinhole
+from sags_node.engine.rasterizer.arguments import view_of
 from sags_node.errors import SagsError
 from sags_node.evaluation.provenance import machine_name
 from sags_node.kernels.jit import aligned
@@ -156,10 +156,10 @@ class Program:
             gaussians.opacities, gaussians.colors,
         )  # fmt: skip
         self._inputs = [_Buffer(array.shape, np.float32, array) for array in given]
-        pinhole = as_pinhole(camera)
+        view = view_of(camera)
         self._camera = _Camera(
-            (ctypes.c_float * 9)(*pinhole.R.ravel()), (ctypes.c_float * 3)(*(pinhole.t * MILLIMETRE)),
-            pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, case.width, case.height,
+            (ctypes.c_float * 9)(*view[:9]), (ctypes.c_float * 3)(*(view[9:12] * MILLIMETRE)),
+            *view[12:16], case.width, case.height,
         )  # fmt: skip
         tile_width, tile_height = library.tile_w(), library.tile_h()
         columns, rows = -(-case.width // tile_width), -(-case.height // tile_height)

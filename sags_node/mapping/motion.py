@@ -179,11 +179,11 @@ def _advect_rows(
             if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
                 z1 += pull * (measured - z1)
         # From pixel and depth to the world: the transposed rotation.
-        x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[3]
-        y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[7]
+        x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[9]
+        y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[10]
         z1 -= cam1[11]
         for k in range(3):
-            displacements[i, k] = cam1[k] * x1 + cam1[4 + k] * y1 + cam1[8 + k] * z1 - means[i, k]
+            displacements[i, k] = cam1[k] * x1 + cam1[3 + k] * y1 + cam1[6 + k] * z1 - means[i, k]
         seen[i] = 1
 
 

@@ -18,7 +18,7 @@ from benchmarks.__main__ import main
 from benchmarks.kernels import yardstick
 from benchmarks.kernels.rasterizing import Drawing, RasterCase
 from sags_node.engine.interface import MIN_ALPHA
-from sags_node.engine.rasterizer import projector
+from sags_node.engine.rasterizer import cpu
 
 PROGRAM = ROOT.parent / "shared/experiments/raster/splat.cpp"
 needs_program = pytest.mark.skipif(not PROGRAM.exists(), reason="the program is not part of the project")
@@ -51,7 +51,7 @@ def test_one_row_per_case(tmp_path: Path) -> None:
 @needs_program
 def test_both_draw_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """With its screen filter in the place of ours."""
-    monkeypatch.setattr(projector, "MIP_VARIANCE", 0.3)
+    monkeypatch.setattr(cpu, "MIP_VARIANCE", 0.3)
     case = RasterCase(500, 64, 64, 1)
     ours = Drawing(case).forward()[:3]
     with yardstick.compiled(PROGRAM, 1) as library:

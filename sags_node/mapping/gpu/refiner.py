@@ -14,7 +14,7 @@ import warp as wp
 
 from sags_node.engine import device
 from sags_node.engine.gpu.rasterizer import sent
-from sags_node.engine.rasterizer.rasterize import as_pinhole
+from sags_node.engine.rasterizer.arguments import view_of
 from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import largest, tile_grid
 from sags_node.mapping.gpu.device_map import DeviceMap
@@ -90,7 +90,7 @@ class GpuRefiner:
         self._frame = model, deformation, observation, node_step
         self._picture = self._picture_for(observation.camera, self._pictures)
         self._picture.show(observation.image, observation.tissue, observation.depth)
-        self._pinhole = as_pinhole(observation.camera)
+        self._view = view_of(observation.camera)
         self._touched = tile_grid(observation.tissue)
         self._changed = False
         self.on_gpu.begin(model, deformation)
@@ -147,7 +147,7 @@ class GpuRefiner:
     @_or_on_the_cpu
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         picture = self._picture_for(camera, self._viewers)
-        picture.rasterizer.forward(sent(gaussians, self._device), as_pinhole(camera))
+        picture.rasterizer.forward(sent(gaussians, self._device), view_of(camera))
         return picture.fetched(anew=True)
 
     def _give_up(self, error: RuntimeError) -> None:
@@ -165,7 +165,7 @@ class GpuRefiner:
             self._cpu.draw()
 
     def _draw(self, tiles: Bool | None) -> None:
-        self._picture.rasterizer.forward(self.on_gpu.drawn(), self._pinhole, tiles)
+        self._picture.rasterizer.forward(self.on_gpu.drawn(), self._view, tiles)
         self._picture.is_fetched = False
 
     def _step(self, rates: LearningRates, nodes: bool = True) -> wp.array:
