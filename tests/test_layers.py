@@ -21,7 +21,7 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9489,
+    "benchmarks": 9817,
     "sags_lab": 4958,
     "sags_node": 1726,
     "sags_node/bridge": 2638,
@@ -29,14 +29,14 @@ LINES = {
     "sags_node/cli": 3087,
     "sags_node/config": 1357,
     "sags_node/detail": 865,
-    "sags_node/engine": 4508,
+    "sags_node/engine": 4071,
     "sags_node/evaluation": 3571,
     "sags_node/export": 891,
     "sags_node/field": 1723,
     "sags_node/fitting": 1530,
     "sags_node/importing": 1099,
     "sags_node/kernels": 1314,
-    "sags_node/mapping": 5683,
+    "sags_node/mapping": 5706,
     "sags_node/media": 718,
     "sags_node/messaging": 5087,
     "sags_node/model": 960,
@@ -51,7 +51,7 @@ LINES = {
     "sags_node/terminal": 338,
     "sags_node/viewer": 1042,
     "sags_node/vision": 5454,
-    "tests": 45930,
+    "tests": 45952,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -120,7 +120,7 @@ class Refining:
         planes = refiner.planes().copy()
         refiner.refine(STILL)
         refiner.download()
-        refiner.redraw(1.0, refiner.touched())
+        refiner.draw()
         refiner.planes()
         return planes
 
@@ -129,7 +129,6 @@ class Refining:
         for _ in range(STEPS):
             self.refiner.draw()
             self.refiner.refine(STILL)
-        self.refiner.touched()
 
 
 def gpu_table(measured: dict[str, Any]) -> Table:

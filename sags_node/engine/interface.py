@@ -14,6 +14,7 @@ DILATION_VARIANCE = 0.3  # px^2, in its place without antialiasing: 3D Gaussian 
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is cut off where its alpha falls below this
 MAX_OPACITY = 0.999  # keeps 1 - alpha away from zero
 MIN_QUAT_NORM = 1e-12  # shorter quaternions have no direction; such Gaussians are not drawn
+BEHIND_SURFACE = 0.035  # of the depth: what is this far behind the drawn surface is hidden by it
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is held within the frustum widened by this share of its half width
 
 

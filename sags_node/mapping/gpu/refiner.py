@@ -15,8 +15,7 @@ import warp as wp
 from sags_node.engine import device
 from sags_node.engine.gpu.rasterizer import sent
 from sags_node.engine.rasterizer.arguments import view_of
-from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.focus import largest, tile_grid
+from sags_node.mapping.focus import largest
 from sags_node.mapping.gpu.device_map import DeviceMap
 from sags_node.mapping.gpu.picture import Picture
 from sags_node.mapping.optimiser import LearningRates
@@ -91,7 +90,6 @@ class GpuRefiner:
         self._picture = self._picture_for(observation.camera, self._pictures)
         self._picture.show(observation.image, observation.tissue, observation.depth)
         self._view = view_of(observation.camera)
-        self._touched = tile_grid(observation.tissue)
         self._changed = False
         self.on_gpu.begin(model, deformation)
 
@@ -107,42 +105,25 @@ class GpuRefiner:
             self._loss, self._changed = loss, False
 
     @_or_on_the_cpu
-    def draw(self) -> None:
-        self._draw(None)
-
-    @_or_on_the_cpu
-    def redraw(self, share: float, tiles: Bool) -> None:
-        some = None
-        if share < 1.0:
-            some = tiles | self._touched
-            if share > 0:
-                some |= self._worst_tiles(share)
-        self._draw(some)
+    def draw(self, tiles: Bool | None = None, share: float = 0.0) -> None:
+        if tiles is not None and share > 0:
+            tiles = None if share >= 1 else tiles | self._worst_tiles(share)
+        self._draw(tiles)
 
     @_or_on_the_cpu
     def planes(self) -> F32:
         return self._picture.fetched()
 
     @_or_on_the_cpu
-    def exposure_gain(self) -> F32:
-        assert self._frame is not None
-        observation = self._frame[2]
-        return exposure_gain(self._picture.fetched(), observation.image, observation.tissue)
-
-    @_or_on_the_cpu
     def refine(self, rates: LearningRates) -> None:
         self.on_gpu.note_contribution(self._step(rates))
 
     @_or_on_the_cpu
-    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
         tiles = self._worst_tiles(share)
         self._draw(tiles)
         self._step(rates, nodes)
-        self._touched |= tiles
-
-    @_or_on_the_cpu
-    def touched(self) -> Bool:
-        return self._touched
+        return tiles
 
     @_or_on_the_cpu
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
