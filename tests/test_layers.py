@@ -21,7 +21,7 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 8884,
+    "benchmarks": 9212,
     "sags_lab": 5032,
     "sags_node": 1680,
     "sags_node/bridge": 2638,
@@ -29,14 +29,14 @@ LINES = {
     "sags_node/cli": 3082,
     "sags_node/config": 1352,
     "sags_node/detail": 928,
-    "sags_node/engine": 4508,
+    "sags_node/engine": 4071,
     "sags_node/evaluation": 3085,
     "sags_node/export": 891,
     "sags_node/field": 1723,
     "sags_node/fitting": 1530,
     "sags_node/importing": 1071,
     "sags_node/kernels": 1222,
-    "sags_node/mapping": 5574,
+    "sags_node/mapping": 5597,
     "sags_node/media": 718,
     "sags_node/messaging": 5087,
     "sags_node/model": 960,
@@ -51,7 +51,7 @@ LINES = {
     "sags_node/terminal": 335,
     "sags_node/viewer": 1041,
     "sags_node/vision": 5454,
-    "tests": 45058,
+    "tests": 45080,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -14,7 +14,8 @@ from benchmarks.kernels.timing import median_ms
 from sags_node.engine import device
 from sags_node.engine.gpu.rasterizer import DERIVED, DeviceRasterizer, sent
 from sags_node.engine.interface import MIP_VARIANCE, NEAR_PLANE
-from sags_node.engine.rasterizer.rasterize import as_pinhole, make_rasterizer
+from sags_node.engine.rasterizer.arguments import view_of
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import Camera, Gaussians
 
 Row = dict[str, Any]
@@ -57,10 +58,10 @@ def measure_drawing(count: int, width: int, height: int, runs: int) -> Row:
         wp.array(each, dtype=float, device=chosen)
         for each in make_cotangents(RasterCase(count, width, height, 1))
     )
-    pinhole = as_pinhole(camera)
+    view = view_of(camera)
 
     def forward() -> None:
-        rasterizer.forward(tables, pinhole)
+        rasterizer.forward(tables, view)
         wp.synchronize_device(chosen)
 
     def backward() -> None:

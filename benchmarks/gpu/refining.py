@@ -81,7 +81,7 @@ class Refining:
         planes = refiner.planes().copy()
         refiner.refine(STILL)
         refiner.download()
-        refiner.redraw(1.0, refiner.touched())
+        refiner.draw()
         refiner.planes()
         return planes
 
@@ -90,4 +90,3 @@ class Refining:
         for _ in range(STEPS):
             self.refiner.draw()
             self.refiner.refine(STILL)
-        self.refiner.touched()

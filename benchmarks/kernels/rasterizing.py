@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.kernels.reference import ReferenceRasterizer
 from benchmarks.kernels.scenes import SCENES, with_harmonics
 from benchmarks.kernels.timing import Stages, StageTimes, median_ms, stage_clock
 from benchmarks.kernels.work import Work, share_of_peak, stage_rows
@@ -19,7 +20,7 @@ from sags_node.engine.rasterizer import (
     spherical_harmonics,
 )
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.kernels.peak import Peak
 from sags_node.kernels.vectors import BLOCK_WIDTH, RECORD
 from sags_node.types import F32, Bool, Camera, Gaussians
@@ -91,18 +92,19 @@ def _time_twin(case: RasterCase, runs: int) -> float:
     import torch
 
     torch.set_num_threads(case.threads)
-    Drawing(replace(case, count=100, width=32, height=32), "reference").forward_backward()  # torch starts up
-    return median_ms(Drawing(case, "reference").forward_backward, runs, warm_up=0)
+    small = replace(case, count=100, width=32, height=32)
+    Drawing(small, ReferenceRasterizer()).forward_backward()  # torch starts up
+    return median_ms(Drawing(case, ReferenceRasterizer()).forward_backward, runs, warm_up=0)
 
 
 class Drawing:
     """One case on the host's arrays."""
 
-    def __init__(self, case: RasterCase, backend: str = "numba") -> None:
+    def __init__(self, case: RasterCase, rasterizer: Rasterizer | None = None) -> None:
         self.gaussians, self._camera = make_scene(case)
         self._tiles = _active_tiles(case)
         self._v_planes, self._weight = make_cotangents(case)
-        self._rasterizer = make_rasterizer(backend, case.width, case.height)
+        self._rasterizer = rasterizer or make_rasterizer("numba", case.width, case.height)
 
     def forward(self) -> F32:
         return self._rasterizer.forward(self.gaussians, self._camera, self._tiles)

@@ -22,7 +22,7 @@ from sags_node.evaluation.provenance import machine_name
 from sags_node.evaluation.receipt import Receipt
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
-from sags_node.mapping.mapper import SETTLED
+from sags_node.mapping.mapped import SETTLED
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.processes import resident_mb

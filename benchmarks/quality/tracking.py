@@ -24,13 +24,13 @@ from sags_lab.protocols.point_tracks import (
     shares_within,
     surely_seen,
 )
+from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import percentiles
 from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project, transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.motion import BEHIND_TOLERANCE
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
 from sags_node.pipeline.warm_up import warm_up
@@ -310,5 +310,5 @@ def _common_gaussians(first: FrameResult, result: FrameResult) -> tuple[F64, F64
     x, y = np.rint(np.nan_to_num(started, nan=-1)).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     drawn = view.depth[y.clip(0, height - 1), x.clip(0, width - 1)]
-    seen = inside & (drawn > 0) & (np.abs(z - drawn) < BEHIND_TOLERANCE * drawn)
+    seen = inside & (drawn > 0) & (np.abs(z - drawn) < BEHIND_SURFACE * drawn)
     return started[seen], ended[seen]

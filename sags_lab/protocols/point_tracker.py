@@ -81,7 +81,7 @@ class PointTracker:
         """
         anchors = self._pinned(pixels, now)
         assert self._newest is not None  # it is `now`
-        return self._found(anchors, pixels, self._newest, self._pipeline.anchors.at(now.t_capture_ns))
+        return self._found(anchors, pixels, self._newest, self._pipeline.anchors.states())
 
     def _pinned(self, pixels: F64, now: StereoFrame) -> I64:
         """Anchors of the points [P], -1: it cannot be pinned. Those of points not asked for are removed."""

@@ -1,11 +1,11 @@
-"""What a rasteriser backend takes and gives."""
+"""What every rasteriser takes and gives."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Protocol
 
-from sags_node.types import F32, F64, I32, Bool, Camera, Gaussians
+from sags_node.types import F32, I32, Bool, Camera, Gaussians
 
 # The camera model and the limits all backends share; see Mip-Splatting (Yu et al., CVPR 2024).
 NEAR_PLANE = 1e-3  # m; nearer Gaussians are not drawn
@@ -14,33 +14,8 @@ DILATION_VARIANCE = 0.3  # px^2, in its place without antialiasing: 3D Gaussian 
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is cut off where its alpha falls below this
 MAX_OPACITY = 0.999  # keeps 1 - alpha away from zero
 MIN_QUAT_NORM = 1e-12  # shorter quaternions have no direction; such Gaussians are not drawn
+BEHIND_SURFACE = 0.035  # of the depth: what is this far behind the drawn surface is hidden by it
 FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is held within the frustum widened by this share of its half width
-
-
-@dataclass(frozen=True, slots=True)
-class Pinhole:
-    """A camera as the rasterisers see it: the first pixel covers 0..1, so its centre is (0.5, 0.5)."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    R: F64  # [3, 3] world to camera
-    t: F64  # [3] m
-
-    @property
-    def limits(self) -> tuple[float, float, float, float]:
-        """Smallest and largest x/z, then y/z, at which the projection is linearised."""
-        margin_x = FRUSTUM_MARGIN * 0.5 * self.width / self.fx
-        margin_y = FRUSTUM_MARGIN * 0.5 * self.height / self.fy
-        return (
-            -self.cx / self.fx - margin_x,
-            (self.width - self.cx) / self.fx + margin_x,
-            -self.cy / self.fy - margin_y,
-            (self.height - self.cy) / self.fy + margin_y,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +31,6 @@ class Gradients:
     sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
     contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
     spread: F32  # [N] the same, each pixel times its squared distance in the Gaussian's standard deviations
-
-
-class Backend(Protocol):
-    """One implementation of the arithmetic; `make_rasterizer` wraps it with the checks."""
-
-    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32: ...
-
-    def backward(self, v_planes: F32, weight: F32) -> Gradients: ...
-
-    def median(self) -> tuple[F32, I32]: ...
 
 
 class Rasterizer(Protocol):

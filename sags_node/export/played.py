@@ -97,7 +97,7 @@ def _played(session: Session) -> Iterator[tuple[FrameResult, AnchorStates]]:
                 continue
             if len(pipeline.anchors) == 0 and not result.held:
                 _pin(pipeline, result)
-                yield result, pipeline.anchors.at(frame.t_capture_ns)
+                yield result, pipeline.anchors.states()
             else:
                 yield result, result.anchors
 

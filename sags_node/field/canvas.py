@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 import torch
 from torch import Tensor
 
-from sags_node.engine.rasterizer.rasterize import as_pinhole
+from sags_node.engine.rasterizer.arguments import view_of
 from sags_node.model.alias_free import FILTER_VARIANCE, VIEW_MARGIN
 from sags_node.types import Camera
 
@@ -43,7 +43,7 @@ class Canvas:
                 )
                 for name, table in tables.items()
             }
-            planes: Tensor = self._warp.to_torch(self._rasterizer.forward(given, as_pinhole(camera)))
+            planes: Tensor = self._warp.to_torch(self._rasterizer.forward(given, view_of(camera)))
         return planes
 
     def backward(self, v_planes: Tensor, weight: Tensor) -> dict[str, Tensor]:

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from sags_node.confidence import confidence_of
+from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.errors import SagsError
 from sags_node.geometry import project, scale_pixels, unproject
-from sags_node.mapping.motion import BEHIND_TOLERANCE
 from sags_node.mapping.recall import Place, Recall, fits_depth, straightened
 from sags_node.model.forecast import points_ahead, reached
 from sags_node.types import (
@@ -228,8 +228,8 @@ class Anchors:
             self._find(observation)
             self._find_lost(observation, snapshot, view)
 
-    def at(self, stamp_ns: int, held: bool = False, equal: bool = False) -> AnchorStates:
-        """All anchors as they are now, as part of the frame captured at `stamp_ns`.
+    def age(self, stamp_ns: int, held: bool = False, equal: bool = False) -> None:
+        """Let the time pass until a frame captured at `stamp_ns`.
 
         Args:
             held: the frame is not taken in.
@@ -241,6 +241,10 @@ class Anchors:
         table.ages[:] += passed
         found_again = equal & (table.visibility == 1) & (table.found == table.searched)
         table.unseen[~found_again] += UNWATCHED * passed if held else passed
+
+    def states(self) -> AnchorStates:
+        """All anchors as they are now."""
+        table = self._table
         return AnchorStates(
             ids=table.ids.copy(),
             points=table.points.astype(np.float32),
@@ -447,7 +451,7 @@ def _seen(pixels: F64, depths: F64, tissue: Bool, drawn: F32) -> F64:
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
     places = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
     surface = drawn[places]
-    free = (surface == 0) | (surface > (1 - BEHIND_TOLERANCE) * depths[:, None, None])
+    free = (surface == 0) | (surface > (1 - BEHIND_SURFACE) * depths[:, None, None])
     return np.asarray(np.mean(inside & tissue[places] & free, axis=(1, 2)), np.float64)
 
 

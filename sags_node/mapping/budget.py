@@ -44,7 +44,13 @@ class Budget(Protocol):
         """True when a new model that has had so many steps may have one more in its first frame."""
 
     def more(self) -> bool:
-        """True when one more step may be taken. Asked once before every step."""
+        """True when one more step may be taken."""
+
+    def step(self) -> None:
+        """A step begins."""
+
+    def end_steps(self) -> None:
+        """The frame gets no more steps: what follows is drawn and shown."""
 
     def finish(self, gaussians: int, matched: bool = False) -> None:
         """The frame is done; the model has so many, and depth was matched."""
@@ -58,19 +64,24 @@ class StepBudget:
     def __init__(self, steps: int, rung: Rung = EVERYTHING) -> None:
         self._rung = rung
         self._steps = steps
-        self._left = steps
+        self._taken = 0
         self._frames = 0
         self.plan = FramePlan(rung, None, depth=True)
 
     def start(self, waited: float = 0.0) -> FramePlan:
-        self._left = self._steps
+        self._taken = 0
         self._frames += 1
         self.plan = FramePlan(self._rung, None, self._frames % self._rung.depth_every == 0)
         return self.plan
 
     def more(self) -> bool:
-        self._left -= 1
-        return self._left >= 0
+        return self._taken < self._steps
+
+    def step(self) -> None:
+        self._taken += 1
+
+    def end_steps(self) -> None:
+        pass
 
     def more_at_first(self, steps: int) -> bool:
         return True
@@ -103,9 +114,9 @@ class TimeBudget:
 
     def start(self, waited: float = 0.0) -> FramePlan:
         rung = self.ladder.rung
-        self._started = self._asked = self._clock()
+        self._started = self._stepped = self._clock()
         self._deadline = self._started + max(0.0, self.ladder.seconds - waited)
-        self._asks = 0
+        self._steps = 0
         self._since_depth += 1
         self._optional = 0.0  # s, spent on all steps but the first
         late = self._started + self._cost_with_depth.value > self._deadline
@@ -117,24 +128,32 @@ class TimeBudget:
         return steps < LEAST_FIRST_STEPS or self._clock() - self._started <= FIRST_SECONDS
 
     def more(self) -> bool:
-        now = self._clock()
-        if self._asks > 1:  # what came before the first step, and the first, are no measure of a further one
-            self._step_cost.add(now - self._asked)
-            self._optional += now - self._asked
-        self._asked = now
-        self._asks += 1
-        if self._asks == 1 or now + self._step_cost.value + self._after_cost.value <= self._deadline:
-            return True
-        if self._asks == 2:  # nothing is learnt of a step that is never taken: try one again some day
+        needed = self._step_cost.value + self._after_cost.value
+        return self._steps == 0 or self._clock() + needed <= self._deadline
+
+    def step(self) -> None:
+        self._note_step()
+        self._steps += 1
+
+    def end_steps(self) -> None:
+        self._note_step()
+        if self._steps == 1:  # nothing is learnt of a step that is never taken: try one again some day
             self._step_cost.value *= FORGET
-        return False
+
+    def _note_step(self) -> None:
+        """Learn what the step before took; the first, and what follows it, say nothing of a further one."""
+        now = self._clock()
+        if self._steps > 1:
+            self._step_cost.add(now - self._stepped)
+            self._optional += now - self._stepped
+        self._stepped = now
 
     def finish(self, gaussians: int, matched: bool = False) -> None:
-        """Learn from this frame. One that never asked, since it made a new model, tells nothing."""
-        if self._asks == 0:
+        """Learn from this frame. One without steps, since it made a new model, tells nothing."""
+        if self._steps == 0:
             return
         now = self._clock()
-        self._after_cost.add(now - self._asked)
+        self._after_cost.add(now - self._stepped)
         essential = now - self._started - self._optional
         if matched:
             self._since_depth = 0

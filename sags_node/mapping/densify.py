@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numba import prange
 
+from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.engine.losses.pieces import LEVEL
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
+from sags_node.mapping.initialise import insert
+from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, U8, Bool, Observation
 from sags_node.vision.depth_grid import depth_at, grid_of
@@ -16,7 +20,6 @@ from sags_node.vision.depth_grid import depth_at, grid_of
 HOLE_ALPHA = 0.4  # below this a tissue pixel is a hole; 0.8 would count the gaps between small Gaussians
 RESIDUAL_NEW_SURFACE = 0.2  # summed over RGB: with a surface in front of the model, content is new
 RESIDUAL_DETAIL = 0.45  # summed over RGB: with the right depth, detail is missing
-DEPTH_TOLERANCE = 0.035  # of the depth
 GRID = 4  # px between candidates
 MAX_INSERTED = 1500  # per frame: a budget, and a brake on runaway insertion
 FRONT_TOLERANCE = 0.065  # of the depth: so far in front of the measured surface is free space
@@ -25,6 +28,8 @@ MIN_OPACITY = 0.03
 CROWDED = 0.9  # share of the cap above which what does not show is given up
 SHED = 0.03  # of all, per frame: so many are given up while there are more than the machine can afford
 LITTLE = 0.35  # of the mean contribution: what shows more would leave a hole
+HOLES = 200  # Gaussians per frame that are exchanged for new ones when the model is full
+ADDED = 500  # Gaussians per frame that may be added even when there are as many as the machine affords
 IDLE = 0.1  # px of coverage: less does not show
 LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
 
@@ -48,6 +53,12 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
         phase % GRID, pixels, depths, errors,
     )  # fmt: skip
     return pixels[:count], depths[:count], errors[:count]
+
+
+def prune(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> int:
+    """Remove what `prune_mask` says and `prune_to_budget`; returns how many."""
+    removed = model.remove(prune_mask(model, surface, depth_is_new, limit))
+    return removed + prune_to_budget(model, limit)
 
 
 def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> Bool:
@@ -88,6 +99,34 @@ def prune_to_budget(model: GaussianModel, limit: int) -> int:
     if share < 1:
         model.grow(1 / np.sqrt(1 - share))
     return removed
+
+
+def fill(
+    model: GaussianModel, nodes: NodeDeformation, planes: F32, observation: Observation, phase: int,
+    limit: int, smoothing: bool, give_up: Callable[[int], int],
+) -> tuple[I32, int, int]:  # fmt: skip
+    """Insert what `candidates` want. A full model gives up what shows least for some of them.
+
+    Args:
+        planes: [5, H, W] of the model, drawn for the frame.
+        give_up: removes up to so many that show least; returns how many.
+
+    Returns:
+        The pixels [M, 2] of the new Gaussians, how many there are, and how many were given up.
+    """
+    room, given_up = max(ADDED, limit - model.count), 0
+    pixels, depths, errors = (each[:room] for each in candidates(planes, observation, phase))
+    lacking = min(len(pixels), HOLES) - max(0, limit - model.count)
+    if 0 < lacking < model.count:
+        given_up = give_up(lacking)
+    rows = insert(model, observation, pixels, depths, errors, GRID, smoothing)
+    nodes.attach(model, rows)
+    return pixels, rows.stop - rows.start, given_up
+
+
+def give_up(model: GaussianModel, count: int) -> int:
+    """Remove `least_shown`; returns how many."""
+    return model.remove(least_shown(model, count))
 
 
 def least_shown(model: GaussianModel, count: int) -> Bool:
@@ -135,9 +174,9 @@ def _candidates(
                         z = drawn_z
                     behind = drawn_z - z
                     if rank == 1:
-                        wanted = residual > RESIDUAL_NEW_SURFACE and behind > 2 * DEPTH_TOLERANCE * z
+                        wanted = residual > RESIDUAL_NEW_SURFACE and behind > 2 * BEHIND_SURFACE * z
                     else:
-                        wanted = residual > RESIDUAL_DETAIL and abs(behind) < DEPTH_TOLERANCE * z
+                        wanted = residual > RESIDUAL_DETAIL and abs(behind) < BEHIND_SURFACE * z
                 if wanted:
                     if n == len(pixels):
                         return n

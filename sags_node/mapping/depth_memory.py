@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numba import prange
 
+from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.initialise import LARGEST_ERROR
-from sags_node.mapping.motion import BEHIND_TOLERANCE, DEPTH_GATE
+from sags_node.mapping.motion import DEPTH_GATE
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32
 
@@ -51,7 +52,7 @@ def _remember_rows(
     for i in range(first, end):
         error, z, measured, its_error = errors[i], surface[i, 0], surface[i, 1], surface[i, 2]
         apart = measured - z
-        if measured > 0 and abs(apart) < np.float32(BEHIND_TOLERANCE) * z:
+        if measured > 0 and abs(apart) < np.float32(BEHIND_SURFACE) * z:
             expected = error * error + its_error * its_error
             square = left * error * error + (np.float32(1) - left) * its_error * its_error
             error = np.sqrt(square + pull * max(apart * apart - expected, np.float32(0)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -17,6 +18,8 @@ from sags_node.vision.picture_fit import MISFIT
 
 MIN_FIRST_DEPTHS = 200  # px
 LOST_COVERAGE = 0.3  # of the tissue
+SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
+SETTLED_EVERY = 5  # frames: then it is refined so rarely
 SOME = slice(None, None, 8)  # rows and columns of a picture that are enough to judge by
 
 
@@ -31,6 +34,13 @@ class Mapped:
 def can_start(observation: Observation) -> bool:
     """Whether this frame has depth enough for a first model."""
     return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
+
+
+def most_steps(still: int, frames: int) -> float:
+    """How many steps the frame of that number may have at most, after so many still ones."""
+    if still <= SETTLED:
+        return math.inf
+    return 0 if frames % SETTLED_EVERY else 1
 
 
 def is_lost(planes: F32, observation: Observation) -> bool:

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from sags_node.mapping import densify, initialise
+from sags_node.mapping import densify
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
+from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import tile_grid, tiles_of, with_neighbours
-from sags_node.mapping.mapped import Mapped, as_view, can_start, is_lost, snapshot_of
+from sags_node.mapping.mapped import Mapped, as_view, can_start, is_lost, most_steps, snapshot_of
 from sags_node.mapping.motion import Tracks, depth_pull, scene_flow
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import Refiner
-from sags_node.mapping.split import split_worst
+from sags_node.mapping.split import split_where_room
 from sags_node.mapping.surface import surface_at
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import narrow
@@ -25,13 +26,8 @@ from sags_node.vision.observe import resized
 
 CONTROL_NODES = 512
 FIRST_STEPS = 30  # of a new model: long ones, in its first frame or, where time is short, in the next ones
-HOLES = 200  # Gaussians per frame that are exchanged for new ones when the model is full
-GROWN = 0.8  # of the Gaussians that are allowed: up to there splitting adds some
-ADDED = 500  # Gaussians per frame that may be added even when there are as many as the machine affords
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
-SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
-SETTLED_EVERY = 5  # frames: then it is refined so rarely
 FOCUS = 0.2  # of the picture: shows most for its time on pulled tissue and on a beating heart
 FIRST_RATES = LearningRates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
@@ -105,7 +101,7 @@ class Mapper:
         elif not learn:
             counts = self._follow_only(observation, tracks)
         elif still and self._scale == before:
-            counts = self._touch_up(observation, budget, settled=still > SETTLED)
+            counts = self._touch_up(observation, budget, most_steps(still, self._frames))
         else:
             counts = self._follow(observation, tracks, budget)
         assert self._view is not None
@@ -115,7 +111,8 @@ class Mapper:
         )
         mapped = Mapped(snapshot, self._view)
         if learn and not still:
-            self._split_worst(observation, budget)
+            limit = self._limit(budget)
+            self._split = split_where_room(self.model, observation, self._view, limit) > 0
         return mapped
 
     def pace(self, unhurried: bool) -> None:
@@ -133,12 +130,7 @@ class Mapper:
             self._view = as_view(planes, self.model, observation)
             return {"inserted": 0}
         drawn = resized(observation, self._scale)
-        limit = int(initialise.INITIAL_SHARE * self._limit(budget))
-        pixels, depths, errors, spacing = initialise.first_pixels(drawn, limit)
-        rows = initialise.insert(self.model, drawn, pixels, depths, errors, spacing, self._smoothing)
-        self.map.deformation = NodeDeformation(self.model.means, CONTROL_NODES)
-        self.map.deformation.attach(self.model, rows)
-        self.map.lamp = observation.camera.T_world_cam
+        depths = self.map.begin(drawn, self._limit(budget), CONTROL_NODES, self._smoothing)
         self._begin(drawn)
         self._first_steps = 0
         while self._first_steps < FIRST_STEPS and budget.more_at_first(self._first_steps):
@@ -146,9 +138,9 @@ class Mapper:
             self._refiner.refine(FIRST_RATES)
             self._first_steps += 1
         self._refiner.download()
-        self._show(observation, 1.0, tile_grid(drawn.tissue))
+        self._show(observation)
         self.step += self._first_steps
-        return {"inserted": len(pixels), "iterations": self._first_steps}
+        return {"inserted": len(depths), "iterations": self._first_steps}
 
     def _follow(self, observation: Observation, tracks: Tracks | None, budget: Budget) -> dict[str, int]:
         # 1. Deform: every Gaussian goes to where flow and depth saw its tissue go.
@@ -156,9 +148,7 @@ class Mapper:
         self.map.move_light(observation.camera)
         # 2. Prune: what floats in front of the tissue, and what the machine does not afford.
         limit = self._limit(budget)
-        is_new = observation.depth_is_new
-        removed = self.model.remove(densify.prune_mask(self.model, surface, is_new, limit))
-        removed += densify.prune_to_budget(self.model, limit)
+        removed = densify.prune(self.model, surface, observation.depth_is_new, limit)
         if self._smoothing:
             narrow(self.model.smoothing, self.model.means, observation.camera)
 
@@ -166,7 +156,7 @@ class Mapper:
         drawn = resized(observation, self._scale)
         self._begin(drawn)
         self._refiner.draw()
-        gain = self._refiner.exposure_gain()
+        gain = exposure_gain(self._refiner.planes(), drawn.image, drawn.tissue)
         if np.abs(gain - 1).max() > EXPOSURE_JUMP:
             self.model.colors[:] *= gain
             self.model.slopes[:] *= gain.mean()
@@ -177,41 +167,46 @@ class Mapper:
             self.map.restart()
             return self._initialise(observation, budget) | {"restarted": 1}
         # 4. Refine once on that drawing, before inserting: it serves both, since it shows the holes, too.
-        pixels, depths, errors = densify.candidates(planes, drawn, phase=7 * self._frames)
         iterations = 0
         if budget.more():
+            budget.step()
             self._refiner.refine(self._next_rates())
             iterations = 1
         # 5. Densify: new Gaussians in the holes. A full model gives up what shows least for them.
-        room = max(ADDED, limit - self.model.count)
-        pixels, depths, errors = pixels[:room], depths[:room], errors[:room]
-        lacking = min(len(pixels), HOLES) - max(0, limit - self.model.count)
-        if 0 < lacking < self.model.count:
-            self._refiner.download()
-            removed += self.model.remove(densify.least_shown(self.model, lacking))
-            self._refiner.take(self._all_rows)
-        rows = initialise.insert(self.model, drawn, pixels, depths, errors, densify.GRID, self._smoothing)
-        self._deformation.attach(self.model, rows)
-        self._refiner.take(rows)
+        pixels, inserted, given_up = densify.fill(
+            self.model, self._deformation, planes, drawn, 7 * self._frames, limit, self._smoothing,
+            self._give_up,
+        )  # fmt: skip
+        self._refiner.take(slice(self.model.count - inserted, self.model.count))
+        tiles = tiles_of(pixels, drawn.tissue)
         # 6. Refine where it is worst, while the frame's time lasts; then draw what is shown.
         while budget.more():
-            self._refiner.refine_worst(self._focus, self._next_rates())
+            budget.step()
+            tiles |= self._refiner.refine_worst(self._focus, self._next_rates())
             iterations += 1
+        budget.end_steps()
         self._refiner.download()
-        self._show(observation, budget.plan.rung.redraw, tiles_of(pixels, drawn.tissue))
+        self._show(observation, tiles, budget.plan.rung.redraw)
         self.step += iterations
-        return {"inserted": rows.stop - rows.start, "removed": removed, "iterations": iterations}
+        return {"inserted": inserted, "removed": removed + given_up, "iterations": iterations}
+
+    def _give_up(self, count: int) -> int:
+        """`densify.give_up`, in the middle of a frame."""
+        self._refiner.download()
+        removed = densify.give_up(self.model, count)
+        self._refiner.take(self._all_rows)
+        return removed
 
     def _follow_only(self, observation: Observation, tracks: Tracks | None) -> dict[str, int]:
         self._predict(observation, tracks)
-        drawn = resized(observation, self._scale)
-        self._begin(drawn)
-        self._show(observation, 1.0, tile_grid(drawn.tissue))
+        self._begin(resized(observation, self._scale))
+        self._show(observation)
         self._refiner.download()
         return {"inserted": 0, "removed": 0, "iterations": 0}
 
-    def _touch_up(self, observation: Observation, budget: Budget, settled: bool) -> dict[str, int]:
-        """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes."""
+    def _touch_up(self, observation: Observation, budget: Budget, most: float) -> dict[str, int]:
+        """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes. There
+        are at most so many steps."""
         surface, is_new = surface_at(self.model.means, observation), observation.depth_is_new
         prune_mask = densify.prune_mask(self.model, surface, is_new, self._limit(budget))
         if np.count_nonzero(prune_mask) > TORN * self.model.count:
@@ -219,18 +214,19 @@ class Mapper:
             return self._follow(counted, None, budget)  # damage: there are holes to be filled
         self.model.velocities[:] = 0
         removed = self.model.remove(prune_mask)
-        rests = settled and self._frames % SETTLED_EVERY > 0
         iterations = 0
-        self._begin(resized(observation, self._scale))
-        while not (rests or (settled and iterations)) and budget.more():
-            self._refiner.refine_worst(self._focus, self._next_rates(), nodes=False)
+        drawn = resized(observation, self._scale)
+        touched = tile_grid(drawn.tissue)
+        self._begin(drawn)
+        while iterations < most and budget.more():
+            budget.step()
+            touched |= self._refiner.refine_worst(self._focus, self._next_rates(), nodes=False)
             iterations += 1
         self._refiner.download()
-        stale = with_neighbours(self._refiner.touched())
         if removed or self._split:
-            self._show(observation, 1.0, stale)
-        elif stale.any():
-            self._show(observation, 0.0, stale)
+            self._show(observation)
+        elif touched.any():
+            self._show(observation, with_neighbours(touched))
         elif self._view is not None:
             stamp = observation.t_capture_ns
             self._view = replace(self._view, frame_id=observation.frame_id, t_capture_ns=stamp)
@@ -246,9 +242,9 @@ class Mapper:
         self._first_steps += 1
         return FIRST_RATES if self._first_steps <= FIRST_STEPS else self._rates
 
-    def _show(self, observation: Observation, share: float, tiles: Bool) -> None:
-        """Draw the model to be shown; see `Refiner.redraw`."""
-        self._refiner.redraw(share, tiles)
+    def _show(self, observation: Observation, tiles: Bool | None = None, share: float = 0.0) -> None:
+        """Draw the model to be shown; see `Refiner.draw`."""
+        self._refiner.draw(tiles, share)
         self._split = False
         self._view = as_view(self._refiner.planes(), self.model, observation)
 
@@ -289,14 +285,6 @@ class Mapper:
         known = known[known > 0]
         if known.size:
             self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
-
-    def _split_worst(self, observation: Observation, budget: Budget) -> None:
-        """Split Gaussians that show too little detail, for the frames to come."""
-        assert self._view is not None
-        limit = self._limit(budget)
-        if limit - self.model.count > HOLES:  # else what hardly shows is needed to fill holes
-            grown = round(GROWN * limit) - self.model.count
-            self._split = split_worst(self.model, observation, self._view, max(0, grown)) > 0
 
     def _forecast(self, t_ns: int, still: bool) -> Forecast | None:
         """What the remembered motion, with the nodes' places at the end of this frame, expects next."""

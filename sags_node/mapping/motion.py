@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
+from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.types import F32, Bool, Observation, RenderedView
@@ -16,7 +17,6 @@ from sags_node.vision.margin import ClearOfInstruments
 from sags_node.vision.pyramid import pyramid_of
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
-BEHIND_TOLERANCE = 0.035  # of the depth: what is this far behind the drawn surface is hidden by it
 SEEN_ALPHA = 0.3
 HALVINGS = 1  # of the masks: finer than the flow that they guard
 DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best 0.3-0.5
@@ -137,7 +137,7 @@ def _find_rows(
             or alpha[py, px] < SEEN_ALPHA
         ):
             continue
-        if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_TOLERANCE * z:
+        if drawn_depth[py, px] > 0 and z - drawn_depth[py, px] > BEHIND_SURFACE * z:
             continue
         fx, fy = across * (u + half) - half, down * (v + half) - half
         du, dv = _bilinear(flow, fx, fy, 0), _bilinear(flow, fx, fy, 1)
@@ -179,11 +179,11 @@ def _advect_rows(
             if measured > 0 and abs(measured - z1) < DEPTH_GATE * z1:
                 z1 += pull * (measured - z1)
         # From pixel and depth to the world: the transposed rotation.
-        x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[3]
-        y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[7]
+        x1 = (u - cam1[14]) * z1 / cam1[12] - cam1[9]
+        y1 = (v - cam1[15]) * z1 / cam1[13] - cam1[10]
         z1 -= cam1[11]
         for k in range(3):
-            displacements[i, k] = cam1[k] * x1 + cam1[4 + k] * y1 + cam1[8 + k] * z1 - means[i, k]
+            displacements[i, k] = cam1[k] * x1 + cam1[3 + k] * y1 + cam1[6 + k] * z1 - means[i, k]
         seen[i] = 1
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer
-from sags_node.mapping.exposure import exposure_gain
 from sags_node.mapping.focus import largest, sum_residuals, tile_grid
 from sags_node.mapping.optimiser import LearningRates, Optimiser
 from sags_node.model.deformation import NodeDeformation
@@ -54,23 +53,16 @@ class Refiner(Protocol):
     def download(self) -> None:
         """Write what was refined into the model and the nodes."""
 
-    def draw(self) -> None:
-        """Draw the model for the frame's camera."""
-
-    def redraw(self, share: float, tiles: Bool) -> None:
-        """Draw the model as it is after the steps, to be shown.
+    def draw(self, tiles: Bool | None = None, share: float = 0.0) -> None:
+        """Draw the model for the frame's camera.
 
         Args:
-            share: of the picture, where it was worst before the steps. What else the steps changed, they
-                changed little: it keeps what was drawn before them. 1: all of it.
-            tiles: [rows, columns] that are drawn in any case, as those are that `refine_worst` drew.
+            tiles: [rows, columns] that are drawn; the others keep what was drawn before. None: all are drawn.
+            share: of the picture, drawn too, where it was worst before the steps; 1: all of it.
         """
 
     def planes(self) -> F32:
         """[5, H, W] as they were drawn last; overwritten by the next drawing."""
-
-    def exposure_gain(self) -> F32:
-        """[3] see `exposure.exposure_gain`, of what was drawn last."""
 
     def refine(self, rates: LearningRates) -> None:
         """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians.
@@ -78,15 +70,15 @@ class Refiner(Protocol):
         Teaches the model what each Gaussian contributes to the picture, too; a part of it would not tell.
         """
 
-    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
         """Draw that share of the picture anew, where it is worst, and take one step on it.
 
         Args:
             nodes: move them too.
-        """
 
-    def touched(self) -> Bool:
-        """The tiles [rows, columns] that `refine_worst` drew since `begin`."""
+        Returns:
+            The tiles [rows, columns] that were drawn.
+        """
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         """Planes [5, H, W] of any Gaussians for any camera, in memory of their own; overwritten by the next
@@ -122,9 +114,8 @@ class CpuRefiner:
         self._model, self._deformation, self._observation = model, deformation, observation
         self._node_step = node_step
         self._rasterizer = self._rasterizer_for(observation.camera, self._rasterizers)
-        self._touched = tile_grid(observation.tissue)
-        self._sums = np.zeros(self._touched.shape, np.float32)
-        self._old = ~self._touched
+        self._old = ~tile_grid(observation.tissue)
+        self._sums = np.zeros(self._old.shape, np.float32)
 
     def take(self, rows: slice) -> None:
         pass
@@ -132,34 +123,22 @@ class CpuRefiner:
     def download(self) -> None:
         pass
 
-    def draw(self) -> None:
-        self._forward(None)
+    def draw(self, tiles: Bool | None = None, share: float = 0.0) -> None:
+        if tiles is not None and share > 0:
+            tiles = None if share >= 1 else tiles | self._worst_tiles(share)
+        self._forward(tiles)
 
     def planes(self) -> F32:
         return self._planes
 
-    def exposure_gain(self) -> F32:
-        return exposure_gain(self._planes, self._observation.image, self._observation.tissue)
-
     def refine(self, rates: LearningRates) -> None:
         self._model.contribution[:] = self._step(rates).contribution
 
-    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
         tiles = self._worst_tiles(share)
         self._forward(tiles)
         self._step(rates, nodes)
-        self._touched |= tiles
-
-    def touched(self) -> Bool:
-        return self._touched
-
-    def redraw(self, share: float, tiles: Bool) -> None:
-        some = None
-        if share < 1.0:
-            some = tiles | self._touched
-            if share > 0:
-                some |= self._worst_tiles(share)
-        self._forward(some)
+        return tiles
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         return self._rasterizer_for(camera, self._viewers).forward(gaussians, camera)

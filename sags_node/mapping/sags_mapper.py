@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from sags_node.field.deformation import Deltas, FieldRates, NodeField
 from sags_node.field.hexplane import FIRST_LINE, HexPlane
 from sags_node.field.model import Rates
 from sags_node.field.window import WindowModel
-from sags_node.mapping import densify, initialise
+from sags_node.mapping import densify
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.depth_memory import remember
 from sags_node.mapping.exposure import exposure_gain
@@ -35,20 +36,14 @@ from sags_node.mapping.mapped import (
     can_start,
     is_lost,
     is_worse_than_one_colour,
+    most_steps,
     snapshot_of,
 )
-from sags_node.mapping.mapper import (
-    ADDED,
-    FIRST_STEPS,
-    GROWN,
-    HOLES,
-    SETTLED,
-    SETTLED_EVERY,
-)  # fmt: skip
+from sags_node.mapping.mapper import FIRST_STEPS
 from sags_node.mapping.motion import DEPTH_PULL, Tracks
 from sags_node.mapping.optimiser import COLOUR_DAMPING, COLOUR_RELAXATION
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
-from sags_node.mapping.split import split_worst
+from sags_node.mapping.split import split_where_room
 from sags_node.mapping.surface import surface_at
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model import columns
@@ -193,12 +188,7 @@ class SagsMapper:
         if not can_start(observation):  # a black or covered picture: try again with the next frame
             self._show(observation, frame)
             return {"inserted": 0}
-        limit = int(initialise.INITIAL_SHARE * self._limit(budget))
-        pixels, depths, errors, spacing = initialise.first_pixels(drawn, limit)
-        rows = initialise.insert(model, drawn, pixels, depths, errors, spacing, smoothing=True)
-        self.map.deformation = NodeDeformation(model.means, NODES)
-        self.map.deformation.attach(model, rows)
-        self.map.lamp = observation.camera.T_world_cam
+        depths = self.map.begin(drawn, self._limit(budget), NODES)
         self._deltas = self._make_deltas(model.means, frame.t_ns)
         self._field = WindowModel(rows_of(model), NodeField(self._deltas, self._nodes.nodes.copy()))
         self._ids, self._written = model.ids.copy(), rows_of(model)
@@ -214,7 +204,7 @@ class SagsMapper:
         self._write(frame)
         self._show(observation, frame)
         self.step += steps
-        return {"inserted": len(pixels), "iterations": steps}
+        return {"inserted": len(depths), "iterations": steps}
 
     def _make_deltas(self, means: F32, t_ns: int) -> FrameDeltas:
         low, high = np.quantile(means, [OUTLIERS, 1 - OUTLIERS], axis=0)
@@ -241,23 +231,31 @@ class SagsMapper:
         if learn:
             self._keep(frame)
             # 2. Prune; draw, and let the colours follow a jump of the exposure; split, and fill holes.
-            removed = self._prune(observation, budget)  # also if still: a broken row breaks all gradients
+            model, limit = self.model, self._limit(budget)
+            surface = surface_at(model.means, observation)  # also if still: a broken row breaks all gradients
+            removed = densify.prune(model, surface, observation.depth_is_new, limit)
             if removed or not still:
                 planes = self._exposed(frame)
                 if is_lost(planes, frame.drawn) and can_start(observation):
                     return self._restart(observation, frame, budget)
-                inserted, given_up = self._densify(observation, frame, planes, budget)
+                split_where_room(model, observation, as_view(planes, model, observation), limit)
+                _, inserted, given_up = densify.fill(
+                    model, self._nodes, planes, frame.drawn, 7 * self._frames, limit, smoothing=True,
+                    give_up=partial(densify.give_up, model),
+                )  # fmt: skip
                 removed += given_up
             self._take_over(frame.t_ns)
             # 3. Refine while the time lasts, on the newest frame and on earlier ones, lest they be lost.
-            settled = still > SETTLED
-            rests = settled and self._frames % SETTLED_EVERY > 0
-            while not (rests or (settled and iterations)) and budget.more():
+            most = most_steps(still, self._frames)
+            while iterations < most and budget.more():
+                budget.step()
                 if iterations % 2 == 0:
                     self._refine(frame, COLOUR_RELAXATION)
                 else:
                     self._refine(self.kept[self._rng.integers(len(self.kept))], EARLIER_RELAXATION)
                 iterations += 1
+            if not still:
+                budget.end_steps()
             self._write(frame)
         # 4. Say how it moves, and draw what is shown.
         self.model.velocities[:] = 0 if still else self._velocities(frame.t_ns)
@@ -280,29 +278,6 @@ class SagsMapper:
             self.kept = deque([frame])  # the others are in another exposure
             planes = self._draw(frame)
         return planes
-
-    def _prune(self, observation: Observation, budget: Budget) -> int:
-        """By the rules of `Mapper`, as `_densify`; how many were removed."""
-        model, limit = self.model, self._limit(budget)
-        surface = surface_at(model.means, observation)
-        removed = model.remove(densify.prune_mask(model, surface, observation.depth_is_new, limit))
-        return removed + densify.prune_to_budget(model, limit)
-
-    def _densify(self, observation: Observation, frame: Kept, planes: F32, budget: Budget) -> tuple[int, int]:
-        """Split, and fill holes; how many were inserted, and given up for them."""
-        model, drawn, limit, removed = self.model, frame.drawn, self._limit(budget), 0
-        if limit - model.count > HOLES:  # else what hardly shows is needed to fill holes
-            room = max(0, round(GROWN * limit) - model.count)
-            split_worst(model, observation, as_view(planes, model, observation), room)
-        pixels, depths, errors = densify.candidates(planes, drawn, phase=7 * self._frames)
-        room = max(ADDED, limit - model.count)
-        lacking = min(len(pixels[:room]), HOLES) - max(0, limit - model.count)
-        if 0 < lacking < model.count:
-            removed = model.remove(densify.least_shown(model, lacking))
-        new = pixels[:room], depths[:room], errors[:room]
-        rows = initialise.insert(model, drawn, *new, densify.GRID, smoothing=True)
-        self._nodes.attach(model, rows)
-        return rows.stop - rows.start, removed
 
     def _refine(self, frame: Kept, relaxation: float, deformed: bool = True) -> None:
         """One step on a frame: Adam on field, decoder and canonical Gaussians; on their colours the step in

@@ -16,10 +16,11 @@ from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.geometry import quat_to_matrix
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
-from sags_node.mapping.densify import FRONT_TOLERANCE, mean_contribution
+from sags_node.mapping.densify import FRONT_TOLERANCE, HOLES, mean_contribution
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I64, U8, Bool, Observation, RenderedView
 
+GROWN = 0.8  # of the Gaussians that are allowed: up to there splitting adds some
 SPLIT = 0.005  # of all, per frame: at most so many are split, where the parts take others' rows
 GROWTH = 0.03  # of all, per frame: the same where there is room
 HARDLY = 0.15  # of the mean contribution: less hardly shows
@@ -60,6 +61,13 @@ def split_worst(model: GaussianModel, observation: Observation, view: RenderedVi
             rows = spare_rows[np.argpartition(contribution[spare_rows], 2 * count - 1)[: 2 * count]]
         _split(model, worst, rows)
     return count
+
+
+def split_where_room(model: GaussianModel, observation: Observation, view: RenderedView, limit: int) -> int:
+    """`split_worst` of a model that may have `limit` Gaussians; how many were split."""
+    if limit - model.count <= HOLES:
+        return 0  # what hardly shows is needed to fill holes
+    return split_worst(model, observation, view, max(0, round(GROWN * limit) - model.count))
 
 
 def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sags_node.mapping.initialise import LARGEST_ERROR
+from sags_node.mapping import initialise
 from sags_node.mapping.motion_field import MotionField
 from sags_node.model.deformation import NodeDeformation, nearest_nodes
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.light import is_near, light_gain
-from sags_node.types import F32, F64, I64, Camera, Gaussians
+from sags_node.types import F32, F64, I64, Camera, Gaussians, Observation
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +45,23 @@ class TissueMap:
         self.motion = MotionField() if field else None
         self.lamp: F64 | None = None
         self.restarts = 0
+
+    def begin(self, observation: Observation, limit: int, nodes: int, smoothing: bool = True) -> F32:
+        """Make the first model of a map from a frame; returns the depths of its Gaussians [N] m.
+
+        Args:
+            limit: Gaussians that there may be.
+            nodes: how many move them.
+            smoothing: give them the 3D filter.
+        """
+        pixels, depths, errors, spacing = initialise.first_pixels(
+            observation, int(initialise.INITIAL_SHARE * limit)
+        )
+        rows = initialise.insert(self.model, observation, pixels, depths, errors, spacing, smoothing)
+        self.deformation = NodeDeformation(self.model.means, nodes)
+        self.deformation.attach(self.model, rows)
+        self.lamp = observation.camera.T_world_cam
+        return depths
 
     def restart(self) -> None:
         """Forget the tissue; the next frame, or this one if it is being taken in, makes a new map."""
@@ -107,7 +124,9 @@ class TissueMap:
 
     def doubt(self, error: float) -> None:
         """The depth of all Gaussians may be wrong by so much more, m, until it is measured again."""
-        self.model.depth_errors[:] = np.minimum(self.model.depth_errors + np.float32(error), LARGEST_ERROR)
+        self.model.depth_errors[:] = np.minimum(
+            self.model.depth_errors + np.float32(error), initialise.LARGEST_ERROR
+        )
 
     def _forget_motion(self) -> None:
         if self.motion is not None:

@@ -266,8 +266,8 @@ class Pipeline:
             budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
         with clock("anchors"):
             self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
-            states = self.anchors.at(pair.t_capture_ns)
-            anchors = self.anchors.ahead(states, mapped.snapshot, request.latency)
+            self.anchors.age(pair.t_capture_ns)
+            anchors = self.anchors.ahead(self.anchors.states(), mapped.snapshot, request.latency)
         self.newest = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
             self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
@@ -296,8 +296,8 @@ class Pipeline:
 
     def _repeated(self, frame: StereoFrame, pair: RectifiedPair, clock: Stopwatch) -> FrameResult:
         assert self.newest is not None
-        anchors = self.anchors.at(pair.t_capture_ns, equal=not self._freeze.findings)
-        return repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, anchors)
+        self.anchors.age(pair.t_capture_ns, equal=not self._freeze.findings)
+        return repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, self.anchors.states())
 
     def _held(
         self, frame: StereoFrame, pair: RectifiedPair, clock: Stopwatch, what: str, why: str,
@@ -309,8 +309,8 @@ class Pipeline:
         self._still.forget()
         seconds = max(0, pair.t_capture_ns - self.newest.pair.t_capture_ns) * 1e-9
         self._unwatched = UNWATCHED * seconds
-        anchors = self.anchors.at(pair.t_capture_ns, held=True)
-        last = repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, anchors)
+        self.anchors.age(pair.t_capture_ns, held=True)
+        last = repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, self.anchors.states())
         held = doubted(last, self._unwatched)
         return replace(held, observation=observation, skipped={what: why}, held=why, hurried=False)
 

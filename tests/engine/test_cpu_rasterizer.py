@@ -28,28 +28,26 @@ from engine_scenes import (
 from numpy.typing import NDArray
 from rounding import after
 
+from benchmarks.kernels import reference
 from sags_node import geometry
 from sags_node.config.schema import LaunchConfig
 from sags_node.engine.interface import MIN_ALPHA
 from sags_node.engine.rasterizer import (
     binning,
     compositing,
+    cpu,
     projection,
     projection_backward,
-    projector,
     smoothing,
 )
-from sags_node.engine.rasterizer import cpu as numba_rasterizer
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import (
     TILE_HEIGHT,
     TILE_WIDTH,
-    as_pinhole,
     make_rasterizer,
     rasterize,
     to_view,
 )
-from sags_node.engine.reference import rasterizer as reference
 from sags_node.errors import UsageError
 from sags_node.kernels.jit import parallel_kernel, take
 from sags_node.kernels.threads import configure_threads
@@ -85,7 +83,7 @@ def assert_same_bits(found: list[Any], expected: list[Any]) -> None:
 def alphas(gaussians: Gaussians, view: Camera) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Of the twin: [pixels, splats], 0 where cut; and which Gaussians the splats are."""
     inputs = [torch.tensor(getattr(gaussians, name), dtype=torch.float64) for name in INPUTS]
-    splats = reference.project(as_pinhole(view), inputs)
+    splats = reference.project(view, inputs)
     alpha, _, touching, _ = reference.alphas(splats, 0, 0, view.width, view.height)
     return alpha.numpy(), splats.rows[touching].numpy()
 
@@ -188,7 +186,7 @@ def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
     gaussians = crowd(corner)
     planes = make_rasterizer("numba", 100, 77).forward(gaussians, WIDE).copy()
     assert planes[4].max() > 0.99
-    true = make_rasterizer("reference", 100, 77).forward(gaussians, WIDE)
+    true = reference.ReferenceRasterizer().forward(gaussians, WIDE)
     # a tile stops at a transmittance of 1e-4
     np.testing.assert_allclose(planes, true, rtol=0, atol=1e-4 + 2 * EXPONENTIAL)
     order = np.random.default_rng(5).permutation(2000)
@@ -210,8 +208,7 @@ def test_same_bits_however_many_share_the_work(tiles: Bool | None, monkeypatch: 
     expected = everything(scene(), WIDE, tiles)
     assert_same_bits(on_one_thread(lambda: everything(scene(), WIDE, tiles)), expected)
     for pieces in (2, 3, 7, 64):  # more workers than this machine may have cores
-        for module in (numba_rasterizer, projector):
-            monkeypatch.setattr(module, "thread_count", lambda pieces=pieces: pieces)
+        monkeypatch.setattr(cpu, "thread_count", lambda pieces=pieces: pieces)
         assert_same_bits(everything(scene(), WIDE, tiles), expected)
 
 

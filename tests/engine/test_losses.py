@@ -73,7 +73,7 @@ def twin(planes: Any, image: Any, tissue: Any, depth: Any) -> list[Any]:
     """The gradient of the stated loss by each of the planes, in float64."""
     import torch
 
-    from sags_node.engine.reference import rasterizer as reference
+    from benchmarks.kernels import reference
 
     drawn = torch.tensor(planes, dtype=torch.float64, requires_grad=True)
     seen = (torch.tensor(array) for array in (image / 255, tissue, depth))

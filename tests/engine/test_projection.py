@@ -62,11 +62,10 @@ def smooth_scene() -> tuple[Camera, list[F64], F64]:
 def twin_planes(view: Camera, inputs: Sequence[Any], variance: F64) -> Any:
     import torch
 
-    from sags_node.engine.rasterizer.rasterize import as_pinhole
-    from sags_node.engine.reference import rasterizer as reference
+    from benchmarks.kernels import reference
 
     tensors = [torch.as_tensor(array) for array in inputs]
-    splats = reference.project(as_pinhole(view), tensors, torch.tensor(variance))
+    splats = reference.project(view, tensors, torch.tensor(variance))
     return reference.blend(splats, view.width, view.height)
 
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from rounding import after
 from warp_on_cpu import use_warp_on_cpu
 
+from benchmarks.kernels.reference import ReferenceRasterizer
 from sags_node import geometry
 from sags_node.engine.interface import MAX_OPACITY, MIN_ALPHA, NEAR_PLANE
 from sags_node.engine.rasterizer.rasterize import (
@@ -488,8 +489,7 @@ def test_median_agrees_with_the_twin(backend: Backend) -> None:
     are off by 1e-5 of themselves, so this is one pixel in 100,000."""
     gaussians = random_gaussians(5, len(wide_scene()), WIDE)
     results = []
-    for name in (backend.name, "reference"):
-        rasterizer = make_rasterizer(name, WIDE.width, WIDE.height)
+    for rasterizer in (backend.rasterizer(WIDE), ReferenceRasterizer()):
         rasterizer.forward(gaussians, WIDE)
         results.append(rasterizer.median())
     (depths, found), (true_depths, true) = results

@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 from rounding import U, after, moved, roughly
 
+from benchmarks.kernels.reference import ReferenceRasterizer
 from sags_node.engine.interface import MAX_OPACITY
-from sags_node.engine.rasterizer.rasterize import Gradients, make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer, make_rasterizer
 from sags_node.types import F32, F64, U8, Camera, Gaussians
 
 T = TypeVar("T")
@@ -116,7 +117,9 @@ def draw_and_differentiate(
     gaussians: Gaussians, view: Camera, backend: str = "numba", seed: int = 0, antialias: bool = True
 ) -> tuple[F32, dict[str, NDArray[np.floating]]]:
     """Planes, and gradients for a random cotangent, as copies."""
-    rasterizer = make_rasterizer(backend, view.width, view.height, antialias)
+    rasterizer: Rasterizer = ReferenceRasterizer(antialias)
+    if backend != "reference":
+        rasterizer = make_rasterizer(backend, view.width, view.height, antialias)
     planes = rasterizer.forward(gaussians, view).copy()
     gradients = rasterizer.backward(*cotangents(view, seed))
     return planes, {name: getattr(gradients, name).copy() for name in DERIVATIVES}
@@ -161,7 +164,7 @@ def truth(
     As `rounding.exact`: the twin draws `moves` times more from inputs that are a little off, with an
     exponential that is off by `EXPONENTIAL`, anew for each pixel of each Gaussian or always the same way.
     """
-    rasterizer = make_rasterizer("reference", view.width, view.height, antialias)
+    rasterizer = ReferenceRasterizer(antialias)
 
     def draw(
         gaussians: Gaussians, view: Camera, v_planes: F32, weight: F32

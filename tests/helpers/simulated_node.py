@@ -162,7 +162,9 @@ class Pipeline:
         gaussians = USED * rung.gaussians
         world.sleep(1e-3 * self._machine * price(rung, gaussians, FULL) * chance.uniform(0.8, 1.2))
         while budget.more():
+            budget.step()
             world.sleep(1e-3 * self._machine * 2.0)
+        budget.end_steps()
         if chance.random() < 0.01:
             world.sleep(chance.uniform(0.1, 2.0))  # another process, a driver, a disk
         if chance.random() < self._run.failing:

@@ -59,6 +59,12 @@ def flat(frame: int) -> Scene:
     return scene(frame, np.full((HEIGHT, WIDTH), 90, np.uint8))
 
 
+def at(anchors: Anchors, stamp_ns: int, **how: bool) -> AnchorStates:
+    """As they are when a frame of that time was taken in."""
+    anchors.age(stamp_ns, **how)
+    return anchors.states()
+
+
 def only(states: AnchorStates) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Point, pixel, visibility and confidence of the only anchor."""
     assert len(states) == 1
@@ -68,13 +74,13 @@ def only(states: AnchorStates) -> tuple[np.ndarray, np.ndarray, float, float]:
 def test_an_anchor_moves_with_the_gaussians_around_it() -> None:
     anchors = Anchors()
     assert anchors.add_pixel(40.3, 50.6, *flat(0)) == 1
-    start, pixel, visibility, _ = only(anchors.at(0))
+    start, pixel, visibility, _ = only(at(anchors, 0))
     assert (
         np.allclose(pixel, [40.3, 50.6], atol=1e-3) and visibility == 1 and start[2] == pytest.approx(DEPTH)
     )
     for i in range(1, 4):
         anchors.update(*moved(flat(i), np.array([i * 4e-4, -i * 8e-4, 0])))
-    point, pixel, _, _ = only(anchors.at(3 * PERIOD_NS))
+    point, pixel, _, _ = only(at(anchors, 3 * PERIOD_NS))
     assert np.allclose(point - start, [12e-4, -24e-4, 0], atol=1e-6)
     assert np.allclose(pixel, [40.3 + 1.5, 50.6 - 3], atol=1e-2)
 
@@ -90,7 +96,7 @@ def test_it_knows_its_depth_as_well_as_the_tissue_that_carries_it() -> None:
         assert anchors.depth_confidence(pinned) == pytest.approx(expected, rel=1e-3)
         better = replace(known.gaussians, depth_errors=np.full_like(errors, 1e-3))
         anchors.update(observation, replace(known, gaussians=better), view)
-        assert anchors.at(PERIOD_NS).depth_confidence[0] == pytest.approx(2 ** (-1 / 3), rel=1e-3)
+        assert at(anchors, PERIOD_NS).depth_confidence[0] == pytest.approx(2 ** (-1 / 3), rel=1e-3)
 
 
 def test_a_speck_without_depth_takes_the_nearest_depth_of_tissue() -> None:
@@ -102,17 +108,17 @@ def test_a_speck_without_depth_takes_the_nearest_depth_of_tissue() -> None:
         observation.tissue[row, column] = False
     anchors = Anchors()
     anchors.add_pixel(40, 50, observation, snapshot, view)
-    point, pixel, _, _ = only(anchors.at(0))
+    point, pixel, _, _ = only(at(anchors, 0))
     assert point[2] == pytest.approx(0.99 * DEPTH) and np.allclose(pixel, [40, 50], atol=1e-3)
 
 
 def test_gaussians_far_away_do_not_move_it() -> None:
     anchors = Anchors()
     anchors.add_pixel(30, 50, *flat(0))
-    start = only(anchors.at(0))[0]
+    start = only(at(anchors, 0))[0]
     one = flat(1)
     anchors.update(*moved(one, np.where(one[1].gaussians.means[:, :1] > 0, 0.01, 0.0)))
-    assert np.allclose(only(anchors.at(PERIOD_NS))[0], start, atol=1e-7)
+    assert np.allclose(only(at(anchors, PERIOD_NS))[0], start, atol=1e-7)
 
 
 def test_what_the_picture_shows_corrects_what_the_gaussians_missed() -> None:
@@ -121,7 +127,7 @@ def test_what_the_picture_shows_corrects_what_the_gaussians_missed() -> None:
     anchors.add_pixel(60, 45, *scene(0))
     for i, shift in enumerate([(2, -1), (4, -3), (7, -3)]):
         anchors.update(*scene(i + 1, texture(shift)))
-    point, pixel, visibility, confidence = only(anchors.at(3 * PERIOD_NS))
+    point, pixel, visibility, confidence = only(at(anchors, 3 * PERIOD_NS))
     assert np.allclose(pixel, [67, 42], atol=0.1)
     assert np.allclose(point[:2], (np.array([67, 42]) - CENTRE) / FOCAL * DEPTH, atol=1e-4)
     assert visibility == 1 and confidence > 0.8
@@ -133,19 +139,19 @@ def test_it_keeps_its_distance_to_the_drawn_surface() -> None:
     for i in range(1, 60):
         observation, snapshot, view = flat(i)
         anchors.update(observation, snapshot, replace(view, depth=view.depth + np.float32(5e-4)))
-    assert only(anchors.at(0))[0][2] == pytest.approx(DEPTH + 1.5e-3, abs=2e-5)
+    assert only(at(anchors, 0))[0][2] == pytest.approx(DEPTH + 1.5e-3, abs=2e-5)
 
 
 def test_removed_gaussians_are_replaced_by_their_neighbours() -> None:
     anchors = Anchors()
     anchors.add_pixel(60, 45, *flat(0))
-    start = only(anchors.at(0))[0]
+    start = only(at(anchors, 0))[0]
     rng = np.random.default_rng(0)
     kept = np.ones(len(scene()[1].gaussians), bool)
     for i in range(1, 12):  # of every Gaussian's kind less than one in three is left at the end
         kept &= rng.uniform(size=len(kept)) > 0.1
         anchors.update(*moved(flat(i), np.array([i * 1e-4, 0, 0]), kept))
-    assert np.allclose(only(anchors.at(PERIOD_NS))[0] - start, [11e-4, 0, 0], atol=1e-6)
+    assert np.allclose(only(at(anchors, PERIOD_NS))[0] - start, [11e-4, 0, 0], atol=1e-6)
 
 
 def test_after_a_restart_of_the_model_it_is_lost_for_good_and_says_so() -> None:
@@ -155,32 +161,32 @@ def test_after_a_restart_of_the_model_it_is_lost_for_good_and_says_so() -> None:
     fresh = replace(snapshot.gaussians, ids=snapshot.gaussians.ids + 100_000)
     for gaussians in (fresh, snapshot.gaussians):
         anchors.update(observation, replace(snapshot, gaussians=gaussians), view)
-        point, pixel, visibility, confidence = only(anchors.at(PERIOD_NS))
+        point, pixel, visibility, confidence = only(at(anchors, PERIOD_NS))
         assert np.isnan(point).all() and np.isnan(pixel).all() and visibility == confidence == 0
     anchors.remove(1)
-    assert len(anchors.at(PERIOD_NS)) == 0
+    assert len(at(anchors, PERIOD_NS)) == 0
 
 
 def test_visibility_tells_what_hides_it_and_confidence_falls_meanwhile() -> None:
     anchors = Anchors()
     anchors.add_pixel(60, 45, *scene(0))
-    assert only(anchors.at(0))[2:] == (1.0, 1.0)
+    assert only(at(anchors, 0))[2:] == (1.0, 1.0)
     observation, snapshot, view = scene(1)
     observation.tissue[:, 60:] = False  # an instrument over the right half of the 5 x 5 px around it
     anchors.update(observation, snapshot, view)
-    assert only(anchors.at(0))[2] == pytest.approx(0.4)
+    assert only(at(anchors, 0))[2] == pytest.approx(0.4)
     anchors.update(*scene(2, drawn=0.9 * DEPTH))  # other tissue in front
-    assert only(anchors.at(0))[2] == 0
+    assert only(at(anchors, 0))[2] == 0
     observation, snapshot, view = scene(3)
     observation.tissue[:] = False
     seconds = 3
     for i in range(1, seconds + 1):
         anchors.update(observation, snapshot, view)
-        states = anchors.at(i * 10 * PERIOD_NS)
+        states = at(anchors, i * 10 * PERIOD_NS)
     assert states.confidence[0] == pytest.approx(0.5 ** (seconds / module.HALF_LIFE))
     assert states.ages[0] == pytest.approx(seconds)
     anchors.update(*scene(4))
-    assert only(anchors.at(seconds * 10 * PERIOD_NS))[2:] == (1.0, pytest.approx(1.0, abs=0.01))
+    assert only(at(anchors, seconds * 10 * PERIOD_NS))[2:] == (1.0, pytest.approx(1.0, abs=0.01))
 
 
 def test_while_the_picture_stays_the_same_what_was_found_in_it_stays_sure() -> None:
@@ -191,9 +197,9 @@ def test_while_the_picture_stays_the_same_what_was_found_in_it_stays_sure() -> N
         observation, snapshot, view = scene(1, texture()[:, ::-1].copy() if other else None)
         observation.tissue[:] = shown
         anchors.update(observation, snapshot, view)
-        first = anchors.at(0)
+        first = at(anchors, 0)
         for i in range(1, 5):
-            states = anchors.at(i * 10 * PERIOD_NS, equal=True)
+            states = at(anchors, i * 10 * PERIOD_NS, equal=True)
         halvings = 0 if shown and not other else 4 / module.HALF_LIFE
         assert states.confidence[0] == pytest.approx(first.confidence[0] * 0.5**halvings)
         assert states.ages[0] == pytest.approx(4)
@@ -203,7 +209,7 @@ def test_what_leaves_the_picture_is_followed_there() -> None:
     anchors = Anchors()
     anchors.add_pixel(4, 45, *flat(0))
     anchors.update(*moved(flat(1), np.array([-8e-3, 0, 0])))
-    _, pixel, visibility, _ = only(anchors.at(0))
+    _, pixel, visibility, _ = only(at(anchors, 0))
     assert pixel[0] == pytest.approx(-6, abs=0.01) and visibility == 0
 
 
@@ -245,7 +251,7 @@ def test_who_wants_it_learns_also_where_an_anchor_is_expected() -> None:
     anchors.look_ahead(asked, 0.5)  # far beyond 0.1 s
     anchors.look_ahead(soon, None)
     anchors.update(observation, snapshot, view)
-    states = anchors.ahead(anchors.at(0), snapshot, 0.025)
+    states = anchors.ahead(at(anchors, 0), snapshot, 0.025)
     assert states.ahead is not None and list(states.ids) == [asked, silent, soon]
     np.testing.assert_allclose(states.ahead.seconds, [0.1, 0, 0.025], atol=1e-6)
     np.testing.assert_allclose((states.ahead.points - states.points)[:, 0], [2e-3, 0, 5e-4], atol=1e-6)
@@ -253,7 +259,7 @@ def test_who_wants_it_learns_also_where_an_anchor_is_expected() -> None:
     np.testing.assert_allclose(
         (states.ahead.pixels - states.pixels)[:, 0], [2e-3 * px, 0, 5e-4 * px], atol=1e-2
     )
-    assert anchors.ahead(anchors.at(0), replace(snapshot, forecast=None), 0.025).ahead is None
+    assert anchors.ahead(at(anchors, 0), replace(snapshot, forecast=None), 0.025).ahead is None
 
 
 def test_ids_are_never_used_again_and_their_number_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,7 +270,7 @@ def test_ids_are_never_used_again_and_their_number_is_limited(monkeypatch: pytes
         anchors.add_pixel(50, 50, *scene())
     anchors.remove(3)
     assert anchors.add_pixel(50, 50, *scene()) == 4
-    assert anchors.at(0).ids.tolist() == [1, 2, 4]
+    assert at(anchors, 0).ids.tolist() == [1, 2, 4]
 
 
 # ---- on the phantom --------------------------------------------------------------------------------------
@@ -326,9 +332,9 @@ def test_the_farther_it_is_carried_out_of_sight_the_less_sure_it_is() -> None:
     for step in (0.0, 1e-3):
         anchors = Anchors()
         anchors.add_pixel(64, 48, *flat(0))
-        anchors.at(0)
+        at(anchors, 0)
         for frame in range(1, 6):
             anchors.update(*moved(flat(frame), np.array([frame * step, 0, 0])), clear=False)
-            ways[step] = anchors.at(frame * PERIOD_NS)
+            ways[step] = at(anchors, frame * PERIOD_NS)
     assert ways[0.0].confidence[0] > 0.8
     assert ways[1e-3].confidence[0] == pytest.approx(0.5 * ways[0.0].confidence[0], rel=0.05)  # 5 mm

@@ -28,7 +28,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.devices import Skips
 from sags_node.mapping.gpu.device_map import REFINED, DeviceMap
 from sags_node.mapping.gpu.refiner import GpuRefiner
-from sags_node.mapping.mapper import Mapper
+from sags_node.mapping.mapper import FOCUS, Mapper
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.tissue_map import TissueMap
@@ -159,7 +159,7 @@ def test_follows_the_tissue_as_the_cpu_does() -> None:
             anchors.update(observation, snapshot, view)
             errors.append(psnr(view, observation))
             counts.append(dict(snapshot.counts))
-        state = anchors.at(snapshot.t_capture_ns)
+        state = anchors.states()
         found.append((errors, counts, played.row("ids"), state.points, snapshot.step, snapshot.loss))
     (errors, counts, ids, points, step, loss), device = found
     np.testing.assert_allclose(device[0], errors, atol=SAME_PSNR)
@@ -216,8 +216,8 @@ def test_still_frames_touch_the_same_tiles() -> None:
     found = []
     for played in (on_cpu(), on_device()):
         played.take(frame(0))
-        played.take(frame(0), steps=1, still=1)
-        found.append(played.refiner.touched())
+        played.begin(frame(0))
+        found.append(played.refiner.refine_worst(FOCUS, LearningRates(), nodes=False))
     assert found[0].sum() == 1
     np.testing.assert_array_equal(found[1], found[0])
 

@@ -60,8 +60,8 @@ def scene(
 def follow(anchors: Anchors, *scenes: Scene) -> AnchorStates:
     for each in scenes:
         anchors.update(*each)
-        states = anchors.at(each[0].t_capture_ns)
-    return states
+        anchors.age(each[0].t_capture_ns)
+    return anchors.states()
 
 
 def pinned() -> Anchors:

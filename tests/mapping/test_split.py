@@ -12,7 +12,7 @@ from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.geometry import project, unproject
-from sags_node.mapping import densify, initialise, mapper, split
+from sags_node.mapping import densify, initialise, split
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.split import split_worst
 from sags_node.model.gaussians import GaussianModel
@@ -155,7 +155,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Played:
     """Plays a recording with so many Gaussians: PSNR* and all else, frame by frame."""
 
     def play(most: int, splits: bool) -> tuple[F64, list[FrameResult]]:
-        monkeypatch.setattr(mapper, "split_worst", split_worst if splits else lambda *args: 0)
+        monkeypatch.setattr(split, "split_worst", split_worst if splits else lambda *args: 0)
         session = open_session(SESSION, ["source.pace:=step", f"mapping.max_gaussians:={most}"])
         pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
         errors, results = [], []
@@ -171,7 +171,7 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Played:
 
 
 def test_the_same_number_of_gaussians_shows_more(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mapper, "GROWN", 0.0)  # else splitting adds some as well
+    monkeypatch.setattr(split, "GROWN", 0.0)  # else splitting adds some as well
     (errors, results), (plain, others) = played(20_000, True), played(20_000, False)
     assert errors[5:].mean() > plain[5:].mean() + 0.15
     assert count(results) < 1.02 * count(others)
@@ -183,7 +183,7 @@ def test_a_model_grows_by_splitting_to_what_it_may_have(
     """As it does when the machine turns out to afford more: no hole asks for Gaussians then."""
     monkeypatch.setattr(initialise, "INITIAL_SHARE", 0.2)
     (errors, results), (plain, others) = played(10_000, True), played(10_000, False)
-    assert mapper.GROWN * 10_000 - 2 <= count(results) <= 10_000  # splits stop there; what appears may go on
+    assert split.GROWN * 10_000 - 2 <= count(results) <= 10_000  # splits stop there; what appears may go on
     assert (1 + 2 * split.GROWTH) ** len(errors) * count(others) > count(
         results
     )  # two more for each that is split

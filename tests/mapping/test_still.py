@@ -20,7 +20,8 @@ from sags_node.mapping import motion
 from sags_node.mapping.budget import FramePlan, StepBudget
 from sags_node.mapping.densify import FRONT_FRAMES
 from sags_node.mapping.devices import ALL_SKIPS, Skips
-from sags_node.mapping.mapper import SETTLED, SETTLED_EVERY, TORN, Mapper
+from sags_node.mapping.mapped import SETTLED, SETTLED_EVERY
+from sags_node.mapping.mapper import TORN, Mapper
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging.content import tells_of
@@ -375,13 +376,13 @@ def test_what_is_drawn_in_parts_is_the_whole_model(
     for frame in frames[:4]:
         play(frame)
     whole = make_rasterizer("numba", 320, 256)
-    wholes, redraw = [], CpuRefiner.redraw
+    wholes, draw = [], CpuRefiner.draw
 
-    def watched(refiner: CpuRefiner, share: float, tiles: np.ndarray) -> None:
-        wholes.append(share == 1)
-        redraw(refiner, share, tiles)
+    def watched(refiner: CpuRefiner, tiles: np.ndarray | None = None, share: float = 0.0) -> None:
+        wholes.append(tiles is None)
+        draw(refiner, tiles, share)
 
-    monkeypatch.setattr(CpuRefiner, "redraw", watched)
+    monkeypatch.setattr(CpuRefiner, "draw", watched)
     for _ in range(25):
         result = play.again(frames[3])
         for eye, shown in result.views.items():

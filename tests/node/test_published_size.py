@@ -99,7 +99,7 @@ def test_a_pixel_that_is_asked_for_is_one_of_the_published_picture(phantom_sessi
     asked = operations.handlers()["add_anchor"]({"u": PINNED[0], "v": PINNED[1]})
     beyond = operations.handlers()["add_anchor"]({"u": 320, "v": 4})
     operations.for_mapping.serve()
-    states = pipeline.anchors.at(result.pair.t_capture_ns)
+    states = pipeline.anchors.states()
     row = int(np.flatnonzero(states.ids == asked.result()["id"])[0])
     camera = published.camera_of(result.pair)
     place, depth = project(camera, states.points[row].astype(np.float64))

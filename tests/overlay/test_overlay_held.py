@@ -227,7 +227,8 @@ def test_what_one_visible_anchor_holds_is_unsure_until_it_is_recognised_again() 
     for number in range(230):
         observation, snapshot, view = textured(1 if 30 <= number < 180 else 0, number)
         anchors.update(observation, snapshot, view)
-        states = anchors.at(number * 100_000_000)
+        anchors.age(number * 100_000_000)
+        states = anchors.states()
         assert states.visibility[0] == 1
         known = {1: Anchor(states.points[0].astype(np.float64), 1.0, float(states.confidence[0]))}
         frame = TissueFrame(number, number, "s", 0, TEXTURED, BASELINE, view.depth, observation.tissue, known)

@@ -11,12 +11,12 @@ import warp as wp
 
 from sags_node.engine.gpu import binning, compositing, projection, runtime
 from sags_node.engine.gpu.binning import LANES, TILE
-from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Gradients, Pinhole
+from sags_node.engine.interface import DILATION_VARIANCE, MIP_VARIANCE, Gradients
 from sags_node.engine.rasterizer import spherical_harmonics
+from sags_node.engine.rasterizer.arguments import check_size, checked, checked_cotangents, drawn, view_of
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
-from sags_node.engine.rasterizer.projector import centre_of
 from sags_node.errors import SagsError
-from sags_node.types import F32, I32, Bool, Gaussians
+from sags_node.types import F32, I32, Bool, Camera, Gaussians
 
 MAX_PAIRS = 1 << 25  # 3 GiB
 SPARE = 1.25  # what is asked for beyond the need when a buffer grows
@@ -63,14 +63,12 @@ class DeviceRasterizer:
         self._hold(1024)
         self._hold_pairs(4096)
 
-    def forward(
-        self, tables: Mapping[str, wp.array], pinhole: Pinhole, tiles: Bool | None = None
-    ) -> wp.array:
+    def forward(self, tables: Mapping[str, wp.array], view: F32, tiles: Bool | None = None) -> wp.array:
         """Draw for a camera.
 
         Args:
             tables: by the names and of the types of `KINDS`.
-            pinhole: of the rasteriser's picture size.
+            view: of `arguments.view_of`, for a camera of the rasteriser's picture size.
             tiles: as `interface.Rasterizer.forward` has them.
 
         Returns:
@@ -83,8 +81,7 @@ class DeviceRasterizer:
         self._tables = tables
         if n > self._room:
             self._hold(int(n * SPARE))
-        limits = [pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, *pinhole.limits]
-        self._view.assign(np.array([*pinhole.R.ravel(), *pinhole.t, *limits], np.float32))
+        self._view.assign(view)
         self._choose(tiles)
         total = self._sort_by_depth(tables) if n else 0
         if total > MAX_PAIRS:
@@ -203,37 +200,45 @@ class DeviceRasterizer:
     _medians: tuple[wp.array, wp.array] | None = None
 
 
-class WarpBackend:
-    """Backend `warp`: arrays of the host in and out, copied on every call."""
+class WarpRasterizer:
+    """`interface.Rasterizer` on a device: arrays of the host in and out, copied on every call."""
 
     def __init__(self, width: int, height: int, antialias: bool, device: wp.Device) -> None:
+        """See `rasterize.make_rasterizer`."""
+        self._width, self._height = width, height
         self._on_device = DeviceRasterizer(width, height, device, antialias)
         self._device = device
+        self._given: Gaussians | None = None  # what was drawn last
 
-    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
-        self._given, self._centre = gaussians, centre_of(pinhole)
+    def forward(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
+        check_size(self._width, self._height, camera, tiles)
+        gaussians, view = checked(gaussians), view_of(camera)
+        given, self._centre = gaussians, tuple(map(np.float32, camera.T_world_cam[:3, 3]))
         if gaussians.sh_rest is not None:  # the one thing that the host's kernels do
             seen = np.empty_like(gaussians.colors)
             spherical_harmonics.color(
                 gaussians.means, gaussians.colors, gaussians.sh_rest, self._centre, seen
             )
             gaussians = replace(gaussians, colors=seen)
-        tables = sent(gaussians, self._device)
-        planes: F32 = self._on_device.forward(tables, pinhole, tiles).numpy()
+        planes: F32 = self._on_device.forward(sent(gaussians, self._device), view, tiles).numpy()
+        self._given = given
         return planes
 
     def backward(self, v_planes: F32, weight: F32) -> Gradients:
-        given = (wp.array(array, dtype=float, device=self._device) for array in (v_planes, weight))
+        last = drawn(self._given, "backward")
+        cotangents = checked_cotangents(v_planes, weight, self._width, self._height)
+        given = (wp.array(array, dtype=float, device=self._device) for array in cotangents)
         found = {name: array.numpy() for name, array in self._on_device.backward(*given).items()}
-        rest = self._given.sh_rest
-        v_rest = np.zeros((len(self._given), 0 if rest is None else rest.shape[1], 3), np.float32)
+        rest = last.sh_rest
+        v_rest = np.zeros((len(last), 0 if rest is None else rest.shape[1], 3), np.float32)
         if rest is not None:
             spherical_harmonics.color_backward(
-                self._given.means, rest, self._centre, found["colors"], v_rest, found["means"]
+                last.means, rest, self._centre, found["colors"], v_rest, found["means"]
             )
         return Gradients(**found, sh_rest=v_rest)
 
     def median(self) -> tuple[F32, I32]:
+        drawn(self._given, "median")
         depths, rows = self._on_device.median()
         return depths.numpy(), rows.numpy()
 

@@ -15,12 +15,12 @@ import numpy as np
 from numba import prange
 
 from sags_node.confidence import HALVING, LEAST
+from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.types import F32, DepthGrid, Gaussians, RenderedView
 
 CELLS = 80  # across the picture
-BEHIND = 0.035  # of the depth: what is so far behind the drawn surface is hidden by it
 SHARES = 4  # of the Gaussians, each added up by itself
 ENOUGH = 3  # Gaussians in a cell, on the average: of more not all are looked at
 
@@ -98,7 +98,7 @@ def _add_up_rows(
         if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
             continue
         column, row = int(u + half), int(v + half)
-        if depth[row, column] * np.float32(1 + BEHIND) < z:
+        if depth[row, column] * np.float32(1 + BEHIND_SURFACE) < z:
             continue
         covered = opacities[i] * scales[i, 0] * scales[i, 1] / (z * z)
         row, column = int((row + half) * per_px), int((column + half) * per_px)

@@ -24,6 +24,7 @@ import numba
 import numpy as np
 
 from sags_node.engine import interface
+from sags_node.engine.pinhole import to_camera
 from sags_node.kernels.jit import copy, inlined, kernel, parallel_kernel, take
 from sags_node.kernels.vectors import (
     LANES,
@@ -67,25 +68,16 @@ WHITEN2 = f4(0.5 / math.log(2.0))  # exponents of base e and 1/2 to base 2
 L1, L3, L5, L7, L9 = (f4(2.0 / math.log(2.0) / k) for k in (1, 3, 5, 7, 9))
 
 Row = tuple[Any, ...]
-VIEW = 20  # numbers of a camera: 9 rows of its world-to-camera rotation, 3 of its translation, fx, fy, cx, cy
-# and the limits of x/z and y/z in the Jacobian: low, high, low, high
 
 
 @inlined
 def unpack(view: F32) -> Row:
-    """Rotation, translation, intrinsics and limits: tuples travel in registers."""
-    R = view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8]
-    t, intrinsics = (view[9], view[10], view[11]), (view[12], view[13], view[14], view[15])
-    return R, t, intrinsics, (view[16], view[17], view[18], view[19])
-
-
-@inlined
-def to_camera(R: Row, t: Row, x: Any, y: Any, z: Any) -> Row:
-    return (
-        R[0] * x + R[1] * y + R[2] * z + t[0],
-        R[3] * x + R[4] * y + R[5] * z + t[1],
-        R[6] * x + R[7] * y + R[8] * z + t[2],
-    )
+    """Pose, intrinsics and limits of a camera of `pinhole.pack`: tuples travel in registers."""
+    pose = (
+        view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8],
+        view[9], view[10], view[11],
+    )  # fmt: skip
+    return pose, (view[12], view[13], view[14], view[15]), (view[16], view[17], view[18], view[19])
 
 
 @inlined
@@ -225,7 +217,7 @@ def _project_blocks(
     next_block: I64, splats: F32, depths: F32,
 ) -> None:  # fmt: skip
     count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
-    R, t, (fx, fy, cx, cy), limits = unpack(view)
+    pose, (fx, fy, cx, cy), limits = unpack(view)
     block, end = 0, 0
     while True:
         block += 1
@@ -242,7 +234,7 @@ def _project_blocks(
             S[GREEN + lane] = colors[first + lane, 1]
             S[BLUE + lane] = colors[first + lane, 2]
         for j in range(0, filled, LANES):
-            x, y, z = to_camera(R, t, load(S, MEAN_X + j), load(S, MEAN_Y + j), load(S, MEAN_Z + j))
+            x, y, z = to_camera(pose, load(S, MEAN_X + j), load(S, MEAN_Y + j), load(S, MEAN_Z + j))
             in_front = z > NEAR_PLANE
             inverse_z = ONE / select(in_front, z, ONE)
             slope_x, slope_y = x * inverse_z, y * inverse_z
@@ -253,7 +245,7 @@ def _project_blocks(
             )
             Q = rotation(qw, qx, qy, qz)
             j00, j11 = fx * inverse_z, fy * inverse_z
-            A = screen_axes(R, j00, -j00 * held_x, j11, -j11 * held_y)
+            A = screen_axes(pose, j00, -j00 * held_x, j11, -j11 * held_y)
             U = times_rotation(A, Q)
             V = scale_axes(U, load(S, SCALE_X + j), load(S, SCALE_Y + j), load(S, SCALE_Z + j))
             xx, xy, yy, det0, _, _, _ = covariance(V)
@@ -298,7 +290,7 @@ def project(
     opacities: F32,
     colors: F32,
     slopes: F32,
-    view: F32,  # [VIEW]
+    view: F32,  # [20] of `pinhole.pack`
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
     next_block: I64,  # [1] for the workers

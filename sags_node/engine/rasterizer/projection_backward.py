@@ -8,6 +8,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from sags_node.engine.pinhole import to_camera
 from sags_node.engine.rasterizer.layout import SPLAT_GRADIENT
 from sags_node.engine.rasterizer.projection import (
     BLOCK,
@@ -44,7 +45,6 @@ from sags_node.engine.rasterizer.projection import (
     screen_slopes,
     times_axes,
     times_rotation,
-    to_camera,
     unit_quaternion,
     unpack,
     whitening,
@@ -117,7 +117,7 @@ def _blocks_backward(
     v_quats: F32, v_scales: F32, v_opacities: F32, v_slopes: F32,
 ) -> None:  # fmt: skip
     count, blocks = means.shape[0], (means.shape[0] + BLOCK - 1) // BLOCK
-    R, t, (fx, fy, _, _), limits = unpack(view)
+    pose, (fx, fy, _, _), limits = unpack(view)
     given_up = screen_filter[0] * screen_filter[1]
     block, end = 0, 0
     while True:
@@ -147,7 +147,7 @@ def _blocks_backward(
                 load_records(S, RECORDS + j * RECORD)
             )
             # the forward pass again
-            x, y, z = to_camera(R, t, load(S, MEAN_X + j), load(S, MEAN_Y + j), load(S, MEAN_Z + j))
+            x, y, z = to_camera(pose, load(S, MEAN_X + j), load(S, MEAN_Y + j), load(S, MEAN_Z + j))
             inverse_z = ONE / select(z > NEAR_PLANE, z, ONE)
             slope_x, slope_y = x * inverse_z, y * inverse_z
             held_x = clamp(slope_x, limits[0], limits[1])
@@ -158,7 +158,7 @@ def _blocks_backward(
             Q = rotation(qw, qx, qy, qz)
             j00, j11 = fx * inverse_z, fy * inverse_z
             j02, j12 = -j00 * held_x, -j11 * held_y
-            A = screen_axes(R, j00, j02, j11, j12)
+            A = screen_axes(pose, j00, j02, j11, j12)
             U = times_rotation(A, Q)
             sx, sy, sz = load(S, SCALE_X + j), load(S, SCALE_Y + j), load(S, SCALE_Z + j)
             V = scale_axes(U, sx, sy, sz)
@@ -233,10 +233,10 @@ def _blocks_backward(
             a3 = v3 * Q[0] + v4 * Q[1] + v5 * Q[2]
             a4 = v3 * Q[3] + v4 * Q[4] + v5 * Q[5]
             a5 = v3 * Q[6] + v4 * Q[7] + v5 * Q[8]
-            v_j00 = a0 * R[0] + a1 * R[1] + a2 * R[2]
-            v_j02 = a0 * R[6] + a1 * R[7] + a2 * R[8]
-            v_j11 = a3 * R[3] + a4 * R[4] + a5 * R[5]
-            v_j12 = a3 * R[6] + a4 * R[7] + a5 * R[8]
+            v_j00 = a0 * pose[0] + a1 * pose[1] + a2 * pose[2]
+            v_j02 = a0 * pose[6] + a1 * pose[7] + a2 * pose[8]
+            v_j11 = a3 * pose[3] + a4 * pose[4] + a5 * pose[5]
+            v_j12 = a3 * pose[6] + a4 * pose[7] + a5 * pose[8]
             # j00 = fx / z, j02 = -fx / z held_x; a held slope is constant
             v_inverse_z = fx * (v_j00 - held_x * v_j02) + fy * (v_j11 - held_y * v_j12)
             free_x = select(held_x == slope_x, spread(ONE), ZERO)
@@ -245,9 +245,9 @@ def _blocks_backward(
             v_slope_y = fy * v_mean_y - free_y * j11 * v_j12
             v_x, v_y = v_slope_x * inverse_z, v_slope_y * inverse_z
             v_z = g_depth - inverse_z * (v_slope_x * slope_x + v_slope_y * slope_y + v_inverse_z * inverse_z)
-            store(S, V_MEAN_X + j, R[0] * v_x + R[3] * v_y + R[6] * v_z)
-            store(S, V_MEAN_Y + j, R[1] * v_x + R[4] * v_y + R[7] * v_z)
-            store(S, V_MEAN_Z + j, R[2] * v_x + R[5] * v_y + R[8] * v_z)
+            store(S, V_MEAN_X + j, pose[0] * v_x + pose[3] * v_y + pose[6] * v_z)
+            store(S, V_MEAN_Y + j, pose[1] * v_x + pose[4] * v_y + pose[7] * v_z)
+            store(S, V_MEAN_Z + j, pose[2] * v_x + pose[5] * v_y + pose[8] * v_z)
             store(S, V_OPACITY + j, v_log_opacity / larger(load(S, OPACITY + j), TINY))
         for lane in range(filled):
             i, drawn = first + lane, S[DRAWN + lane] > ZERO
@@ -267,7 +267,7 @@ def project_backward(
     scales: F32,
     opacities: F32,
     slopes: F32,
-    view: F32,  # [VIEW]
+    view: F32,  # [20] of `pinhole.pack`
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
     next_block: I64,  # [1] for the workers

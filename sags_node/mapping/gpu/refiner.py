@@ -14,9 +14,8 @@ import warp as wp
 
 from sags_node.engine import device
 from sags_node.engine.gpu.rasterizer import sent
-from sags_node.engine.rasterizer.rasterize import as_pinhole
-from sags_node.mapping.exposure import exposure_gain
-from sags_node.mapping.focus import largest, tile_grid
+from sags_node.engine.rasterizer.arguments import view_of
+from sags_node.mapping.focus import largest
 from sags_node.mapping.gpu.device_map import DeviceMap
 from sags_node.mapping.gpu.picture import Picture
 from sags_node.mapping.optimiser import LearningRates
@@ -90,8 +89,7 @@ class GpuRefiner:
         self._frame = model, deformation, observation, node_step
         self._picture = self._picture_for(observation.camera, self._pictures)
         self._picture.show(observation.image, observation.tissue, observation.depth)
-        self._pinhole = as_pinhole(observation.camera)
-        self._touched = tile_grid(observation.tissue)
+        self._view = view_of(observation.camera)
         self._changed = False
         self.on_gpu.begin(model, deformation)
 
@@ -107,47 +105,30 @@ class GpuRefiner:
             self._loss, self._changed = loss, False
 
     @_or_on_the_cpu
-    def draw(self) -> None:
-        self._draw(None)
-
-    @_or_on_the_cpu
-    def redraw(self, share: float, tiles: Bool) -> None:
-        some = None
-        if share < 1.0:
-            some = tiles | self._touched
-            if share > 0:
-                some |= self._worst_tiles(share)
-        self._draw(some)
+    def draw(self, tiles: Bool | None = None, share: float = 0.0) -> None:
+        if tiles is not None and share > 0:
+            tiles = None if share >= 1 else tiles | self._worst_tiles(share)
+        self._draw(tiles)
 
     @_or_on_the_cpu
     def planes(self) -> F32:
         return self._picture.fetched()
 
     @_or_on_the_cpu
-    def exposure_gain(self) -> F32:
-        assert self._frame is not None
-        observation = self._frame[2]
-        return exposure_gain(self._picture.fetched(), observation.image, observation.tissue)
-
-    @_or_on_the_cpu
     def refine(self, rates: LearningRates) -> None:
         self.on_gpu.note_contribution(self._step(rates))
 
     @_or_on_the_cpu
-    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> None:
+    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
         tiles = self._worst_tiles(share)
         self._draw(tiles)
         self._step(rates, nodes)
-        self._touched |= tiles
-
-    @_or_on_the_cpu
-    def touched(self) -> Bool:
-        return self._touched
+        return tiles
 
     @_or_on_the_cpu
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         picture = self._picture_for(camera, self._viewers)
-        picture.rasterizer.forward(sent(gaussians, self._device), as_pinhole(camera))
+        picture.rasterizer.forward(sent(gaussians, self._device), view_of(camera))
         return picture.fetched(anew=True)
 
     def _give_up(self, error: RuntimeError) -> None:
@@ -165,7 +146,7 @@ class GpuRefiner:
             self._cpu.draw()
 
     def _draw(self, tiles: Bool | None) -> None:
-        self._picture.rasterizer.forward(self.on_gpu.drawn(), self._pinhole, tiles)
+        self._picture.rasterizer.forward(self.on_gpu.drawn(), self._view, tiles)
         self._picture.is_fetched = False
 
     def _step(self, rates: LearningRates, nodes: bool = True) -> wp.array:

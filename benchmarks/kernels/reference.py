@@ -1,6 +1,6 @@
 """The readable twin of the CPU kernels in torch: the same formulas in any precision, gradients by autograd.
 
-Slow: seconds per picture. For tests, and for whoever wants to know what the kernels compute.
+Slow: seconds per picture. The tests compare every rasteriser with it; read it to know what kernels compute.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 
 from sags_node.engine.interface import (
     DILATION_VARIANCE,
+    FRUSTUM_MARGIN,
     MAX_OPACITY,
     MIN_ALPHA,
     MIN_QUAT_NORM,
     MIP_VARIANCE,
     NEAR_PLANE,
     Gradients,
-    Pinhole,
 )
+from sags_node.engine.rasterizer.arguments import checked
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
-from sags_node.types import F32, I32, Bool, Gaussians
+from sags_node.types import F32, I32, Bool, Camera, Gaussians
 
 if TYPE_CHECKING:  # torch takes seconds to import; only who draws with this backend pays
     from torch import Tensor
@@ -34,16 +35,17 @@ TILE = 64  # px; pictures are blended tile by tile to bound memory
 
 
 class ReferenceRasterizer:
-    """Backend `reference`, in float64."""
+    """`interface.Rasterizer` in float64, for pictures of any size."""
 
-    def __init__(self, antialias: bool) -> None:
+    def __init__(self, antialias: bool = True) -> None:
         self._antialias = antialias
         self._shown = np.zeros((5, 0, 0), np.float32)
         self._depths, self._rows = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
 
-    def forward(self, gaussians: Gaussians, pinhole: Pinhole, tiles: Bool | None) -> F32:
+    def forward(self, gaussians: Gaussians, camera: Camera, tiles: Bool | None = None) -> F32:
         import torch
 
+        gaussians = checked(gaussians)
         none = np.zeros((len(gaussians), 0, 3), np.float32)
         arrays = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors]
         arrays.append(np.zeros_like(gaussians.means) if gaussians.slopes is None else gaussians.slopes)
@@ -52,8 +54,8 @@ class ReferenceRasterizer:
         if gaussians.smoothing is not None:
             smoothing = torch.tensor(gaussians.smoothing, dtype=torch.float64)
         self._inputs = [torch.tensor(array, dtype=torch.float64, requires_grad=True) for array in arrays]
-        splats = self._splats = project(pinhole, self._inputs, smoothing, self._antialias)
-        width, height = pinhole.width, pinhole.height
+        splats = self._splats = project(camera, self._inputs, smoothing, self._antialias)
+        width, height = camera.width, camera.height
         self._planes = blend(splats, width, height)
         depths, rows = median(splats, width, height)
         self._drawn = _drawn_pixels(tiles, width, height)
@@ -104,7 +106,7 @@ class Splats:
 
 
 def project(
-    pinhole: Pinhole,
+    camera: Camera,
     inputs: Sequence[Tensor],
     smoothing: Tensor | None = None,
     antialias: bool = True,
@@ -112,7 +114,7 @@ def project(
     """EWA projection (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
 
     Args:
-        pinhole: the camera.
+        camera: OpenCV's; here the first pixel has its centre at (0.5, 0.5).
         inputs: means, quats, scales, opacities, colors, slopes and, where there are any, sh_rest; shapes as
             in `types.Gaussians`.
         smoothing: [N] as in `types.Gaussians`.
@@ -121,7 +123,10 @@ def project(
     import torch
 
     means, quats, scales, opacities, colors, slopes, *harmonics = inputs
-    R, t = torch.tensor(pinhole.R, dtype=means.dtype), torch.tensor(pinhole.t, dtype=means.dtype)
+    R = torch.tensor(camera.T_world_cam[:3, :3].T.copy(), dtype=means.dtype)
+    t = -R @ torch.tensor(camera.T_world_cam[:3, 3], dtype=means.dtype)
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    cx, cy = cx + 0.5, cy + 0.5
     if smoothing is not None:
         variance = torch.clamp(smoothing, min=0)[:, None]
         ratio = torch.where(variance == 0, 1, scales / torch.sqrt(scales.square() + variance))
@@ -135,14 +140,15 @@ def project(
     rows = torch.nonzero(usable)[:, 0]
 
     x, y, z = torch.addmm(t, means[rows], R.T).unbind(1)
-    mean2d = torch.stack([pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy], 1)
-    low_x, high_x, low_y, high_y = pinhole.limits
-    held_x, held_y = torch.clamp(x / z, low_x, high_x), torch.clamp(y / z, low_y, high_y)
+    mean2d = torch.stack([fx * x / z + cx, fy * y / z + cy], 1)
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * camera.width / fx, FRUSTUM_MARGIN * 0.5 * camera.height / fy
+    held_x = torch.clamp(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    held_y = torch.clamp(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
     J = torch.stack(
         [
-            torch.stack([pinhole.fx / z, zero, -pinhole.fx * held_x / z], 1),
-            torch.stack([zero, pinhole.fy / z, -pinhole.fy * held_y / z], 1),
+            torch.stack([fx / z, zero, -fx * held_x / z], 1),
+            torch.stack([zero, fy / z, -fy * held_y / z], 1),
         ],
         1,
     )
@@ -294,11 +300,6 @@ def contributions(splats: Splats, weight: Tensor, count: int) -> Tensor:
     with torch.no_grad():
         _tile_by_tile(tile, width, height)
     return sums
-
-
-def render(pinhole: Pinhole, *arrays: Tensor) -> Tensor:
-    """Planes [5, H, W] of the inputs of `project`."""
-    return blend(project(pinhole, arrays), pinhole.width, pinhole.height)
 
 
 def tissue_loss(

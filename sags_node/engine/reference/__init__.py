@@ -1,1 +1,0 @@
-"""Slow readable twins in torch, which tests compare the kernels to."""
