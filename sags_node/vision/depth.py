@@ -11,11 +11,11 @@ import numpy as np
 from sags_node.config.schema import VisionConfig
 from sags_node.types import F32, Bool, Finding, RectifiedPair, StereoFrame
 from sags_node.vision.alignment import RowErrors
-from sags_node.vision.match_watch import MatchWatch
 from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.pyramid import pyramids
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
+from sags_node.vision.watch.match_watch import MatchWatch
 
 LEAST_MATCHED = 0.05  # of the tissue that both eyes see; less is chance. Clear recordings have over a half
 TOO_FEW = (

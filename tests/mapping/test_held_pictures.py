@@ -23,7 +23,7 @@ from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.types import U8, DrawnView, Finding, FrameResult, StereoFrame
-from sags_node.vision.match_watch import MatchWatch
+from sags_node.vision.watch.match_watch import MatchWatch
 
 FIRST, COUNT, AFTER = 8, 8, 11  # frames, at 10 Hz: before, with the fault, and until the tenth after it
 WITHIN = 5  # frames: half a second

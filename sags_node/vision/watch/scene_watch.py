@@ -16,20 +16,20 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
-from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
-from sags_node.vision.judgement import Evidence, Judgement
 from sags_node.vision.landmarks import Landmarks, find_again, motion
-from sags_node.vision.palette import Palette
-from sags_node.vision.picture_fit import (
+from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
+from sags_node.vision.watch.clarity import SMOKE
+from sags_node.vision.watch.judgement import Evidence, Judgement
+from sags_node.vision.watch.palette import Palette
+from sags_node.vision.watch.picture_fit import (
     COVERED,
     FEWEST,
     GREEN,
     LEAST_MATCH,
     Fit,
 )
-from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.standing import Debounced
 
 WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5

@@ -15,11 +15,11 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I8, Bool, Finding
-from sags_node.vision.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
-from sags_node.vision.judgement import Evidence, Judgement
-from sags_node.vision.picture_fit import middle_of
 from sags_node.vision.pyramid import BORDER, inner, pyramids
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
+from sags_node.vision.watch.judgement import Evidence, Judgement
+from sags_node.vision.watch.picture_fit import middle_of
+from sags_node.vision.watch.standing import Debounced
 
 CELLS = 40  # across the picture
 SMALLEST = 8  # px of the first half, the side of a cell: of fewer, the detail is chance
@@ -30,7 +30,7 @@ NOISE = 0.5  # grey levels: detail below it is a camera's noise
 LOST, BACK = 1.0, 0.5 * LOST_CONTRAST
 ALIKE = 5  # of a cell and the eight around it have lost it: drops are wider than a cell
 FEWEST = 6  # cells: the area of a drop whose radius is 3.5 % of the width
-VEIL = 0.5 * LOST  # of the median cell: something lies over the whole lens, see `vision.clarity`
+VEIL = 0.5 * LOST  # of the median cell: something lies over the whole lens, see `vision.watch.clarity`
 
 _TEXT = "drops or dirt on the {eye} lens hide some of the tissue, which is not learnt: clean the lens"
 _LEFT, _RIGHT = (Finding(f"{eye}_eye_drops", _TEXT.format(eye=eye)) for eye in ("left", "right"))

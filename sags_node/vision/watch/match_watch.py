@@ -18,7 +18,7 @@ from sags_node.types import Finding, GrayPyramid
 from sags_node.vision.alignment import RowErrors
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.pyramid import inner, narrowed
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.standing import Debounced
 
 STRIDE = 4  # px
 WINDOW_NS = 200_000_000  # of the motion that is compared with row errors

@@ -15,11 +15,11 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
-from sags_node.vision.blocks import is_blocky
-from sags_node.vision.clarity import LENS, SMOKE, Clarity, mean_difference, structure
-from sags_node.vision.judgement import Evidence, Judgement
 from sags_node.vision.pyramid import pyramids
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.blocks import is_blocky
+from sags_node.vision.watch.clarity import LENS, SMOKE, Clarity, mean_difference, structure
+from sags_node.vision.watch.judgement import Evidence, Judgement
+from sags_node.vision.watch.standing import Debounced
 
 WIDTH = 80  # px of the small pictures
 BLACK = 20.0  # grey levels; video that keeps its black at 16 too
