@@ -32,11 +32,11 @@ LINES = {
     "sags_node/engine": 4071,
     "sags_node/evaluation": 3085,
     "sags_node/export": 891,
-    "sags_node/field": 1723,
-    "sags_node/fitting": 1530,
+    "sags_node/field": 1720,
+    "sags_node/fitting": 1523,
     "sags_node/importing": 1071,
     "sags_node/kernels": 1222,
-    "sags_node/mapping": 5597,
+    "sags_node/mapping": 5587,
     "sags_node/media": 718,
     "sags_node/messaging": 5087,
     "sags_node/model": 960,
@@ -50,8 +50,8 @@ LINES = {
     "sags_node/sources": 5606,
     "sags_node/terminal": 335,
     "sags_node/viewer": 1041,
-    "sags_node/vision": 5454,
-    "tests": 45080,
+    "sags_node/vision": 5462,
+    "tests": 45039,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -12,8 +12,6 @@ from sags_node.engine.rasterizer.arguments import view_of
 from sags_node.model.alias_free import FILTER_VARIANCE, VIEW_MARGIN
 from sags_node.types import Camera
 
-KEPT = ("contribution", "spread")  # of what `backward` gives: read after the next drawing
-
 
 class Canvas:
     """As `interface.Rasterizer`, on tensors. Not for two threads."""
@@ -47,14 +45,11 @@ class Canvas:
         return planes
 
     def backward(self, v_planes: Tensor, weight: Tensor) -> dict[str, Tensor]:
-        """`interface.Gradients` by their names; all but `KEPT` are overwritten by the next `backward`."""
+        """`interface.Gradients` by their names, overwritten by the next `backward`."""
         with self._on_the_stream():
             arrays = (self._warp.from_torch(each.contiguous()) for each in (v_planes, weight))
             found = self._rasterizer.backward(*arrays)
-            return {
-                name: self._warp.to_torch(array).clone() if name in KEPT else self._warp.to_torch(array)
-                for name, array in found.items()
-            }
+            return {name: self._warp.to_torch(array) for name, array in found.items()}
 
     def _on_the_stream(self) -> AbstractContextManager[object]:
         if self._stream is None:

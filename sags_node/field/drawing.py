@@ -126,7 +126,9 @@ class _Rasterize(torch.autograd.Function):
             arrays = drawing.rasterizer.backward(v_planes.numpy(), weight.numpy())
             names = (*TABLES, "contribution", "spread")
             found = {name: torch.from_numpy(getattr(arrays, name)) for name in names}
-        drawing.v_means = found["means"]
-        drawing.contribution, drawing.spread = found["contribution"], found["spread"]
+        # Copies: the rasteriser overwrites its own in the next drawing, which may come before these are read
+        drawing.v_means, drawing.contribution, drawing.spread = (
+            found[name].clone() for name in ("means", "contribution", "spread")
+        )
         *v_rows, v_slopes = (found[name] for name in TABLES)
         return *v_rows, v_slopes if ctx.has_slopes else None, None

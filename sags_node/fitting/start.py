@@ -8,6 +8,7 @@ learns these paths by regression, which needs no drawing and so is fast. What it
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,7 +20,6 @@ from sags_node.errors import SagsError
 from sags_node.field.deformation import Field
 from sags_node.field.drawing import deactivate
 from sags_node.fitting.clip import Clip, ClipFrame
-from sags_node.fitting.paths import Paths
 from sags_node.fitting.residuals import Residuals, check_size
 from sags_node.fitting.settings import FitSettings
 from sags_node.geometry import unproject
@@ -30,7 +30,7 @@ from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model import columns
 from sags_node.model.exposure import Exposure
-from sags_node.types import F32, I64, Gaussians
+from sags_node.types import F32, I64, Bool, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
 ONLINE_STEPS = 2  # of the mapper per frame
@@ -43,6 +43,15 @@ NEIGHBOURS_AT_A_TIME = 2048  # points whose distances to all others a GPU holds
 HIDDEN = -5.0  # of an opacity logit
 
 Progress = Callable[[str, int, int], None]  # what, done, of
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """How the online mapper saw each Gaussian at some times."""
+
+    times_ns: I64  # [K]
+    states: F32  # [K, N, 14], see `columns`
+    known: Bool  # [K, N]
 
 
 def pooled_rows(

@@ -32,7 +32,8 @@ from sags_node.types import (
     RenderedView,
     Snapshot,
 )
-from sags_node.vision.landmarks import RATIO, features_in
+from sags_node.vision.features import RATIO
+from sags_node.vision.landmarks import features_of
 from sags_node.vision.pyramid import pyramid_of
 
 MAX_ANCHORS = 256
@@ -282,7 +283,7 @@ class Anchors:
         if not (seen.any() or lost.any()) or 0 <= stamp - self._recalled_ns < period * 1e9:
             return
         self._recalled_ns = stamp
-        features = features_in(pyramid_of(observation), observation.tissue)
+        features = features_of(pyramid_of(observation), observation.tissue)
         for place in self._recall.look(features, table.ids[lost]) if lost.any() else []:
             _put_back(table, place, observation, snapshot, view)
         self._recall.remember(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sags_node.geometry import invert
+from sags_node.geometry import disparity_to_depth, invert
 from sags_node.kernels.jit import inlined, kernel
-from sags_node.types import F32, F64, Camera
+from sags_node.types import F32, F64, Camera, Observation
 
 ROUNDS = 8
 SPREADS = 2.0  # spreads of the residuals beyond which a point counts less than a quarter
@@ -68,6 +70,18 @@ def fit_pose(points: F32, pixels: F32, disparities: F32, camera: Camera, baselin
             break
     view[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(view[:3, :3])[0])[0]  # poses are chained: no error may grow
     return PoseFit(invert(view), weights, scale)
+
+
+def at_pixels(picture: NDArray[Any], pixels: F32) -> NDArray[Any]:
+    """Values [N] of a picture [H, W] at pixels [N, 2] in it."""
+    columns, rows = (pixels + np.float32(0.5)).astype(np.intp).T
+    return np.asarray(picture[rows, columns])
+
+
+def disparities_at(observation: Observation, pixels: F32) -> F32:
+    """Disparities [N] px that were measured at pixels [N, 2]; 0: none was."""
+    depths, focal = at_pixels(observation.depth, pixels), float(observation.camera.K[0, 0])
+    return disparity_to_depth(depths, focal, observation.baseline)  # its own inverse
 
 
 def exponential(twist: F64) -> F64:

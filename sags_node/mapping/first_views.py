@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sags_node.geometry import disparity_to_depth, project, unproject
-from sags_node.mapping.camera_pose import fit_pose
+from sags_node.geometry import project, unproject
+from sags_node.mapping.camera_pose import at_pixels, disparities_at, fit_pose
 from sags_node.mapping.keyframes import distance
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F32, F64, U8, Camera, Observation
@@ -82,7 +82,9 @@ class FirstViews:
         apart = CORNER_DISTANCE * camera.width
         corners = cv2.goodFeaturesToTrack(observation.gray, CORNERS, CORNER_QUALITY, apart, mask=where)
         pixels = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
-        points = np.asarray(unproject(observation.camera, pixels, _at(observation.depth, pixels)), np.float32)
+        points = np.asarray(
+            unproject(observation.camera, pixels, at_pixels(observation.depth, pixels)), np.float32
+        )
         return _View(camera, observation.gray, pixels, points - self._map.displacement_at(points))
 
     def _fitted(self, view: _View, observation: Observation, camera: Camera) -> F64 | None:
@@ -99,21 +101,11 @@ class FirstViews:
         )  # fmt: skip
         found = (status[:, 0] > 0) & (np.abs(pixels - expected).max(1) < ASIDE * width)
         found &= ((pixels > 0) & (pixels < [width - 1, height - 1])).all(1)
-        found[found] = _at(observation.tissue, pixels[found])
+        found[found] = at_pixels(observation.tissue, pixels[found])
         if np.count_nonzero(found) < LEAST_CORNERS:
             return None
         pixels, rest = pixels[found], rest[found]
-        depths = _at(observation.depth, pixels)
-        disparities = disparity_to_depth(
-            depths, float(camera.K[0, 0]), observation.baseline
-        )  # its own inverse
-        fit = fit_pose(rest, pixels, disparities, camera, observation.baseline)
+        fit = fit_pose(rest, pixels, disparities_at(observation, pixels), camera, observation.baseline)
         if fit.inliers < LEAST_INLIERS * len(pixels) or fit.scale > LARGEST_SCALE * width:
             return None
         return fit.T_world_cam
-
-
-def _at(picture: np.ndarray, pixels: F32) -> np.ndarray:
-    """Of a picture [H, W] at pixels [K, 2] in it."""
-    columns, rows = (pixels + np.float32(0.5)).astype(np.intp).T
-    return np.asarray(picture[rows, columns])

@@ -11,6 +11,7 @@ import numpy as np
 from sags_node.geometry import invert, project, unproject
 from sags_node.mapping.pose_agreement import Agreement, Small, agreement, shrunk, small_frame
 from sags_node.types import F32, F64, U8, Bool, Camera, Observation, RenderedView
+from sags_node.vision.features import Features, features_in, matched
 
 MOST = 8
 PERIOD_NS = 500_000_000  # between keyframes
@@ -18,7 +19,6 @@ APART = 4e-3  # m: a nearer keyframe is replaced, since tissue changes
 LEVER = 0.08  # m: what an endoscope looks at; a turn moves it by the angle times this
 FEATURES = 800
 FAST_THRESHOLD = 7  # grey levels: tissue has few corners
-DISTINCT = 0.8  # of the next best match's distance (D. Lowe, IJCV 2004)
 REPROJECTION = 4 / 640  # of the width
 LEAST_MATCHES = 15
 WITNESSES = 2  # keyframes, the nearest, that a frame is compared with
@@ -45,7 +45,7 @@ class _Keyframe:
         return small, np.asarray(unproject(there.camera, pixels, small.depth), np.float32)
 
     @cached_property
-    def features(self) -> tuple[F32, U8 | None]:
+    def features(self) -> Features:
         return _features(self.observation.gray, self.observation.tissue & (self.depth > 0))
 
 
@@ -77,10 +77,10 @@ class Keyframes:
         """`T_world_cam` [4, 4] from which the picture may have been taken: one for each keyframe that
         shows some of it, that with most matching features that agree first (ORB; perspective from points in
         RANSAC)."""
-        pixels, features = _features(observation.gray, observation.tissue)
-        if features is None:
+        features = _features(observation.gray, observation.tissue)
+        if len(features.codes) < LEAST_MATCHES:
             return []
-        found = [_pose_from(each, pixels, features, observation.camera) for each in self._kept]
+        found = [_pose_from(each, features, observation.camera) for each in self._kept]
         poses = [pose for pose in found if pose is not None]
         return [pose for _, pose in sorted(poses, key=lambda pose: pose[0], reverse=True)]
 
@@ -118,20 +118,16 @@ def _warped(there: Small, points: F32, frame: Small, observation: Observation) -
     return agreement(expected, found, observation.camera, observation.baseline)
 
 
-def _pose_from(keyframe: _Keyframe, pixels: F32, features: U8, camera: Camera) -> tuple[int, F64] | None:
-    there = keyframe.observation
-    places, described = keyframe.features
-    if described is None:
+def _pose_from(keyframe: _Keyframe, features: Features, camera: Camera) -> tuple[int, F64] | None:
+    before, after = matched(keyframe.features, features)
+    if len(before) < LEAST_MATCHES:
         return None
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(described, features, k=2)
-    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < DISTINCT * p[1].distance]
-    if len(good) < LEAST_MATCHES:
-        return None
-    ours = places[[match.queryIdx for match in good]]
+    ours = keyframe.features.places[before]
     columns, rows = np.rint(ours).astype(np.intp).T
-    points = unproject(there.camera, ours.astype(np.float64), keyframe.depth[rows, columns].astype(float))
+    depths = keyframe.depth[rows, columns].astype(float)
+    points = unproject(keyframe.observation.camera, ours.astype(np.float64), depths)
     found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, pixels[[match.trainIdx for match in good]].astype(np.float64), camera.K, None,
+        points, features.places[after].astype(np.float64), camera.K, None,
         reprojectionError=REPROJECTION * camera.width, iterationsCount=300,
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < LEAST_MATCHES:
@@ -141,13 +137,8 @@ def _pose_from(keyframe: _Keyframe, pixels: F32, features: U8, camera: Camera) -
     return len(inliers), invert(view)
 
 
-def _features(gray: U8, where: Bool) -> tuple[F32, U8 | None]:
-    """Pixels [F, 2] and descriptors [F, 32], None where there are fewer than needed."""
-    orb = cv2.ORB.create(FEATURES, fastThreshold=FAST_THRESHOLD)
-    corners, described = orb.detectAndCompute(gray, where.view(np.uint8))
-    if described is None or len(corners) < LEAST_MATCHES:
-        return np.zeros((0, 2), np.float32), None
-    return np.array([corner.pt for corner in corners], np.float32), np.asarray(described)
+def _features(gray: U8, where: Bool) -> Features:
+    return features_in(gray, where, FEATURES, FAST_THRESHOLD)
 
 
 def distance(a: Camera, b: Camera) -> float:

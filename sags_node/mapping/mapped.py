@@ -14,7 +14,7 @@ from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.mapping.densify import HOLE_ALPHA
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Forecast, Observation, RenderedView, Snapshot
-from sags_node.vision.picture_fit import MISFIT
+from sags_node.vision.watch.picture_fit import MISFIT
 
 MIN_FIRST_DEPTHS = 200  # px
 LOST_COVERAGE = 0.3  # of the tissue
@@ -45,7 +45,7 @@ def most_steps(still: int, frames: int) -> float:
 
 def is_lost(planes: F32, observation: Observation) -> bool:
     """Whether the model, moved to this frame, hardly covers it: after damage, or where the camera is known to
-    be in another place. What the picture shows is judged before, see `vision.scene_watch`."""
+    be in another place. What the picture shows is judged before, see `vision.watch.scene_watch`."""
     tissue = observation.tissue[SOME, SOME]
     covered = tissue & (planes[4, SOME, SOME] > HOLE_ALPHA)
     return bool(np.count_nonzero(covered) < LOST_COVERAGE * np.count_nonzero(tissue))

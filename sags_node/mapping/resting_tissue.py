@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sags_node.geometry import disparity_to_depth, invert, project
-from sags_node.mapping.camera_pose import fit_pose
+from sags_node.geometry import invert, project
+from sags_node.mapping.camera_pose import at_pixels, disparities_at, fit_pose
 from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.motion import Drawn, Tracks
 from sags_node.mapping.tissue_map import TissueMap
@@ -65,7 +65,7 @@ class RestingTissue:
         ways = np.linalg.norm(away, axis=1)
         calm = ways <= CALM * np.median(ways)
         rows, away = rows[calm], away[calm]
-        seen = _values(observation.gray, pixels[rows])
+        seen = at_pixels(observation.gray, pixels[rows]).astype(np.float32)
         if correlation(model.colors[rows].mean(1), seen) < LEAST_AGREEMENT:
             return "the picture does not show the model's tissue"
 
@@ -78,10 +78,7 @@ class RestingTissue:
         if len(rows) < LEAST_POINTS:
             return "too little texture to follow"
         points = model.means[rows]
-        # The formula is its own inverse.
-        disparities = disparity_to_depth(
-            _values(observation.depth, pixels), float(camera.K[0, 0]), observation.baseline
-        )
+        disparities = disparities_at(observation, pixels)
         start_camera = replace(camera, T_world_cam=start)
         near = fit_pose(points, pixels, disparities, start_camera, observation.baseline)
         if near.inliers < LEAST_INLIERS * len(rows) or near.scale > LARGEST_SCALE * camera.width:
@@ -132,12 +129,6 @@ def _is_inside(pixels: F32, picture: U8) -> Bool:
     u, v = pixels.T
     inside: Bool = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     return inside
-
-
-def _values(picture: U8 | F32, pixels: F32) -> F32:
-    """Of a picture [H, W] at pixels [N, 2] in it."""
-    columns, rows = (pixels + np.float32(0.5)).astype(np.intp).T
-    return np.asarray(picture[rows, columns], np.float32)
 
 
 def _most_textured(gray: U8, pixels: F32) -> I64:

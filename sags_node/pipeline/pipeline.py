@@ -48,16 +48,16 @@ from sags_node.types import (
 )
 from sags_node.vision.change import StillScene, is_repeat
 from sags_node.vision.depth import DepthChoice, Measured
-from sags_node.vision.freeze_watch import FreezeWatch
-from sags_node.vision.judgement import Evidence, Judgement, Watcher
-from sags_node.vision.lens_watch import LensWatch
 from sags_node.vision.observe import observe
-from sags_node.vision.pair_watch import PairWatch
-from sags_node.vision.pose_watch import PoseWatch
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.scene_watch import SceneWatch, enlarged, exposed
 from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
+from sags_node.vision.watch.freeze_watch import FreezeWatch
+from sags_node.vision.watch.judgement import Evidence, Judgement, Watcher
+from sags_node.vision.watch.lens_watch import LensWatch
+from sags_node.vision.watch.pair_watch import PairWatch
+from sags_node.vision.watch.pose_watch import PoseWatch
+from sags_node.vision.watch.scene_watch import SceneWatch, enlarged, exposed
 
 if TYPE_CHECKING:
     from sags_node.mapping.sags_mapper import SagsMapper

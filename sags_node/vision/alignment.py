@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sags_node.types import F32, Bool
+from sags_node.types import F32, Bool, Finding
 
 SAMPLES = 40  # of a field's width
 WINDOW = 60  # fields behind the slow median
@@ -77,6 +77,12 @@ class RowMonitor:
         self._fields.append((self.newest.median, spread))
         if len(self._fields) >= FEWEST_FIELDS:
             self.alignment = self._judge()
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """That the rows differ, and what helps. May be read from any thread."""
+        alignment = self.alignment
+        return (Finding("rows_differ", alignment.warning),) if alignment and alignment.warning else ()
 
     def stay(self) -> None:
         """Take a frame in which nothing has moved: its rows are those of the last field."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache, partial
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from sags_node.config.schema import VisionConfig
 from sags_node.types import F32, Bool, Finding, RectifiedPair, StereoFrame
-from sags_node.vision.match_watch import MatchWatch
+from sags_node.vision.alignment import RowErrors
 from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.pyramid import pyramids
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
+from sags_node.vision.watch.match_watch import MatchWatch
 
 LEAST_MATCHED = 0.05  # of the tissue that both eyes see; less is chance. Clear recordings have over a half
 TOO_FEW = (
@@ -63,7 +65,6 @@ class DepthChoice:
         if config.onnx.path is not None:
             self._network = NetworkDepth(config, self.stereo, camera, baseline)
         self._matches = MatchWatch()
-        self._unsound = ""  # why what was matched in this frame is no depth; empty: it is
         self._was_sound = True  # what was matched last is depth
         self._last: Measured | None = None  # of the last frame in which it was measured, or could not be
 
@@ -111,29 +112,33 @@ class DepthChoice:
         was_sound, self._was_sound = self._was_sound, True
         if no_stereo and frame.depth is None and pair.right is not None:
             return Measured.nothing(tissue.shape, no_stereo)
-        measured = self._best(frame, pair, tissue)
-        self._was_sound = not self._unsound
-        return measured._replace(found_out=was_sound and not self._was_sound)
-
-    def _best(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> Measured:
-        self._unsound, skipped = "", {}
+        before, skipped = self.stereo.rows.newest, {}
+        measure = cache(partial(self._without_network, frame, pair, tissue))
         found = None
         if self._network is not None:
-
-            def measure() -> F32 | None:
-                can = frame.depth is not None or pair.right is not None
-                return self._measured(frame, pair, tissue)[0] if can else None
-
-            found = self._network(pair, tissue, measure)
+            can = frame.depth is not None or pair.right is not None
+            found = self._network(pair, tissue, lambda: measure()[0] if can else None)
             if self._network.problem:
                 skipped["network"] = self._network.problem
-        depth, confidence = found or self._measured(frame, pair, tissue)
-        if self._unsound:
-            depth, confidence = np.zeros((2, *tissue.shape), np.float32)
-            skipped["depth"] = self._unsound
-        return Measured(depth, confidence, skipped)
+        depth, confidence = found or measure()
+        rows = self.stereo.rows.newest
+        if rows is not None and rows is not before:  # the eyes were matched
+            unsound = self._unsound(pair.t_capture_ns, rows, measure()[0], tissue)
+            if unsound:
+                depth, confidence = np.zeros((2, *tissue.shape), np.float32)
+                skipped["depth"] = unsound
+            self._was_sound = not unsound
+        return Measured(depth, confidence, skipped, found_out=was_sound and not self._was_sound)
 
-    def _measured(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
+    def _unsound(self, stamp_ns: int, rows: RowErrors, depth: F32, tissue: Bool) -> str:
+        """Why the depth that was matched is none; empty: it is."""
+        why = self._matches(stamp_ns, rows)
+        if self._matches.is_late:
+            self.stereo.rows.withdraw()
+        too_few = np.count_nonzero(depth) < LEAST_MATCHED * np.count_nonzero(tissue)
+        return TOO_FEW if too_few else why
+
+    def _without_network(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
         """The session's own depth, fully trusted, or else stereo; all unknown for one camera alone."""
         if frame.depth is not None:
             given = self._rectifier.depth(frame.depth)
@@ -141,11 +146,4 @@ class DepthChoice:
             return np.where(known, given, np.float32(0)), known.astype(np.float32)
         if pair.right is None:
             return np.zeros(tissue.shape, np.float32), np.zeros(tissue.shape, np.float32)
-        measured = self.stereo(pair, tissue)
-        if self.stereo.rows.newest is not None:
-            self._unsound = self._matches(pair.t_capture_ns, self.stereo.rows.newest)
-            if self._matches.is_late:
-                self.stereo.rows.withdraw()
-        if np.count_nonzero(measured[0]) < LEAST_MATCHED * np.count_nonzero(tissue):
-            self._unsound = TOO_FEW
-        return measured
+        return self.stereo(pair, tissue)

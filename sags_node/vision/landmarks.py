@@ -1,9 +1,8 @@
 """Places of the tissue that are found in a later picture, however far they moved: what tells a scene that
 was lost from sight from another one.
 
-Oriented binary features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011), matched
-where the best is clearly better than the second (Lowe, IJCV 2004). Tissue bends, so there is no common motion
-to vote for: a match counts when it moves as those around it do.
+Tissue bends, so there is no common motion to vote for: a match of features counts when it moves as those
+around it do.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, I64, U8, Bool, GrayPyramid
+from sags_node.types import F32, U8, Bool, GrayPyramid
+from sags_node.vision.features import Features, features_in, matched
 from sags_node.vision.pyramid import inner
 
 WIDTH = 360  # px, at most, of the picture in which they are looked for
 COUNT = 600  # features of a picture
 FAST_THRESHOLD = 5  # grey levels: tissue is smooth, and smoke takes contrast away
-RATIO = 0.8  # of the distance to the second best match
 LARGEST_TURN = 40.0  # degrees
 FARTHEST = 0.3  # of the width
 AROUND = 5  # matches nearby, whose median motion a match must follow
@@ -38,39 +37,17 @@ class Landmarks(NamedTuple):
     after: F32  # [K, 2]
 
 
-class Features(NamedTuple):
-    """What can be recognised in a picture."""
-
-    places: F32  # [F, 2] px of the whole picture
-    angles: F32  # [F] degrees
-    codes: U8  # [F, 32] ORB
-    width: int  # px of the whole picture
-
-
-def features_in(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
-    """Features of a picture, where `tissue` [H, W] is: everywhere by default."""
+def features_of(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
+    """Features of a picture, px of the whole one, where `tissue` [H, W] is: everywhere by default."""
     small, per_px = _small(pyramid)
     mask = None
     if tissue is not None:
-        mask = cv2.resize(tissue.view(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    points, codes = cv2.ORB.create(COUNT, fastThreshold=FAST_THRESHOLD).detectAndCompute(small, mask)
-    places = np.array([point.pt for point in points], np.float32).reshape(-1, 2)
-    angles = np.array([point.angle for point in points], np.float32)
-    codes = np.zeros((0, 32), np.uint8) if codes is None else np.asarray(codes, np.uint8)
+        resized = cv2.resize(tissue.view(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        mask = resized.view(np.bool_)
+    found = features_in(small, mask, COUNT, FAST_THRESHOLD)
     # The middle of the first pixel is at 0 in both sizes.
-    places = (places + np.float32(0.5)) * np.float32(per_px) - np.float32(0.5)
-    return Features(places, angles, codes, pyramid.full.shape[1])
-
-
-def matched(before: Features, after: Features) -> tuple[I64, I64]:
-    """Rows [K] of both pictures' features that clearly look alike."""
-    none = np.zeros(0, np.int64)
-    if min(len(before.codes), len(after.codes)) < 2:
-        return none, none
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(before.codes, after.codes, 2)
-    clear = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
-    rows = np.array([(match.queryIdx, match.trainIdx) for match in clear], np.int64).reshape(-1, 2)
-    return rows[:, 0], rows[:, 1]
+    places = (found.places + np.float32(0.5)) * np.float32(per_px) - np.float32(0.5)
+    return found._replace(places=places, width=pyramid.full.shape[1])
 
 
 def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmarks | None:
@@ -79,7 +56,7 @@ def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmar
     Args:
         tissue: [H, W] of the earlier picture.
     """
-    first, second = features_in(before, tissue), features_in(after)
+    first, second = features_of(before, tissue), features_of(after)
     if min(len(first.places), len(second.places)) < FEWEST:
         return None
     a, b = matched(first, second)

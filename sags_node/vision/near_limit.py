@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from sags_node.config.schema import StereoConfig
-from sags_node.types import F32, Bool, GrayPyramid
+from sags_node.types import F32, Bool, Finding, GrayPyramid
 from sags_node.vision.coarse_stereo import coarse_disparity
 from sags_node.vision.matchers import GUESS_WIDTH
 from sags_node.vision.pyramid import BORDER, inner, level
@@ -35,8 +35,8 @@ class NearLimit:
 
     Attributes:
         limit: m, no tissue is nearer as far as is known.
-        too_near: m, the depth of what is nearer than a limit that was set, or else than `NEAREST`; 0: nothing
-            is. May be read from any thread.
+        findings: that tissue is nearer than a limit that was set, or else than `NEAREST`, and what helps. May
+            be read from any thread.
     """
 
     def __init__(self, config: StereoConfig, focal_baseline: float) -> None:
@@ -46,20 +46,12 @@ class NearLimit:
             focal_baseline: px m, of the whole picture.
         """
         self.limit = self._usual = config.nearest
-        self.too_near = 0.0
+        self.findings: tuple[Finding, ...] = ()
         self._is_set = config.min_depth is not None
         self._focal_baseline = focal_baseline
         self._looked_ns: int | None = None
         self._beyond = np.inf  # m, the nearest that was found by searching on
         self._found: deque[float] = deque(maxlen=RETREAT)
-
-    @property
-    def said(self) -> str:
-        """Of what is too near, and what helps."""
-        where = f"tissue lies at {1e3 * self.too_near:.0f} mm, nearer than"
-        if self._is_set:
-            return f"{where} vision.stereo.min_depth: lower it, or leave it out"
-        return f"{where} the {1e3 * NEAREST:.0f} mm from which depth can be matched: move the scope back"
 
     def look(self, t_capture_ns: int, left: GrayPyramid, right: GrayPyramid, tissue: Bool) -> None:
         """Take the pictures of one frame and its tissue [H, W]; most of them are let pass unseen."""
@@ -73,18 +65,24 @@ class NearLimit:
         if not self._is_set:
             beyond = nearest_tissue(left, right, tissue, self._focal_baseline, BEYOND, BEYOND_SHARE)
             before, self._beyond = self._beyond, beyond
-            self.too_near = beyond if max(before, beyond) < NEAREST else 0.0
+            self.findings = (self._too_near(beyond),) if max(before, beyond) < NEAREST else ()
         latest = list(self._found)[-AGREED:]
         agrees = len(latest) == AGREED or first  # before there is a model nothing can be spoilt
         if self._is_set:
             if agrees and max(latest) < self.limit:
-                self.too_near = min(latest)
+                self.findings = (self._too_near(min(latest)),)
             elif min(latest) >= self.limit:
-                self.too_near = 0.0
+                self.findings = ()
         elif agrees and max(latest) < self.limit:
             self.limit = max(NEAREST, ROOM * min(latest))
         elif len(self._found) == RETREAT and ROOM * min(self._found) > self.limit:
             self.limit = min(self._usual, ROOM * min(self._found))
+
+    def _too_near(self, depth: float) -> Finding:
+        fix = f"the {1e3 * NEAREST:.0f} mm from which depth can be matched: move the scope back"
+        if self._is_set:
+            fix = "vision.stereo.min_depth: lower it, or leave it out"
+        return Finding("tissue_too_near", f"tissue lies at {1e3 * depth:.0f} mm, nearer than {fix}")
 
 
 def nearest_tissue(

@@ -77,13 +77,7 @@ class StereoDepth:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is wrong with the rig, as far as matching tells. May be read from any thread."""
-        found = []
-        alignment = self.rows.alignment
-        if alignment is not None and alignment.warning:
-            found.append(Finding("rows_differ", alignment.warning))
-        if self._near.too_near > 0:
-            found.append(Finding("tissue_too_near", self._near.said))
-        return tuple(found)
+        return (*self.rows.findings, *self._near.findings)
 
     def judge(self, pair: RectifiedPair, disparity: F32, tissue: Bool) -> tuple[F32, F32]:
         """Depth and confidence of a disparity [H, W] (px; NaN or <= 0: unknown) that something else found,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -66,6 +68,21 @@ def test_planes_and_gradients_are_those_of_the_rasteriser() -> None:
     ):
         np.testing.assert_allclose(found[:, place], wanted, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(slopes.grad.numpy(), expected.slopes)
+
+
+def test_the_next_drawing_leaves_what_the_last_one_found() -> None:
+    """A batch draws several times before it looks at who was seen."""
+    rasterizer = make_rasterizer("numba", 64, 48)
+    away = camera(64, 48)
+    away = replace(away, T_world_cam=away.T_world_cam @ np.diag([-1.0, 1.0, -1.0, 1.0]))  # sees nothing
+    v_planes, found = np.ones((5, 48, 64), np.float32), []
+    for view in (VIEW, away):
+        rows, slopes = leaves()
+        drawing = Drawing(rasterizer, view, rows, slopes, np.arange(60), [VIEW])
+        drawing.differentiate(v_planes, WEIGHT)
+        found.append(drawing)
+    for part in ("v_means", "contribution", "spread"):
+        assert getattr(found[0], part).any() and not getattr(found[1], part).any(), part
 
 
 def test_a_loss_of_the_planes_reaches_what_the_rows_came_from() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sags_node.types import RectifiedPair, StereoFrame
-from sags_node.vision.judgement import Evidence, Judgement, Watcher
+from sags_node.vision.watch.judgement import Evidence, Judgement, Watcher
 
 
 def judged(watcher: Watcher, frame: StereoFrame, pair: RectifiedPair | None = None) -> Judgement:

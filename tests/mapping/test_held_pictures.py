@@ -9,23 +9,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from places import SESSION
+from recorded_session import both, frames_of, opened, psnr
 
-from sags_node.confidence import SURE
+from sags_node.confidence import HALVING, SURE
 from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import as_float
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.messaging.content import OF_THE_MODEL, tells_of
 from sags_node.node.allowance import Allowance
 from sags_node.node.health import WAITING_AFTER
 from sags_node.node.operations import NodeState, Operations
 from sags_node.node.views import Views
-from sags_node.pipeline.pipeline import NOTICED_LATE, Pipeline
-from sags_node.pipeline.session import Session, open_session
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session
 from sags_node.types import U8, DrawnView, Finding, FrameResult, StereoFrame
-from sags_node.vision.match_watch import MatchWatch
+from sags_node.vision.watch.match_watch import MatchWatch
 
 FIRST, COUNT, AFTER = 8, 8, 11  # frames, at 10 Hz: before, with the fault, and until the tenth after it
 WITHIN = 5  # frames: half a second
@@ -33,19 +31,12 @@ WITHIN = 5  # frames: half a second
 
 @pytest.fixture(scope="module")
 def session() -> Session:
-    return open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+    return opened("mapping.max_gaussians:=4000")
 
 
 @pytest.fixture(scope="module")
 def frames(session: Session) -> list[StereoFrame]:
-    with session.source as source:
-        return [frame for frame, _ in zip(source, range(FIRST + COUNT + AFTER), strict=False)]
-
-
-def both(frame: StereoFrame, change: Callable[[U8], np.ndarray]) -> StereoFrame:
-    assert frame.right is not None
-    left, right = (np.clip(change(eye), 0, 255).astype(np.uint8) for eye in (frame.left, frame.right))
-    return replace(frame, left=left, right=right)
+    return frames_of(session)[: FIRST + COUNT + AFTER]
 
 
 def bleeding(picture: U8) -> np.ndarray:
@@ -83,18 +74,19 @@ def play(session: Session, frames: list[StereoFrame]) -> tuple[list[FrameResult]
     return results, codes, pipeline
 
 
-def psnr(result: FrameResult, clean: FrameResult) -> float:
-    truth = clean.observation
-    error = (as_float(result.views["left"].rgb) - as_float(truth.image))[truth.tissue]
-    return float(-10 * np.log10(np.mean(np.square(error))))
-
-
 @pytest.fixture(scope="module")
 def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
     results, codes, pipeline = play(session, frames)
     assert set().union(*codes) == set() and pipeline.map.restarts == 0
     assert not any(result.held or result.skipped for result in results)
     return results
+
+
+def leaves_no_trace(results: list[FrameResult], clean: list[FrameResult]) -> bool:
+    """Whether the model and its picture are in the end what they were before, and would have been."""
+    kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
+    as_good = psnr(results[-1], clean[-1].observation) > psnr(clean[-1]) - 1.0
+    return results[-1].epoch == 0 and bool(kept.mean() > 0.8) and as_good
 
 
 @pytest.mark.fault("picture: the right eye is black")
@@ -112,8 +104,7 @@ def test_a_fault_is_said_and_leaves_no_trace(
     spoil, what = FAULTS[code]
     during = range(FIRST, FIRST + COUNT)
     given = [spoil(frame, i) if i in during else frame for i, frame in enumerate(frames)]
-    results, codes, pipeline = play(session, given)
-    assert pipeline.map.restarts == 0
+    results, codes, _ = play(session, given)
     if code:
         assert any(code in codes[i] for i in range(FIRST, FIRST + WITHIN))
     assert not set().union(*codes[:FIRST], *codes[during.stop + WITHIN :])
@@ -122,18 +113,17 @@ def test_a_fault_is_said_and_leaves_no_trace(
         assert all(bool(results[i].held) == (what == "picture") for i in during)
     for i in during:  # of a frame that is held nothing is measured, and nothing old is said to be
         assert not results[i].skipped.get(what, "") or not results[i].observation.depth.any()
-    kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
-    assert kept.mean() > 0.8
-    assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+    assert leaves_no_trace(results, clean)
 
 
-def frozen(frames: list[StereoFrame], during: range, live: bool = True) -> list[StereoFrame]:
+def frozen(frames: list[StereoFrame], during: range) -> list[StereoFrame]:
     """The frames as a camera gives them; in `during` the pictures of the one before, under new stamps."""
     last = frames[during.start - 1]
-    given = [replace(f, t_arrival_ns=f.t_capture_ns + 1 if live else 0) for f in frames]
-    for i in during:
-        given[i] = replace(given[i], left=last.left.copy(), right=both(last, np.array).right)
-    return given
+    shown = [both(last, np.array) if i in during else frame for i, frame in enumerate(frames)]
+    return [
+        replace(frame, left=eyes.left, right=eyes.right, t_arrival_ns=frame.t_capture_ns + 1)
+        for frame, eyes in zip(frames, shown, strict=True)
+    ]
 
 
 @pytest.mark.fault("picture: both eyes of a live feed are frozen")
@@ -141,17 +131,14 @@ def test_a_live_feed_that_freezes_is_held_and_said(
     session: Session, frames: list[StereoFrame], clean: list[FrameResult]
 ) -> None:
     during = range(FIRST, FIRST + COUNT)
-    results, codes, pipeline = play(session, frozen(frames, during))
+    results, codes, _ = play(session, frozen(frames, during))
     said = [i for i, found in enumerate(codes) if "picture_frozen" in found]
     held = [i for i, result in enumerate(results) if result.held]
     assert said == held == list(range(FIRST + 2, during.stop))  # 10 Hz: unchanged for 0.3 s then
     assert all(not tells_of(results[i], topic) for i in held for topic in OF_THE_MODEL)
     doubts = [np.median(result.snapshot.gaussians.depth_errors) for result in results]
     assert all(np.diff(doubts[held[0] - 1 : held[-1] + 1]) > 0)
-    assert pipeline.map.restarts == 0
-    kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
-    assert kept.mean() > 0.8
-    assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+    assert leaves_no_trace(results, clean)
 
 
 @pytest.mark.fault("picture: both eyes of a live feed are frozen, and an anchor is pinned")
@@ -223,13 +210,6 @@ def test_a_view_that_is_opened_while_nothing_new_is_seen_waits(
     assert {one.eyes[""].t_capture_ns for one in drawn_now.values()} == {later.t_capture_ns}
 
 
-def test_what_a_recording_repeats_is_no_frozen_feed(session: Session, frames: list[StereoFrame]) -> None:
-    during = range(FIRST, FIRST + COUNT)
-    results, codes, _ = play(session, frozen(frames[: during.stop], during, live=False))
-    assert not set().union(*codes) and not any(result.held for result in results)
-    assert all("frame" in results[i].skipped for i in during)
-
-
 def test_a_model_made_of_a_frozen_picture_is_not_shown(session: Session, frames: list[StereoFrame]) -> None:
     """A reset while the feed is frozen: the picture is old, whatever the model."""
     given = frozen(frames[: FIRST + COUNT + 1], range(FIRST, FIRST + COUNT))
@@ -252,7 +232,7 @@ def test_lost_frames_are_no_fault_of_the_others(
     stamps = [frame.t_capture_ns for i, frame in enumerate(frames) if i not in lost]
     assert [result.views["left"].t_capture_ns for result in results] == stamps
     assert not any(result.held for result in results)
-    assert psnr(results[-1], clean[-1]) > psnr(clean[-1], clean[-1]) - 1.0
+    assert psnr(results[-1], clean[-1].observation) > psnr(clean[-1]) - 1.0
 
 
 def test_what_nobody_watches_is_less_sure(session: Session, frames: list[StereoFrame]) -> None:
@@ -320,8 +300,8 @@ def test_what_was_measured_before_a_late_eye_was_noticed_is_doubted_once(
         assert result.snapshot.gaussians.depth_errors is not None
         errors.append(float(np.median(result.snapshot.gaussians.depth_errors)))
     steps = np.diff(errors[FIRST - 1 :])
-    assert steps[0] >= NOTICED_LATE
-    assert (steps[1:] < NOTICED_LATE / 3).all()  # 10 Hz: what tissue moves by unseen
+    assert steps[0] >= HALVING  # m: what is so unsure is half as sure
+    assert (steps[1:] < HALVING / 3).all()  # 10 Hz: what tissue moves by unseen
 
 
 def test_a_frame_without_its_pose_is_shown_by_no_new_model(
@@ -350,4 +330,4 @@ def test_where_no_frame_comes_depth_is_doubted_as_where_none_is_taken_in(
         there = frames[: FIRST + COUNT - gone]
         results, _, _ = play(session, [*there, last])
         before, after = (np.median(each.snapshot.gaussians.depth_errors) for each in results[-2:])
-        assert (after > before + 0.9 * UNWATCHED * 0.1 * COUNT) == doubted
+        assert (after > before + 0.9 * 0.016) == doubted  # m: 0.8 s at 20 mm/s

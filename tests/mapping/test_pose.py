@@ -9,17 +9,16 @@ import cv2
 import numpy as np
 import pytest
 from places import SESSION
+from recorded_session import both, psnr
 
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.metrics import as_float
 from sags_node.evaluation.session import evaluate
 from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.findings import by_code
 from sags_node.geometry import invert, project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, fit_pose
-from sags_node.mapping.camera_tracker import GIVE_UP_NS, TRIAL
 from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.keyframes import Keyframes
 from sags_node.phantom import PhantomScene, write_session
@@ -164,12 +163,6 @@ def known_poses(frames: list[StereoFrame]) -> F64:
     return np.stack([frame.T_world_cam for frame in frames if frame.T_world_cam is not None])
 
 
-def psnr(result: FrameResult) -> float:
-    tissue = result.observation.tissue
-    error = (as_float(result.views["left"].rgb) - as_float(result.observation.image))[tissue]
-    return float(-10 * np.log10(np.mean(np.square(error))))
-
-
 def test_over_still_tissue_the_path_is_true_to_a_fraction_of_a_millimetre(
     still: Path, followed: tuple[list[StereoFrame], list[FrameResult]]
 ) -> None:
@@ -239,10 +232,7 @@ def test_instruments_in_nearly_half_of_the_picture_do_not_pull_the_pose(still: P
 def test_after_a_blackout_of_a_second_the_same_model_goes_on(deforming: Path) -> None:
     session, frames = opened(deforming)
     first, last = 4, 4 + round(RATE)
-    dark = [
-        replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.left))
-        for frame in frames[first:last]
-    ]
+    dark = [both(frame, np.zeros_like) for frame in frames[first:last]]
     pipeline, results = play(session, [*frames[:first], *dark])
     held = results[first:]
     assert all("black" in result.held for result in held) and "left_eye_black" in by_code(pipeline.warnings)
@@ -254,7 +244,7 @@ def test_after_a_blackout_of_a_second_the_same_model_goes_on(deforming: Path) ->
     budget = StepBudget(1)
     back = [pipeline.process(frame, budget) for frame in frames[last:]]
     after = [result for result in back if not result.held]
-    assert len(back) - len(after) <= TRIAL  # it may have to be verified first
+    assert len(back) - len(after) <= RATE / 2  # half a second: it may have to be verified first
     assert {result.epoch for result in back} == {0} and "pose" not in pipeline.warnings
     assert np.isin(after[0].snapshot.gaussians.ids, held[0].snapshot.gaussians.ids).mean() > 0.9
     assert max(psnr(result) for result in after) > psnr(results[first - 1]) - 1
@@ -265,18 +255,17 @@ def test_after_a_blackout_of_a_second_the_same_model_goes_on(deforming: Path) ->
 
 def test_another_scene_begins_a_new_model_at_the_last_pose(still: Path) -> None:
     session, frames = opened(still)
-    assert frames[0].right is not None
     tissue = np.ones(frames[0].left.shape[:2], bool)
-    other = replace(frames[0], left=255 - frames[0].left, right=255 - frames[0].right, tissue=tissue)
+    other = replace(both(frames[0], lambda eye: 255 - eye), tissue=tissue)
     pipeline, before = play(session, frames[:4])
     budget = StepBudget(1)
     # The first frame finds the camera lost, the next is the first of those that show something else.
-    stamps = frames[4].t_capture_ns + np.arange(0, GIVE_UP_NS + 2e9 / RATE, 1e9 / RATE).astype(np.int64)
+    stamps = frames[4].t_capture_ns + np.arange(0, 3e9 + 2e9 / RATE, 1e9 / RATE).astype(np.int64)
     results = [
         pipeline.process(replace(other, frame_id=4 + k, t_capture_ns=int(stamp)), budget)
         for k, stamp in enumerate(stamps)
     ]
-    given_up = int(np.searchsorted(stamps - stamps[1], GIVE_UP_NS))
+    given_up = int(np.searchsorted(stamps - stamps[1], 3e9))
     assert all("pose" in result.skipped and result.epoch == 0 for result in results[:given_up])
     new = results[given_up]
     assert new.epoch == 1 and "pose" not in new.skipped and psnr(new) > 25

@@ -13,7 +13,7 @@ from flat_scene import Scene, camera_in_front, flat_means, flat_scene
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.recall import MOST_PICTURES, Recall
 from sags_node.types import AnchorStates
-from sags_node.vision.landmarks import features_in
+from sags_node.vision.landmarks import features_of
 from sags_node.vision.pyramid import pyramid_of
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 320, 256, 250.0, 0.08
@@ -187,7 +187,7 @@ def test_one_that_was_removed_does_not_come_back(monkeypatch: pytest.MonkeyPatch
     remembered, ids = Recall(), np.arange(1, len(PINNED) + 1)
     monkeypatch.setattr("sags_node.mapping.anchors.Recall", lambda: remembered)
     anchors, (observation, *_) = pinned(), scene(0)
-    features = features_in(pyramid_of(observation), observation.tissue)
+    features = features_of(pyramid_of(observation), observation.tissue)
 
     def recalled() -> int:
         """How many anchors, by any of the pictures remembered: one at a time."""

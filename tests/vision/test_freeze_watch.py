@@ -11,7 +11,7 @@ import pytest
 from watching import judged
 
 from sags_node.types import U8, StereoFrame
-from sags_node.vision.freeze_watch import Box, FreezeWatch
+from sags_node.vision.watch.freeze_watch import Box, FreezeWatch
 
 HEIGHT, WIDTH = 48, 64
 S = 1_000_000_000

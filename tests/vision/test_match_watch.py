@@ -19,8 +19,8 @@ from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, GrayPyramid
 from sags_node.vision.alignment import RowErrors
-from sags_node.vision.match_watch import MatchWatch
 from sags_node.vision.pyramid import gray_pyramid
+from sags_node.vision.watch.match_watch import MatchWatch
 
 NOISE = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (256, 320)).astype(np.float32), (0, 0), 3)
 TEXTURE = cv2.normalize(NOISE, None, 20, 230, cv2.NORM_MINMAX)

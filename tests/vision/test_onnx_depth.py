@@ -27,10 +27,10 @@ from sags_node.types import F32, U8, Bool, FrameResult, RectifiedPair, StereoFra
 from sags_node.vision.mono_depth import MonoDepth, fit_scale_shift
 from sags_node.vision.onnx_depth import DepthNetwork
 from sags_node.vision.onnx_session import DepthNetworkError
-from sags_node.vision.pair_watch import PairWatch
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.scene_watch import SceneWatch
 from sags_node.vision.stereo import StereoDepth
+from sags_node.vision.watch.pair_watch import PairWatch
+from sags_node.vision.watch.scene_watch import SceneWatch
 
 WIDTH, HEIGHT = 320, 256
 PICTURE = [1, 3, "h", "w"]

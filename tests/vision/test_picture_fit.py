@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from rounding import after
 
-from sags_node.vision.clarity import LOCAL, small_level, structure
-from sags_node.vision.pair_watch import row_correlation
-from sags_node.vision.picture_fit import Fit, middle_of
 from sags_node.vision.pyramid import gray_pyramid, inner
+from sags_node.vision.watch.clarity import LOCAL, small_level, structure
+from sags_node.vision.watch.pair_watch import row_correlation
+from sags_node.vision.watch.picture_fit import Fit, middle_of
 
 GAIN = np.array([1.2, 1.0, 0.8], np.float32)
 

@@ -16,20 +16,20 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
-from sags_node.vision.clarity import SMOKE
 from sags_node.vision.flow import OpticalFlow
-from sags_node.vision.judgement import Evidence, Judgement
 from sags_node.vision.landmarks import Landmarks, find_again, motion
-from sags_node.vision.palette import Palette
-from sags_node.vision.picture_fit import (
+from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
+from sags_node.vision.watch.clarity import SMOKE
+from sags_node.vision.watch.judgement import Evidence, Judgement
+from sags_node.vision.watch.palette import Palette
+from sags_node.vision.watch.picture_fit import (
     COVERED,
     FEWEST,
     GREEN,
     LEAST_MATCH,
     Fit,
 )
-from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, pyramids
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.standing import Debounced
 
 WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5
@@ -74,7 +74,7 @@ class Look(NamedTuple):
     clear: bool = True  # it is good in itself
 
 
-class SceneWatch:
+class SceneWatch(Debounced):
     """Compares every picture with the frame mapped last."""
 
     def __init__(self, moving: bool = False) -> None:
@@ -83,18 +83,13 @@ class SceneWatch:
             moving: the camera's pose is estimated: what shows another scene is left to that.
         """
         self._moving = moving
-        self._standing = Debounced()
+        super().__init__()
         self._since: dict[str, int] = {}  # stamps: how long something has lasted
         self._gain: F32 = np.ones(3, np.float32)  # of the frame before
         self._taken_out: F32 = np.ones(3, np.float32)
         self._palette = Palette()
         self._tissue: Bool | None = None  # [h, w] of the last clear frame
         self._is_clear = True  # the last frame was
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the pictures. May be read from any thread."""
-        return self._standing.findings
 
     def forget(self) -> None:
         """There is a new model."""
@@ -117,11 +112,11 @@ class SceneWatch:
         seen = look(pair, last, picture, self._tissue)
         if seen.wrong is _UNKNOWN and self._moving:
             self._is_clear = False
-            self._standing.update(now, [])
+            self.note(now, [])
             return judged
         if seen.wrong is not None:
             self._is_clear = False
-            self._standing.update(now, [seen.wrong])
+            self.note(now, [seen.wrong])
             lasts = self._lasts("scene", seen.wrong is _UNKNOWN and seen.clear, now)
             is_new = lasts >= NEW_SCENE_NS
             return replace(judged, hold="" if is_new else seen.wrong.text, is_new_scene=is_new)
@@ -129,12 +124,12 @@ class SceneWatch:
         veiled = not judged.learn
         if veiled or (seen.veiled and self._lasts("veil", True, now) < LONGEST_NS["veil"]):
             self._is_clear = False
-            self._standing.update(now, [] if veiled else [SMOKE])
+            self.note(now, [] if veiled else [SMOKE])
             return replace(judged, learn=False, guess=seen.guess)
         self._lasts("veil", False, now)
         cover = self._cover(seen, picture, now)
         self._is_clear = cover is None
-        self._standing.update(now, [] if cover is None else [_COVERED])
+        self.note(now, [] if cover is None else [_COVERED])
         gain = self._exposure(seen.gain, now)
         learn = gain is None or seen.whole
         return replace(judged, learn=learn, covered=cover, gain=gain, guess=seen.guess)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from sags_node.types import Finding
-from sags_node.vision.judgement import Evidence, Judgement
+from sags_node.vision.watch.judgement import Evidence, Judgement
 
 
 class PoseWatch:

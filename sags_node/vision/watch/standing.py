@@ -13,7 +13,7 @@ FEWEST = 2  # frames
 
 
 class Debounced:
-    """The findings of the last frames, and those of them that last.
+    """What watchers have in common: the findings of the last frames, and those of them that last.
 
     Attributes:
         findings: those that stand. May be read from any thread.
@@ -23,7 +23,7 @@ class Debounced:
         self.findings: tuple[Finding, ...] = ()
         self._frames: deque[tuple[int, tuple[Finding, ...]]] = deque()  # stamp, and what was found
 
-    def update(self, stamp_ns: int, found: Sequence[Finding]) -> None:
+    def note(self, stamp_ns: int, found: Sequence[Finding]) -> None:
         """Take what was found in one frame."""
         frames = self._frames
         if frames and stamp_ns < frames[-1][0]:  # the clock has jumped back

@@ -15,11 +15,11 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I8, Bool, Finding
-from sags_node.vision.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
-from sags_node.vision.judgement import Evidence, Judgement
-from sags_node.vision.picture_fit import middle_of
 from sags_node.vision.pyramid import BORDER, inner, pyramids
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
+from sags_node.vision.watch.judgement import Evidence, Judgement
+from sags_node.vision.watch.picture_fit import middle_of
+from sags_node.vision.watch.standing import Debounced
 
 CELLS = 40  # across the picture
 SMALLEST = 8  # px of the first half, the side of a cell: of fewer, the detail is chance
@@ -30,25 +30,20 @@ NOISE = 0.5  # grey levels: detail below it is a camera's noise
 LOST, BACK = 1.0, 0.5 * LOST_CONTRAST
 ALIKE = 5  # of a cell and the eight around it have lost it: drops are wider than a cell
 FEWEST = 6  # cells: the area of a drop whose radius is 3.5 % of the width
-VEIL = 0.5 * LOST  # of the median cell: something lies over the whole lens, see `vision.clarity`
+VEIL = 0.5 * LOST  # of the median cell: something lies over the whole lens, see `vision.watch.clarity`
 
 _TEXT = "drops or dirt on the {eye} lens hide some of the tissue, which is not learnt: clean the lens"
 _LEFT, _RIGHT = (Finding(f"{eye}_eye_drops", _TEXT.format(eye=eye)) for eye in ("left", "right"))
 
 
-class LensWatch:
+class LensWatch(Debounced):
     """Compares the eyes of every pair."""
 
     def __init__(self) -> None:
-        self._standing = Debounced()
+        super().__init__()
         self._stamp_ns: int | None = None
         self._usual: F32 | None = None  # octaves of the left eye over the right one, of each cell
         self._hidden: I8 = np.zeros((1, 1), np.int8)  # -1: from the left eye, 1: from the right one
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the lenses, and how to fix it. May be read from any thread."""
-        return self._standing.findings
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
         """The depth of the frame mapped last says where tissue is in the right picture."""
@@ -58,7 +53,7 @@ class LensWatch:
         left, right = pyramids(pair)
         sound = judged.learn and not (judged.hold or judged.no_stereo or evidence.eyes_are_late)
         if right is None or not sound or judged.is_new_scene:
-            self._standing.update(pair.t_capture_ns, [])
+            self.note(pair.t_capture_ns, [])
             return judged
         height, width = inner(left.halves[0]).shape
         side = max(SMALLEST, round(width / CELLS))  # px of the first half
@@ -79,12 +74,12 @@ class LensWatch:
         off = apart - self._usual
         if abs(middle_of(off[apart != 0])) > VEIL:
             self._usual = (self._usual + share * off).clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
-            self._standing.update(pair.t_capture_ns, [])
+            self.note(pair.t_capture_ns, [])
             return judged
         covered = np.zeros((2, rows, columns), np.bool_)
         counts = _judge(apart, last.observation.tissue, 2 * side, share, self._usual, self._hidden, covered)
         many = [count >= FEWEST for count in counts]
-        self._standing.update(
+        self.note(
             pair.t_capture_ns, [found for found, is_so in zip((_LEFT, _RIGHT), many, strict=True) if is_so]
         )
         hidden = (mask if is_so else None for mask, is_so in zip(covered, many, strict=True))

@@ -18,7 +18,7 @@ from sags_node.types import Finding, GrayPyramid
 from sags_node.vision.alignment import RowErrors
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.pyramid import inner, narrowed
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.standing import Debounced
 
 STRIDE = 4  # px
 WINDOW_NS = 200_000_000  # of the motion that is compared with row errors
@@ -59,7 +59,7 @@ class _Sums(NamedTuple):
         return self.product / math.sqrt(self.motion * self.matches) if self.motion > 0 else 0.0
 
 
-class MatchWatch:
+class MatchWatch(Debounced):
     """Looks at every field of matches. They may be farther apart than flow can follow: the motion is that
     since a frame shortly before, which need not have been matched.
 
@@ -69,18 +69,13 @@ class MatchWatch:
 
     def __init__(self) -> None:
         self.is_late = False
-        self._standing = Debounced()
+        super().__init__()
         self._flow = OpticalFlow(STRIDE)
         self._seen: deque[tuple[int, GrayPyramid]] = deque()  # stamps and left pictures of the last frames
         self._sums: deque[_Sums] = deque()
         self._median: float | None = None  # px, usual
         self._matched: float | None = None  # usual share
         self._stamp_ns: int | None = None
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the eyes, and how to fix it. May be read from any thread."""
-        return self._standing.findings
 
     def see(self, stamp_ns: int, left: GrayPyramid) -> None:
         """Take the left picture of a frame, whether it is matched or not."""
@@ -105,7 +100,7 @@ class MatchWatch:
             found.append(_KNOCKED)
         else:
             self._median += share * (median - self._median)
-        self._standing.update(stamp_ns, found)
+        self.note(stamp_ns, found)
         usual, self._matched = self._matched, self._matched + share * (matched - self._matched)
         if found:
             return found[0].text

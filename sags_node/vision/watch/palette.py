@@ -11,7 +11,7 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, U8, Bool
-from sags_node.vision.picture_fit import BRIGHT, DARK, FINE
+from sags_node.vision.watch.picture_fit import BRIGHT, DARK, FINE
 
 BINS = 32  # of the share of red in a colour, and of green
 RARE = 0.002  # of the tissue has a colour like this, or less

@@ -3,7 +3,7 @@
 A camera never gives the same picture twice: its noise differs. A capture card or a scope's processor that
 lost its input repeats the last one, often under a caption that goes on: a clock, a dot. A codec on the way
 sends it anew with each key frame, equal up to quantisation. Where both eyes take that way, neither tells of
-the other (`vision.pair_watch`). Recordings may repeat pictures: nobody takes them for the present.
+the other (`vision.watch.pair_watch`). Recordings may repeat pictures: nobody takes them for the present.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from sags_node.types import F32, U8, Bool, Finding
-from sags_node.vision.judgement import Evidence, Judgement
+from sags_node.vision.watch.judgement import Evidence, Judgement
 
 LONGEST_NS = 300_000_000  # what converts frame rates repeats a picture for 0.1 s at most (10 Hz given as 30)
 LONGEST_STILL_NS = 2_000_000_000  # tissue that lives moves within a heartbeat, or a breath

@@ -8,7 +8,7 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import U8
-from sags_node.vision.picture_fit import GREEN
+from sags_node.vision.watch.picture_fit import GREEN
 
 BLOCK = 8  # px: of JPEG and its kin
 EVERY = 16  # rows

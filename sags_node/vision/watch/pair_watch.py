@@ -15,11 +15,11 @@ import numpy as np
 
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
-from sags_node.vision.blocks import is_blocky
-from sags_node.vision.clarity import LENS, SMOKE, Clarity, mean_difference, structure
-from sags_node.vision.judgement import Evidence, Judgement
 from sags_node.vision.pyramid import pyramids
-from sags_node.vision.standing import Debounced
+from sags_node.vision.watch.blocks import is_blocky
+from sags_node.vision.watch.clarity import LENS, SMOKE, Clarity, mean_difference, structure
+from sags_node.vision.watch.judgement import Evidence, Judgement
+from sags_node.vision.watch.standing import Debounced
 
 WIDTH = 80  # px of the small pictures
 BLACK = 20.0  # grey levels; video that keeps its black at 16 too
@@ -64,18 +64,13 @@ class Small(NamedTuple):
     gray: F32  # [h, w]
 
 
-class PairWatch:
+class PairWatch(Debounced):
     """Looks at every pair of a source."""
 
     def __init__(self) -> None:
-        self._standing = Debounced()
+        super().__init__()
         self._clarity = Clarity()
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the eyes, and how to fix it. May be read from any thread."""
-        return self._standing.findings
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
         """Without its left picture a frame is held; without its right one nothing is matched."""
@@ -84,7 +79,7 @@ class PairWatch:
         learn = not any(code.startswith("picture") for code, _ in found)
         if is_blocky(frame.left):  # learnt all the same: on D4D leaving it out cost more than it spared
             found = [*found, _COMPRESSED]
-        self._standing.update(frame.t_capture_ns, found)
+        self.note(frame.t_capture_ns, found)
         hold, no_stereo = judged.hold, judged.no_stereo
         for code, text in found:
             if code.startswith("left") or code == _EXCHANGED.code:
