@@ -26,6 +26,7 @@ from sags_node.messaging import topics
 from sags_node.messaging.address import Address, ClientKeys, Clock, NodeAddress, found
 from sags_node.messaging.freshness import Freshness, StaleError
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
+from sags_node.messaging.sockets import Closes
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
 from sags_node.workers import go_on
@@ -307,7 +308,7 @@ class Receiver:
         self._resources.close()
 
 
-class Subscriber(Receiver):
+class Subscriber(Receiver, Closes):
     """Receives topics in the background; `latest`, `read`, `wait` and `aligned` give what has come.
 
     Arguments and errors: see `Receiver`. Any number of threads may ask.
@@ -332,9 +333,3 @@ class Subscriber(Receiver):
         wanted = list(names)
         with self._arrived:
             return self._arrived.wait_for(lambda: self._frame(wanted, stamp_ns), timeout)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
