@@ -30,7 +30,7 @@ from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import NO_RIGHT_EYE
 from sags_node.overlay import draw as overlay_draw
 from sags_node.overlay.draw import Body, Placed
-from sags_node.overlay.durations import Durations
+from sags_node.overlay.durations import REMEMBERED, Durations
 from sags_node.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.overlay.held import HeldObject, Pinner
 from sags_node.overlay.mesh import mesh_of
@@ -236,13 +236,7 @@ class _Overlay:
         node = self._subscriber
         lost = [] if node is None else [node.lost(name) for name in NEEDED if node.latest(name) is not None]
         return {
-            "frames": self._frames,
-            "overlay": self._frames - self._blanked.total(),
-            "blanked": dict(self._blanked),
-            "latency_ms": self._latency_ms.percentiles(),
-            "draw_ms": self._draw_ms.percentiles(),
-            "freezes": self._freezes.status(),
-            "objects": [held.status() for held in self._objects],
+            **self._figures(),
             "lost": sum(lost),
             "endpoints": self._stream.endpoints,
             "saved": self._output.saved,
@@ -339,18 +333,24 @@ class _Overlay:
 
     # ---- what is said --------------------------------------------------------------------------------------
 
-    def _facts(self) -> dict[str, Any]:
+    def _figures(self, recent: int = REMEMBERED) -> dict[str, Any]:
+        """What was shown; durations of the newest `recent` frames, or of all."""
         return {
             "frames": self._frames,
             "overlay": self._frames - self._blanked.total(),
             "blanked": dict(self._blanked),
-            "latency_ms": self._latency_ms.percentiles(RECENT),
-            "draw_ms": self._draw_ms.percentiles(RECENT),
+            "latency_ms": self._latency_ms.percentiles(recent),
+            "draw_ms": self._draw_ms.percentiles(recent),
             "freezes": self._freezes.status(),
+            "objects": [held.status() for held in self._objects],
+        }
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            **self._figures(RECENT),
             "max_age": self._options.max_age,
             "clock": None if self._clock is None else self._clock.status(),
             "no_right_eye": self._right or None,
-            "objects": [held.status() for held in self._objects],
             "warning_codes": self._warnings,
         }
 
