@@ -146,7 +146,7 @@ def _given(endpoint: str, keys: ClientKeys | None) -> Address:
 
 
 def _known(endpoint: str, node_key: str | None, keys: ClientKeys | None) -> Address:
-    if endpoint.startswith("ipc:") or node_key is keys is None:
+    if endpoint.startswith("ipc:") or (node_key is None and keys is None):
         return Address(endpoint)
     if keys is None:
         raise UsageError(f"{endpoint} wants a key: {_HOW}")
