@@ -21,10 +21,10 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9489,
+    "benchmarks": 9490,
     "sags_lab": 4958,
     "sags_node": 1726,
-    "sags_node/bridge": 2638,
+    "sags_node/bridge": 2597,
     "sags_node/calibration": 1846,
     "sags_node/cli": 3087,
     "sags_node/config": 1357,
@@ -38,10 +38,10 @@ LINES = {
     "sags_node/kernels": 1314,
     "sags_node/mapping": 5683,
     "sags_node/media": 718,
-    "sags_node/messaging": 5087,
+    "sags_node/messaging": 5084,
     "sags_node/model": 960,
     "sags_node/node": 1425,
-    "sags_node/overlay": 2230,
+    "sags_node/overlay": 2208,
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 825,
     "sags_node/recording": 2600,
@@ -49,9 +49,9 @@ LINES = {
     "sags_node/ros": 332,
     "sags_node/sources": 5606,
     "sags_node/terminal": 338,
-    "sags_node/viewer": 1042,
+    "sags_node/viewer": 1008,
     "sags_node/vision": 5454,
-    "tests": 45930,
+    "tests": 45903,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -106,6 +106,7 @@ class Receiver:
         self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
         self._socket: zmq.Socket[bytes] | None = None  # before there is a node
+        self._address: Address | None = None
         if may_be_absent and endpoint is None:
             self._look_for_node()
             if self.refusal is not None:
@@ -127,7 +128,7 @@ class Receiver:
     @property
     def endpoint(self) -> str:
         """Where the node is, or was when it was last heard of; empty before that."""
-        return "" if self._socket is None else self._address.endpoint
+        return "" if self._address is None else self._address.endpoint
 
     # ---- what has come ---------------------------------------------------------------------------------
 
@@ -259,6 +260,7 @@ class Receiver:
         self._socket, self._watch = resources.enter_context(data_socket(address, prefixes))
         self._resources.close()
         self._resources, self._address, self._subscribed = resources, address, asked
+        self.refusal = None  # what the one before had against this client
 
     def _receive_next(self) -> None:
         if self._socket is None:
@@ -288,7 +290,7 @@ class Receiver:
         try:
             address = self._find()
             self.absent = None
-            if self._socket is None or address != self._address:
+            if address != self._address:
                 self._connect(address)
         except UsageError as error:  # the new one wants keys, or wants none any more
             self.refusal = str(error)

@@ -14,6 +14,7 @@ from typing import Self
 
 import msgspec
 import pytest
+from keyed_node import make_keys, node
 from places import HELPERS
 from ports import free_port
 from synthetic import publisher, stream
@@ -153,3 +154,17 @@ def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> Non
         until(lambda: "wants a key" in str(subscriber.problem("tf")))
         with pytest.raises(UsageError, match="wants a key"):
             asker.request("ping")
+
+
+def test_a_subscriber_that_may_begin_before_its_node_says_what_is_missing(tmp_path: Path) -> None:
+    run_dir, keys = tmp_path / "run", make_keys(tmp_path / "keys")
+    with Subscriber(["tf"], run_dir=run_dir, may_be_absent=True) as subscriber:
+        assert "no node runs as 'sags'" in str(subscriber.problem("tf")) and not subscriber.endpoint
+        with node(run_dir, keys, ipc=False):
+            until(lambda: "wants a key" in str(subscriber.problem("tf")))
+        with node(run_dir):
+            until(lambda: subscriber.ok("tf"))
+            assert subscriber.refusal is None
+        until(lambda: "no node runs as 'sags'" in str(subscriber.problem("tf")))
+        with node(run_dir, keys, ipc=False), pytest.raises(UsageError, match="wants a key"):
+            Subscriber(["tf"], run_dir=run_dir, may_be_absent=True)
