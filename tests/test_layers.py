@@ -21,10 +21,10 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9212,
+    "benchmarks": 9213,
     "sags_lab": 5032,
     "sags_node": 1680,
-    "sags_node/bridge": 2638,
+    "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
     "sags_node/cli": 3082,
     "sags_node/config": 1352,
@@ -38,10 +38,10 @@ LINES = {
     "sags_node/kernels": 1222,
     "sags_node/mapping": 5587,
     "sags_node/media": 718,
-    "sags_node/messaging": 5087,
+    "sags_node/messaging": 5084,
     "sags_node/model": 960,
     "sags_node/node": 1425,
-    "sags_node/overlay": 2230,
+    "sags_node/overlay": 2208,
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 840,
     "sags_node/recording": 2600,
@@ -49,9 +49,9 @@ LINES = {
     "sags_node/ros": 332,
     "sags_node/sources": 5606,
     "sags_node/terminal": 335,
-    "sags_node/viewer": 1041,
+    "sags_node/viewer": 1007,
     "sags_node/vision": 5462,
-    "tests": 45039,
+    "tests": 45012,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -34,9 +34,10 @@ from benchmarks.node.processes import descriptors, threads
 from sags_node.errors import SagsError
 from sags_node.evaluation.metrics import psnr
 from sags_node.evaluation.provenance import machine_name
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freezes import Freezes
 from sags_node.messaging.received import ReceivedImage, TopicName
-from sags_node.messaging.stream import listen
+from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, Meta
 from sags_node.processes import end, resident_mb
@@ -172,7 +173,7 @@ def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: A
 def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iterator[None]:
     """Each published frame after the first seconds is added to `heard`."""
     begun = last = time.monotonic()
-    messages = listen((EACH_FRAME,), None, neighbours.NS, None, run_dir=run_dir, high_water=HIGH_WATER)
+    messages = listen_to(NodeAddress(neighbours.NS, run_dir=run_dir), (EACH_FRAME,), None, HIGH_WATER)
     with closing(messages):
         for arrived in messages:
             now = time.monotonic()

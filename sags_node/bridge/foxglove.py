@@ -220,38 +220,21 @@ class _Way(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
 class _Messages:
-    """The node's own messages."""
+    """One message for each that comes: the node's own, or its status as JSON."""
 
-    def __init__(self, output: Output, context: foxglove.Context) -> None:
-        topic = topics.find(output.sources[0].topic)
-        assert topic is not None  # `outputs` takes them from there
-        text = cdr.definition(topic.type).encode()
-        schema = foxglove.Schema(name=topic.type, encoding="ros2msg", data=text)
-        self._channel = foxglove.Channel(output.name, schema=schema, message_encoding="cdr", context=context)
+    channel: foxglove.Channel
+    made_of: Callable[[Received], bytes | str]
+    empty_of: Callable[[Received, int, str], bytes | str | None]
 
     def show(self, received: Received, grown: bool) -> None:
-        self._channel.log(received.ros(), log_time=received.stamp_ns)
+        self.channel.log(self.made_of(received), log_time=received.stamp_ns)
 
     def blank(self, shown: Received, reason: str) -> None:
         now_ns = time.time_ns()
-        empty = empty_of(shown, now_ns, reason)
-        if empty is not None:
-            self._channel.log(empty, log_time=now_ns)
-
-
-class _Figures:
-    """The node's status as JSON."""
-
-    def __init__(self, output: Output, context: foxglove.Context) -> None:
-        self._channel = foxglove.Channel(output.name, schema={"type": "object"}, context=context)
-
-    def show(self, received: Received, grown: bool) -> None:
-        assert isinstance(received, ReceivedText)  # so is the topic's type
-        self._channel.log(received.text, log_time=received.stamp_ns)
-
-    def blank(self, shown: Received, reason: str) -> None:
-        self._channel.log(silent(reason), log_time=time.time_ns())
+        if (empty := self.empty_of(shown, now_ns, reason)) is not None:
+            self.channel.log(empty, log_time=now_ns)
 
 
 class _Video:
@@ -281,7 +264,19 @@ class _Video:
 def _way(output: Output, context: foxglove.Context) -> _Way:
     if output.name.endswith(VIDEO):
         return _Video(output, context)
-    return (_Figures if output.name.endswith(FIGURES) else _Messages)(output, context)
+    if output.name.endswith(FIGURES):
+        channel = foxglove.Channel(output.name, schema={"type": "object"}, context=context)
+        return _Messages(channel, _text_of, lambda shown, now_ns, reason: silent(reason))
+    topic = topics.find(output.sources[0].topic)
+    assert topic is not None  # `outputs` takes them from there
+    schema = foxglove.Schema(name=topic.type, encoding="ros2msg", data=cdr.definition(topic.type).encode())
+    channel = foxglove.Channel(output.name, schema=schema, message_encoding="cdr", context=context)
+    return _Messages(channel, Received.ros, empty_of)
+
+
+def _text_of(received: Received) -> str:
+    assert isinstance(received, ReceivedText)  # so is the topic's type
+    return received.text
 
 
 def _served(

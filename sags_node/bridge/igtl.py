@@ -28,7 +28,6 @@ HEADER_BYTES = 58
 MAX_BODY_BYTES = 65536  # of what peers send: requests and points
 OK, NOT_READY = 1, 13  # codes of STATUS
 NONE = "none"  # the name of the point that stands for none
-_HEADER = struct.Struct(">H12s20sIIQQ")
 _BAD_BYTES = (struct.error, ValueError, TypeError, IndexError)  # what pyigtl raises for a stranger's body
 
 
@@ -86,17 +85,6 @@ def string(device: str, seconds: float, words: str) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
-    """What comes before each message."""
-
-    version: int
-    kind: str
-    device: str
-    body_bytes: int
-    crc: int
-
-
-@dataclass(frozen=True, slots=True)
 class Said:
     """What a peer sent."""
 
@@ -106,38 +94,33 @@ class Said:
     points: tuple[tuple[str, F64], ...] = ()  # of POINT: name, place [3] mm
 
 
-def header(raw: bytes) -> Header | None:
-    """The header in 58 bytes from anybody; None when it is none, or announces too much."""
-    version, kind, device, _, _, body_bytes, crc = _HEADER.unpack(raw)
-    if not 1 <= version <= 3 or body_bytes > MAX_BODY_BYTES:
-        return None
+def header(raw: bytes) -> dict[str, Any] | None:
+    """The fields of the header in 58 bytes from anybody, see `MessageBase.parse_header`, and its `crc`; None
+    when it is none, or announces too much."""
     try:
-        names = [name.rstrip(b"\0 ").decode("ascii") for name in (kind, device)]
+        fields: dict[str, Any] = MessageBase.parse_header(raw)
     except UnicodeDecodeError:
         return None
-    return Header(version, names[0], names[1], body_bytes, crc)
-
-
-def said(head: Header, body: bytes) -> Said | None:
-    """What a message says, if it is a STRING or a POINT; None for other kinds and for damaged ones."""
-    if head.kind not in ("STRING", "POINT") or CRC64(body) != head.crc:
+    if not 1 <= fields["header_version"] <= 3 or fields["body_size"] > MAX_BODY_BYTES:
         return None
-    message: Any = StringMessage() if head.kind == "STRING" else PointMessage()
-    fields = {
-        "header_version": head.version,
-        "message_type": head.kind,
-        "device_name": head.device,
-        "timestamp": 0.0,
-    }
+    return fields | {"crc": int.from_bytes(raw[-8:])}
+
+
+def said(head: dict[str, Any], body: bytes) -> Said | None:
+    """What a message says, if it is a STRING or a POINT; None for other kinds and for damaged ones."""
+    kind, device = head["message_type"], head["device_name"]
+    if kind not in ("STRING", "POINT") or CRC64(body) != head["crc"]:
+        return None
+    message: Any = MessageBase.create_message(kind)
     try:
-        message.unpack(fields, body)
+        message.unpack(head, body)
     except _BAD_BYTES:
         return None
-    if head.kind == "STRING":
-        return Said(head.kind, head.device, text=message.string)
+    if kind == "STRING":
+        return Said(kind, device, text=message.string)
     places = [np.array(place, np.float64) for place in message.positions]
     named = zip(message.names, places, strict=True)
-    return Said(head.kind, head.device, points=tuple((n, p) for n, p in named if np.isfinite(p).all()))
+    return Said(kind, device, points=tuple((n, p) for n, p in named if np.isfinite(p).all()))
 
 
 def _packed(message: MessageBase) -> bytes:

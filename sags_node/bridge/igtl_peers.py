@@ -137,7 +137,7 @@ class Peers:
         """Take in what a peer says until it has gone; False when it speaks another language."""
         with suppress(asyncio.IncompleteReadError, OSError):
             while (head := igtl.header(await reader.readexactly(igtl.HEADER_BYTES))) is not None:
-                heard = igtl.said(head, await reader.readexactly(head.body_bytes))
+                heard = igtl.said(head, await reader.readexactly(head["body_size"]))
                 if heard is not None:
                     self._hear(heard)
             return False

@@ -146,14 +146,12 @@ def _given(endpoint: str, keys: ClientKeys | None) -> Address:
 
 
 def _known(endpoint: str, node_key: str | None, keys: ClientKeys | None) -> Address:
-    if endpoint.startswith("ipc:"):
+    if endpoint.startswith("ipc:") or (node_key is None and keys is None):
         return Address(endpoint)
-    if node_key is None and keys is not None:
-        raise UsageError(f"{endpoint} is not encrypted; leave out --key, or set publish.key for the node")
-    if node_key is not None and keys is None:
+    if keys is None:
         raise UsageError(f"{endpoint} wants a key: {_HOW}")
-    if node_key is None or keys is None:
-        return Address(endpoint)
+    if node_key is None:
+        raise UsageError(f"{endpoint} is not encrypted; leave out --key, or set publish.key for the node")
     return Address(endpoint, ClientKeys(keys.own, keys.node or node_key.encode()))
 
 

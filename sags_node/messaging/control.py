@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
-from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -21,7 +20,7 @@ from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connec
 from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, RateLimitedLog
-from sags_node.messaging.sockets import waiting
+from sags_node.messaging.sockets import Closes, Took, waiting
 from sags_node.messaging.wire import PROTOCOL
 
 MAX_REQUEST_BYTES = 65536  # per part
@@ -40,7 +39,6 @@ ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls who has no key
 PLAIN = Client("a client without a key")  # it came in all the same, so it may do everything
 
 Handler = Callable[[dict[str, Any]], Any]
-Took = Callable[[int, int], None]
 Identifier = int | Annotated[str, msgspec.Meta(max_length=128)] | None
 
 log = logging.getLogger(__name__)
@@ -73,6 +71,13 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     retry_after_s: float | None = None  # of "too_often"
 
 
+def refused(
+    identifier: Identifier, error: str, code: str | None = None, retry_after_s: float | None = None
+) -> Reply:
+    """Say why a request is not carried out."""
+    return Reply(PROTOCOL, identifier, False, None, error, code, retry_after_s)
+
+
 # What msgspec raises for bytes of a stranger: too deep, not hashable as a key, bad UTF-8 or a bad value.
 _BAD_BYTES = (msgspec.MsgspecError, UnicodeError, RecursionError, TypeError, ValueError)
 
@@ -99,7 +104,7 @@ class ControlServer:
     A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
 
     Args:
-        took: called with the file descriptor of a peer and the bytes of each request read from it.
+        took: is told what was read of whom.
         gate: who came through it with which key.
 
     Attributes:
@@ -110,7 +115,7 @@ class ControlServer:
         self,
         socket: zmq.Socket[bytes],
         handlers: Mapping[str, Handler],
-        took: Took = lambda *_: None,
+        took: Took | None = None,
         gate: Gate = Gate(),  # noqa: B008  it is frozen
     ) -> None:
         self._socket = socket
@@ -130,9 +135,8 @@ class ControlServer:
 
     def serve(self) -> None:
         """Answer what has arrived and what has been finished, without waiting."""
-        for frames in waiting(self._socket, MAX_REQUESTS_AT_ONCE, MAX_REQUEST_PARTS):
-            *envelope, body = parts = [frame.bytes for frame in frames]
-            self._took(int(frames[-1].get(zmq.SRCFD)), sum(map(len, parts)))
+        for frames in waiting(self._socket, MAX_REQUESTS_AT_ONCE, MAX_REQUEST_PARTS, self._took):
+            *envelope, body = (frame.bytes for frame in frames)
             if len(envelope) in (1, 2):
                 self._handle(self._sender(frames[-1], envelope), body)
         now = time.monotonic()
@@ -156,9 +160,9 @@ class ControlServer:
         try:
             request = self._request.decode(body)
         except _BAD_BYTES as error:
-            self._send(sender, Reply(PROTOCOL, None, False, error=f"not a request: {error}"))
+            self._send(sender, refused(None, f"not a request: {error}"))
             return
-        too_late = Reply(PROTOCOL, request.id, False, error=TOO_LATE) if request.left <= 0 else None
+        too_late = refused(request.id, TOO_LATE) if request.left <= 0 else None
         refusal = too_late or self._refusal(sender, request)
         if refusal is not None:
             self._send(sender, refusal)
@@ -168,18 +172,17 @@ class ControlServer:
 
     def _refusal(self, sender: _Sender, request: Request) -> Reply | None:
         """What speaks against a request, before it is looked at further."""
-        refused = partial(Reply, PROTOCOL, request.id, False)
         wait = self._rate.wait(sender.id)
         if wait:
             self._count("requests_too_often", sender, request.op)
             text = f"{RATE:g} requests a second of one client are answered; ask again in {wait:.3f} s"
-            return refused(error=text, code="too_often", retry_after_s=wait)
+            return refused(request.id, text, "too_often", wait)
         if request.op not in self._handlers:
             known = ", ".join(sorted(self._handlers))
-            return refused(error=f"unknown op '{request.op}'; this node knows: {known}")
+            return refused(request.id, f"unknown op '{request.op}'; this node knows: {known}")
         client = sender.client
         if client is None:
-            return refused(error="this key is no longer in publish.allow", code="not_allowed")
+            return refused(request.id, "this key is no longer in publish.allow", "not_allowed")
         if not client.may(request.op):
             self._count("requests_not_allowed", sender, request.op)
             role = needed(request.op)
@@ -187,10 +190,10 @@ class ControlServer:
                 f"{request.op} takes the role '{role}', and {client.name} has '{client.role}'; "
                 f"move {client.name}.pub into the folder '{role}' of the node's publish.allow"
             )
-            return refused(error=text, code="not_allowed")
+            return refused(request.id, text, "not_allowed")
         of_sender = sum(waiting.id == sender.id for waiting, *_ in self._pending)
         if len(self._pending) >= MAX_PENDING or of_sender >= MAX_PENDING_OF_ONE:
-            return refused(error="too many requests are waiting for an answer; try again later")
+            return refused(request.id, "too many requests are waiting for an answer; try again later")
         return None
 
     def _count(self, why: str, sender: _Sender, op: str) -> None:
@@ -205,16 +208,15 @@ class ControlServer:
             result = work()
             if isinstance(result, Future):
                 self._pending.append((sender, identifier, result, until))
-                return
-            self._send(sender, Reply(PROTOCOL, identifier, True, result=result))
+            else:
+                self._send(sender, Reply(PROTOCOL, identifier, True, result=result))
         except SagsError as error:
-            self._send(sender, Reply(PROTOCOL, identifier, False, error=str(error)))
+            self._send(sender, refused(identifier, str(error)))
         except CancelledError:
-            self._send(sender, Reply(PROTOCOL, identifier, False, error=TOO_LATE))
+            self._send(sender, refused(identifier, TOO_LATE))
         except Exception as error:  # a request must not end the node
             log.exception("a control request failed")
-            text = f"internal error: {type(error).__name__}: {error}"
-            self._send(sender, Reply(PROTOCOL, identifier, False, error=text))
+            self._send(sender, refused(identifier, f"internal error: {type(error).__name__}: {error}"))
 
     def _send(self, sender: _Sender, reply: Reply) -> None:
         body = msgspec.msgpack.encode(reply)
@@ -224,7 +226,7 @@ class ControlServer:
             log.debug("a reply was not sent: %s", error)
 
 
-class ControlClient:
+class ControlClient(Closes):
     """Asks the node; one request at a time, from one thread.
 
     A node that is restarted is followed, to another port, too, when it was found by its connection file.
@@ -330,9 +332,3 @@ class ControlClient:
 
     def close(self) -> None:
         self._context.destroy(linger=0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -169,12 +169,9 @@ class Inbox:
     def _waiting(self) -> list[tuple[_Sender, Message, int]]:
         """What has come, in its order; of each sender's topics the newest."""
         came: list[tuple[_Sender, Message, int]] = []
-        for identity, *frames in waiting(self._socket, MOST_AT_ONCE, wire.MAX_PARTS + 1):
+        for identity, *frames in waiting(self._socket, MOST_AT_ONCE, wire.MAX_PARTS + 1, self._peers.took):
             arrival_ns = time.time_ns()
             sender = self._sender(identity.bytes)
-            if frames:
-                size = sum(len(frame.buffer) for frame in frames)
-                self._peers.took(int(frames[-1].get(zmq.SRCFD)), size)
             try:
                 came.append((sender, wire.decode([frame.buffer for frame in frames]), arrival_ns))
             except wire.WireError as error:

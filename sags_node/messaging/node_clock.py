@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, Self
 from sags_node.errors import SagsError
 from sags_node.messaging.address import ClientKeys, NodeAddress
 from sags_node.messaging.control import ControlClient
+from sags_node.messaging.sockets import Closes
 from sags_node.workers import go_on
 
 DRIFT = 500e-6  # s/s between two clocks, at most: NTP slews by no more (RFC 5905), quartz drifts by a tenth
@@ -87,7 +88,7 @@ class OffsetEstimate:
         return self._between[0] - drifted, self._between[1] + drifted
 
 
-class NodeClock:
+class NodeClock(Closes):
     """Follows the clock of a node's machine, from a thread of its own. Any thread may ask.
 
     Args:
@@ -178,12 +179,6 @@ class NodeClock:
         """End the thread."""
         self._stopping.set()
         self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def stamps() -> dict[str, int]:

@@ -40,6 +40,19 @@ class _Peer:
     taken: int = 0  # bytes of its messages that the node has read
     expelled: bool = False
 
+    @property
+    def is_local(self) -> bool:
+        """Whether it came by ipc, so that it is a process of the same user."""
+        return self.connection.family == sockets.AF_UNIX
+
+    @property
+    def sent(self) -> int:
+        """Bytes that a tcp peer has sent so far; 0 for ipc."""
+        if self.is_local:
+            return 0
+        info = self.connection.getsockopt(sockets.IPPROTO_TCP, sockets.TCP_INFO, _BYTES_RECEIVED + 8)
+        return int(struct.unpack_from("=Q", info, _BYTES_RECEIVED)[0])
+
 
 class Peers:
     """Follows the connections of one bound socket, from a thread of its own.
@@ -122,14 +135,14 @@ class Peers:
         now = time.monotonic()
         for peer in self._open.values():
             allowed = self._max_untaken + peer.taken + SMALL_TALK * (now - peer.since)
-            if not peer.expelled and _bytes_received(peer.connection) > allowed:
+            if not peer.expelled and peer.sent > allowed:
                 self._expel(peer, "flooding")
                 self._closed_until = now + QUARANTINE
 
     def _expel_all(self) -> None:
         """Nothing tells which key a connection came with: each has to show it anew."""
         for peer in self._open.values():
-            if not peer.expelled and peer.connection.family != sockets.AF_UNIX:
+            if not peer.expelled and not peer.is_local:
                 self._expel(peer, "renewed")
 
     def _note(self, event: int, value: int) -> None:
@@ -141,7 +154,7 @@ class Peers:
             except OSError:
                 return  # it has gone already
             self._open[value] = peer
-            closed = peer.since < self._closed_until and peer.connection.family != sockets.AF_UNIX
+            closed = peer.since < self._closed_until and not peer.is_local
             if closed or len(self._open) > MAX_PEERS:
                 self._expel(peer, "too_many")
         elif event == zmq.EVENT_DISCONNECTED:
@@ -163,7 +176,7 @@ class Peers:
             peer.connection.shutdown(sockets.SHUT_RDWR)
         except OSError:
             return  # it has gone by itself
-        if peer.connection.family != sockets.AF_UNIX:
+        if not peer.is_local:
             # After a shutdown Linux still reads what a tcp peer goes on sending. To connect to no address
             # (AF_UNSPEC) resets the connection.
             _libc.connect(peer.connection.fileno(), bytes(_ADDRESS_BYTES), _ADDRESS_BYTES)
@@ -171,11 +184,3 @@ class Peers:
     def _log(self) -> None:
         if self._seldom.due():
             log.warning("%s socket: connections refused since the start: %s", self._name, self.counts())
-
-
-def _bytes_received(connection: sockets.socket) -> int:
-    """What a tcp peer has sent so far; 0 for ipc, whose peers are processes of the same user."""
-    if connection.family == sockets.AF_UNIX:
-        return 0
-    info = connection.getsockopt(sockets.IPPROTO_TCP, sockets.TCP_INFO, _BYTES_RECEIVED + 8)
-    return int(struct.unpack_from("=Q", info, _BYTES_RECEIVED)[0])

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import msgspec
 import zmq
@@ -22,7 +22,7 @@ from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.rundir import Connection, RunDirectory
 from sags_node.messaging.security import Gate, RateLimitedLog, authenticated, check_endpoint
-from sags_node.messaging.sockets import bind, limit, waiting
+from sags_node.messaging.sockets import Closes, bind, limit, waiting
 from sags_node.messaging.wire import PROTOCOL, Message, Meta, encode
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair
 
@@ -44,17 +44,17 @@ LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a
 
 
 @dataclass(frozen=True, slots=True)
-class _Kept:
-    """The last value of a topic, for those who subscribe later."""
+class _Value:
+    """What is sent of a topic, once or again for those who subscribe later."""
 
     body: Content
     stamp_ns: int
     frame_id: int = -1
-    epoch: int | None = None
+    epoch: int | None = None  # None: that of the last frame
     ahead_ns: int = 0
 
 
-class Publisher:
+class Publisher(Closes):
     """Publishes frames and health, and answers control requests.
 
     A topic is encoded only while somebody subscribes to it. Nothing here ever waits for a peer: one that
@@ -105,7 +105,7 @@ class Publisher:
         self._last: FrameResult | None = None
         self._dropped = 0
         self._pictured = -1  # the newest frame whose picture went before its result
-        self._kept: dict[str, _Kept] = {}  # last values that no `FrameResult` holds
+        self._kept: dict[str, _Value] = {}  # last values that no `FrameResult` holds
         self._peers: dict[str, Peers] = {}
         self._resources = ExitStack()
         self._run = RunDirectory(config.run_dir, ns)
@@ -173,8 +173,8 @@ class Publisher:
         self._pictured = pair.frame_id
         self._seq[EARLY_PICTURE] += 1
         if self.wanted(EARLY_PICTURE):
-            body = content.left_image(pair)
-            self._send(EARLY_PICTURE, body, pair.frame_id, pair.t_capture_ns, epoch)
+            picture = content.left_image(pair)
+            self._send(EARLY_PICTURE, _Value(picture, pair.t_capture_ns, pair.frame_id, epoch))
 
     def publish_result(self, result: FrameResult, dropped: int) -> None:
         """Send one frame's topics to those who asked; `dropped` counts the frames the node left out."""
@@ -202,22 +202,23 @@ class Publisher:
     ) -> None:
         """Send what was made elsewhere, e.g. recorded; the topic `name` (without namespace) may be any."""
         self._seq[name] = self._seq.get(name, 0) + 1
-        topic = topics.find(name)
+        topic, value = topics.find(name), _Value(body, stamp_ns, frame_id, epoch, ahead_ns)
         if topic is not None and topic.cached:
-            self._kept[name] = _Kept(body, stamp_ns, frame_id, epoch, ahead_ns)
-        self._send(name, body, frame_id, stamp_ns, epoch, ahead_ns)
+            self._kept[name] = value
+        self._send(name, value)
 
     def publish_view(self, name: str, drawn: DrawnView) -> None:
         """Send the topics of the view `name` to those who asked for them."""
         shown, ahead_ns = next(iter(drawn.eyes.values())), round(drawn.ahead_s * 1e9)
         for topic, body in content.view(name, drawn).items():
             self._seq[topic] = self._seq.get(topic, self._view_seq) + 1
+            value = _Value(body, shown.t_capture_ns, shown.frame_id, drawn.epoch, ahead_ns)
             if drawn.still or body.type == topics.CAMERA_INFO:
-                self._kept[topic] = _Kept(body, shown.t_capture_ns, shown.frame_id, drawn.epoch, ahead_ns)
+                self._kept[topic] = value
             else:
                 self._kept.pop(topic, None)  # of when it was drawn once
             if self.wanted(topic):
-                self._send(topic, body, shown.frame_id, shown.t_capture_ns, drawn.epoch, ahead_ns)
+                self._send(topic, value)
 
     def publish_thin(self, result: FrameResult, pictures: Mapping[str, Content]) -> None:
         """Send thin pictures of a frame, by topic, to those who still ask for them."""
@@ -249,34 +250,26 @@ class Publisher:
 
     def _publish_text(self, name: str, text: Content, stamp_ns: int) -> None:
         self._seq[name] += 1
-        self._kept[name] = _Kept(text, stamp_ns)
+        value = self._kept[name] = _Value(text, stamp_ns)
         if self.wanted(name):
-            self._send(name, text, -1, stamp_ns)
+            self._send(name, value)
 
     def _send_frame_topic(self, name: str) -> None:
         assert self._last is not None
         pair = self._last.pair
-        self._send(name, content.FRAME_CONTENT[name](self._last), pair.frame_id, pair.t_capture_ns)
+        self._send(name, _Value(content.FRAME_CONTENT[name](self._last), pair.t_capture_ns, pair.frame_id))
 
-    def _send(
-        self,
-        name: str,
-        body: Content,
-        frame_id: int,
-        stamp_ns: int,
-        epoch: int | None = None,
-        ahead_ns: int = 0,
-    ) -> None:
-        last = self._last
+    def _send(self, name: str, value: _Value) -> None:
+        body, last, epoch = value.body, self._last, value.epoch
         if epoch is None:
             epoch = 0 if last is None else last.epoch
-        recorded_s = None if last is None or last.pair.frame_id != frame_id else last.recorded_s
+        recorded_s = None if last is None or last.pair.frame_id != value.frame_id else last.recorded_s
         meta = Meta(
             type=body.type,
             type_hash=type_hash(body.type),
             seq=self._seq.get(name, 0),
-            frame_id=frame_id,
-            stamp_ns=stamp_ns,
+            frame_id=value.frame_id,
+            stamp_ns=value.stamp_ns,
             publish_ns=time.time_ns(),
             session=self.session,
             epoch=epoch,
@@ -285,7 +278,7 @@ class Publisher:
             shape=list(body.shape),
             dtype=body.dtype,
             dropped=self._dropped,
-            ahead_ns=ahead_ns or msgspec.UNSET,
+            ahead_ns=value.ahead_ns or msgspec.UNSET,
             detail_age_ns=msgspec.UNSET if body.detail_age_ns is None else body.detail_age_ns,
             scale=body.scale or msgspec.UNSET,
             window=list(body.window) or msgspec.UNSET,
@@ -331,8 +324,7 @@ class Publisher:
             self._subscription(frames[0].bytes, resend)
         for name in sorted(resend):
             if name in self._kept:
-                kept = self._kept[name]
-                self._send(name, kept.body, kept.frame_id, kept.stamp_ns, kept.epoch, kept.ahead_ns)
+                self._send(name, self._kept[name])
             elif self._last is not None and name in content.FRAME_CONTENT:
                 if content.tells_of(self._last, name):
                     self._send_frame_topic(name)
@@ -377,7 +369,7 @@ class Publisher:
                 raise UsageError(f"'{name}': {MAX_THIN} thin pictures are made already, the most at once")
         except UsageError as error:
             if len(name) <= MAX_THIN_NAME:
-                self._send(name, cdr.string(str(error)), -1, time.time_ns())
+                self._send(name, _Value(cdr.string(str(error)), time.time_ns()))
         else:
             self.thin = {**self.thin, name: asked}
             self._seq.setdefault(name, self._thin_seq)
@@ -412,9 +404,3 @@ class Publisher:
         self._resources.close()
         self._context.destroy(linger=LAST_WORDS_MS)
         self._run.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -1,4 +1,7 @@
-"""How many requests a client may send: each has a bucket of tokens that fills again at a steady rate."""
+"""How many requests a client may send: a bucket of tokens that fills again at a steady rate.
+
+Of each bucket one number is kept: when it will be full again (GCRA, ITU-T I.371).
+"""
 
 from __future__ import annotations
 
@@ -22,20 +25,16 @@ class RequestRate:
         self, rate: float = RATE, burst: int = BURST, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._rate, self._burst, self._clock = rate, burst, clock
-        self._buckets: dict[bytes, tuple[float, float]] = {}  # tokens in it, and when that was
+        self._full: dict[bytes, float] = {}  # by client: when its bucket is full again
 
     def wait(self, client: bytes) -> float:
         """Take a token; 0. Where there is none: s until there is one."""
         now = self._clock()
-        tokens = self._tokens(client, now)
-        if tokens < 1:
-            return (1 - tokens) / self._rate
-        if len(self._buckets) >= FORGET_ABOVE:
-            known = self._buckets
-            self._buckets = {one: known[one] for one in known if self._tokens(one, now) < self._burst}
-        self._buckets[client] = tokens - 1, now
+        full = max(now, self._full.get(client, now)) + 1 / self._rate
+        wait = full - now - self._burst / self._rate
+        if wait > 1e-9:  # more than rounding
+            return wait
+        if len(self._full) >= FORGET_ABOVE:
+            self._full = {one: when for one, when in self._full.items() if when > now}
+        self._full[client] = full
         return 0.0
-
-    def _tokens(self, client: bytes, now: float) -> float:
-        tokens, at = self._buckets.get(client, (float(self._burst), now))
-        return min(self._burst, tokens + (now - at) * self._rate)

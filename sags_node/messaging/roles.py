@@ -37,12 +37,17 @@ class Client:
     def __str__(self) -> str:
         return self.name if self.role == ALL else f"{self.name} ({self.role})"
 
+    @property
+    def rank(self) -> int:
+        """The place of its role: 0 may do the least."""
+        return ROLES.index(self.role)
+
     def may(self, op: str) -> bool:
-        return ROLES.index(self.role) >= ROLES.index(needed(op))
+        return self.rank >= ROLES.index(needed(op))
 
 
 def needed(op: str) -> Role:
-    """The least role that may ask for an operation; one that is not listed takes the highest."""
+    """The lowest role that may ask for an operation; the highest for one that is not listed."""
     return next((role for role in ROLES if op in _OPERATIONS[role]), ALL)
 
 
@@ -50,8 +55,3 @@ def client_of(file: Path) -> Client:
     """Whose key a `.pub` file holds, by its place."""
     folder = file.absolute().parent.name
     return Client(file.stem, next((role for role in ROLES if role == folder), ALL))
-
-
-def lesser(one: Client, other: Client) -> Client:
-    """Of two places of one key."""
-    return min(one, other, key=lambda client: ROLES.index(client.role))

@@ -25,7 +25,7 @@ from zmq.utils import z85
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import whole, writing
-from sags_node.messaging.roles import ROLES, Client, client_of, lesser
+from sags_node.messaging.roles import ROLES, Client, client_of
 
 if TYPE_CHECKING:
     from sags_node.config.schema import Guarded  # whose validation a client need not load
@@ -136,10 +136,8 @@ def read_allow_list(places: Sequence[Path], section: str = "publish") -> dict[by
 
 
 def _by_key(listed: Iterable[tuple[bytes, Client]]) -> dict[bytes, Client]:
-    found: dict[bytes, Client] = {}
-    for key, client in listed:
-        found[key] = lesser(client, found.get(key, client))
-    return found
+    """The clients by key; a key in several folders has the lowest role of them."""
+    return dict(sorted(listed, key=lambda one: -one[1].rank))
 
 
 def _read(file: Path) -> tuple[bytes, bytes | None]:

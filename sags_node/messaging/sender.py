@@ -12,7 +12,7 @@ import logging
 import time
 import uuid
 from collections import Counter
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import msgspec
 import zmq
@@ -23,6 +23,7 @@ from sags_node.messaging import cdr
 from sags_node.messaging.address import Address, ClientKeys, connect
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.receipt import Receipt
+from sags_node.messaging.sockets import Closes
 from sags_node.messaging.wire import Message, Meta, encode
 from sags_node.types import F64
 
@@ -32,7 +33,7 @@ Picture = NDArray[Any] | bytes  # [H, W] or [H, W, C] uint8; or the bytes of a J
 MAX_RECEIPT_BYTES = 1 << 16
 
 
-class Sender:
+class Sender(Closes):
     """Sends to a node without ever waiting: what does not fit into the queue is left out and counted.
 
     Used from one thread. A node that is away or restarted gets what is sent from then on.
@@ -107,12 +108,6 @@ class Sender:
 
     def close(self) -> None:
         self._context.destroy(linger=0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class FrameSender(Sender):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Self
 
 import zmq
 
@@ -21,6 +22,21 @@ HANDSHAKES = (  # events of a socket's monitor
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
 HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
+
+Took = Callable[[int, int], None]  # the file descriptor of a peer, and the bytes of a message read from it
+
+
+class Closes:
+    """Something whose `with` block ends with `close`."""
+
+    def close(self) -> None:
+        """Give back what it holds."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 def limit(
@@ -68,14 +84,23 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | 
     return bound
 
 
-def waiting(socket: zmq.Socket[bytes], most: int, most_parts: int) -> Iterator[list[zmq.Frame]]:
-    """The messages that have arrived, at most `most` of them, so that no peer keeps the reader; their parts
-    as in `receive_frames`."""
+def waiting(
+    socket: zmq.Socket[bytes], most: int, most_parts: int, took: Took | None = None
+) -> Iterator[list[zmq.Frame]]:
+    """Read the messages that have arrived, at most `most` of them, so that no peer keeps the reader; their
+    parts as in `receive_frames`.
+
+    Args:
+        took: is told what was read of whom.
+    """
     for _ in range(most):
         try:
-            yield receive_frames(socket, most_parts)
+            frames = receive_frames(socket, most_parts)
         except zmq.Again:
             return
+        if took is not None:
+            took(int(frames[-1].get(zmq.SRCFD)), sum(len(frame) for frame in frames))
+        yield frames
 
 
 def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:

@@ -6,13 +6,12 @@ import difflib
 import time
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 import zmq
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics, wire
-from sags_node.messaging.address import Address, ClientKeys, HandshakeWatch, NodeAddress, connect
+from sags_node.messaging.address import Address, HandshakeWatch, NodeAddress, connect
 from sags_node.messaging.sockets import HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS, receive_frames
 
 MAX_MESSAGE_BYTES = 128 << 20  # of one part: a 4096 x 4096 picture of 8 bytes a pixel
@@ -68,19 +67,13 @@ def receive(socket: zmq.Socket[bytes]) -> wire.Message:
     return wire.decode([frame.buffer for frame in receive_frames(socket, wire.MAX_PARTS)])
 
 
-def listen(
-    names: Sequence[str],
-    endpoint: str | None,
-    ns: str,
-    seconds: float | None,
-    run_dir: Path | None = None,
-    keys: ClientKeys | None = None,
-    high_water: int = RECEIVE_HIGH_WATER,
+def listen_to(
+    node: NodeAddress, names: Sequence[str], seconds: float | None, high_water: int = RECEIVE_HIGH_WATER
 ) -> Generator[tuple[wire.Message, int] | None, None, None]:
-    """Every message of some topics and its time of arrival, for up to `seconds`.
+    """Give every message of some topics and its time of arrival, for up to `seconds`.
 
-    Topics may be named with or without `ns`; naming none means all. Up to `high_water` messages wait when the
-    caller is slow.
+    Topics may be named with or without the namespace; naming none means all. Up to `high_water` messages wait
+    when the caller is slow.
 
     Yields None at least every `POLL_MS` while none of them arrives, so that a caller can keep time. What
     is no message is left out.
@@ -89,13 +82,6 @@ def listen(
         UsageError: an unknown topic.
         SagsError: no endpoint is known, or the node refuses this client.
     """
-    return listen_to(NodeAddress(ns, endpoint, None, run_dir, keys), names, seconds, high_water)
-
-
-def listen_to(
-    node: NodeAddress, names: Sequence[str], seconds: float | None, high_water: int = RECEIVE_HIGH_WATER
-) -> Generator[tuple[wire.Message, int] | None, None, None]:
-    """`listen`, to this node."""
     ns = node.ns
     known = [check_topic(name.lstrip("/").removeprefix(f"{ns}/")) for name in names]
     wanted = {topics.full_name(ns, topic.name) for topic in known}

@@ -26,6 +26,7 @@ from sags_node.messaging import topics
 from sags_node.messaging.address import Address, ClientKeys, Clock, NodeAddress, found
 from sags_node.messaging.freshness import Freshness, StaleError
 from sags_node.messaging.received import Frame, R, Received, ReceivedText, TopicName, interpret
+from sags_node.messaging.sockets import Closes
 from sags_node.messaging.stream import POLL_MS, check_topic, data_socket, receive
 from sags_node.messaging.wire import WireError
 from sags_node.workers import go_on
@@ -57,6 +58,12 @@ class Receiver:
         paused: begin as after `pause`.
         patience: s to wait for a node that does not run yet; default: 10, and 0 for asyncio, whose loop must
             not be blocked. With an `endpoint` none need run.
+        may_be_absent: wait for none, and follow the node as soon as there is one.
+
+    Attributes:
+        refusal: why the node does not let this client in.
+        absent: that no node runs, as far as that is known.
+        rejected: malformed messages.
 
     Raises:
         UsageError: an unknown topic, or the node wants keys that are not given.
@@ -77,11 +84,13 @@ class Receiver:
         clock: Clock | None = None,
         paused: bool = False,
         patience: float | None = None,
+        may_be_absent: bool = False,
     ) -> None:
         wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
         rates = rates or {}
-        self.refusal: str | None = None  # why the node does not let this client in
-        self.rejected = 0  # messages that were none, or whose content does not fit its description
+        self.refusal: str | None = None
+        self.absent: str | None = None
+        self.rejected = 0
         self._ns = ns
         self._clock = clock
         self._clock_ns = clock_ns if clock is None else clock.latest_ns
@@ -96,8 +105,15 @@ class Receiver:
         self._asked = _ALWAYS if paused else frozenset(self._kept)
         self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
-        patience = self._patience if patience is None else patience
-        self._connect(found(self._find, time.monotonic() + patience))
+        self._socket: zmq.Socket[bytes] | None = None  # before there is a node
+        self._address: Address | None = None
+        if may_be_absent and endpoint is None:
+            self._look_for_node()
+            if self.refusal is not None:
+                raise UsageError(self.refusal)
+        else:
+            patience = self._patience if patience is None else patience
+            self._connect(found(self._find, time.monotonic() + patience))
         turn = self._receive_next, self._stopping, "sags-subscriber"
         self._thread = threading.Thread(target=go_on, args=turn, name="sags-subscriber", daemon=True)
         self._thread.start()
@@ -111,8 +127,8 @@ class Receiver:
 
     @property
     def endpoint(self) -> str:
-        """Where the node is, or was when it was last heard of."""
-        return self._address.endpoint
+        """Where the node is, or was when it was last heard of; empty before that."""
+        return "" if self._address is None else self._address.endpoint
 
     # ---- what has come ---------------------------------------------------------------------------------
 
@@ -216,8 +232,8 @@ class Receiver:
         if (refused := self._refused.get(name)) is not None:  # another thread may take it out
             return refused
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
-        if problem is not None and self.refusal is not None:
-            return self.refusal
+        if problem is not None and (why := self.refusal or self.absent) is not None:
+            return why
         unknown = None if self._clock is None else self._clock.problem
         return problem or unknown or self._sender_problem(name)
 
@@ -244,15 +260,21 @@ class Receiver:
         self._socket, self._watch = resources.enter_context(data_socket(address, prefixes))
         self._resources.close()
         self._resources, self._address, self._subscribed = resources, address, asked
+        self.refusal = None  # what the one before had against this client
 
     def _receive_next(self) -> None:
-        self._subscribe()
+        if self._socket is None:
+            self._stopping.wait(POLL_MS * 1e-3)
+            self._look_for_node()
+            return
+        self._subscribe(self._socket)
         if self._socket.poll(POLL_MS):
-            self._receive_one()
+            self._receive_one(self._socket)
         else:
+            self.refusal = self._watch.refusal()
             self._look_for_node()
 
-    def _subscribe(self) -> None:
+    def _subscribe(self, socket: zmq.Socket[bytes]) -> None:
         """As it is asked for now; a socket is used by one thread alone."""
         asked = self._asked
         if asked == self._subscribed:
@@ -260,24 +282,25 @@ class Receiver:
         for full, name in self._names.items():
             if (name in asked) != (name in self._subscribed):
                 option = zmq.SUBSCRIBE if name in asked else zmq.UNSUBSCRIBE
-                self._socket.setsockopt_string(option, full)
+                socket.setsockopt_string(option, full)
         self._subscribed = asked
 
     def _look_for_node(self) -> None:
-        """Nothing comes: the node may have been restarted elsewhere, or not let this client in."""
-        self.refusal = self._watch.refusal()
+        """Nothing comes: the node may have come, or been restarted elsewhere."""
         try:
             address = self._find()
+            self.absent = None
             if address != self._address:
                 self._connect(address)
         except UsageError as error:  # the new one wants keys, or wants none any more
             self.refusal = str(error)
-        except SagsError:  # there is none; ZeroMQ goes on trying where the last one was
-            return
+        except SagsError as error:  # there is none; ZeroMQ goes on trying where the last one was
+            self.absent = str(error)
 
-    def _receive_one(self) -> None:
+    def _receive_one(self, socket: zmq.Socket[bytes]) -> None:
+        self.absent = None
         try:
-            message = receive(self._socket)
+            message = receive(socket)
             name = self._names.get(message.topic)
             if name is None:  # a subscription is a prefix: that to a depth brings its confidence too
                 return
@@ -307,7 +330,7 @@ class Receiver:
         self._resources.close()
 
 
-class Subscriber(Receiver):
+class Subscriber(Receiver, Closes):
     """Receives topics in the background; `latest`, `read`, `wait` and `aligned` give what has come.
 
     Arguments and errors: see `Receiver`. Any number of threads may ask.
@@ -332,9 +355,3 @@ class Subscriber(Receiver):
         wanted = list(names)
         with self._arrived:
             return self._arrived.wait_for(lambda: self._frame(wanted, stamp_ns), timeout)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

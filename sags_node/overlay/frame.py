@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 
 from sags_node.confidence import SURE, SURE_OF_ANCHOR
-from sags_node.geometry import quat_to_matrix
 from sags_node.messaging.received import (
     Frame,
     ReceivedCameraInfo,
@@ -17,6 +16,7 @@ from sags_node.messaging.received import (
     ReceivedRos,
     TopicName,
 )
+from sags_node.messaging.wire import WireError
 from sags_node.types import F32, F64, Bool, Camera
 
 DEPTH = TopicName("left/render/depth", ReceivedImage)
@@ -85,19 +85,18 @@ def tissue_frame(
     """
     depth, tissue, info, anchors = messages[DEPTH], messages[TISSUE], messages[INFO], messages[ANCHORS]
     size = (info.height, info.width)
-    poses = messages[POSE].message.transforms
     fields = anchors.points.dtype.names or ()
     said = {(message.meta.session, message.meta.epoch) for message in messages.values()}
-    if not depth.array.shape == tissue.array.shape == size or len(poses) != 1 or len(said) != 1:
+    if not depth.array.shape == tissue.array.shape == size or len(said) != 1:
         return None
     if not {"id", "visibility", "confidence"} <= set(fields):
         return None
     if confidence is not None and confidence.array.shape != size:
         return None
-    moved = poses[0].transform
-    T = np.eye(4)
-    T[:3, :3] = quat_to_matrix(np.array([getattr(moved.rotation, axis) for axis in "wxyz"]))
-    T[:3, 3] = [getattr(moved.translation, axis) for axis in "xyz"]
+    try:
+        T_world_cam = messages[POSE].pose()
+    except WireError:
+        return None
     rows = anchors.points
     places = anchors.xyz().astype(np.float64)
     if "ahead" in fields:
@@ -107,7 +106,7 @@ def tissue_frame(
         stamp_ns=depth.stamp_ns,
         session=depth.meta.session,
         epoch=depth.meta.epoch,
-        camera=Camera(info.width, info.height, info.K, T),
+        camera=Camera(info.width, info.height, info.K, T_world_cam),
         baseline=None if right is None else float(-right.P[0, 3] / right.P[0, 0]),
         depth=depth.array,
         tissue=tissue.array > 0,

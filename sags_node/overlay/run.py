@@ -30,7 +30,7 @@ from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import NO_RIGHT_EYE
 from sags_node.overlay import draw as overlay_draw
 from sags_node.overlay.draw import Body, Placed
-from sags_node.overlay.durations import Durations
+from sags_node.overlay.durations import REMEMBERED, Durations
 from sags_node.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.overlay.held import HeldObject, Pinner
 from sags_node.overlay.mesh import mesh_of
@@ -46,7 +46,6 @@ MAX_AGE = 0.5  # s since capture; an older overlay is taken away
 WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
 WAIT_FOR_REST = 0.05  # s for what belongs to the frame
 PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
-LOOK = 0.1  # s between looks for a node
 UNSEEN = "nothing of it is in sight: beyond the picture, or behind an instrument"
 RECENT = 300  # durations are behind the figures in `status`
 
@@ -158,9 +157,12 @@ class _Overlay:
         """
         # A mask comes with every frame, also while the camera is lost, and never before the picture.
         leading = NEEDED[0] if self._options.save is None else TISSUE
-        seconds = self._options.seconds
+        options, seconds = self._options, self._options.seconds
         end = math.inf if seconds is None else time.monotonic() + seconds
-        self._subscriber = self._connected(end)
+        wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
+        if options.node.endpoint is not None:
+            self._clock = NodeClock.at(options.node)
+        self._subscriber = Subscriber.at(options.node, wanted, clock=self._clock, may_be_absent=True)
         patient_until = time.monotonic() + PATIENCE
         last: Received | None = None
         while time.monotonic() < end:
@@ -168,9 +170,14 @@ class _Overlay:
             received = self._node.wait(leading, WAIT_FOR_FRAME, after=last)
             if received is not None:
                 if last is None:  # a node without a control socket: better said now than never
-                    self._options.node.control_socket()
+                    options.node.control_socket()
                 last = received
                 self._take(received)
+            elif last is None and self._node.absent is not None:
+                self._say_waiting(self._node.absent)
+                patient_until = time.monotonic() + PATIENCE
+            elif last is None and not self._node.endpoint and self._node.refusal is not None:
+                raise UsageError(self._node.refusal)
             elif last is None and time.monotonic() > patient_until:
                 if self._node.refusal is not None:
                     break
@@ -178,30 +185,7 @@ class _Overlay:
             self._look_at_the_clock()
             self._stream.tell(self._facts())
         if last is None:
-            raise SagsError(self._node.refusal or self._silence)
-
-    def _connected(self, end: float) -> Subscriber:
-        """The node's subscriber, as soon as a node is there.
-
-        Raises:
-            UsageError: the node's keys do not fit.
-            SagsError: none came until `end`, or the endpoint is malformed.
-        """
-        options = self._options
-        wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
-        while True:
-            try:
-                if options.node.endpoint is not None and self._clock is None:
-                    self._clock = NodeClock.at(options.node)
-                return Subscriber.at(options.node, wanted, clock=self._clock)
-            except SagsError as error:
-                is_absent = not isinstance(error, UsageError) and options.node.endpoint is None
-                if not is_absent or time.monotonic() > end:
-                    raise
-                self._say_waiting(str(error))
-            self._stream.serve()
-            self._stream.tell(self._facts())
-            time.sleep(LOOK)
+            raise SagsError(self._node.refusal or self._node.absent or self._silence)
 
     def _say_waiting(self, why: str) -> None:
         """Once, and again when it is for another reason."""
@@ -211,7 +195,7 @@ class _Overlay:
 
     @property
     def _node(self) -> Subscriber:
-        assert self._subscriber is not None  # what needs it comes after `_connected`
+        assert self._subscriber is not None  # `run` begins with it
         return self._subscriber
 
     @property
@@ -236,13 +220,7 @@ class _Overlay:
         node = self._subscriber
         lost = [] if node is None else [node.lost(name) for name in NEEDED if node.latest(name) is not None]
         return {
-            "frames": self._frames,
-            "overlay": self._frames - self._blanked.total(),
-            "blanked": dict(self._blanked),
-            "latency_ms": self._latency_ms.percentiles(),
-            "draw_ms": self._draw_ms.percentiles(),
-            "freezes": self._freezes.status(),
-            "objects": [held.status() for held in self._objects],
+            **self._figures(),
             "lost": sum(lost),
             "endpoints": self._stream.endpoints,
             "saved": self._output.saved,
@@ -339,18 +317,24 @@ class _Overlay:
 
     # ---- what is said --------------------------------------------------------------------------------------
 
-    def _facts(self) -> dict[str, Any]:
+    def _figures(self, recent: int = REMEMBERED) -> dict[str, Any]:
+        """What was shown; durations of the newest `recent` frames, or of all."""
         return {
             "frames": self._frames,
             "overlay": self._frames - self._blanked.total(),
             "blanked": dict(self._blanked),
-            "latency_ms": self._latency_ms.percentiles(RECENT),
-            "draw_ms": self._draw_ms.percentiles(RECENT),
+            "latency_ms": self._latency_ms.percentiles(recent),
+            "draw_ms": self._draw_ms.percentiles(recent),
             "freezes": self._freezes.status(),
+            "objects": [held.status() for held in self._objects],
+        }
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            **self._figures(RECENT),
             "max_age": self._options.max_age,
             "clock": None if self._clock is None else self._clock.status(),
             "no_right_eye": self._right or None,
-            "objects": [held.status() for held in self._objects],
             "warning_codes": self._warnings,
         }
 

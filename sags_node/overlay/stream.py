@@ -9,14 +9,14 @@ from __future__ import annotations
 import time
 import uuid
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from sags_node.config.schema import PublishConfig
 from sags_node.messaging import cdr, content
 from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.sockets import Closes
 from sags_node.messaging.topics import OVERLAY_TOPICS
 from sags_node.overlay.draw import color_key
 from sags_node.overlay.mark import draw_lines
@@ -28,7 +28,7 @@ STATUS_PERIOD = 1.0  # s
 EYES = {"left": cdr.LEFT_FRAME, "right": cdr.RIGHT_FRAME}
 
 
-class OverlayStream:
+class OverlayStream(Closes):
     """The overlay's socket, in a namespace of its own: ipc, and a free port of this machine.
 
     Args:
@@ -129,10 +129,5 @@ class OverlayStream:
                 body = cdr.image(picture, encoding, stamp_ns, EYES[eye])
                 self._publisher.publish_content(topic, body, frame_id, stamp_ns, self._epoch, ahead_ns)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self._publisher.close()

@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.gallery import Picture
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.node_clock import NodeClock
@@ -95,29 +94,19 @@ class Feed:
 
     def __init__(self, node: NodeAddress, clock: NodeClock | None = None) -> None:
         self._clock = clock
-        self._address = node
-        self._subscriber: Subscriber | None = None
         self._frame: dict[str, Received] | None = None  # the newest that came as a whole
-        self._absent: str | None = None  # why there is no subscriber
-        try:
-            self._connect()
-        except UsageError:
-            raise
-        except SagsError as error:
-            if node.endpoint is not None:
-                raise
-            self._absent = str(error)
+        rates = dict.fromkeys(TOPICS, LEAST_HZ)
+        self._subscriber = Subscriber.at(
+            node, TOPICS, rates=rates, clock=clock, paused=True, may_be_absent=True
+        )
 
     def now(self) -> Moment:
         """What may be shown now. The node sends one frame for it, and nothing until the next `now`; it is
         waited for up to `WAIT_FOR_PICTURE` and `WAIT_FOR_REST`."""
-        self._follow()
         subscriber = self._subscriber
-        if subscriber is None:
-            return Moment(self._absent)
         subscriber.resume()
         try:
-            sends = _status_of(subscriber).state not in _STATES
+            sends = subscriber.absent is None and _status_of(subscriber).state not in _STATES
             before = subscriber.latest(PICTURE)
             picture = subscriber.wait(PICTURE, WAIT_FOR_PICTURE, after=before) if sends else None
             if picture is not None:
@@ -144,41 +133,19 @@ class Feed:
             anchors=_records(subscriber, ANCHORS, ANCHOR_FIELDS),
         )
 
-    def rest(self) -> None:
-        """Take nothing from the node until the next `now`: nobody looks."""
-        if self._subscriber is not None:
-            self._subscriber.close()
-        self._subscriber = self._frame = None
-
     def close(self) -> None:
         """Follow no node any more."""
-        self.rest()
+        self._subscriber.close()
         if self._clock is not None:
             self._clock.close()
 
-    def _connect(self) -> None:
-        rates = dict.fromkeys(TOPICS, LEAST_HZ)
-        self._subscriber = Subscriber.at(self._address, TOPICS, rates=rates, clock=self._clock)
-        self._absent = None
-
-    def _follow(self) -> None:
-        """Connect, and again where the node is now, when it has moved or has ended."""
-        try:
-            if self._subscriber is not None and _silence(self._subscriber) > SILENT_AFTER:
-                if self._address.data().endpoint != self._subscriber.endpoint:
-                    self.rest()
-            if self._subscriber is None:
-                self._connect()
-        except SagsError as error:
-            self.rest()
-            self._absent = str(error)
-
     def _problem(self, subscriber: Subscriber, status: Status) -> str | None:
         """Why nothing may be shown: what the node is, and else what its pictures are."""
+        why = subscriber.refusal or subscriber.absent
         if not status.state:
-            return subscriber.refusal or f"waiting for a node at {subscriber.endpoint}"
+            return why or f"waiting for a node at {subscriber.endpoint}"
         if (silence := _silence(subscriber)) > SILENT_AFTER:
-            return subscriber.refusal or f"stale for {silence:.1f} s: the node is silent"
+            return why or f"stale for {silence:.1f} s: the node is silent"
         if status.state in _STATES:
             return _STATES[status.state]
         newest = subscriber.latest(PICTURE)

@@ -56,10 +56,9 @@ def run_viewer(
 
 
 def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:
-    """Nothing is taken from the node while no browser looks, and no browser gets ahead of what it shows."""
+    """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows."""
     while not stop.is_set():
         if not server.get_clients():
-            feed.rest()
             scene.show(Moment())
             stop.wait(IDLE_WAIT)
             continue

@@ -12,7 +12,7 @@ import pytest
 from made_messages import meta
 from simulation import START_NS, World
 
-from sags_node.bridge import feed, gst, relay
+from sags_node.bridge import gst, relay
 from sags_node.bridge.relay import LEAD, LOOK, MAX_AGE, Output, Relay, Source
 from sags_node.messaging import address
 from sags_node.messaging.address import NodeAddress
@@ -95,7 +95,7 @@ def bridged(
     world = World(seed)
     node, peer, stop = Node(world), Peer(world), world.threading.Event()
     monkeypatch.setattr(relay, "Feed", node.make)
-    for module in (relay, feed, address):
+    for module in (relay, address):
         monkeypatch.setattr(module, "time", world)
     monkeypatch.setattr(relay, "threading", world.threading)
     loop = Relay((NodeAddress(),), (output,), peer)

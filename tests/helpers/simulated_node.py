@@ -65,6 +65,9 @@ class Frame:
     def __init__(self, data: bytes, more: bool = False) -> None:
         self.bytes, self.more = data, more
 
+    def __len__(self) -> int:
+        return len(self.bytes)
+
     def get(self, option: int | str) -> int | str:
         return 0 if isinstance(option, int) else "anonymous"
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -14,17 +12,15 @@ from typing import Any
 
 import independent_client as client
 import msgpack
-import msgspec
 import pytest
 import zmq
 from ports import free_port
 from waiting import repeating, until
 
 from sags_node.config.schema import PublishConfig
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError
 from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
 from sags_node.messaging.publisher import Publisher
-from sags_node.messaging.rundir import Connection
 from sags_node.node.operations import Requests
 
 pytestmark = pytest.mark.live
@@ -153,44 +149,7 @@ def test_silence_is_an_error() -> None:
         asker.request("ping", timeout=0.1)
 
 
-# ---- a node that is started anew -------------------------------------------------------------------------
-
-
-@contextmanager
-def node_process(run_dir: Path, session: str, control: str = "tcp://127.0.0.1:*") -> Iterator[None]:
-    """A node in its own process, which ends with SIGKILL and so leaves its connection file behind."""
-    program = (
-        "import sys; from pathlib import Path\n"
-        "from sags_node.config.schema import PublishConfig\n"
-        "from sags_node.messaging.publisher import Publisher\n"
-        f"config = PublishConfig(data=(), control={control!r}, run_dir=Path({str(run_dir)!r}))\n"
-        f"handlers = {{'who': lambda args: {session!r}}}\n"
-        f"with Publisher(config, 'sags', {session!r}, handlers) as running:\n"
-        "    print(running.connection.control, flush=True)\n"
-        "    while True:\n"
-        "        running.poll(20)\n"
-    )
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("tcp://")
-        try:
-            yield
-        finally:
-            process.kill()
-            process.wait()
-
-
-def test_a_killed_node_is_followed_to_another_port(tmp_path: Path) -> None:
-    with node_process(tmp_path / "run", "first"):
-        asker = ControlClient(run_dir=tmp_path / "run")
-        assert asker.request("who", timeout=30) == "first"
-    with asker:
-        before = asker.endpoint
-        with pytest.raises(SagsError, match=f"no answer from {before} in 0.3 s"):
-            asker.request("who", timeout=0.3)
-        with node_process(tmp_path / "run", "second"):
-            assert asker.request("who", timeout=30) == "second"
-            assert asker.endpoint != before
+# ---- a node that is started anew; one that was killed, or that wants keys then: test_reconnection.py -----
 
 
 def test_a_node_that_stopped_in_order_is_waited_for(tmp_path: Path) -> None:
@@ -240,15 +199,6 @@ def test_what_may_have_been_done_is_not_asked_for_again(tmp_path: Path) -> None:
         assert asked == ["first"]
         asker.request("mark", timeout=30)
         assert asked == ["first", "second"]
-
-
-def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:
-    with node(tmp_path / "run", {}), ControlClient(run_dir=tmp_path / "run") as asker:
-        file = tmp_path / "run/sags.json"
-        known = msgspec.json.decode(file.read_bytes(), type=Connection)
-        file.write_bytes(msgspec.json.encode(msgspec.structs.replace(known, public_key="k" * 40)))
-        with pytest.raises(UsageError, match="wants a key"):
-            asker.request("ping")
 
 
 def test_an_endpoint_that_was_given_is_kept(tmp_path: Path) -> None:

@@ -14,12 +14,15 @@ from typing import Self
 
 import msgspec
 import pytest
+from keyed_node import make_keys, node
 from places import HELPERS
 from ports import free_port
 from synthetic import publisher, stream
 from waiting import until
 
+from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import stream as data_stream
+from sags_node.messaging.control import ControlClient
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -30,8 +33,8 @@ def _node(run_dir: Path, session: str, port: int, ipc: bool = False) -> Iterator
     """A publisher in its own process, which ends with SIGKILL and so leaves its files behind."""
     program = (
         "import time; from pathlib import Path; from synthetic import publisher, stream\n"
-        f"data = ('tcp://127.0.0.1:{port or '*'}',)\n"
-        f"with publisher(Path({str(run_dir)!r}), data=data, ipc={ipc}) as running:\n"
+        f"data, handlers = ('tcp://127.0.0.1:{port}',), {{'who': lambda args: {session!r}}}\n"
+        f"with publisher(Path({str(run_dir)!r}), handlers, data=data, ipc={ipc}) as running:\n"
         f"    running.session = {session!r}\n"
         "    with stream(running):\n"
         "        time.sleep(60)\n"
@@ -55,15 +58,18 @@ def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, mov
     where = {} if by_file else {"endpoint": f"tcp://127.0.0.1:{port}"}
     with _node(run_dir, "first", port, ipc):
         until((run_dir / "sags.json").exists)
-        subscriber = Subscriber(["tf"], run_dir=run_dir, **where)
+        subscriber, asker = Subscriber(["tf"], run_dir=run_dir, **where), ControlClient(run_dir=run_dir)
         found = subscriber.wait("tf", 30)
-        assert found is not None and found.meta.session == "first"
-    with subscriber:
+        assert found is not None and found.meta.session == asker.request("who", timeout=30) == "first"
+    with subscriber, asker:
         until(lambda: not subscriber.ok("tf"))
-        before = subscriber.endpoint
+        before, asked = subscriber.endpoint, asker.endpoint
+        with pytest.raises(SagsError, match=f"no answer from {asked} in 0.3 s"):
+            asker.request("who", timeout=0.3)
         with _node(run_dir, "second", free_port() if moves else port, ipc):
             until(lambda: (newest := subscriber.latest("tf")) is not None and newest.meta.session == "second")
             until(lambda: subscriber.ok("tf"))
+            assert asker.request("who", timeout=30) == "second" and asker.endpoint != asked
         assert (subscriber.endpoint != before) == moves
         assert subscriber.lost("tf") == 0
 
@@ -140,8 +146,25 @@ class Cable:
 def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     with publisher(run_dir, ipc=False) as running:
-        known, subscriber = running.connection, Subscriber(["tf"], run_dir=run_dir)
-    with subscriber:
+        known = running.connection
+        subscriber, asker = Subscriber(["tf"], run_dir=run_dir), ControlClient(run_dir=run_dir)
+    with subscriber, asker:
         with_keys = msgspec.json.encode(msgspec.structs.replace(known, public_key="k" * 40))
         (run_dir / "sags.json").write_bytes(with_keys)
         until(lambda: "wants a key" in str(subscriber.problem("tf")))
+        with pytest.raises(UsageError, match="wants a key"):
+            asker.request("ping")
+
+
+def test_a_subscriber_that_may_begin_before_its_node_says_what_is_missing(tmp_path: Path) -> None:
+    run_dir, keys = tmp_path / "run", make_keys(tmp_path / "keys")
+    with Subscriber(["tf"], run_dir=run_dir, may_be_absent=True) as subscriber:
+        assert "no node runs as 'sags'" in str(subscriber.problem("tf")) and not subscriber.endpoint
+        with node(run_dir, keys, ipc=False):
+            until(lambda: "wants a key" in str(subscriber.problem("tf")))
+        with node(run_dir):
+            until(lambda: subscriber.ok("tf"))
+            assert subscriber.refusal is None
+        until(lambda: "no node runs as 'sags'" in str(subscriber.problem("tf")))
+        with node(run_dir, keys, ipc=False), pytest.raises(UsageError, match="wants a key"):
+            Subscriber(["tf"], run_dir=run_dir, may_be_absent=True)

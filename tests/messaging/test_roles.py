@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +12,17 @@ import msgpack
 import pytest
 import zmq
 from independent_client import zmq_socket
-from keyed_node import error_of, make_keys, of
-from synthetic import publisher, stream
+from keyed_node import TOPIC, Node, error_of, make_keys, node
 from waiting import repeating, until
 
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import MAX_ANCHORS
-from sags_node.messaging.control import MAX_PENDING_OF_ONE, ControlClient
-from sags_node.messaging.publisher import Publisher
+from sags_node.messaging.control import MAX_PENDING_OF_ONE
 from sags_node.messaging.request_rate import BURST, FORGET_ABOVE, RATE, RequestRate
 from sags_node.messaging.requests import MAX_VIEW_HZ
 from sags_node.messaging.roles import ROLES, Client, needed
 from sags_node.messaging.security import read_allow_list, write_key_pair
-from sags_node.messaging.subscriber import Subscriber
 from sags_node.node.views import MAX_VIEWS
-
-TOPIC = "left/depth"
 
 # ---- where a role comes from ---------------------------------------------------------------------------
 
@@ -66,18 +60,11 @@ def keys(tmp_path: Path) -> Path:
     return make_keys(tmp_path / "keys")
 
 
-@contextmanager
-def answering(run_dir: Path, **config: Any) -> Iterator[Publisher]:
-    """A publisher that answers; `wait` never is."""
+def answering(run_dir: Path, keys: Path | None = None, **config: Any) -> AbstractContextManager[Node]:
+    """A node that answers; `wait` never is."""
     names = ("get_status", "pause", "save_model")
     handlers: dict[str, Any] = {name: lambda args: "done" for name in names}
-    with publisher(run_dir, handlers=handlers | {"wait": lambda args: Future()}, **config) as running:
-        with stream(running):
-            yield running
-
-
-def client(running: Publisher, keys: Path, role: str) -> ControlClient:
-    return ControlClient(running.connection.control, keys=of(keys, f"clients/{role}/{role}"))
+    return node(run_dir, keys, handlers | {"wait": lambda args: Future()}, **config)
 
 
 @pytest.mark.live
@@ -85,9 +72,9 @@ def test_each_role_may_do_its_own_and_what_those_before_it_may(
     tmp_path: Path, keys: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     refused = 0
-    with answering(tmp_path / "run", key=keys / "node.key", allow=(keys / "clients",)) as running:
+    with answering(tmp_path / "run", keys) as one:
         for role in ROLES:
-            with client(running, keys, role) as asker:
+            with one.asker(f"clients/{role}/{role}") as asker:
                 for op, least in (("get_status", "listen"), ("pause", "control"), ("save_model", "files")):
                     if ROLES.index(role) >= ROLES.index(least):
                         assert asker.request(op) == "done"
@@ -97,10 +84,9 @@ def test_each_role_may_do_its_own_and_what_those_before_it_may(
                             SagsError, match=f"takes the role '{least}'.*into the folder '{least}'"
                         ):
                             asker.request(op)
-        own = of(keys, "clients/listen/listen")
-        with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=own) as subscriber:
+        with one.subscriber("clients/listen/listen") as subscriber:
             assert subscriber.wait(TOPIC, 60) is not None
-        assert running.connections["control"]["requests_not_allowed"] == refused == 3
+        assert one.running.connections["control"]["requests_not_allowed"] == refused == 3
     said = [record for record in caplog.records if "requests_not_allowed" in record.getMessage()]
     assert len(said) == 1 and "listen" in said[0].getMessage()  # the others came within seconds
 
@@ -109,8 +95,8 @@ def test_each_role_may_do_its_own_and_what_those_before_it_may(
 @pytest.mark.fault("keys: a client's role is changed while it runs")
 def test_a_role_changes_while_a_client_is_connected(tmp_path: Path, keys: Path) -> None:
     folders = keys / "clients"
-    with answering(tmp_path / "run", key=keys / "node.key", allow=(folders,)) as running:
-        with client(running, keys, "control") as asker:
+    with answering(tmp_path / "run", keys) as one:
+        with one.asker("clients/control/control") as asker:
             assert asker.request("pause") == "done"
             (folders / "control/control.pub").rename(folders / "listen/control.pub")
             until(lambda: "takes the role" in error_of(asker, "pause"))
@@ -123,10 +109,9 @@ def test_a_role_changes_while_a_client_is_connected(tmp_path: Path, keys: Path) 
 @pytest.mark.parametrize("with_keys", [False, True])
 def test_who_needs_no_key_may_do_everything(tmp_path: Path, keys: Path, with_keys: bool) -> None:
     """On loopback without keys, and by ipc also where there are some."""
-    config = {"key": keys / "node.key", "allow": (keys / "clients",)} if with_keys else {}
     control = f"ipc://{tmp_path}/control.ipc" if with_keys else "tcp://127.0.0.1:*"
-    with answering(tmp_path / "run", control=control, **config) as running:
-        with ControlClient(running.connection.control) as asker:
+    with answering(tmp_path / "run", keys if with_keys else None, control=control) as one:
+        with one.asker() as asker:
             assert asker.request("save_model") == "done"
 
 
@@ -182,7 +167,7 @@ def test_a_client_that_was_refused_asks_again_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sags_node.messaging.control.RequestRate", lambda: RequestRate(rate=20, burst=1))
-    with answering(tmp_path / "run") as running, ControlClient(running.connection.control) as asker:
+    with answering(tmp_path / "run") as one, one.asker() as asker:
         began = time.monotonic()
         assert [asker.request("pause", timeout=60) for _ in range(5)] == ["done"] * 5
         assert time.monotonic() - began > 0.19  # four waits of 1/20 s
@@ -193,7 +178,7 @@ def test_a_client_that_would_have_to_wait_for_longer_than_it_may_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sags_node.messaging.control.RequestRate", lambda: RequestRate(rate=1e-3, burst=1))
-    with answering(tmp_path / "run") as running, ControlClient(running.connection.control) as asker:
+    with answering(tmp_path / "run") as one, one.asker() as asker:
         assert asker.request("pause", timeout=60) == "done"
         with pytest.raises(SagsError, match=r"requests a second of one client"):
             asker.request("pause", timeout=5)
@@ -202,7 +187,8 @@ def test_a_client_that_would_have_to_wait_for_longer_than_it_may_is_told(
 @pytest.mark.live
 @pytest.mark.fault("socket: flooded with requests")
 def test_a_flood_of_requests_does_not_slow_others(tmp_path: Path) -> None:
-    with answering(tmp_path / "run") as running:
+    with answering(tmp_path / "run") as one:
+        running = one.running
         answers: list[Any] = []
 
         def flood(number: int) -> None:
@@ -216,7 +202,7 @@ def test_a_flood_of_requests_does_not_slow_others(tmp_path: Path) -> None:
         began = time.monotonic()
         with zmq_socket(zmq.DEALER, running.connection.control) as flooder, repeating(flood):
             until(lambda: running.connections["control"]["requests_too_often"])
-            with ControlClient(running.connection.control) as asker:
+            with one.asker() as asker:
                 for _ in range(100):
                     assert asker.request("pause", timeout=60) == "done"
                 with pytest.raises(SagsError, match=r"no answer|not begun in the time"):  # not refused

@@ -17,9 +17,9 @@ import zmq
 from click.testing import CliRunner, Result
 from command_line import sags
 from independent_client import zmq_socket
-from keyed_node import error_of, make_keys, of, secured
+from keyed_node import TOPIC, error_of, make_keys, node, of
 from running_node import RunningNode
-from synthetic import publisher, stream
+from synthetic import publisher
 from waiting import until
 from zmq.auth import load_certificate
 
@@ -30,12 +30,10 @@ from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS
 from sags_node.messaging.roles import Client
-from sags_node.messaging.security import read_allow_list, read_key_pair, read_public_key, write_key_pair
+from sags_node.messaging.security import read_allow_list, read_key_pair, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
-
-TOPIC = "left/depth"
 
 
 @pytest.fixture(scope="module")
@@ -152,8 +150,8 @@ def test_keys_in_a_launch_file_are_relative_to_it(tmp_path: Path) -> None:
 def test_other_machines_only_with_keys_or_with_a_warning(
     tmp_path: Path, keys: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with secured(tmp_path / "run", keys, data=("tcp://*:*",)) as running:
-        assert running.connection.data[-1].startswith("tcp://0.0.0.0:")
+    with node(tmp_path / "run", keys, data=("tcp://*:*",)) as secured:
+        assert secured.running.connection.data[-1].startswith("tcp://0.0.0.0:")
     assert not caplog.records
     with publisher(tmp_path / "run", data=("tcp://*:*",), insecure=True):
         assert "anybody" in caplog.text
@@ -172,14 +170,14 @@ def test_other_machines_only_with_keys_or_with_a_warning(
 def test_a_listed_key_gets_data_and_answers(tmp_path: Path, keys: Path) -> None:
     run_dir = tmp_path / "run"
     viewer = of(keys, "clients/viewer")
-    with secured(run_dir, keys) as running, stream(running):
-        for node_key in (viewer.node, None):  # named, or from the connection file
-            endpoint = running.connection.data[-1] if node_key else None
-            control = running.connection.control if node_key else None
-            mine = ClientKeys(viewer.own, node_key)
-            with Subscriber([TOPIC], endpoint=endpoint, run_dir=run_dir, keys=mine) as subscriber:
+    by_file = {"run_dir": run_dir, "keys": ClientKeys(viewer.own)}
+    with node(run_dir, keys) as secured:
+        for subscriber, asker in (
+            (secured.subscriber("clients/viewer"), secured.asker("clients/viewer")),
+            (Subscriber([TOPIC], **by_file), ControlClient(**by_file)),
+        ):
+            with subscriber, asker:
                 assert subscriber.wait(TOPIC, 60) is not None and subscriber.refusal is None
-            with ControlClient(control, run_dir=run_dir, keys=mine) as asker:
                 assert asker.request("ping") == "pong"
         said = json.loads((run_dir / "sags.json").read_text())
         assert said["public_key"] == viewer.node.decode()  # type: ignore[union-attr]  # `of` sets it
@@ -189,24 +187,24 @@ def test_a_listed_key_gets_data_and_answers(tmp_path: Path, keys: Path) -> None:
 
 @pytest.mark.parametrize("which", ["data", "control"])
 @pytest.mark.parametrize(
-    ("client", "node", "why"),
+    ("client", "server", "why"),
     [
         ("stranger", "node", "refuses this key"),
-        (None, None, "wants a key"),
+        (None, "node", "wants a key"),
         ("clients/viewer", "stranger", "is --server-key the public key of this very node"),
     ],
 )
 def test_others_are_refused_counted_and_told_why(
-    tmp_path: Path, keys: Path, which: str, client: str | None, node: str | None, why: str
+    tmp_path: Path, keys: Path, which: str, client: str | None, server: str, why: str
 ) -> None:
-    mine = None if client is None else of(keys, client, str(node))
-    with secured(tmp_path / "run", keys) as running, stream(running):
+    with node(tmp_path / "run", keys) as secured:
+        running = secured.running
         if which == "data":
-            with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=mine) as subscriber:
+            with secured.subscriber(client, server) as subscriber:
                 until(lambda: why in str(subscriber.problem(TOPIC)))
                 assert subscriber.latest(TOPIC) is None
         else:
-            with ControlClient(running.connection.control, keys=mine) as asker:
+            with secured.asker(client, server) as asker:
                 until(lambda: why in error_of(asker))
         until(lambda: running.connections[which]["refused"] >= 1)
         assert running.connections[which]["unlisted_key"] == (client == "stranger")
@@ -220,12 +218,8 @@ def test_keys_are_revoked_and_added_while_the_node_runs(tmp_path: Path) -> None:
     keys, clients = tmp_path / "keys", tmp_path / "keys/clients"
     for folder, name in ((keys, "node"), (clients, "stays"), (clients, "goes"), (keys, "comes")):
         write_key_pair(folder, name)
-
-    def subscriber(name: str) -> Subscriber:
-        return Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=of(keys, name))
-
-    with secured(tmp_path / "run", keys) as running, stream(running):
-        with subscriber("clients/stays") as stays, subscriber("clients/goes") as goes:
+    with node(tmp_path / "run", keys) as secured:
+        with secured.subscriber("clients/stays") as stays, secured.subscriber("clients/goes") as goes:
             assert stays.wait(TOPIC, 60) is not None and goes.wait(TOPIC, 60) is not None
             (clients / "broken.pub").write_text("no key")  # lets nobody in, and keeps nobody out
             (clients / "goes.pub").unlink()
@@ -234,13 +228,12 @@ def test_keys_are_revoked_and_added_while_the_node_runs(tmp_path: Path) -> None:
             assert stays.wait(TOPIC, 60) is not None
             until(lambda: stays.problem(TOPIC) is None)
             assert goes.latest(TOPIC) is before
-            with subscriber("comes") as early:
+            with secured.subscriber("comes") as early:
                 until(lambda: early.refusal)
             (keys / "comes.pub").rename(clients / "comes.pub")
-            mine = ClientKeys(read_key_pair(keys / "comes.key"), read_public_key(keys / "node.pub"))
 
             def gets_in() -> bool:
-                with ControlClient(running.connection.control, keys=mine) as asker:
+                with secured.asker("comes") as asker:
                     return not error_of(asker)
 
             until(gets_in)
@@ -249,11 +242,7 @@ def test_keys_are_revoked_and_added_while_the_node_runs(tmp_path: Path) -> None:
 
 def test_ipc_needs_no_key_and_belongs_to_its_user(tmp_path: Path, keys: Path) -> None:
     run_dir = tmp_path / "run"
-    with (
-        secured(run_dir, keys) as running,
-        stream(running),
-        Subscriber([TOPIC], run_dir=run_dir) as subscriber,
-    ):
+    with node(run_dir, keys), Subscriber([TOPIC], run_dir=run_dir) as subscriber:
         assert subscriber.endpoint.startswith("ipc:")
         assert subscriber.wait(TOPIC, 30) is not None
         assert stat.S_IMODE((run_dir / "sags.ipc").stat().st_mode) == 0o600
@@ -262,7 +251,7 @@ def test_ipc_needs_no_key_and_belongs_to_its_user(tmp_path: Path, keys: Path) ->
 def test_missing_and_needless_keys_are_named_at_once(tmp_path: Path, keys: Path) -> None:
     run_dir = tmp_path / "run"
     viewer = ClientKeys(read_key_pair(keys / "clients/viewer.key"))
-    with secured(run_dir, keys, ipc=False):
+    with node(run_dir, keys, ipc=False):
         with pytest.raises(UsageError, match="wants a key: make a key pair with sags keygen"):
             ControlClient(run_dir=run_dir)
         with pytest.raises(UsageError, match="wants a key"):
@@ -286,15 +275,11 @@ def test_refusals_reach_the_log_but_do_not_fill_it(
     tmp_path: Path, keys: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     stranger = of(keys, "stranger")
-    with (
-        caplog.at_level(logging.DEBUG, "sags_node"),
-        secured(tmp_path / "run", keys) as running,
-        stream(running),
-    ):
+    with caplog.at_level(logging.DEBUG, "sags_node"), node(tmp_path / "run", keys) as secured:
         for _ in range(20):
-            with Subscriber([TOPIC], endpoint=running.connection.data[-1], keys=stranger) as subscriber:
+            with secured.subscriber("stranger") as subscriber:
                 until(lambda subscriber=subscriber: subscriber.refusal is not None)
-        until(lambda: running.connections["data"]["unlisted_key"] == 20)
+        until(lambda: secured.running.connections["data"]["unlisted_key"] == 20)
     warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warnings) == 2
     assert any(stranger.own.public.decode() in warning for warning in warnings)
@@ -310,8 +295,6 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
     tmp_path: Path, keys: Path, with_keys: bool
 ) -> None:
     rng = np.random.default_rng(9)
-    mine = of(keys, "clients/viewer") if with_keys else None
-    opened = secured(tmp_path / "run", keys) if with_keys else publisher(tmp_path / "run")
     starts = (
         b"",
         b"\xff" + bytes(8) + b"\x7f",
@@ -319,21 +302,17 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
         b"\x01\x00",
         b"GET / ",
     )
-    with opened as running, stream(running):
-        connection = running.connection
-        with Subscriber([TOPIC], endpoint=connection.data[-1], keys=mine) as subscriber:
-            assert subscriber.wait(TOPIC, 30) is not None
+    with node(tmp_path / "run", keys if with_keys else None) as attacked:
+        running, connection = attacked.running, attacked.running.connection
+        with attacked.serves_on("clients/viewer"):
             before = _resident_mb()
             for i in range(400):
                 endpoint = str(connection.control if i % 2 else connection.data[-1])
                 with hostile.raw(endpoint) as stranger:
                     stranger.sendall(starts[i % len(starts)] + rng.bytes(int(rng.integers(1, 3000))))
             until(lambda: sum(running.connections[name]["refused"] for name in ("data", "control")) == 400)
-            newest = subscriber.latest(TOPIC)
-            assert subscriber.wait(TOPIC, 30, after=newest) is not None
-            assert subscriber.lost(TOPIC) == 0 and subscriber.refusal is None
             assert _resident_mb() - before < 30
-        with ControlClient(connection.control, keys=mine) as asker:
+        with attacked.asker("clients/viewer") as asker:
             assert asker.request("ping") == "pong"
 
 
@@ -370,19 +349,17 @@ def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:
 
 @pytest.mark.fault("socket: too many connections")
 def test_peers_are_capped_and_those_who_are_in_stay_in(tmp_path: Path) -> None:
-    with publisher(tmp_path / "run") as running, stream(running):
-        endpoint = running.connection.data[-1]
-        with Subscriber([TOPIC], endpoint=endpoint) as subscriber:
-            assert subscriber.wait(TOPIC, 30) is not None
-            crowd = hostile.crowd(endpoint, MAX_PEERS + 30)
+    with node(tmp_path / "run") as attacked:
+        running = attacked.running
+        with attacked.serves_on() as subscriber:
+            crowd = hostile.crowd(running.connection.data[-1], MAX_PEERS + 30)
             until(lambda: running.connections["data"]["too_many"] >= 31)
             until(lambda: running.connections["data"]["open"] <= MAX_PEERS)
             assert subscriber.wait(TOPIC, 30, after=subscriber.latest(TOPIC)) is not None
             for connection in crowd:
                 connection.close()
-            with Subscriber([TOPIC], endpoint=endpoint) as late:
+            with attacked.subscriber() as late:
                 assert late.wait(TOPIC, 30) is not None
-            assert subscriber.lost(TOPIC) == 0
 
 
 SUBSCRIPTIONS = b"".join(b"\x00\xc9\x01" + np.random.default_rng(i).bytes(200) for i in range(2000))
@@ -395,10 +372,10 @@ ENDLESS = b"".join(b"\x01\xc9" + bytes(201) for _ in range(2000))  # each part s
 )
 def test_a_flood_is_cut_off(tmp_path: Path, which: str, kind: bytes, block: bytes) -> None:
     """Endless subscriptions and endless messages; ZeroMQ would keep them all."""
-    with publisher(tmp_path / "run") as running, stream(running):
+    with node(tmp_path / "run") as attacked:
+        running = attacked.running
         endpoint = str(running.connection.control if which == "control" else running.connection.data[-1])
-        with Subscriber([TOPIC], endpoint=running.connection.data[-1]) as subscriber:
-            assert subscriber.wait(TOPIC, 30) is not None
+        with attacked.serves_on():
             before = _resident_mb()
             sent: list[int] = []
             attack = threading.Thread(target=lambda: sent.append(hostile.flood(endpoint, kind, block, 2.0)))
@@ -407,8 +384,6 @@ def test_a_flood_is_cut_off(tmp_path: Path, which: str, kind: bytes, block: byte
             attack.join()
             assert sent[0] > len(block)
             assert _resident_mb() - before < 100
-            assert subscriber.wait(TOPIC, 30, after=subscriber.latest(TOPIC)) is not None
-            assert subscriber.lost(TOPIC) == 0
 
 
 def test_a_reply_too_large_for_the_client_is_not_taken() -> None:
@@ -432,9 +407,9 @@ def test_a_secured_node_as_a_process_and_its_clients(
     phantom_session: Path, keys: Path, tmp_path: Path
 ) -> None:
     secured = (f"publish.key:={keys}/node.key", f"publish.allow:={keys}/clients", "publish.data:=[tcp://*:*]")
-    node = RunningNode(phantom_session, tmp_path, *secured)
+    process = RunningNode(phantom_session, tmp_path, *secured)
     try:
-        port = node.data.rpartition(":")[2]
+        port = process.data.rpartition(":")[2]
         where = ["--endpoint", f"tcp://127.0.0.1:{port}"]
         good = tf_rate(*where, "--key", f"{keys}/clients/viewer.key", "--server-key", f"{keys}/node.pub")
         assert good.exit_code == 0 and json.loads(good.stdout)["average_rate"] > 0
@@ -443,12 +418,12 @@ def test_a_secured_node_as_a_process_and_its_clients(
         plain = tf_rate(*where)
         assert plain.exit_code == 1 and "wants a key" in plain.stderr
         viewer = ClientKeys(read_key_pair(keys / "clients/viewer.key"))
-        with ControlClient(run_dir=node.run_dir, keys=viewer) as asker:
+        with ControlClient(run_dir=process.run_dir, keys=viewer) as asker:
             connections = asker.request("get_status")["connections"]
         assert connections["data"]["unlisted_key"] == 1 and connections["data"]["refused"] >= 2
     finally:
-        node.stop()
-    said = node.said()
+        process.stop()
+    said = process.said()
     assert "Traceback" not in said
     assert read_key_pair(keys / "stranger.key").public.decode() in said.replace("\n", "").replace(" ", "")
 

@@ -26,7 +26,7 @@ from sags_node.messaging.control import ControlClient
 from sags_node.messaging.introspection import topic_figures
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
-from sags_node.messaging.stream import listen
+from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.overlay.run import OverlayOptions, run_overlay
 from sags_node.recording.info import bag_info
@@ -165,7 +165,7 @@ def test_a_clock_tells_the_moment_of_the_recording(plane_bag: Path, tmp_path: Pa
     depths: list[int] = []
     with playing(plane_bag, run_dir, topics=("left/depth",), rate=rate, clock_hz=clock_hz) as player:
         player.toggle_pause()
-        for arrived in listen(["clock", "left/depth"], None, "sags", 60.0, run_dir=run_dir):
+        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["clock", "left/depth"], 60.0):
             if arrived is None:
                 continue
             message, _ = arrived

@@ -28,7 +28,7 @@ def test_the_node_makes_one_frame_for_each_update_and_nothing_between(tmp_path: 
             assert moment.problem is None and moment.model is not None, "the whole frame came"
             assert moment.splats is not None and moment.anchors is not None
             shown.append(moment.model.frame_id)
-        feed.rest()
+        feed.close()
     assert shown == sorted(set(shown)), "a new one each time"
 
 
@@ -41,4 +41,4 @@ def test_a_node_of_two_frames_a_second_is_shown_too(tmp_path: Path) -> None:
         for _ in range(3):
             moment = feed.now()
             assert moment.problem is None and moment.model is not None
-        feed.rest()
+        feed.close()

@@ -19,9 +19,10 @@ from command_line import RUN_HERE
 from places import ROOT
 from waiting import until
 
+from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedImage, TopicName
-from sags_node.messaging.stream import listen
+from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -133,7 +134,7 @@ def test_the_picture_goes_out_before_its_frame_is_mapped(home: Path) -> None:
     """Once, and every frame's: so that a mask of it is there for the next frame."""
     sent: dict[str, dict[int, int]] = {PICTURE: {}, DEPTH: {}}
     sequence: list[int] = []
-    for arrived in listen([PICTURE, DEPTH], None, "sags", 60.0, run_dir=home / "sags"):
+    for arrived in listen_to(NodeAddress(run_dir=home / "sags"), [PICTURE, DEPTH], 60.0):
         if len(sent[PICTURE].keys() & sent[DEPTH].keys()) > 20:
             break
         if arrived is not None:
