@@ -23,7 +23,7 @@ from av.stream import Discard, Disposition
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.media.cut_off import ends_in_a_packet, ends_in_its_segment
+from sags_node.media.cut_off import ends_in_a_packet, lacks_its_end
 from sags_node.types import I64, U8
 
 if TYPE_CHECKING:
@@ -305,14 +305,15 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
                 if packet.is_keyframe and packet.pts is not None:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
         is_broken = is_broken or ends_in_a_packet(path, size, container.format.name)
-        if is_broken and shown:
+        is_short = lacks_its_end(path, size, container.format.name)
+        if (is_broken or is_short) and shown:
             shown.pop()  # a part of a picture
         known = np.array([pts for pts in shown if pts is not None], np.int64)
         # AVI knows no order but that of decoding: FFmpeg guesses, and some codecs hold pictures back.
         is_guessed = container.format.name == "avi" and stream.codec_context.has_b_frames
-        lacks = 2 * len(known) <= len(shown) or (is_guessed and (np.diff(known) > 0).all())
-        unused = "" if lacks else _why_unused(known, base)
-        is_used = not lacks and not unused
+        are_few = 2 * len(known) <= len(shown) or (is_guessed and (np.diff(known) > 0).all())
+        unused = "" if are_few else _why_unused(known, base)
+        is_used = not are_few and not unused
         pts = np.unique(known) if is_used else None
         ends = 0.0 if not ticks else float((max(ticks) + np.diff(ticks).max(initial=0)) * base)
         missing = 0.0  # s
@@ -323,8 +324,8 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         cut_off = ""
         if named > total:
             cut_off = f"is cut off: of {named} pictures it holds {total}"
-        elif missing > float(0.5 * base) or ends_in_its_segment(path, size, container.format.name):
-            cut_off = "is cut off: it ends before it says so"
+        elif missing > float(0.5 * base) or is_short:
+            cut_off = "is cut off: its end is missing"
         elif is_broken:
             cut_off = "is cut off: of its last picture a part is there"
         return _Index(len(shown), pts, np.array(sorted(keys), np.int64).reshape(-1, 3), unused, cut_off)

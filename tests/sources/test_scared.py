@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from command_line import figures_of
 from numbered_pictures import write_video
+from stamped_videos import write
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
@@ -22,6 +23,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.geometry import invert, project, unproject
+from sags_node.importing.check import check_folder
 from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, U8, StereoFrame
@@ -298,6 +300,34 @@ def test_frames_without_a_pose_are_left_out(keyframe: Path, caplog: pytest.LogCa
     with open_source(cfg.ScaredSource(folder=keyframe)) as source:
         assert source.frame_count == 5
     assert "has poses for 5 of 6 frames; the rest is left out" in caplog.text
+
+
+@pytest.mark.fault("file: a video is cut off")
+def test_a_video_that_is_cut_off_is_refused_and_what_is_there_plays(keyframe: Path) -> None:
+    file = keyframe / "data/rgb.mp4"
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (2 * HEIGHT, WIDTH, 3), np.uint8) for _ in range(FRAMES)]
+    write(file, noise, rate=25, muxer={"movflags": "faststart"}, options={"bf": "0"})
+    file.write_bytes(file.read_bytes()[: 2 * file.stat().st_size // 3])
+    with pytest.raises(UsageError, match=r"rgb\.mp4 is cut off.*source\.frames:=(\d)") as caught:
+        play(keyframe)
+    there = int(str(caught.value)[-1])
+    assert 2 <= there < FRAMES and len(play(keyframe, frames=there)) == there
+    (error,) = [each for each in check_folder(keyframe) if each.level == "error"]
+    assert "is cut off" in error.what and error.fix.endswith(f"source.frames:={there}")
+
+
+def test_a_video_that_pauses_is_played_by_its_stamps(keyframe: Path) -> None:
+    seconds = [0.0, 0.04, 0.08, 2.0, 2.04, 2.08]
+    write(keyframe / "data/rgb.mp4", [np.vstack(pictures(n)) for n in range(FRAMES)], seconds, rate=25)
+    assert [frame.t_capture_ns * 1e-9 for frame in play(keyframe)] == pytest.approx(seconds)
+
+
+def test_poses_of_more_frames_than_the_video_has_are_told(
+    keyframe: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(keyframe / "data/rgb.mp4", [np.vstack(pictures(n)) for n in range(4)], rate=25)
+    assert len(play(keyframe)) == 4 and "has poses of more than its 4 pictures" in caplog.text
 
 
 def test_a_frame_without_points_has_no_reference(keyframe: Path) -> None:

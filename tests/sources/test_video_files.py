@@ -195,7 +195,11 @@ def test_stamps_that_begin_anew_are_passed_over(tmp_path: Path, caplog: pytest.L
         ("a.webm", {"codec": "libvpx", "options": {"deadline": "realtime"}}, 0.02),
         ("a.ts", {}, 0.5), ("a.ts", {}, 0.02), ("a.mts", {"format": "mpegts"}, 0.02),
         ("a.m2ts", {"format": "mpegts", "muxer": {"mpegts_m2ts_mode": "1"}}, 0.3),
-        ("a.vob", {"codec": "mpeg2video"}, 0.1),
+        ("a.vob", {"codec": "mpeg2video"}, 0.1), ("a.mpg", MPEG2 | {"format": "mpeg"}, 0.1),
+        ("a.flv", {}, 0.02), ("a.flv", {"muxer": {"flvflags": "no_duration_filesize"}}, 0.05),
+        ("a.mxf", MPEG2 | {"rate": 25}, 0.05), ("a.asf", {"codec": "msmpeg4"}, 0.25),
+        ("a.wmv", CONTAINERS["a.wmv"], 0.25), ("live.mkv", {"muxer": {"live": "1"}}, 0.02),
+        ("pieces.mp4", CONTAINERS["pieces.mp4"], 0.12),
     ],
 )  # fmt: skip
 def test_a_file_that_is_cut_off_is_told_from_a_whole_one(
@@ -210,11 +214,15 @@ def test_a_file_that_is_cut_off_is_told_from_a_whole_one(
     assert 0 < video.count < 120 and "cut off" in video.cut_off
     shown = [video.read(number) for number in range(video.count)]
     assert video.stamps is not None  # of pictures that refer to later ones the last may be missing
-    numbers = np.rint((video.stamps - video.stamps[0]) * (RATE * 1e-9)).tolist()
+    rate = 25 if name == "a.mxf" else RATE
+    numbers = np.rint((video.stamps - video.stamps[0]) * (rate * 1e-9)).tolist()
     assert [number_in(picture) for picture in shown if picture is not None] == numbers
 
 
-@pytest.mark.parametrize(("name", "muxer"), [("a.mkv", {"live": "1"}), ("a.ts", {})])
+@pytest.mark.parametrize(
+    ("name", "muxer"),
+    [("a.mkv", {"live": "1"}), ("a.ts", {}), ("a.flv", {"flvflags": "no_duration_filesize"})],
+)
 def test_a_file_that_its_recorder_never_ended_is_not_called_cut_off(
     tmp_path: Path, name: str, muxer: dict[str, str]
 ) -> None:
