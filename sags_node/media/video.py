@@ -19,8 +19,10 @@ from typing import TYPE_CHECKING
 import av
 import cv2
 import numpy as np
+from av.sidedata.sidedata import Type as SideData
 from av.stream import Discard, Disposition
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+from numpy.typing import NDArray
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.media.cut_off import ends_in_a_packet, lacks_its_end
@@ -46,12 +48,7 @@ HD = {(1280, 720), (1440, 1080), (1920, 1080), (2048, 1080), (3840, 2160), (4096
 BROKEN = (av.FFmpegError, IndexError)  # where a file breaks off; where another stream begins in it: PyAV
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
 _MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
-_TURNS = {
-    90: cv2.ROTATE_90_COUNTERCLOCKWISE,
-    -90: cv2.ROTATE_90_CLOCKWISE,
-    180: cv2.ROTATE_180,
-    -180: cv2.ROTATE_180,
-}
+DEEP = 16  # bits of a sample
 
 
 class LostPictureError(SagsError):
@@ -80,6 +77,7 @@ class Video:
         is_even: stamps say no more than the rate.
         pixel_aspect: width of a pixel over its height.
         cut_off: why the file must have been longer; "": it is whole.
+        is_interlaced: the file says so of its first picture.
         oddities: what is to be said of the file, each with a remedy after a semicolon.
 
     Raises:
@@ -103,10 +101,13 @@ class Video:
         if first is None:
             raise UsageError(f"video {path} holds no picture that can be decoded")
         self._coded = first.width, first.height
-        self._turn = _TURNS.get(first.rotation)
-        self.size = self._coded if first.rotation % 180 == 0 else self._coded[::-1]
+        self.is_interlaced = first.interlaced_frame
+        shown = first.side_data.get(SideData.DISPLAYMATRIX)
+        self._matrix = None if shown is None else np.frombuffer(bytes(shown), np.int32).reshape(3, 3)
+        is_on_its_side = self._matrix is not None and self._matrix[0, 0] == 0
+        self.size = self._coded[::-1] if is_on_its_side else self._coded
         aspect = float(self._stream.sample_aspect_ratio or 1)
-        self.pixel_aspect = aspect if first.rotation % 180 == 0 else 1 / aspect
+        self.pixel_aspect = 1 / aspect if is_on_its_side else aspect
         self._untagged = Colorspace.ITU709 if _is_hd(*self.size) else Colorspace.ITU601
         self.stamps: I64 | None = None
         if self._pts is not None and first.pts is not None:
@@ -118,6 +119,11 @@ class Video:
         self.rate, self.is_even = self._find_rate()
         self.cut_off = index.cut_off
         self.oddities = [f"{path}: {index.unused}"] if index.unused else []
+        if (bits := _bits_used(first)) is not None:
+            self.oddities.append(
+                f"{path} has samples of {DEEP} bits, of which its first picture uses {bits}: it may be "
+                "played too dark; play its pictures as a folder, which finds the bits (ffmpeg -i OLD %06d.png)"
+            )
 
     @property
     def gaps(self) -> list[tuple[int, int]]:
@@ -253,8 +259,8 @@ class Video:
             frame, format="rgb24", interpolation=Interpolation.BICUBIC, threads=1
         )
         picture = rgb.to_ndarray()
-        if self._turn is not None:
-            picture = cv2.rotate(picture, self._turn)
+        if self._matrix is not None:
+            picture = _upright(picture, self._matrix)
         # FFmpeg's memory goes back at once, to be used again: new pages cost more than a small copy.
         return picture.astype(np.uint8, copy=picture.nbytes < LARGE)
 
@@ -344,6 +350,23 @@ def _why_unused(pts: I64, base: Fraction) -> str:
     if steps.max(initial=0) > LONGEST_PAUSE:
         return f"its stamps jump by {steps.max():.0f} s after picture {int(np.argmax(steps))}; {remedy}"
     return ""
+
+
+def _upright(picture: U8, matrix: NDArray[np.int32]) -> U8:
+    """Turned and mirrored as a display matrix [3, 3] (ISO/IEC 14496-12) says, by quarters."""
+    across, down = matrix[0, 0], matrix[1, 1]
+    if across == 0:
+        picture = cv2.transpose(picture)
+        across, down = matrix[1, 0], matrix[0, 1]
+    return np.ascontiguousarray(picture[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
+
+
+def _bits_used(frame: av.VideoFrame) -> int | None:
+    """How many bits of deep grey samples a picture uses; None where white is surely that of all of them."""
+    if frame.format.name != "gray16le":
+        return None
+    bits = int(frame.to_ndarray().max()).bit_length()
+    return bits if 8 <= bits <= DEEP - 2 else None
 
 
 def _is_hd(width: int, height: int) -> bool:

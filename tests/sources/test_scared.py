@@ -302,7 +302,6 @@ def test_frames_without_a_pose_are_left_out(keyframe: Path, caplog: pytest.LogCa
     assert "has poses for 5 of 6 frames; the rest is left out" in caplog.text
 
 
-@pytest.mark.fault("file: a video is cut off")
 def test_a_video_that_is_cut_off_is_refused_and_what_is_there_plays(keyframe: Path) -> None:
     file = keyframe / "data/rgb.mp4"
     rng = np.random.default_rng(0)
