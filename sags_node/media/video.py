@@ -122,7 +122,7 @@ class Video:
         if (bits := _bits_used(first)) is not None:
             self.oddities.append(
                 f"{path} has samples of {DEEP} bits, of which its first picture uses {bits}: it may be "
-                "played too dark; play its pictures as a folder, which finds the bits (ffmpeg -i OLD %06d.png)"
+                "played too dark; play its pictures as a folder, which finds the bits (ffmpeg -i OLD %d.png)"
             )
 
     @property
