@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 
@@ -385,18 +384,3 @@ def test_the_check_says_what_stamps_and_pixels_say(tmp_path: Path) -> None:
     assert "left.MTS: its stamps have a gap behind picture 8, as long as 1 pictures" in said
     assert "1 and 1 pictures have no partner at their time" in said
     assert "pixels are 1.33 times as wide as high" in said
-
-
-@pytest.mark.parametrize("name", ["a.mp4", "a.ts", "a.mkv", "mjpeg.avi"])
-def test_damage_ends_in_no_traceback(tmp_path: Path, name: str) -> None:
-    whole = write(tmp_path / name, pictures(range(COUNT)), **CONTAINERS[name]).read_bytes()
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        data = np.frombuffer(whole, np.uint8).copy()
-        data[rng.integers(0, len(data), 10)] = rng.integers(0, 256, 10)
-        (tmp_path / name).write_bytes(data.tobytes())
-        with suppress(UsageError):
-            video = Video(tmp_path / name)
-            for number in (*range(video.count), 0, video.count - 1):
-                with suppress(SagsError):
-                    video.read(number)
