@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import av
 import cv2
 import numpy as np
-from av.sidedata.sidedata import Type as SideData
+from av.sidedata.sidedata import Type
 from av.stream import Discard, Disposition
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from sags_node.types import I64, U8
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.sidedata.sidedata import SideDataContainer
 
 log = logging.getLogger(__name__)
 
@@ -102,8 +103,10 @@ class Video:
             raise UsageError(f"video {path} holds no picture that can be decoded")
         self._coded = first.width, first.height
         self.is_interlaced = first.interlaced_frame
-        shown = first.side_data.get(SideData.DISPLAYMATRIX)
-        self._matrix = None if shown is None else np.frombuffer(bytes(shown), np.int32).reshape(3, 3)
+        self._matrix: NDArray[np.int32] | None = None
+        said = cast("SideDataContainer", first.side_data)  # PyAV's stub names another type
+        if Type.DISPLAYMATRIX in said:
+            self._matrix = np.frombuffer(bytes(said[Type.DISPLAYMATRIX]), np.int32).reshape(3, 3)
         is_on_its_side = self._matrix is not None and self._matrix[0, 0] == 0
         self.size = self._coded[::-1] if is_on_its_side else self._coded
         aspect = float(self._stream.sample_aspect_ratio or 1)
@@ -258,11 +261,10 @@ class Video:
         rgb = self._reformatter.reformat(
             frame, format="rgb24", interpolation=Interpolation.BICUBIC, threads=1
         )
-        picture = rgb.to_ndarray()
-        if self._matrix is not None:
-            picture = _upright(picture, self._matrix)
+        decoded = rgb.to_ndarray()
         # FFmpeg's memory goes back at once, to be used again: new pages cost more than a small copy.
-        return picture.astype(np.uint8, copy=picture.nbytes < LARGE)
+        picture = decoded.astype(np.uint8, copy=decoded.nbytes < LARGE)
+        return picture if self._matrix is None else _upright(picture, self._matrix)
 
 
 def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:

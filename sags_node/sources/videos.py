@@ -145,13 +145,12 @@ class VideoPairs(Pairs):
         if apart <= NEAR * period:
             return None
         by_time = left.count != right.count and abs(right.stamps[-1] - left.stamps[-1]) <= period
-        how, if_so = "number", "took each picture together: then one rate is wrong"
+        how, fits = "number", "took each picture together: then one rate is wrong"
         if by_time:
-            how, if_so = "time", "ended at one moment"
+            how, fits = "time", "ended at one moment"
         self.oddities.append(
-            f"{left.path} has {left.rate:.6g} frames/s but {right.path} has {right.rate:.6g}: at the end stamps "
-            f"of one number are {apart * 1e-9:.2f} s apart; pictures are paired by {how}, which is right if both "
-            f"{if_so}"
+            f"{left.path} has {left.rate:.6g} frames/s but {right.path} has {right.rate:.6g}: stamps of one "
+            f"number get {apart * 1e-9:.2f} s apart; they are paired by {how}, which is right if both {fits}"
         )
         return pair(left.stamps, right.stamps, NEAR * period * 1e-9) if by_time else None
 
