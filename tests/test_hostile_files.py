@@ -21,9 +21,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.media import picture_file
 from sags_node.media.picture_file import claimed_size, is_whole, native_output
-from sags_node.overlay.mesh import mesh_of
 from sags_node.overlay.save import Output
-from sags_node.overlay.scene import ObjectSpec
 from sags_node.recording.pictures import decode_file
 from sags_node.sources.numbered import open_numbered
 from sags_node.sources.pictures import read_picture
@@ -217,44 +215,6 @@ def test_a_link_to_a_file_is_one(tmp_path: Path) -> None:
 
 
 # ---- libraries that talk ---------------------------------------------------------------------------------
-
-
-def ply(faces: bytes, count: int = 1, form: str = "ascii") -> bytes:
-    """Four corners and a face."""
-    head = f"ply\nformat {form} 1.0\nelement vertex 4\n" + "".join(f"property float {a}\n" for a in "xyz")
-    head += f"element face {count}\nproperty list uchar int vertex_indices\nend_header\n"
-    corners = (0, 0, 0), (0.01, 0, 0), (0, 0.01, 0), (0.01, 0.01, 0)
-    text = "".join("{:g} {:g} {:g}\n".format(*corner) for corner in corners).encode()
-    return head.encode() + (text if form == "ascii" else struct.pack("<12f", *sum(corners, ()))) + faces
-
-
-def face(form: str, *corners: int) -> bytes:
-    if form == "ascii":
-        return ply(" ".join(map(str, (len(corners), *corners))).encode())
-    return ply(struct.pack(f"<B{len(corners)}i", len(corners), *corners), form="binary_little_endian")
-
-
-MISSING = "a face names a vertex that is not there"  # Open3D's reader would end the process
-FEW = r"a face has \d different corners"
-MESHES = {
-    "words": (ply(b"")[:-4] + b"nonsense\n", "could not convert string to float"),
-    **{f"{form}, {sides} sides, corner {corner}": (face(form, *range(sides - 1), corner), MISSING)
-       for form in ("ascii", "binary") for sides in (3, 5) for corner in (4, 2**31 - 1, -1)},
-    **{f"face {text.decode()}": (ply(text), FEW) for text in (b"0", b"2 0 1", b"4 0 1 2 1")},
-}  # fmt: skip
-
-
-@pytest.mark.fault("file: a mesh whose faces name corners that there are not")
-@pytest.mark.parametrize("name", MESHES)
-def test_a_damaged_mesh_is_refused_in_one_message(
-    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """What the reader had not read was drawn where memory happened to say."""
-    content, said = MESHES[name]
-    (tmp_path / "mesh.ply").write_bytes(content)
-    with pytest.raises(UsageError, match=rf"mesh\.ply is damaged: {said}"):
-        mesh_of(ObjectSpec(file=tmp_path / "mesh.ply"))
-    assert capfd.readouterr() == ("", "")
 
 
 def test_a_video_that_cannot_be_written_is_one_message(

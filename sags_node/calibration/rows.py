@@ -34,7 +34,7 @@ TINY = 1e-12  # so that an exact fit keeps all
 ALIGNED = (0.35, 1.0)  # px of a picture 640 px wide, or smaller, median and 90 %: rows that were rectified
 WORSE = 2.0  # times: rows of these after they were rectified once more
 RECTIFIED = "rectified:=true"
-PICTURES_SWAPPED = "the pictures are swapped: the left ones come from the right camera"
+PICTURES_EXCHANGED = "the pictures are exchanged: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
 
 
@@ -94,8 +94,8 @@ def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
     if best <= limit:
         enough = max(CLEARLY * best, best + CLEARLY_PX)
         named = next(reading for reading in fitting if reading.rows.median <= enough)
-        if named.what == PICTURES_SWAPPED and as_is.rows.median <= enough:
-            return [_swapped_or_shifted(as_is.rows)]
+        if named.what == PICTURES_EXCHANGED and as_is.rows.median <= enough:
+            return [_exchanged_or_shifted(as_is.rows)]
         if named is not as_is or _signed_baseline(rig) < 0:
             return [Finding("error", named.what, named.fix, _figures(named.rows))]
     if as_is.rows.median > limit:
@@ -129,9 +129,9 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
     """As it is, then all that users get wrong; of two that fit alike the first is meant."""
     rows = rectified_rows(rig, matches)
     exchanged = rectified_rows(StereoRig(rig.name, rig.right, rig.left), matches)
-    swapped_files = Reading(
+    exchanged_files = Reading(
         exchanged,
-        "the eyes are swapped in the calibration: left.yaml is of the camera that took the right pictures",
+        "the eyes are exchanged in the calibration: left.yaml is of the camera that took the right pictures",
         "exchange left.yaml and right.yaml; the pictures are in order",
     )
     wrong_sign = Reading(
@@ -143,7 +143,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
         yield Reading(rows, "", "")
         yield Reading(
             exchanged,
-            PICTURES_SWAPPED,
+            PICTURES_EXCHANGED,
             "exchange left and right of the source; the calibration is in order",
         )
         yield wrong_sign
@@ -153,7 +153,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
             "pictures and calibration agree that the left eye stands to the right of the other",
             "exchange left and right of the source, and both files of the calibration",
         )
-        yield from (swapped_files, wrong_sign) if rig.left.P[0, 3] < 0 else (wrong_sign, swapped_files)
+        yield from (exchanged_files, wrong_sign) if rig.left.P[0, 3] < 0 else (wrong_sign, exchanged_files)
     yield from _other_directions(rig, matches)
     size = size_made_for(rig)
     if size is not None:
@@ -184,11 +184,11 @@ def _other_directions(rig: StereoRig, matches: F64) -> Iterator[Reading]:
         yield Reading(rectified_rows(other, matches), what, fix)
 
 
-def _swapped_or_shifted(rows: Rows) -> Finding:
+def _exchanged_or_shifted(rows: Rows) -> Finding:
     """Rows fit either way, as in rectified pictures: points behind the eyes then have two causes."""
     shift = float(np.percentile(-rows.disparities, 98))
     what = (
-        f"{PICTURES_SWAPPED}; or their principal points differ by at least {shift:.0f} px more than the "
+        f"{PICTURES_EXCHANGED}; or their principal points differ by at least {shift:.0f} px more than the "
         "calibration says"
     )
     fix = (

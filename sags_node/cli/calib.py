@@ -189,7 +189,7 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
 
     \b
     sags calib live launch/v4l2.yaml
-    sags calib live launch/gst_over_under.yaml source.geometry.first:=right -o swapped.png
+    sags calib live launch/gst_over_under.yaml source.geometry.first:=right -o exchanged.png
     """
     import cv2
 

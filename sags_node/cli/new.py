@@ -35,7 +35,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
 
     Of two videos, folders or devices the left eye comes first. It is opened, and some of its pictures are
     looked at: size and rate, how one picture shows both eyes, borders, interlacing, whether the eyes are
-    swapped, late, or their rows apart, and whether the calibration fits. What a key can fix is set.
+    exchanged, late, or their rows apart, and whether the calibration fits. What a key can fix is set.
     key:=value are written too. Without arguments it asks, where there is a terminal.
 
     Exit code 1: it cannot be played; then nothing is written.

@@ -14,20 +14,23 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import av
 import cv2
 import numpy as np
+from av.sidedata.sidedata import Type
 from av.stream import Discard, Disposition
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
+from numpy.typing import NDArray
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.media.cut_off import ends_in_a_packet, ends_in_its_segment
+from sags_node.media.cut_off import ends_in_a_packet, lacks_its_end
 from sags_node.types import I64, U8
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.sidedata.sidedata import SideDataContainer
 
 log = logging.getLogger(__name__)
 
@@ -46,12 +49,7 @@ HD = {(1280, 720), (1440, 1080), (1920, 1080), (2048, 1080), (3840, 2160), (4096
 BROKEN = (av.FFmpegError, IndexError)  # where a file breaks off; where another stream begins in it: PyAV
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
 _MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
-_TURNS = {
-    90: cv2.ROTATE_90_COUNTERCLOCKWISE,
-    -90: cv2.ROTATE_90_CLOCKWISE,
-    180: cv2.ROTATE_180,
-    -180: cv2.ROTATE_180,
-}
+DEEP = 16  # bits of a sample
 
 
 class LostPictureError(SagsError):
@@ -80,6 +78,7 @@ class Video:
         is_even: stamps say no more than the rate.
         pixel_aspect: width of a pixel over its height.
         cut_off: why the file must have been longer; "": it is whole.
+        is_interlaced: the file says so of its first picture.
         oddities: what is to be said of the file, each with a remedy after a semicolon.
 
     Raises:
@@ -103,10 +102,15 @@ class Video:
         if first is None:
             raise UsageError(f"video {path} holds no picture that can be decoded")
         self._coded = first.width, first.height
-        self._turn = _TURNS.get(first.rotation)
-        self.size = self._coded if first.rotation % 180 == 0 else self._coded[::-1]
+        self.is_interlaced = first.interlaced_frame
+        self._matrix: NDArray[np.int32] | None = None
+        said = cast("SideDataContainer", first.side_data)  # PyAV's stub names another type
+        if Type.DISPLAYMATRIX in said:
+            self._matrix = np.frombuffer(bytes(said[Type.DISPLAYMATRIX]), np.int32).reshape(3, 3)
+        is_on_its_side = self._matrix is not None and self._matrix[0, 0] == 0
+        self.size = self._coded[::-1] if is_on_its_side else self._coded
         aspect = float(self._stream.sample_aspect_ratio or 1)
-        self.pixel_aspect = aspect if first.rotation % 180 == 0 else 1 / aspect
+        self.pixel_aspect = 1 / aspect if is_on_its_side else aspect
         self._untagged = Colorspace.ITU709 if _is_hd(*self.size) else Colorspace.ITU601
         self.stamps: I64 | None = None
         if self._pts is not None and first.pts is not None:
@@ -118,6 +122,11 @@ class Video:
         self.rate, self.is_even = self._find_rate()
         self.cut_off = index.cut_off
         self.oddities = [f"{path}: {index.unused}"] if index.unused else []
+        if (bits := _bits_used(first)) is not None:
+            self.oddities.append(
+                f"{path} has samples of {DEEP} bits, of which its first picture uses {bits}: it may be "
+                "played too dark; play its pictures as a folder, which finds the bits (ffmpeg -i OLD %d.png)"
+            )
 
     @property
     def gaps(self) -> list[tuple[int, int]]:
@@ -252,11 +261,10 @@ class Video:
         rgb = self._reformatter.reformat(
             frame, format="rgb24", interpolation=Interpolation.BICUBIC, threads=1
         )
-        picture = rgb.to_ndarray()
-        if self._turn is not None:
-            picture = cv2.rotate(picture, self._turn)
+        decoded = rgb.to_ndarray()
         # FFmpeg's memory goes back at once, to be used again: new pages cost more than a small copy.
-        return picture.astype(np.uint8, copy=picture.nbytes < LARGE)
+        picture = decoded.astype(np.uint8, copy=decoded.nbytes < LARGE)
+        return picture if self._matrix is None else _upright(picture, self._matrix)
 
 
 def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
@@ -305,14 +313,15 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
                 if packet.is_keyframe and packet.pts is not None:
                     keys.append((packet.pts, packet.pts if packet.dts is None else packet.dts, packet.size))
         is_broken = is_broken or ends_in_a_packet(path, size, container.format.name)
-        if is_broken and shown:
+        is_short = lacks_its_end(path, size, container.format.name)
+        if (is_broken or is_short) and shown:
             shown.pop()  # a part of a picture
         known = np.array([pts for pts in shown if pts is not None], np.int64)
         # AVI knows no order but that of decoding: FFmpeg guesses, and some codecs hold pictures back.
         is_guessed = container.format.name == "avi" and stream.codec_context.has_b_frames
-        lacks = 2 * len(known) <= len(shown) or (is_guessed and (np.diff(known) > 0).all())
-        unused = "" if lacks else _why_unused(known, base)
-        is_used = not lacks and not unused
+        are_few = 2 * len(known) <= len(shown) or (is_guessed and (np.diff(known) > 0).all())
+        unused = "" if are_few else _why_unused(known, base)
+        is_used = not are_few and not unused
         pts = np.unique(known) if is_used else None
         ends = 0.0 if not ticks else float((max(ticks) + np.diff(ticks).max(initial=0)) * base)
         missing = 0.0  # s
@@ -323,8 +332,8 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         cut_off = ""
         if named > total:
             cut_off = f"is cut off: of {named} pictures it holds {total}"
-        elif missing > float(0.5 * base) or ends_in_its_segment(path, size, container.format.name):
-            cut_off = "is cut off: it ends before it says so"
+        elif missing > float(0.5 * base) or is_short:
+            cut_off = "is cut off: its end is missing"
         elif is_broken:
             cut_off = "is cut off: of its last picture a part is there"
         return _Index(len(shown), pts, np.array(sorted(keys), np.int64).reshape(-1, 3), unused, cut_off)
@@ -343,6 +352,23 @@ def _why_unused(pts: I64, base: Fraction) -> str:
     if steps.max(initial=0) > LONGEST_PAUSE:
         return f"its stamps jump by {steps.max():.0f} s after picture {int(np.argmax(steps))}; {remedy}"
     return ""
+
+
+def _upright(picture: U8, matrix: NDArray[np.int32]) -> U8:
+    """Turned and mirrored as a display matrix [3, 3] (ISO/IEC 14496-12) says, by quarters."""
+    across, down = matrix[0, 0], matrix[1, 1]
+    if across == 0:
+        picture = cv2.transpose(picture)
+        across, down = matrix[1, 0], matrix[0, 1]
+    return np.ascontiguousarray(picture[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
+
+
+def _bits_used(frame: av.VideoFrame) -> int | None:
+    """How many bits of deep grey samples a picture uses; None where white is surely that of all of them."""
+    if frame.format.name != "gray16le":
+        return None
+    bits = int(frame.to_ndarray().max()).bit_length()
+    return bits if 8 <= bits <= DEEP - 2 else None
 
 
 def _is_hd(width: int, height: int) -> bool:

@@ -198,7 +198,7 @@ def _check_order(rig: StereoRig) -> list[Finding]:
     left, right = float(rig.left.P[0, 3]) + 0.0, float(rig.right.P[0, 3]) + 0.0  # no minus before a zero
     what = f"projection_matrix[3] is {left:g} in left.yaml and {right:g} in right.yaml"
     if left < 0 and right == 0:
-        return [Finding("error", f"{what}: the eyes are swapped", "exchange left.yaml and right.yaml")]
+        return [Finding("error", f"{what}: the eyes are exchanged", "exchange left.yaml and right.yaml")]
     if left != 0:
         return [Finding("error", what, "the left one must be 0: the left eye is the reference")]
     if right == 0:

@@ -19,6 +19,7 @@ import numpy as np
 from sags_node.config.schema import GstSource
 from sags_node.errors import SagsError
 from sags_node.sources.gst_process import GstProcess
+from sags_node.sources.layout import Layout
 from sags_node.sources.live import EndedError, Input, LiveStereo
 from sags_node.sources.pairing import Shot
 from sags_node.types import Samples, Side
@@ -105,8 +106,7 @@ class Pipeline:
                 f"GStreamer: the left eye's pictures are {one.size[0]}x{one.size[1]} px but the right eye's "
                 f"{other.size[0]}x{other.size[1]}; both eyes need one size"
             )
-        takes_fields = config.geometry.layout == "row_interleaved" or config.geometry.deinterlace != "none"
-        if one.interlaced and not takes_fields:
+        if one.interlaced and not Layout(config.geometry).takes_fields:
             log.warning(
                 "GStreamer: the pictures are interlaced, so what moves is torn; add ! deinterlace fields=top "
                 "to the launch string, or set source.geometry.deinterlace"

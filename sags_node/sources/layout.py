@@ -35,6 +35,7 @@ class Layout:
         self._tones: Tones | None = None  # for the depth of the last picture
         self.is_sequential = config.layout == "frame_sequential"
         self.shows_both = config.layout not in ("separate", "frame_sequential")
+        self.takes_fields = config.layout == "row_interleaved" or config.deinterlace != "none"
         self.order: tuple[Side, Side] = ("right", "left") if config.first == "right" else ("left", "right")
 
     def size(self, width: int, height: int, name: str) -> tuple[int, int]:

@@ -14,6 +14,10 @@ log = logging.getLogger(__name__)
 
 EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
 _LAST = re.compile(r"(\d+)(?:\.(\d+))?(?=\D*$)")  # the last number of a name, and what may be its fraction
+_CLOCK = re.compile(
+    r"(?<!\d)([01]\d|2[0-3])([-_:h]?)([0-5]\d)[-_:m]?([0-5]\d)(?!\d)"
+)  # hours, minutes, seconds
+HALF_DAY = 12 * 3600  # s
 CLEARLY = 2.0  # times as uneven as the other order
 
 
@@ -26,7 +30,7 @@ def in_order(files: Sequence[Path]) -> list[Path]:
     longest = _longest(files)
     plain, times = (sorted(files, key=lambda file: (_natural(file.stem, pad), file)) for pad in (0, longest))
     if plain == times:
-        return plain
+        return _over_midnight(plain)
     uneven = [_unevenness(order, longest, pad) for order, pad in ((plain, 0), (times, longest))]
     if max(uneven) <= CLEARLY * min(uneven):
         log.warning(
@@ -34,7 +38,25 @@ def in_order(files: Sequence[Path]) -> list[Path]:
             "number of digits behind the point",
             *(plain[0].parent, max(files, key=lambda file: len(file.name)).name),
         )
-    return plain if uneven[0] <= uneven[1] else times
+    return _over_midnight(plain if uneven[0] <= uneven[1] else times)
+
+
+def _over_midnight(files: list[Path]) -> list[Path]:
+    """Files that are named by the time of day, after midnight last. A name that holds a date begins otherwise
+    then."""
+    clocks = [found for file in files if (found := _CLOCK.search(file.stem)) is not None]
+    if len(clocks) < max(len(files), 3) or len({found.string[: found.start()] for found in clocks}) > 1:
+        return files
+    seconds = [3600 * int(found[1]) + 60 * int(found[3]) + int(found[4]) for found in clocks]
+    steps = np.diff(seconds)
+    if steps.max() <= HALF_DAY:
+        return files
+    first = int(np.argmax(steps)) + 1
+    log.warning(
+        "%s: names are taken for times of day, with midnight after %s; are they none, count from 0 up",
+        *(files[0].parent, files[-1].name),
+    )
+    return files[first:] + files[:first]
 
 
 def numbers(files: Sequence[Path]) -> list[int]:

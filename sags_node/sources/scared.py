@@ -78,8 +78,11 @@ class ScaredPairs(Pairs):
             *(self._rectification.K[0], self._rectification.distortion[0], self._rectification.R[0]),
             *(self._rectification.P[0], self._rectification.size, cv2.CV_32FC1),
         )
-        self.rate = self._pictures.rate
         self.count = self._pictures.count if self._poses is None else len(self._poses)
+        self.rate, self.pixel_aspect = self._pictures.rate, self._pictures.pixel_aspect
+        self.oddities, self.cut_off, self.reach = self._pictures.oddities, self._pictures.cut_off, self.count
+        stamps = self._pictures.stamps
+        self.stamps = None if stamps is None else stamps[: self.count]
 
     def seek(self, index: int) -> None:
         self._pictures.seek(index)
@@ -228,6 +231,8 @@ def _read_poses(folder: Path, count: int, T_rectified_raw: F64) -> F64 | None:
         if not poses:
             T_world_key = T_rectified_raw @ T_raw_key
         poses.append(T_world_key @ geometry.invert(T_rectified_raw @ T_raw_key))
+    if len(poses) == count and files.read(count) is not None:
+        log.warning("%s has poses of more than its %d pictures; were all of them copied?", folder, count)
     files.close()
     if not poses:
         raise UsageError(f"{folder / 'data/frame_data'} holds no frame_data000000.json; unpack it again")

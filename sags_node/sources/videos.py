@@ -18,6 +18,9 @@ log = logging.getLogger(__name__)
 
 NEAR = 0.6  # of a period, from a picture to its partner: free-running eyes are up to half of one apart
 PARTNERED = 0.5  # share of the pictures that have a partner, where stamps of two files tell it
+TORN = (
+    "the file says that its pictures are interlaced: what moves is torn, unless both fields are of one moment"
+)
 UNEVEN_RATES = 0.1  # that the usual rates of two files with gaps or jitter may differ
 
 
@@ -45,7 +48,7 @@ class VideoPairs(Pairs):
         self.right = None if right is None else Video(right)
         self._layout = layout
         self.rate = self.left.rate
-        self.oddities = [said for video in self._videos for said in video.oddities]
+        self.oddities = [said for video in self._videos for said in _oddities(video, layout)]
         self._late = 0  # ns, of the right file's stamps
         try:
             numbers = None if self.right is None else self._joined(self.left, self.right)
@@ -93,6 +96,11 @@ class VideoPairs(Pairs):
                 f"{left.path} has {size_text(*left.size)} px but {right.path} has {size_text(*right.size)}"
             )
             raise UsageError(f"{sizes}; they are not one stereo pair")
+        if abs(left.pixel_aspect / right.pixel_aspect - 1) > 0.01:
+            self.oddities.append(
+                f"{left.path} has pixels {left.pixel_aspect:.3g} times as wide as high, {right.path} "
+                f"{right.pixel_aspect:.3g}; both are taken for those of the left one: record both alike"
+            )
         is_even = left.is_even and right.is_even
         if left.rate is not None and right.rate is not None:
             apart = abs(left.rate - right.rate) / left.rate
@@ -110,7 +118,7 @@ class VideoPairs(Pairs):
         if is_even and (not of_one_clock or abs(late) <= NEAR * period):
             if not of_one_clock:
                 self._tell_late(late)
-            return None
+            return self._drifted(left, right, period) if of_one_clock else None
         if not of_one_clock:  # two recorders, each with its own zero
             self._tell_late(late)
         self._late = 0 if of_one_clock else late
@@ -128,6 +136,23 @@ class VideoPairs(Pairs):
                 "their time, and are left out; were they lost while recording?"
             )
         return found
+
+    def _drifted(self, left: Video, right: Video, period: float) -> I64 | None:
+        """As `_joined`, of two even videos that begin together: rates that differ a little add up."""
+        assert left.stamps is not None and right.stamps is not None
+        last = min(left.count, right.count) - 1
+        apart = abs(right.stamps[last] - left.stamps[last])
+        if apart <= NEAR * period:
+            return None
+        by_time = left.count != right.count and abs(right.stamps[-1] - left.stamps[-1]) <= period
+        how, fits = "number", "took each picture together: then one rate is wrong"
+        if by_time:
+            how, fits = "time", "ended at one moment"
+        self.oddities.append(
+            f"{left.path} has {left.rate:.6g} frames/s but {right.path} has {right.rate:.6g}: stamps of one "
+            f"number get {apart * 1e-9:.2f} s apart; they are paired by {how}, which is right if both {fits}"
+        )
+        return pair(left.stamps, right.stamps, NEAR * period * 1e-9) if by_time else None
 
     def _tell_late(self, late_ns: int) -> None:
         self.oddities.append(
@@ -176,7 +201,7 @@ class OneVideoPairs(Pairs):
         self.pixel_aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
         self.cut_off = f"{video.path} {video.cut_off}" if video.cut_off else ""
         self.reach = self.count
-        self.oddities = video.oddities
+        self.oddities = _oddities(video, layout)
 
     def read(self) -> RawPair | None:
         if self._next >= self.count:
@@ -196,6 +221,13 @@ class OneVideoPairs(Pairs):
 
     def close(self) -> None:
         self._video.close()
+
+
+def _oddities(video: Video, layout: Layout) -> list[str]:
+    """What is to be said of a video that is played so."""
+    if not video.is_interlaced or layout.takes_fields:
+        return video.oddities
+    return [*video.oddities, f"{video.path}: {TORN}; set source.geometry.deinterlace:=top, or bottom"]
 
 
 def _turns(video: Video) -> I64:

@@ -123,7 +123,7 @@ def test_wrong_value_is_named(folder: Path, key: str, value: Any) -> None:
     assert (f"{key} is missing" if value is None else key) in message
 
 
-def swapped(folder: Path) -> None:
+def exchanged(folder: Path) -> None:
     left, right = (folder / "left.yaml").read_text(), (folder / "right.yaml").read_text()
     (folder / "left.yaml").write_text(right)
     (folder / "right.yaml").write_text(left)
@@ -147,7 +147,7 @@ MIRROR = {"rectification_matrix": {"data": [1.0, 0, 0, 0, 1.0, 0, 0, 0, -1.0]}}
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (swapped, "swapped"),
+        (exchanged, "exchanged"),
         (lambda folder: with_P(folder, 0, 3, -1), r"must be -fx \* baseline"),
         (lambda folder: with_P(folder, 0, 3, 0), "no baseline"),
         (lambda folder: with_P(folder, 0, 3, 1000), "looks like millimetres.*divide"),

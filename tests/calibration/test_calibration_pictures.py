@@ -57,11 +57,11 @@ def f7(data_folder: Path) -> tuple[StereoRig, Pairs]:
     return read_rig(folder, F7_SIZE), [(left, right)]
 
 
-def swapped(pairs: Pairs) -> Pairs:
+def exchanged(pairs: Pairs) -> Pairs:
     return [(right, left) for left, right in pairs]
 
 
-def swapped_files(rig: StereoRig) -> StereoRig:
+def exchanged_files(rig: StereoRig) -> StereoRig:
     return StereoRig(rig.name, rig.right, rig.left)
 
 
@@ -156,16 +156,16 @@ def unchanged(given: Any) -> Any:
 NOTHING = "", ""
 # What is done to the rig and to the pictures; what pictures tell of it and its fix; what numbers alone tell.
 PLANTED: dict[str, tuple[Any, Any, tuple[str, str], tuple[str, str]]] = {
-    "swapped pictures": (
-        unchanged, swapped, ("the pictures are swapped", "calibration is in order"), NOTHING
+    "exchanged pictures": (
+        unchanged, exchanged, ("the pictures are exchanged", "calibration is in order"), NOTHING
     ),
-    "swapped files": (
-        swapped_files, unchanged, ("swapped in the calibration", "pictures are in order"), NOTHING
+    "exchanged files": (
+        exchanged_files, unchanged, ("exchanged in the calibration", "pictures are in order"), NOTHING
     ),
     "wrong sign": (
         with_T_negated, unchanged, ("has the wrong sign", "pictures are in order"), ("", "must be -fx")
     ),
-    "both ends swapped": (swapped_files, swapped, ("pictures and calibration agree", ""), NOTHING),
+    "both ends exchanged": (exchanged_files, exchanged, ("pictures and calibration agree", ""), NOTHING),
     "millimetres": (in_unit("mm"), unchanged, ("", "--unit mm"), ("looks like millimetres", "--unit mm")),
     "centimetres": (in_unit("cm"), unchanged, ("", "--unit cm"), ("looks like centimetres", "--unit cm")),
     "inches": (in_unit("inch"), unchanged, ("", "--unit inch"), ("unusual", "--unit inch")),
@@ -341,7 +341,7 @@ def test_the_calibration_of_another_scope(phantom: tuple[StereoRig, Pairs]) -> N
     assert finding.level == "error" and "not of these pictures" in finding.fix
 
 
-def test_rectified_pictures_swapped(data_folder: Path) -> None:
+def test_rectified_pictures_exchanged(data_folder: Path) -> None:
     """Rows tell nothing here; on which side the points lie does."""
     left, right = (
         sorted((data_folder / "hamlyn_invivo_001_100" / side).iterdir())[:1] for side in ("left", "right")
@@ -349,10 +349,10 @@ def test_rectified_pictures_swapped(data_folder: Path) -> None:
     pairs = [(read_picture(left[0]), read_picture(right[0]))]
     rig = load_rig(ROOT / "calib/hamlyn_heart")
     assert worst(check_pictures(rig, pairs)).level == "ok"
-    assert "the pictures are swapped" in worst(check_pictures(rig, swapped(pairs))).what
+    assert "the pictures are exchanged" in worst(check_pictures(rig, exchanged(pairs))).what
 
 
-def test_principal_points_far_apart_are_not_taken_for_a_swap(phantom: tuple[StereoRig, Pairs]) -> None:
+def test_principal_points_far_apart_are_not_taken_for_an_exchange(phantom: tuple[StereoRig, Pairs]) -> None:
     """Rectified pictures whose right one is cut out farther to the right than the calibration says: points
     seem to lie behind the eyes, as in exchanged ones. Only whoever covers a lens can tell which it is."""
     rig, pairs = phantom
@@ -451,12 +451,12 @@ def test_check_of_a_session_against_itself(phantom_session: Path) -> None:
 
 
 def test_check_against_a_session_with_another_key(phantom_session: Path) -> None:
-    swapped_source = [
+    exchanged_source = [
         f"source.left:={phantom_session / 'right'}",
         f"source.right:={phantom_session / 'left'}",
     ]
-    code, out, err = sags(phantom_session / "calib", "--session", phantom_session, *swapped_source)
-    assert code == 1 and "the pictures are swapped" in out and "cannot be used" in err
+    code, out, err = sags(phantom_session / "calib", "--session", phantom_session, *exchanged_source)
+    assert code == 1 and "the pictures are exchanged" in out and "cannot be used" in err
 
 
 def test_a_broken_calibration_is_checked_against_a_session(phantom_session: Path, tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from numbered_pictures import write_video
 from onnx_networks import save_matcher
 from places import ROOT
 from simulated_node import Socket
+from stamped_videos import write
 from synthetic import plane_result
 
 from sags_node.config import schema as cfg
@@ -490,19 +491,19 @@ def open_network(data: bytes, folder: Path) -> None:
 
 def films(folder: Path) -> list[bytes]:
     shown = [np.random.default_rng(n).integers(0, 255, (48, 128, 3), np.uint8) for n in range(4)]
-    made = [write_video(folder / "a.avi", shown).read_bytes()]
-    writer = cv2.VideoWriter(str(folder / "a.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, (128, 48))
-    for rgb in shown:
-        writer.write(rgb)
-    writer.release()
-    return [*made, (folder / "a.mp4").read_bytes()]
+    made = (
+        write_video(folder / "a.avi", shown),
+        *(write(folder / f"a.{each}", shown) for each in ("mp4", "mkv", "ts")),
+    )
+    return [file.read_bytes() for file in made]
 
 
 def read_film(data: bytes, folder: Path) -> None:
-    file = folder / ("a.avi" if data[:4] == b"RIFF" else "a.mp4")
+    file = folder / "film"
     file.write_bytes(data)
     halves = cfg.GeometryConfig(layout="side_by_side")
-    with open_source(cfg.VideosSource(left=file, geometry=halves, pace="step", frames=8)) as source:
+    config = cfg.VideosSource(left=file, geometry=halves, pace="step", frames=8, loop=True)  # it goes back
+    with open_source(config) as source:
         for frame in source:
             assert frame.right is not None and frame.left.shape == frame.right.shape
 

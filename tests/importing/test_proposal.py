@@ -38,7 +38,7 @@ def set_by(launch: list[str]) -> dict[str, str]:
     return dict(each.split(":=", 1) for each in launch)
 
 
-def test_swapped_videos_are_put_in_order(tmp_path: Path) -> None:
+def test_exchanged_videos_are_put_in_order(tmp_path: Path) -> None:
     left, right = videos(tmp_path, LEFT, RIGHT)
     for named in ((left, right), (right, left)):
         found = propose(named)

@@ -91,7 +91,7 @@ def leaves_no_trace(results: list[FrameResult], clean: list[FrameResult]) -> boo
 
 @pytest.mark.fault("picture: the right eye is black")
 @pytest.mark.fault("picture: the left eye is black")
-@pytest.mark.fault("picture: the eyes are swapped")
+@pytest.mark.fault("picture: the eyes are exchanged")
 @pytest.mark.fault("picture: one eye twice")
 @pytest.mark.fault("picture: of another scene")
 @pytest.mark.fault("picture: far too bright")

@@ -223,6 +223,7 @@ NAMES = {
     "sec.nsec": [f"{each // 10**9}.{each % 10**9}" for each in nanoseconds(24)],
     "sec.nsec over seconds": [f"{each // 10**9}.{each % 10**9}" for each in nanoseconds(24, 2.7e8)],
     "sec.msec": [f"17.{33 * number}" for number in range(24)],
+    "times of one day": [f"{n // 2:02}{n % 2 * 30:02}00" for n in range(24)],
     "a number of numbers": [f"case1.{number}" for number in range(24)],
 }  # fmt: skip
 
@@ -231,6 +232,14 @@ NAMES = {
 def test_names_give_the_order(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert numbers(played(eyes(tmp_path, NAMES[name]))) == list(range(24))
     assert caplog.text == ""
+
+
+@pytest.mark.parametrize("form", ["{:02}{:02}{:02}", "{:02}-{:02}-{:02}.5", "cam_{:02}_{:02}_{:02}_l"])
+def test_times_of_day_go_over_midnight(form: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    seconds = [(86400 - 13 + number) % 86400 for number in range(24)]
+    names = [form.format(each // 3600, each // 60 % 60, each % 60) for each in seconds]
+    assert numbers(played(eyes(tmp_path, names))) == list(range(24))
+    assert "midnight" in caplog.text
 
 
 def test_an_order_that_names_do_not_tell_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import struct
 import tarfile
 from collections.abc import Callable
@@ -14,14 +15,17 @@ import cv2
 import numpy as np
 import pytest
 from command_line import figures_of
+from mistakes import frames_until_error, refused_at_opening
 from numbered_pictures import write_video
+from stamped_videos import write
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.evaluation.measure import MeasureOptions
 from sags_node.evaluation.session import evaluate
 from sags_node.geometry import invert, project, unproject
+from sags_node.importing.check import check_folder
 from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
 from sags_node.types import F32, F64, U8, StereoFrame
@@ -300,6 +304,33 @@ def test_frames_without_a_pose_are_left_out(keyframe: Path, caplog: pytest.LogCa
     assert "has poses for 5 of 6 frames; the rest is left out" in caplog.text
 
 
+def test_a_video_that_is_cut_off_is_refused_and_what_is_there_plays(keyframe: Path) -> None:
+    file = keyframe / "data/rgb.mp4"
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 255, (2 * HEIGHT, WIDTH, 3), np.uint8) for _ in range(FRAMES)]
+    write(file, noise, rate=25, muxer={"movflags": "faststart"}, options={"bf": "0"})
+    file.write_bytes(file.read_bytes()[: 2 * file.stat().st_size // 3])
+    with pytest.raises(UsageError, match=r"rgb\.mp4 is cut off.*source\.frames:=(\d)") as caught:
+        play(keyframe)
+    there = int(str(caught.value)[-1])
+    assert 2 <= there < FRAMES and len(play(keyframe, frames=there)) == there
+    (error,) = [each for each in check_folder(keyframe) if each.level == "error"]
+    assert "is cut off" in error.what and error.fix.endswith(f"source.frames:={there}")
+
+
+def test_a_video_that_pauses_is_played_by_its_stamps(keyframe: Path) -> None:
+    seconds = [0.0, 0.04, 0.08, 2.0, 2.04, 2.08]
+    write(keyframe / "data/rgb.mp4", [np.vstack(pictures(n)) for n in range(FRAMES)], seconds, rate=25)
+    assert [frame.t_capture_ns * 1e-9 for frame in play(keyframe)] == pytest.approx(seconds)
+
+
+def test_poses_of_more_frames_than_the_video_has_are_told(
+    keyframe: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(keyframe / "data/rgb.mp4", [np.vstack(pictures(n)) for n in range(4)], rate=25)
+    assert len(play(keyframe)) == 4 and "has poses of more than its 4 pictures" in caplog.text
+
+
 def test_a_frame_without_points_has_no_reference(keyframe: Path) -> None:
     unpack(keyframe)
     (keyframe / "data/scene_points/scene_points000003.tiff").unlink()
@@ -403,9 +434,7 @@ def test_mistakes_are_named_with_their_fix(
     keyframe: Path, mistake: Callable[[Path], None], message: str
 ) -> None:
     mistake(keyframe)
-    with pytest.raises(SagsError, match=message) as caught:
-        open_source(load_launch(keyframe).source)
-    assert "\n" not in str(caught.value)
+    refused_at_opening(lambda: load_launch(keyframe).source, message)
 
 
 @pytest.mark.parametrize(
@@ -420,12 +449,8 @@ def test_mistakes_are_named_with_their_fix(
 def test_damaged_points_in_the_middle_are_named(keyframe: Path, data: bytes, said: str) -> None:
     unpack(keyframe)
     (keyframe / "data/scene_points/scene_points000002.tiff").write_bytes(data)
-    frames = []
-    with open_source(cfg.ScaredSource(folder=keyframe, pace="step")) as source:
-        with pytest.raises(SagsError, match=f"scene_points of frame 2 .*{said}"):
-            for frame in source:
-                frames.append(frame)
-    assert len(frames) == 2
+    frames, message = frames_until_error(cfg.ScaredSource(folder=keyframe, pace="step"))
+    assert len(frames) == 2 and re.search(f"scene_points of frame 2 .*{said}", message)
 
 
 def test_archive_members_that_are_no_files_are_passed_over(keyframe: Path) -> None:

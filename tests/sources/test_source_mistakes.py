@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from bag_files import ROS1, ROS2, stereo_rows, write_rosbag1, write_rosbag2
+from mistakes import frames_until_error, refused_at_opening
 from numbered_pictures import HEIGHT, WIDTH, numbers, picture, recordings, write_png, write_video
 from places import SESSION
 
@@ -111,10 +112,8 @@ DAMAGED: list[tuple[Callable[[Path], Recording], str]] = [
 def test_mistakes_at_opening(tmp_path: Path, mistake: Callable[[Path], Recording], message: str) -> None:
     """All but damaged picture data are mistakes of the request."""
     recordings(tmp_path)
-    with pytest.raises(SagsError, match=message) as caught:
-        open_source(mistake(tmp_path))
-    assert "\n" not in str(caught.value)
-    assert isinstance(caught.value, UsageError) or (mistake, message) in DAMAGED
+    error = refused_at_opening(lambda: mistake(tmp_path), message)
+    assert isinstance(error, UsageError) or (mistake, message) in DAMAGED
 
 
 def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
@@ -130,14 +129,6 @@ def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path)
 
 
 # ---- on the way ------------------------------------------------------------------------------------------
-
-
-def frames_until_error(config: Recording) -> tuple[list[StereoFrame], str]:
-    frames = []
-    with open_source(config) as source, pytest.raises(SagsError) as caught:
-        for frame in source:
-            frames.append(frame)
-    return frames, str(caught.value)
 
 
 @pytest.mark.fault("file: a picture is cut off")

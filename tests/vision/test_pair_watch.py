@@ -133,7 +133,7 @@ WRONG: dict[str, tuple[Spoil, str]] = {
         lambda f: replace(f, left=_noisy(f.left), right=_jpeg(_noisy(f.left * 0.8 + 10))),
         "both eyes show the same picture",
     ),
-    "exchanged": (_exchanged, "left and right seem to be exchanged: swap"),
+    "exchanged": (_exchanged, "left and right seem to be exchanged: exchange"),
 }
 
 
