@@ -31,6 +31,7 @@ from benchmarks.commands.node import (
     bench_tracking,
     bench_transport,
 )
+from benchmarks.commands.registration import bench_registration
 from sags_node.cli.main import begin, sags_group
 
 
@@ -46,6 +47,7 @@ def main(verbose: bool, form: str) -> None:
 for command in (
     bench_depth,
     bench_masks,
+    bench_registration,
     bench_disturbances,
     bench_pareto,
     bench_endurance,
