@@ -21,12 +21,12 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9489,
+    "benchmarks": 9812,
     "sags_lab": 4958,
     "sags_node": 1726,
     "sags_node/bridge": 2638,
     "sags_node/calibration": 1846,
-    "sags_node/cli": 3087,
+    "sags_node/cli": 3171,
     "sags_node/config": 1357,
     "sags_node/detail": 865,
     "sags_node/engine": 4508,
@@ -41,17 +41,18 @@ LINES = {
     "sags_node/messaging": 5087,
     "sags_node/model": 960,
     "sags_node/node": 1425,
-    "sags_node/overlay": 2230,
+    "sags_node/overlay": 2383,
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 825,
     "sags_node/recording": 2600,
+    "sags_node/registration": 462,
     "sags_node/rig": 1183,
     "sags_node/ros": 332,
     "sags_node/sources": 5606,
     "sags_node/terminal": 338,
     "sags_node/viewer": 1042,
     "sags_node/vision": 5454,
-    "tests": 45930,
+    "tests": 46199,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -76,31 +76,27 @@ def register_live(
 
 
 def _look(node: NodeAddress, seconds: float) -> list[Seen]:
-    """`FRAMES` that are spread over some seconds of one session of a node."""
+    """At most `FRAMES` that are spread over some seconds of one session of a node."""
     seen: list[Seen] = []
+    apart_ns, deadline, last = 1e9 * seconds / FRAMES, time.monotonic() + PATIENCE + seconds, None
     with Subscriber.at(node, [*NEEDED, CONFIDENCE]) as subscriber:
-        leading, deadline = NEEDED[0], time.monotonic() + PATIENCE + seconds
-        last = None
-        while len(seen) < FRAMES and (left := deadline - time.monotonic()) > 0:
-            last = subscriber.wait(leading, min(left, PATIENCE), after=last)
+        while not seen or seen[-1][0].stamp_ns - seen[0][0].stamp_ns < (FRAMES - 1) * apart_ns:
+            last = subscriber.wait(NEEDED[0], max(0.0, deadline - time.monotonic()), after=last)
             if last is None:
                 break
-            if seen and last.stamp_ns - seen[-1][0].stamp_ns < 1e9 * seconds / FRAMES:
-                continue
             messages = subscriber.aligned([*NEEDED, CONFIDENCE], last.stamp_ns, WAIT_FOR_REST)
             frame = None if messages is None else tissue_frame(messages, None)
-            if messages is None or frame is None or subscriber.problem(leading) is not None:
+            if messages is None or frame is None or subscriber.problem(NEEDED[0]) is not None:
                 continue
             if not last.metric:
                 raise SagsError("the node has no calibration, so nothing has a length: see sags calib")
             if seen and (frame.session, frame.epoch) != (seen[0][0].session, seen[0][0].epoch):
-                raise SagsError("the node or its recording began anew meanwhile: register again")
-            seen.append((frame, messages[CONFIDENCE].array))
+                seen.clear()  # places of before are of another world
+            if not seen or frame.stamp_ns - seen[-1][0].stamp_ns >= apart_ns:
+                seen.append((frame, messages[CONFIDENCE].array))
         if not seen:
-            why = subscriber.refusal or subscriber.problem(leading) or "frames are not whole"
-            raise SagsError(
-                f"no depth came from {subscriber.endpoint}: {why}; is the node running, with a model?"
-            )
+            why = subscriber.refusal or subscriber.problem(NEEDED[0]) or "no frame was whole"
+            raise SagsError(f"no depth came from {subscriber.endpoint}: {why}; does the node run and map?")
     return seen
 
 
