@@ -45,14 +45,14 @@ LINES = {
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 825,
     "sags_node/recording": 2600,
-    "sags_node/registration": 462,
+    "sags_node/registration": 464,
     "sags_node/rig": 1183,
     "sags_node/ros": 332,
     "sags_node/sources": 5606,
     "sags_node/terminal": 338,
     "sags_node/viewer": 1042,
     "sags_node/vision": 5454,
-    "tests": 46199,
+    "tests": 46200,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

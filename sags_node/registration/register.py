@@ -29,6 +29,7 @@ LIMITS = (
     (1.5, 4.0, "the surface is {:.1f} mm off: is the organ deformed, or another one?"),
     (5.0, 15.0, "errors up to {:.1f} mm are expected: add pairs, farther apart"),
 )
+FREELY = 0.1  # m: no organ slides farther
 MIRRORED = (
     "it fits as its mirror image only, so the file has the other handedness: turn one of its axes round"
 )
@@ -142,6 +143,7 @@ def _expected(information: F64, arms: F64, bias: F64) -> F64:
 def _judged(found: Registration, slide: float) -> Registration:
     """With the worst of what speaks against it; of equals, the first."""
     assert found.fiducials is not None and found.expected is not None and found.residual is not None
+    slide = min(slide, FREELY)
     lengths = _rms(found.fiducials), slide, 0.1 * (1 - found.share), found.residual[0], found.expected.max()
     verdict: Verdict
     for number, verdict in ((1, "refused"), (0, "doubtful")):
