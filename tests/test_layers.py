@@ -45,7 +45,7 @@ LINES = {
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 825,
     "sags_node/recording": 2600,
-    "sags_node/registration": 464,
+    "sags_node/registration": 466,
     "sags_node/rig": 1183,
     "sags_node/ros": 332,
     "sags_node/sources": 5606,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sags_node.geometry import Array
 from sags_node.types import F64
 
 PICKED = 1e-3  # m along each axis: what people pick landmarks to, before the pairs say more
@@ -18,12 +19,12 @@ PICKED_COUNTS = 6  # residuals that this guess is worth
 NINE_OF_TEN = 1.2816  # standard deviations, below which nine of ten of a normal distribution lie
 
 
-def motion_rows(arms: F64, directions: F64) -> F64:
+def motion_rows(arms: Array, directions: F64) -> F64:
     """How far points [N, 3] (m, from the centre) go along directions [N, 3] in a small motion: [N, 6]."""
     return np.hstack([np.cross(arms, directions), directions])
 
 
-def picking_error(residuals: F64) -> float:
+def picking_error(residuals: Array) -> float:
     """Standard deviation (m) along each axis of picked points, by what their rigid fit left [k, 3].
 
     The fit takes six freedoms of them away. Three or four pairs tell little, so `PICKED` counts as well.
@@ -32,13 +33,13 @@ def picking_error(residuals: F64) -> float:
     return float(np.sqrt(squares / (residuals.size - 6 + PICKED_COUNTS)))
 
 
-def of_pairs(arms: F64, error: float) -> F64:
+def of_pairs(arms: Array, error: float) -> F64:
     """The information [6, 6] of points [k, 3] (m, from the centre) known to `error` (m) along each axis."""
     rows = motion_rows(np.repeat(arms, 3, axis=0), np.tile(np.eye(3), (len(arms), 1)))
     return rows.T @ rows / error**2
 
 
-def nine_of_ten(covariance: F64, arm: F64, bias: F64) -> float:
+def nine_of_ten(covariance: F64, arm: Array, bias: F64) -> float:
     """The length (m) below which nine of ten errors of a target stay.
 
     By two moments of the squared length (Satterthwaite), and the cube root of Wilson and Hilferty.

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sags_node.geometry import invert, transform
+from sags_node.geometry import Array, invert, transform
 from sags_node.registration.certainty import nine_of_ten, of_pairs, picking_error
 from sags_node.registration.rigid import kabsch, on_a_line
 from sags_node.registration.surface_fit import fit_surface
@@ -61,7 +61,7 @@ class Registration:
             said["pairs_mm"] = [_in_mm(each) for each in self.fiducials]
         if self.residual is not None:
             told = [self.expected_by_pairs, self.expected, self.moved]
-            rows = zip(targets.tolist(), *told, strict=True)
+            rows: Any = zip(targets.tolist(), *told, strict=True)
             keys = "at", "expected_by_pairs_mm", "expected_mm", "moved_mm"
             said["targets"] = [dict(zip(keys, [at, *map(_in_mm, row)], strict=True)) for at, *row in rows]
             said["residual_median_mm"], said["residual_p90_mm"] = map(_in_mm, self.residual)
@@ -134,7 +134,7 @@ def _placed(model: Shape, at: F64, places: F64, surface: Surface, targets: F64) 
     return _judged(found, counted.slide())
 
 
-def _expected(information: F64, arms: F64, bias: F64) -> F64:
+def _expected(information: F64, arms: Array, bias: F64) -> F64:
     """Nine of ten errors at targets [t, 3]; `bias` [3] is what all depths may be wrong by at once."""
     covariance = np.linalg.inv(information)
     return np.array([nine_of_ten(covariance, arm, bias) for arm in arms])

@@ -85,12 +85,13 @@ def fit_surface(
             T = motion @ T
             if np.abs(twist).max() < STILL:
                 break
+    assert counted is not None  # there are gates
     return T, counted
 
 
 def _counted(side: Shape, surface: Surface, patches: I64, centre: F64, T: F64, gate: float) -> Counted | None:
     near, normals = side.nearest(transform(invert(T), surface.points))
-    near, normals = transform(T, near), normals @ T[:3, :3].T
+    near, normals = np.asarray(transform(T, near), np.float64), normals @ T[:3, :3].T
     offsets = surface.points - near
     off, distances = np.einsum("nc,nc->n", offsets, normals), np.linalg.norm(offsets, axis=1)
     aside = np.linalg.norm(offsets - off[:, None] * normals, axis=1)

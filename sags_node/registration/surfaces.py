@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sags_node.confidence import LEAST, error_of
-from sags_node.geometry import unproject
+from sags_node.geometry import Array, unproject
 from sags_node.types import F32, F64, I32, Bool, Camera
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -31,21 +31,21 @@ class Shape:
         corners = np.ascontiguousarray(triangles.astype(np.uint32))
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(corners))
 
-    def facing(self, eye: F64) -> Shape:
+    def facing(self, eye: Array) -> Shape:
         """What of it an eye at [3] sees: triangles whose middles nothing hides. Files wind their triangles
         either way, so that does not count."""
         middles = self.vertices[self.triangles].mean(1)
         seen = self._meets(eye, middles) > 1 / BEHIND
         return Shape(self.vertices, self.triangles[seen])
 
-    def nearest(self, points: F64) -> tuple[F64, F64]:
+    def nearest(self, points: Array) -> tuple[F64, F64]:
         """The nearest places on it to points [N, 3], and its unit normals there, both [N, 3]."""
         found = self._scene.compute_closest_points(self._tensor(points.astype(np.float32)))
         return found["points"].numpy().astype(np.float64), found["primitive_normals"].numpy().astype(
             np.float64
         )
 
-    def hides(self, eye: F64, points: F64) -> Bool:
+    def hides(self, eye: Array, points: Array) -> Bool:
         """Which rays from an eye at [3] through points [N, 3] meet it, before or behind the point."""
         return np.isfinite(self._meets(eye, points))
 
@@ -53,7 +53,7 @@ class Shape:
         """It with x turned round, as a file of the other handedness would have it."""
         return Shape(self.vertices * MIRROR, self.triangles[:, ::-1])
 
-    def _meets(self, eye: F64, points: F64) -> F32:
+    def _meets(self, eye: Array, points: Array) -> F32:
         """Where rays from an eye through points [N, 3] meet it first, in lengths of the way; inf: nowhere."""
         rays = np.hstack([np.broadcast_to(eye, points.shape), points - eye]).astype(np.float32)
         found: F32 = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))["t_hit"].numpy()
