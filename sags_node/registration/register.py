@@ -136,7 +136,7 @@ def _placed(model: Shape, at: F64, places: F64, surface: Surface, targets: F64) 
 
 def _expected(information: F64, arms: Array, bias: F64) -> F64:
     """Nine of ten errors at targets [t, 3]; `bias` [3] is what all depths may be wrong by at once."""
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
     return np.array([nine_of_ten(covariance, arm, bias) for arm in arms])
 
 
