@@ -21,12 +21,12 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9213,
+    "benchmarks": 9534,
     "sags_lab": 5032,
     "sags_node": 1680,
     "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
-    "sags_node/cli": 3082,
+    "sags_node/cli": 3166,
     "sags_node/config": 1352,
     "sags_node/detail": 928,
     "sags_node/engine": 4071,
@@ -41,7 +41,7 @@ LINES = {
     "sags_node/messaging": 5084,
     "sags_node/model": 960,
     "sags_node/node": 1425,
-    "sags_node/overlay": 2208,
+    "sags_node/overlay": 2361,
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 840,
     "sags_node/recording": 2600,
@@ -51,7 +51,7 @@ LINES = {
     "sags_node/terminal": 335,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5462,
-    "tests": 45052,
+    "tests": 45321,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

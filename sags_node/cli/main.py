@@ -39,6 +39,7 @@ from sags_node.cli.new import new
 from sags_node.cli.node_options import node_options, ns_option, own_control_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
+from sags_node.cli.register import register
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
@@ -343,7 +344,7 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
 
 
 for command in (
-    *(new, evaluate, fit, export, bag, bridge, calib, overlay, view, topic),
+    *(new, evaluate, fit, export, bag, bridge, calib, overlay, register, view, topic),
     *(anchor, param, pause, resume, reset),
 ):
     main.add_command(command)

@@ -14,8 +14,9 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
 from sags_node.messaging.control import ControlClient
 from sags_node.overlay.frame import Anchor, TissueFrame
-from sags_node.overlay.pose import on_a_line, on_surface, rigid_fit, surface_normal
+from sags_node.overlay.pose import on_surface, surface_normal
 from sags_node.overlay.scene import ObjectSpec
+from sags_node.registration.rigid import on_a_line, rigid_fit
 from sags_node.types import F64
 
 LEAST_ANCHORS = 3  # for a rigid fit

@@ -48,12 +48,24 @@ def mesh_of(spec: ObjectSpec) -> Mesh | None:
     return None if spec.file is None else _load(spec, spec.file)
 
 
+def surface_of(file: Path, scale: float) -> Mesh:
+    """The triangles of a file, which no cloud of points has; `scale` is metres per unit of it.
+
+    Raises:
+        UsageError: as `mesh_of`, or it holds points only.
+    """
+    if file.suffix.lower() not in _MESHES:
+        raise UsageError(f"{file} is no surface: the name must end in one of {' '.join(_MESHES)}")
+    return _load(ObjectSpec(file=file, scale=scale), file, points_too=False)
+
+
 # ---- files -----------------------------------------------------------------------------------------------
 
 
-def _load(spec: ObjectSpec, file: Path) -> Mesh:
+def _load(spec: ObjectSpec, file: Path, points_too: bool = True) -> Mesh:
     points, triangles = parse_mesh(file, _content(file))
-    what = "triangles" if len(triangles) or file.suffix.lower() not in _POINTS else "points"
+    may_be_points = points_too and file.suffix.lower() in _POINTS
+    what = "triangles" if len(triangles) or not may_be_points else "points"
     count, most = (len(triangles), MAX_TRIANGLES) if what == "triangles" else (len(points), MAX_POINTS)
     if count == 0:
         raise UsageError(f"{file} holds no {what}, or is damaged; open it in a mesh viewer")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -20,6 +20,7 @@ Byte = Annotated[int, Field(ge=0, le=255)]
 Color = tuple[Byte, Byte, Byte]  # RGB
 Shape = Literal["target", "sphere"]
 SHAPES: tuple[str, ...] = get_args(Shape)
+S = TypeVar("S", bound=Section)
 
 
 class AnchorSpec(Section):
@@ -58,6 +59,7 @@ class ObjectSpec(Section):
     )
     anchors: tuple[AnchorSpec, ...] = Field((), max_length=32, description="one, or three and more; default: "
                                             "one in the middle of the tissue")  # fmt: skip
+    registration: dict[str, Any] | None = Field(None, description="what sags register found, for people")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -92,6 +94,27 @@ class SceneSpec(Section):
         return self
 
 
+class PairSpec(Section):
+    """A point of the tissue, and the point of a model that belongs there."""
+
+    pixel: tuple[float, float] | None = Field(None, description="u v of left/image_rect_color")
+    anchor: int | None = Field(None, description="number of an anchor of the node")
+    at: Place = Field(description="of the model, in the file's units")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.pixel is None) == (self.anchor is None):
+            raise ValueError("a pair needs either pixel: [u, v] or anchor: NUMBER")
+        return self
+
+
+class PairsSpec(Section):
+    pairs: tuple[PairSpec, ...] = Field(max_length=100)
+    targets: tuple[Place, ...] = Field(
+        (), max_length=32, description="points of the model whose error is told"
+    )
+
+
 def built_in(pixel: tuple[float, float] | None, shape: str) -> SceneSpec:
     """One shape at a pixel, or in the middle of the tissue.
 
@@ -110,11 +133,7 @@ def read_scene(file: Path) -> SceneSpec:
     Raises:
         UsageError: it is missing or too large, is not YAML, or holds an unknown key or a wrong value.
     """
-    try:
-        scene = SceneSpec.model_validate(read_yaml(file, "scene file"))
-    except ValidationError as error:
-        raise UsageError(_explain(error, file)) from None
-    folder = file.parent
+    scene, folder = _read(SceneSpec, file, "scene file"), file.parent
     located = [
         thing if thing.file is None else thing.model_copy(update={"file": folder / thing.file})
         for thing in scene.objects
@@ -122,13 +141,29 @@ def read_scene(file: Path) -> SceneSpec:
     return scene.model_copy(update={"objects": tuple(located)})
 
 
-def _explain(error: ValidationError, file: Path) -> str:
+def read_pairs(file: Path) -> PairsSpec:
+    """Read the pairs of points of a registration.
+
+    Raises:
+        UsageError: as `read_scene`.
+    """
+    return _read(PairsSpec, file, "file of pairs")
+
+
+def _read(root: type[S], file: Path, what: str) -> S:
+    try:
+        return root.model_validate(read_yaml(file, what))
+    except ValidationError as error:
+        raise UsageError(_explain(error, file, root)) from None
+
+
+def _explain(error: ValidationError, file: Path, root: type[Section]) -> str:
     """One mistake: where, what, and the nearest known key for an unknown one, which explains most others."""
     first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
     path = [str(part) for part in first["loc"]]
     where = ".".join(path)
     if first["type"] == "extra_forbidden":
-        return f"{file}: unknown key '{where}'; {_nearest(path)}"
+        return f"{file}: unknown key '{where}'; {_nearest(path, root)}"
     if first["type"] == "missing":
         return f"{file}: {where} is missing; set it"
     what = first["msg"].removeprefix("Value error, ")
@@ -139,9 +174,9 @@ def _explain(error: ValidationError, file: Path) -> str:
     return f"{file}: {where + ': ' if where else ''}{what}"
 
 
-def _nearest(path: Sequence[str]) -> str:
-    models: dict[str, Any] = {"objects": ObjectSpec, "anchors": AnchorSpec}
+def _nearest(path: Sequence[str], root: type[Section]) -> str:
+    models: dict[str, Any] = {"objects": ObjectSpec, "anchors": AnchorSpec, "pairs": PairSpec}
     sections = [models[part] for part in path[:-1] if part in models]
-    known = list((sections[-1] if sections else SceneSpec).model_fields)
+    known = list((sections[-1] if sections else root).model_fields)
     near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
     return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"

@@ -18,8 +18,9 @@ from sags_node.geometry import invert, quat_to_matrix, transform
 from sags_node.mapping.anchors import Anchors
 from sags_node.overlay.frame import Anchor, TissueFrame
 from sags_node.overlay.held import HeldObject, Pinner, Request
-from sags_node.overlay.pose import on_a_line, on_surface, rigid_fit, surface_normal
+from sags_node.overlay.pose import on_surface, surface_normal
 from sags_node.overlay.scene import ObjectSpec
+from sags_node.registration.rigid import on_a_line, rigid_fit
 
 # ---- poses -----------------------------------------------------------------------------------------------
 

@@ -1,0 +1,285 @@
+"""How exactly a model is placed on tissue: on the phantom, whose surface is the model, and on a real organ.
+
+Each seed is another phantom, another part of its surface, and other errors of the picked points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from benchmarks.quality.depth import Advance, rounded
+from benchmarks.quality.depth_ct import CTPair, configured_depth, read_ct_pair
+from sags_node.config.schema import LaunchConfig
+from sags_node.evaluation.receipt import Receipt
+from sags_node.geometry import invert, project, transform
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.budget import StepBudget
+from sags_node.phantom.scene import Phantom, PhantomScene
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.warm_up import warm_up
+from sags_node.registration.register import Registration, register
+from sags_node.registration.rigid import kabsch
+from sags_node.registration.surfaces import MIRROR, Shape, Surface
+from sags_node.types import F32, F64, Camera, StereoFrame
+
+SEEDS = 20
+PAIRS, TARGETS = 5, 5
+PICKED = 1e-3  # m, standard deviation of a picked point along each axis
+BELOW = 0.020  # m under the surface, along the line of sight
+FRAMES, RATE, STEPS = 5, 5.0, 2  # a second of the node; steps of the mapper, each frame
+SIZE = (640, 512)
+PART = (0.35, 0.36)  # half axes of the part that is cut out, of width and height
+REACH = 0.010  # m, of Open3D's ICP
+EVEN = 0.03  # m, half a side of the shapes without a hold
+ERRORS = 5  # of the picked points, on each of these
+RADIUS = 0.05  # m, of the ball
+
+
+class Case:
+    """A model that lies somewhere in its own coordinates, and where it truly is.
+
+    Args:
+        rng: turns it, and errs as it picks.
+        vertices: [V, 3] m, world, that the eye at the world's origin sees.
+    """
+
+    def __init__(self, rng: np.random.Generator, vertices: F64, triangles: F64) -> None:
+        away = np.eye(4)
+        away[:3, :3], away[:3, 3] = cv2.Rodrigues(rng.normal(size=3))[0], rng.normal(0, 0.1, 3)
+        self.truth = invert(away)
+        picked = _far_apart(rng, vertices)
+        seen = vertices[rng.choice(len(vertices), TARGETS)]
+        self.deep = seen * (1 + BELOW / np.linalg.norm(seen, axis=1, keepdims=True))
+        self.at, self.targets = transform(away, picked), transform(away, self.deep)
+        self.places = picked + rng.normal(0, PICKED, picked.shape)
+        self.model = Shape(np.asarray(transform(away, vertices)), triangles)
+
+    def errors(self, T: F64) -> F64:
+        """Of the targets (m) under a pose."""
+        return np.linalg.norm(transform(T, self.targets) - self.deep, axis=1)
+
+
+def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[str, Any]:
+    """All of it.
+
+    Args:
+        ct: folder of the pair with a CT surface; None: the phantom only.
+    """
+    config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    rows, refusals = [], []
+    receipt: Receipt | None = None
+    for seed in range(seeds):
+        advance(seed, seeds, "phantom")
+        phantom = Phantom(
+            PhantomScene(seconds=1.0, width=SIZE[0], height=SIZE[1], seed=seed, still_tissue=True)
+        )
+        receipt = receipt or Receipt(phantom.rig, SIZE, None)
+        camera, surface = _node_sees(config, phantom, receipt)
+        case = Case(rng := np.random.default_rng(seed), *_part(rng, phantom, camera))
+        rows.append({"seed": seed, **_registered(case, surface)})
+        refusals += list(_spoilt(case, surface))
+    refusals += list(_even(np.random.default_rng(0)))
+    assert receipt is not None
+    measured = {
+        "picked_mm": 1e3 * PICKED,
+        "below_mm": 1e3 * BELOW,
+        "phantom": _summary(rows),
+        "rows": rows,
+        "refused": _counted(refusals),
+        "receipts": {"phantom": receipt.as_json()},
+    }
+    if ct is not None:
+        advance(seeds, seeds, "CT")
+        pair = read_ct_pair(ct)
+        rows = [{"seed": seed, **row} for seed, row in enumerate(_on_ct(pair, seeds))]
+        measured |= {"ct": _summary(rows), "ct_rows": rows}
+        measured["receipts"]["ct"] = pair.receipt
+    return measured
+
+
+def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tuple[Camera, Surface]:
+    """What `sags register` gets of a second of the node."""
+    pipeline, parts = Pipeline(config, phantom.rig, rate=RATE), []
+    for number in range(FRAMES):
+        truth = phantom.frame(number, FRAMES)
+        stamp = round((1 + number / RATE) * 1e9)
+        frame = StereoFrame(
+            number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool, T_world_cam=truth.T_world_cam
+        )
+        result = pipeline.process(frame, StepBudget(STEPS))
+        view, tissue = result.views["left"], result.observation.tissue
+        receipt.add(frame, tissue)
+        parts.append(Surface.of_depth(view.depth, view.confidence, tissue, view.camera))
+    return view.camera, Surface.joined(parts)
+
+
+def _part(rng: np.random.Generator, phantom: Phantom, camera: Camera) -> tuple[F64, F64]:
+    """Vertices and triangles of the tissue within an ellipse of the picture."""
+    vertices = phantom.tissue.vertices(0.0).reshape(-1, 3).astype(np.float64)
+    triangles = phantom.tissue.faces.astype(np.int32)
+    size = np.array([camera.width, camera.height])
+    middle = size * rng.uniform(0.4, 0.6, 2)
+    pixels, _ = project(camera, vertices[triangles].mean(1))
+    kept = triangles[np.linalg.norm((pixels - middle) / (PART * size), axis=1) < 1]
+    used, numbers = np.unique(kept, return_inverse=True)
+    return vertices[used], numbers.reshape(-1, 3).astype(np.int32)
+
+
+def _far_apart(rng: np.random.Generator, vertices: F64) -> F64:
+    """As people pick landmarks: each of some that are at hand, the farthest from those before."""
+    chosen = [vertices[rng.integers(len(vertices))]]
+    while len(chosen) < PAIRS:
+        at_hand = vertices[rng.choice(len(vertices), 12)]
+        away = np.linalg.norm(at_hand[:, None] - np.array(chosen), axis=2).min(1)
+        chosen.append(at_hand[away.argmax()])
+    return np.array(chosen)
+
+
+def _registered(case: Case, surface: Surface) -> dict[str, Any]:
+    found = register(case.model, case.at, case.places, surface, case.targets)
+    start = kabsch(case.at, case.places, np.full(PAIRS, 1 / PAIRS))
+    errors = {"by_pairs": case.errors(start), "open3d": case.errors(_open3d(case.model, surface, start))}
+    row = {"verdict": found.verdict, "reason": found.reason}
+    if found.T_world_model is not None and found.residual is not None:
+        errors["fitted"] = case.errors(found.T_world_model)
+        row |= {
+            "share": rounded(found.share),
+            "residual_mm": [rounded(1e3 * each) for each in found.residual],
+        }
+        row |= {"told_by_pairs_mm": _mm(found.expected_by_pairs), "told_mm": _mm(found.expected)}
+    return row | {f"{name}_mm": _mm(each) for name, each in errors.items()}
+
+
+def _open3d(model: Shape, surface: Surface, T: F64) -> F64:
+    """The pose [4, 4] by Open3D's ICP, point to plane, with nothing else set."""
+    import open3d as o3d
+
+    measured, corners = (
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (surface.points, model.vertices)
+    )
+    measured.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.005, 30))
+    way = o3d.pipelines.registration.TransformationEstimationPointToPlane()
+    found = o3d.pipelines.registration.registration_icp(corners, measured, REACH, T, way)
+    return np.asarray(found.transformation)
+
+
+def _spoilt(case: Case, surface: Surface) -> Iterable[tuple[str, Registration, str]]:
+    """What must be refused, and a word of the remedy."""
+    model, at, places, targets = case.model, case.at, case.places, case.targets
+    for name, factor, word in (
+        ("mm read as m", 1000.0, "divide --scale by 1000"),
+        ("m read as mm", 0.001, "multiply --scale by 1000"),
+        ("cm read as mm", 0.1, "multiply --scale by 10"),
+    ):
+        other = Shape(factor * model.vertices, model.triangles)
+        yield name, register(other, factor * at, places, surface, factor * targets), word
+    yield "mirrored", register(model.mirrored(), at * MIRROR, places, surface, targets * MIRROR), "handedness"
+    yield "two pairs", register(model, at[:2], places[:2], surface, targets), "give 3 to 20"
+    line = np.linspace(0, 1, PAIRS)[:, None]
+    on_a_line = [ends[0] + line * (ends[1] - ends[0]) for ends in (at, places)]
+    yield "on a line", register(model, *on_a_line, surface, targets), "add one aside"
+
+
+def _even(rng: np.random.Generator) -> Iterable[tuple[str, Registration, str]]:
+    """A plane and a part of a ball that go on beyond the model, with the errors of a depth."""
+    K = np.array([[576.0, 0, 319.5], [0, 576.0, 255.5], [0, 0, 1]])
+    camera = Camera(*SIZE, K, np.eye(4))
+    x, y = np.meshgrid(np.linspace(-EVEN, EVEN, 61), np.linspace(-EVEN, EVEN, 61))
+    corner = (np.arange(60)[:, None] * 61 + np.arange(60)).ravel()
+    triangles = np.concatenate(
+        [np.stack([corner, corner + 1, corner + 61], 1), np.stack([corner + 62, corner + 61, corner + 1], 1)]
+    )
+    for name, z in (("plane", 0.08 + 0.2 * x), ("ball", 0.08 + RADIUS - np.sqrt(RADIUS**2 - x**2 - y**2))):
+        vertices = np.stack([x, y, z], -1).reshape(-1, 3)
+        noisy = vertices * (1 + rng.normal(0, 3e-4, len(vertices)) / vertices[:, 2])[:, None]
+        surface = Surface(noisy, np.full(len(noisy), 4e-4), camera.T_world_cam[:3, 3])
+        inner = triangles[(np.abs(vertices[triangles, :2].mean(1)) < 0.02).all(1)].astype(np.int32)
+        used, numbers = np.unique(inner, return_inverse=True)
+        for _ in range(ERRORS):
+            case = Case(rng, vertices[used], numbers.reshape(-1, 3).astype(np.int32))
+            yield name, register(case.model, case.at, case.places, surface, case.targets), "with an edge"
+
+
+def _on_ct(pair: CTPair, seeds: int) -> Iterable[dict[str, Any]]:
+    """Other errors of other picked points, each time; the set's own alignment is the truth."""
+    depth, confidence = configured_depth(pair)
+    surface = Surface.of_depth(depth, confidence, pair.evaluated, pair.pair.camera)
+    triangles = _joined_in_picture(pair.pixels.astype(np.float32), pair.points)
+    for seed in range(seeds):
+        case = Case(np.random.default_rng(seed), pair.points, triangles)
+        yield _registered(case, surface)
+
+
+def _joined_in_picture(pixels: F32, points: F64) -> F64:
+    """Triangles [T, 3] of neighbours in the picture (Delaunay) that are neighbours on the surface, too."""
+    width, height = np.ceil(pixels.max(0)).astype(int) + 2
+    mesh = cv2.Subdiv2D((0, 0, int(width), int(height)))
+    numbers = {tuple(np.round(pixel, 3)): number for number, pixel in enumerate(pixels)}
+    mesh.insert([tuple(map(float, pixel)) for pixel in pixels])
+    corners = np.round(mesh.getTriangleList().reshape(-1, 3, 2), 3)
+    found = [[numbers.get(tuple(corner), -1) for corner in triangle] for triangle in corners]
+    triangles = np.array([triangle for triangle in found if min(triangle) >= 0], np.int32)
+    sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
+    lengths = np.linalg.norm(sides, axis=2).max(1)
+    return triangles[lengths < 4 * np.median(lengths)]
+
+
+def _mm(lengths: F64 | None) -> list[float | None]:
+    return [rounded(1e3 * each) for each in (() if lengths is None else lengths)]
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of all targets of all seeds."""
+    said: dict[str, Any] = {"seeds": len(rows)}
+    said["verdicts"] = {v: sum(row["verdict"] == v for row in rows) for v in ("good", "doubtful", "refused")}
+    for name in ("by_pairs", "fitted", "open3d"):
+        errors = np.array([each for row in rows for each in row.get(f"{name}_mm", ())])
+        said[name] = {"median_mm": rounded(np.median(errors)), "p90_mm": rounded(np.quantile(errors, 0.9))}
+    for name, told in (("by_pairs", "told_by_pairs_mm"), ("fitted", "told_mm")):
+        pairs = [
+            pair for row in rows for pair in zip(row.get(f"{name}_mm", ()), row.get(told, ()), strict=True)
+        ]
+        said[name]["told_mm"] = rounded(np.median([each for _, each in pairs]))
+        said[name]["within_told"] = rounded(np.mean([error <= each for error, each in pairs]))
+    return said
+
+
+def _counted(refusals: list[tuple[str, Registration, str]]) -> list[dict[str, Any]]:
+    counted: dict[str, dict[str, Any]] = {}
+    for name, found, word in refusals:
+        row = counted.setdefault(
+            name, {"what": name, "of": 0, "refused": 0, "with_its_remedy": 0, "said": ""}
+        )
+        row["of"] += 1
+        row["refused"] += found.verdict == "refused"
+        row["with_its_remedy"] += found.verdict == "refused" and word in found.reason
+        row["said"] = found.reason
+    return list(counted.values())
+
+
+def tables(measured: dict[str, Any]) -> list[Table]:
+    """For people."""
+    errors = Table(
+        "", "pose by", "median, mm", "nine of ten, mm", "told, mm", "within told", title="targets' error"
+    )
+    for scene in ("phantom", "ct"):
+        for name in ("by_pairs", "fitted", "open3d") if scene in measured else ():
+            row = measured[scene][name]
+            within = f"{row['within_told']:.0%}" if "within_told" in row else ""
+            errors.add_row(
+                scene, name, str(row["median_mm"]), str(row["p90_mm"]), str(row.get("told_mm", "")), within
+            )
+    refused = Table("what", "refused", "with its remedy", "said", title="to be refused")
+    for row in measured["refused"]:
+        refused.add_row(
+            row["what"], f"{row['refused']} of {row['of']}", str(row["with_its_remedy"]), row["said"]
+        )
+    return [errors, refused]

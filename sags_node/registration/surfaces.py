@@ -1,0 +1,89 @@
+"""The two surfaces of a registration: the model's, and the tissue's as it was measured for a moment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sags_node.confidence import LEAST, error_of
+from sags_node.geometry import Array, unproject
+from sags_node.types import F32, F64, I32, Bool, Camera
+
+MIRROR = np.array([-1.0, 1.0, 1.0])
+POINTS = 1500  # of one frame, about
+NINE_OF_TEN = 1.645  # standard deviations, within which nine of ten errors of a depth lie
+BEHIND = 1.01  # of the way to a triangle's middle: what is hit there first is the triangle itself
+
+
+class Shape:
+    """A model: triangles [T, 3] between vertices [V, 3] (m, in its own coordinates). Open3D searches it."""
+
+    def __init__(self, vertices: F64, triangles: I32) -> None:
+        import open3d.core as o3c
+        from open3d.t.geometry import RaycastingScene
+
+        self.vertices, self.triangles = vertices, triangles
+        self._tensor = o3c.Tensor.from_numpy
+        self._scene: Any = RaycastingScene()
+        corners = np.ascontiguousarray(triangles.astype(np.uint32))
+        self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(corners))
+
+    def facing(self, eye: Array) -> Shape:
+        """What of it an eye at [3] sees: triangles whose middles nothing hides. Files wind their triangles
+        either way, so that does not count."""
+        middles = self.vertices[self.triangles].mean(1)
+        seen = self._meets(eye, middles) > 1 / BEHIND
+        return Shape(self.vertices, self.triangles[seen])
+
+    def nearest(self, points: Array) -> tuple[F64, F64]:
+        """The nearest places on it to points [N, 3], and its unit normals there, both [N, 3]."""
+        found = self._scene.compute_closest_points(self._tensor(points.astype(np.float32)))
+        return found["points"].numpy().astype(np.float64), found["primitive_normals"].numpy().astype(
+            np.float64
+        )
+
+    def hides(self, eye: Array, points: Array) -> Bool:
+        """Which rays from an eye at [3] through points [N, 3] meet it, before or behind the point."""
+        return np.isfinite(self._meets(eye, points))
+
+    def mirrored(self) -> Shape:
+        """It with x turned round, as a file of the other handedness would have it."""
+        return Shape(self.vertices * MIRROR, self.triangles[:, ::-1])
+
+    def _meets(self, eye: Array, points: Array) -> F32:
+        """Where rays from an eye through points [N, 3] meet it first, in lengths of the way; inf: nowhere."""
+        rays = np.hstack([np.broadcast_to(eye, points.shape), points - eye]).astype(np.float32)
+        found: F32 = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))["t_hit"].numpy()
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Measured points that say how exact they are."""
+
+    points: F64  # [N, 3] m, world
+    errors: F64  # [N] m, one standard deviation
+    eye: F64  # [3] m, world: where it is seen from
+
+    @classmethod
+    def of_depth(cls, depth: F32, confidence: F32, tissue: Bool, camera: Camera) -> Surface:
+        """About `POINTS` of a depth picture [H, W] (m; 0 or NaN: unknown), evenly, where there is tissue."""
+        every = max(1, int(np.sqrt(depth.size / POINTS)))
+        at = np.s_[every // 2 :: every, every // 2 :: every]
+        rows, columns = np.nonzero((depth[at] > 0) & tissue[at] & (confidence[at] >= LEAST))
+        pixels = np.stack([columns, rows], -1) * every + every // 2
+        z, sure = depth[at][rows, columns], confidence[at][rows, columns]
+        points = unproject(camera, pixels.astype(np.float64), z.astype(np.float64))
+        errors = np.maximum(error_of(sure), 1e-4) / NINE_OF_TEN
+        return cls(np.asarray(points), errors.astype(np.float64), camera.T_world_cam[:3, 3].copy())
+
+    @classmethod
+    def joined(cls, parts: Sequence[Surface]) -> Surface:
+        """All that several frames saw, from where the last of them stood."""
+        points, errors = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "errors")
+        )
+        return cls(points, errors, parts[-1].eye)

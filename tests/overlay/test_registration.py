@@ -1,0 +1,268 @@
+"""A model placed on tissue by pairs of points and its surface: how exactly, what is told, what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from command_line import figures_of, refused
+from running_node import RunningNode
+
+from sags_node.geometry import project, transform
+from sags_node.messaging.address import NodeAddress
+from sags_node.overlay.run import OverlayOptions, run_overlay
+from sags_node.overlay.scene import read_scene
+from sags_node.phantom import write_session
+from sags_node.phantom.scene import Phantom, PhantomScene
+from sags_node.registration.certainty import nine_of_ten, of_pairs, picking_error
+from sags_node.registration.register import Registration, register
+from sags_node.registration.rigid import kabsch, rigid_fit
+from sags_node.registration.surfaces import MIRROR, Shape, Surface
+from sags_node.types import F64, I32, Camera
+
+WIDTH, HEIGHT = 320, 256
+SCENE = PhantomScene(seconds=4.0, width=WIDTH, height=HEIGHT, seed=1, still_tissue=True)
+AWAY = np.eye(4)  # from the world to the model's own coordinates
+AWAY[:3, :3], AWAY[:3, 3] = cv2.Rodrigues(np.array([0.4, -0.9, 0.3]))[0], (0.03, -0.2, 0.1)
+PICKS = np.array([[120, 80], [230, 80], [240, 170], [150, 200], [160, 130]])  # px; no tool comes there
+DEEP = 1.25  # times as far away as a point of the surface
+
+
+# ---- what is told ----------------------------------------------------------------------------------------
+
+
+def test_the_error_told_is_that_of_fitzpatrick() -> None:
+    """His sum over the principal axes of the points, against the trace of what is propagated here."""
+    rng = np.random.default_rng(0)
+    points, target, error = rng.normal(0, [0.04, 0.02, 0.01], (6, 3)), rng.normal(0, 0.05, 3), 1e-3
+    points -= points.mean(0)
+    axes = np.linalg.svd(points)[2]
+    squares = np.square(target) @ np.zeros(3)
+    for axis in axes:
+        from_axis = points - np.outer(points @ axis, axis)
+        squares += np.sum((target - target @ axis * axis) ** 2) / np.mean(np.sum(from_axis**2, axis=1))
+    fitzpatrick = 3 * error**2 / len(points) * (1 + squares / 3)
+    arms = np.hstack([np.cross(np.tile(target, (3, 1)), np.eye(3)), np.eye(3)])
+    told = arms @ np.linalg.inv(of_pairs(points, error)) @ arms.T
+    assert np.trace(told) == pytest.approx(fitzpatrick)
+
+
+@pytest.mark.parametrize(("shape", "quantile"), [((1, 1, 1), 2.500), ((1, 1, 0), 2.146), ((1, 0, 0), 1.645)])
+def test_nine_of_ten_errors_are_below_what_is_told(shape: tuple[int, ...], quantile: float) -> None:
+    """In three, two and one directions: tables of chi squared. Wilson and Hilferty are 1.3 % off in one."""
+    covariance = np.zeros((6, 6))
+    covariance[3:, 3:] = 1e-6 * np.diag(shape)
+    assert nine_of_ten(covariance, np.zeros(3), np.zeros(3)) == pytest.approx(1e-3 * quantile, rel=0.015)
+
+
+@pytest.mark.parametrize(("count", "picked"), [(3, 0.5e-3), (3, 1e-3), (5, 1e-3), (12, 1e-3), (20, 3e-3)])
+def test_what_is_told_of_the_pairs_holds(count: int, picked: float) -> None:
+    """Of six hundred draws: 0.86 is three standard deviations below nine of ten. Few pairs say little of how
+    well they were picked, so picks that are worse than 1 mm are known by many pairs only."""
+    rng = np.random.default_rng(count)
+    within = 0
+    for _ in range(600):
+        at = rng.normal(0, 0.03, (count, 3))
+        places = at + rng.normal(0, picked, at.shape)
+        T = kabsch(at, places, np.full(count, 1 / count))
+        error = picking_error(places - transform(T, at))
+        told = nine_of_ten(np.linalg.inv(of_pairs(at - at.mean(0), error)), np.full(3, 0.03), np.zeros(3))
+        within += np.linalg.norm(transform(T, at.mean(0) + 0.03) - at.mean(0) - 0.03) <= told
+    assert within / 600 > 0.86
+
+
+# ---- the fit ---------------------------------------------------------------------------------------------
+
+
+class Organ:
+    """A part of the phantom's tissue as a model, and what an exact camera measures of all of it."""
+
+    def __init__(self) -> None:
+        phantom = Phantom(SCENE)
+        eye = phantom.rig.left
+        self.camera = Camera(WIDTH, HEIGHT, eye.P[:, :3].copy(), np.eye(4))
+        _, self.depth = phantom.still(0.0).look(self.camera, 1)
+        vertices = phantom.tissue.vertices(0.0).reshape(-1, 3).astype(np.float64)
+        triangles = phantom.tissue.faces.astype(np.int32)
+        pixels, _ = project(self.camera, vertices[triangles].mean(1))
+        part = np.linalg.norm((pixels - [160, 130]) / [120, 95], axis=1) < 1
+        used, numbers = np.unique(triangles[part], return_inverse=True)
+        self.vertices = np.asarray(transform(AWAY, vertices[used]))
+        self.triangles: I32 = numbers.reshape(-1, 3).astype(np.int32)
+        self.model = Shape(self.vertices, self.triangles)
+        rays = np.concatenate([PICKS, np.ones((len(PICKS), 1))], 1) @ np.linalg.inv(self.camera.K).T
+        self.picks = rays * self.depth[PICKS[:, 1], PICKS[:, 0]][:, None].astype(np.float64)
+        self.at = np.asarray(transform(AWAY, self.picks))
+        self.targets = np.asarray(transform(AWAY, DEEP * self.picks))
+        self.surface = self.seen(self.depth)
+
+    def seen(self, depth: Any) -> Surface:
+        sure = np.full(depth.shape, 0.85, np.float32)
+        return Surface.of_depth(depth, sure, np.ones(depth.shape, np.bool_), self.camera)
+
+    def off(self, found: Registration) -> F64:
+        assert found.T_world_model is not None
+        return np.linalg.norm(transform(found.T_world_model, self.targets) - DEEP * self.picks, axis=1)
+
+
+@pytest.fixture(scope="module")
+def organ() -> Organ:
+    return Organ()
+
+
+def picked(organ: Organ, seed: int) -> F64:
+    return organ.picks + np.random.default_rng(seed).normal(0, 1e-3, organ.picks.shape)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_surface_makes_it_better_than_the_pairs_and_no_worse_than_told(organ: Organ, seed: int) -> None:
+    found = register(organ.model, organ.at, picked(organ, seed), organ.surface, organ.targets)
+    assert found.verdict == "good" and found.expected is not None and found.expected_by_pairs is not None
+    assert (organ.off(found) < found.expected).all() and (found.expected < found.expected_by_pairs).all()
+    assert np.median(organ.off(found)) < 1.5e-3
+    assert found.share > 0.95
+
+
+def test_what_lies_over_a_part_of_it_does_not_pull(organ: Organ) -> None:
+    """A fifth of the picture shows something 6 mm nearer, all over the model's middle."""
+    clean = register(organ.model, organ.at, picked(organ, 0), organ.surface, organ.targets)
+    depth = organ.depth.copy()
+    depth[100:160, 110:200] -= 0.006
+    found = register(organ.model, organ.at, picked(organ, 0), organ.seen(depth), organ.targets)
+    assert np.abs(organ.off(found) - organ.off(clean)).max() < 0.5e-3
+    assert found.share < 0.9
+
+
+# ---- refused ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (1000, "divide --scale by 1000"), (1e-3, "multiply --scale by 1000"), (0.1, "multiply --scale by 10"),
+        (25.4, "mm for inch"), (3, "the pairs do not belong together"),
+    ],
+)  # fmt: skip
+def test_a_wrong_unit_is_refused(organ: Organ, factor: float, said: str) -> None:
+    model = Shape(factor * organ.vertices, organ.triangles)
+    found = register(model, factor * organ.at, organ.picks, organ.surface, factor * organ.targets)
+    assert found.verdict == "refused" and said in found.reason
+
+
+@pytest.mark.parametrize("pairs", [3, 5])  # three are as well fitted by their mirror image
+def test_a_mirrored_file_is_refused(organ: Organ, pairs: int) -> None:
+    at, places = organ.at[:pairs] * MIRROR, picked(organ, 1)[:pairs]
+    found = register(organ.model.mirrored(), at, places, organ.surface, organ.targets * MIRROR)
+    assert found.verdict == "refused" and "handedness" in found.reason
+
+
+def test_too_few_points_and_those_on_a_line_are_refused(organ: Organ) -> None:
+    few = register(organ.model, organ.at[:2], organ.picks[:2], organ.surface, organ.targets)
+    assert few.verdict == "refused" and "2 pairs: give 3 to 20" in few.reason
+    line = np.linspace(0, 1, 4)[:, None]
+    ends = [points[0] + line * (points[1] - points[0]) for points in (organ.at, organ.picks)]
+    found = register(organ.model, *ends, organ.surface, organ.targets)
+    assert found.verdict == "refused" and "lie on a line" in found.reason
+
+
+def test_what_is_out_of_sight_and_pairs_that_do_not_fit_are_refused(organ: Organ) -> None:
+    aside = organ.picks + np.array([0.3, 0, 0])
+    assert "in sight" in register(organ.model, organ.at, aside, organ.surface, organ.targets).reason
+    exchanged = organ.picks[[1, 0, 2, 3, 4]]
+    found = register(organ.model, organ.at, exchanged, organ.surface, organ.targets)
+    assert found.verdict == "refused" and "fit each other to" in found.reason
+
+
+@pytest.mark.parametrize("shape", ["plane", "ball", "tube"])
+def test_an_even_shape_is_refused(shape: str) -> None:
+    """However well it fits: it could lie elsewhere as well."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.linspace(-0.03, 0.03, 61), np.linspace(-0.03, 0.03, 61))
+    squares = {"plane": 0 * x, "ball": x**2 + y**2, "tube": x**2}[shape]
+    points = np.stack([x, y, 0.08 + 0.2 * (shape == "plane") * x + 0.05 - np.sqrt(0.05**2 - squares)], -1)
+    first = (np.arange(10, 50)[:, None] * 61 + np.arange(10, 50)).ravel()
+    halves = [[first, first + 1, first + 61], [first + 62, first + 61, first + 1]]
+    triangles = np.concatenate([np.stack(half, 1) for half in halves]).astype(np.int32)
+    vertices = points.reshape(-1, 3)
+    at = vertices[rng.choice(first, 6, replace=False)]
+    measured = vertices + rng.normal(0, 2e-4, vertices.shape) * [0, 0, 1]
+    surface = Surface(measured, np.full(len(measured), 4e-4), np.zeros(3))
+    found = register(Shape(vertices, triangles), at, at + rng.normal(0, 1e-3, at.shape), surface, at)
+    assert found.verdict == "refused" and "its shape is even" in found.reason
+
+
+# ---- the command, beside a node --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
+    folder = tmp_path_factory.mktemp("still")
+    write_session(SCENE, folder / "session", rate=5.0)
+    running = RunningNode(folder / "session", folder, "mapping.iterations:=1")  # the same on a busy machine
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def files(organ: Organ, tmp_path: Path) -> Path:
+    """The organ in mm, and its pairs."""
+    import open3d as o3d
+
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(1e3 * organ.vertices), o3d.utility.Vector3iVector(organ.triangles)
+    )
+    assert o3d.io.write_triangle_mesh(str(tmp_path / "organ.ply"), mesh)
+    pairs = [
+        {"pixel": pixel, "at": (1e3 * at).tolist()}
+        for pixel, at in zip(PICKS.tolist(), organ.at, strict=True)
+    ]
+    targets = (1e3 * organ.targets).tolist()
+    (tmp_path / "pairs.yaml").write_text(yaml.safe_dump({"pairs": pairs, "targets": targets}))
+    return tmp_path
+
+
+@pytest.mark.live
+def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, files: Path) -> None:
+    scene = files / "scene.yaml"
+    given = (files / "organ.ply", "--points", files / "pairs.yaml", "-o", scene, "--run-dir", node.run_dir)
+    said = figures_of("register", *given, "--json")
+    thing = read_scene(scene).objects[0]
+    assert thing.registration == {key: said[key] for key in said if key != "scene"}
+    assert said["verdict"] == "good" and said["share"] > 0.8
+    places, at = (np.array([getattr(anchor, key) for anchor in thing.anchors]) for key in ("place", "at"))
+    T, misfit = rigid_fit(thing.scale * at, places, np.ones(len(at)))
+    off = np.linalg.norm(transform(T, organ.targets) - DEEP * organ.picks, axis=1)
+    assert misfit < 1e-6 and (1e3 * off <= [target["expected_mm"] for target in said["targets"]]).all()
+    assert np.allclose(T @ AWAY, np.eye(4), atol=0.05)
+    played = run_overlay(OverlayOptions(NodeAddress(run_dir=node.run_dir), scene=scene, seconds=6))
+    assert played["overlay"] > 0, played
+    refused(2, "register", *given, said=(str(scene), "exists already", "--force"))
+
+
+@pytest.mark.live
+def test_what_the_command_refuses(node: RunningNode, organ: Organ, files: Path) -> None:
+    pairs = yaml.safe_load((files / "pairs.yaml").read_text())
+
+    def says(code: int, changed: dict[str, Any], *more: object, said: tuple[str, ...]) -> None:
+        (files / "pairs.yaml").write_text(yaml.safe_dump(pairs | changed))
+        given = ("--points", files / "pairs.yaml", "-o", files / "out.yaml", "--run-dir", node.run_dir)
+        refused(code, "register", files / "organ.ply", *given, *more, said=said)
+        assert not (files / "out.yaml").exists()
+
+    def last(**changed: Any) -> dict[str, Any]:
+        return {"pairs": [*pairs["pairs"][:4], {"at": pairs["pairs"][4]["at"]} | changed]}
+
+    says(2, last(pixel=[900, 3]), said=("pair 5", "outside the picture of 320x256"))
+    says(1, last(anchor=77), said=("pair 5: there is no anchor 77; the node has ",))
+    says(2, last(), said=("pairs.yaml: pairs.4", "either pixel: [u, v] or anchor: NUMBER"))
+    says(2, {"pears": 3}, said=("unknown key 'pears'", "did you mean 'pairs'?"))
+    says(2, {}, "--scale", "1", said=("set scale: 0.001",))
+    says(1, {}, "--ns", "other", said=("no node runs as 'other'",))
+    (files / "organ.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n"
+                                     "property float y\nproperty float z\nend_header\n0 0 0\n")  # fmt: skip
+    says(2, {}, said=("holds no triangles",))
