@@ -36,7 +36,7 @@ LINES = {
     "sags_node/fitting": 1523,
     "sags_node/importing": 1071,
     "sags_node/kernels": 1222,
-    "sags_node/mapping": 5587,
+    "sags_node/mapping": 5588,
     "sags_node/media": 833,
     "sags_node/messaging": 5084,
     "sags_node/model": 960,

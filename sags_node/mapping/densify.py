@@ -115,7 +115,8 @@ def fill(
         The pixels [M, 2] of the new Gaussians, how many there are, and how many were given up.
     """
     room, given_up = max(ADDED, limit - model.count), 0
-    pixels, depths, errors = (each[:room] for each in candidates(planes, observation, phase))
+    pixels, depths, errors = candidates(planes, observation, phase)
+    pixels, depths, errors = pixels[:room], depths[:room], errors[:room]
     lacking = min(len(pixels), HOLES) - max(0, limit - model.count)
     if 0 < lacking < model.count:
         given_up = give_up(lacking)
