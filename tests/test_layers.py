@@ -45,13 +45,14 @@ LINES = {
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 840,
     "sags_node/recording": 2600,
+    "sags_node/registration": 466,
     "sags_node/rig": 1169,
     "sags_node/ros": 332,
     "sags_node/sources": 5666,
     "sags_node/terminal": 335,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5462,
-    "tests": 45321,
+    "tests": 45322,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
