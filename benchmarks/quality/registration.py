@@ -6,8 +6,9 @@ Each seed is another phantom, another part of its surface, and other errors of t
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -23,10 +24,10 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import warm_up
-from sags_node.registration.register import Registration, register
+from sags_node.registration.register import Registration, Verdict, register
 from sags_node.registration.rigid import kabsch
 from sags_node.registration.surfaces import MIRROR, Shape, Surface
-from sags_node.types import F32, F64, Camera, StereoFrame
+from sags_node.types import F32, F64, I32, Camera, StereoFrame
 
 SEEDS = 20
 PAIRS, TARGETS = 5, 5
@@ -49,20 +50,38 @@ class Case:
         vertices: [V, 3] m, world, that the eye at the world's origin sees.
     """
 
-    def __init__(self, rng: np.random.Generator, vertices: F64, triangles: F64) -> None:
+    def __init__(self, rng: np.random.Generator, vertices: F64, triangles: I32) -> None:
         away = np.eye(4)
         away[:3, :3], away[:3, 3] = cv2.Rodrigues(rng.normal(size=3))[0], rng.normal(0, 0.1, 3)
         self.truth = invert(away)
         picked = _far_apart(rng, vertices)
         seen = vertices[rng.choice(len(vertices), TARGETS)]
         self.deep = seen * (1 + BELOW / np.linalg.norm(seen, axis=1, keepdims=True))
-        self.at, self.targets = transform(away, picked), transform(away, self.deep)
+        self.at, self.targets, lying = (
+            np.asarray(transform(away, points), np.float64) for points in (picked, self.deep, vertices)
+        )
         self.places = picked + rng.normal(0, PICKED, picked.shape)
-        self.model = Shape(np.asarray(transform(away, vertices)), triangles)
+        self.model = Shape(lying, triangles)
 
     def errors(self, T: F64) -> F64:
         """Of the targets (m) under a pose."""
-        return np.linalg.norm(transform(T, self.targets) - self.deep, axis=1)
+        return np.asarray(np.linalg.norm(transform(T, self.targets) - self.deep, axis=1), np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Placing:
+    """What came of one case. Its errors are by pose: by_pairs, open3d, and fitted where it came to that."""
+
+    verdict: Verdict
+    reason: str
+    share: float  # as `Registration.share`
+    errors_mm: dict[str, list[float]]  # of each target
+    told_mm: dict[str, list[float]]  # the same, as it was told; Open3D tells none
+
+    def as_json(self, seed: int) -> dict[str, Any]:
+        """What is kept of it."""
+        said = {"seed": seed, "verdict": self.verdict, "reason": self.reason, "share": self.share}
+        return {**said, "fitted_mm": self.errors_mm.get("fitted", [])}
 
 
 def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[str, Any]:
@@ -74,7 +93,8 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     warm_up(config)
     configure_threads(config.engine.threads)
-    rows, refusals = [], []
+    placings: list[Placing] = []
+    refusals: list[tuple[str, Registration, str]] = []
     receipt: Receipt | None = None
     for seed in range(seeds):
         advance(seed, seeds, "phantom")
@@ -83,24 +103,26 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
         )
         receipt = receipt or Receipt(phantom.rig, SIZE, None)
         camera, surface = _node_sees(config, phantom, receipt)
-        case = Case(rng := np.random.default_rng(seed), *_part(rng, phantom, camera))
-        rows.append({"seed": seed, **_registered(case, surface)})
-        refusals += list(_spoilt(case, surface))
-    refusals += list(_even(np.random.default_rng(0)))
+        rng = np.random.default_rng(seed)
+        case = Case(rng, *_part(rng, phantom, camera))
+        placings.append(_registered(case, surface))
+        refusals += _spoilt(case, surface)
+    refusals += _even(np.random.default_rng(0))
     assert receipt is not None
-    measured = {
+    measured: dict[str, Any] = {
         "picked_mm": 1e3 * PICKED,
         "below_mm": 1e3 * BELOW,
-        "phantom": _summary(rows),
-        "rows": rows,
+        "phantom": _summary(placings),
+        "rows": [each.as_json(seed) for seed, each in enumerate(placings)],
         "refused": _counted(refusals),
         "receipts": {"phantom": receipt.as_json()},
     }
     if ct is not None:
         advance(seeds, seeds, "CT")
         pair = read_ct_pair(ct)
-        rows = [{"seed": seed, **row} for seed, row in enumerate(_on_ct(pair, seeds))]
-        measured |= {"ct": _summary(rows), "ct_rows": rows}
+        placings = list(_on_ct(pair, seeds))
+        measured["ct"] = _summary(placings)
+        measured["ct_rows"] = [each.as_json(seed) for seed, each in enumerate(placings)]
         measured["receipts"]["ct"] = pair.receipt
     return measured
 
@@ -117,11 +139,12 @@ def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tupl
         result = pipeline.process(frame, StepBudget(STEPS))
         view, tissue = result.views["left"], result.observation.tissue
         receipt.add(frame, tissue)
+        assert view.confidence is not None  # the pipeline states it
         parts.append(Surface.of_depth(view.depth, view.confidence, tissue, view.camera))
     return view.camera, Surface.joined(parts)
 
 
-def _part(rng: np.random.Generator, phantom: Phantom, camera: Camera) -> tuple[F64, F64]:
+def _part(rng: np.random.Generator, phantom: Phantom, camera: Camera) -> tuple[F64, I32]:
     """Vertices and triangles of the tissue within an ellipse of the picture."""
     vertices = phantom.tissue.vertices(0.0).reshape(-1, 3).astype(np.float64)
     triangles = phantom.tissue.faces.astype(np.int32)
@@ -143,19 +166,16 @@ def _far_apart(rng: np.random.Generator, vertices: F64) -> F64:
     return np.array(chosen)
 
 
-def _registered(case: Case, surface: Surface) -> dict[str, Any]:
+def _registered(case: Case, surface: Surface) -> Placing:
     found = register(case.model, case.at, case.places, surface, case.targets)
     start = kabsch(case.at, case.places, np.full(PAIRS, 1 / PAIRS))
-    errors = {"by_pairs": case.errors(start), "open3d": case.errors(_open3d(case.model, surface, start))}
-    row = {"verdict": found.verdict, "reason": found.reason}
-    if found.T_world_model is not None and found.residual is not None:
-        errors["fitted"] = case.errors(found.T_world_model)
-        row |= {
-            "share": rounded(found.share),
-            "residual_mm": [rounded(1e3 * each) for each in found.residual],
-        }
-        row |= {"told_by_pairs_mm": _mm(found.expected_by_pairs), "told_mm": _mm(found.expected)}
-    return row | {f"{name}_mm": _mm(each) for name, each in errors.items()}
+    errors = {"by_pairs": start, "open3d": _open3d(case.model, surface, start)}
+    told: dict[str, list[float]] = {}
+    if found.T_world_model is not None and found.expected_by_pairs is not None and found.expected is not None:
+        errors["fitted"] = found.T_world_model
+        told = {"by_pairs": _mm(found.expected_by_pairs), "fitted": _mm(found.expected)}
+    errors_mm = {name: _mm(case.errors(T)) for name, T in errors.items()}
+    return Placing(found.verdict, found.reason, rounded(found.share), errors_mm, told)
 
 
 def _open3d(model: Shape, surface: Surface, T: F64) -> F64:
@@ -184,8 +204,8 @@ def _spoilt(case: Case, surface: Surface) -> Iterable[tuple[str, Registration, s
     yield "mirrored", register(model.mirrored(), at * MIRROR, places, surface, targets * MIRROR), "handedness"
     yield "two pairs", register(model, at[:2], places[:2], surface, targets), "give 3 to 20"
     line = np.linspace(0, 1, PAIRS)[:, None]
-    on_a_line = [ends[0] + line * (ends[1] - ends[0]) for ends in (at, places)]
-    yield "on a line", register(model, *on_a_line, surface, targets), "add one aside"
+    at, places = (ends[0] + line * (ends[1] - ends[0]) for ends in (at, places))
+    yield "on a line", register(model, at, places, surface, targets), "add one aside"
 
 
 def _even(rng: np.random.Generator) -> Iterable[tuple[str, Registration, str]]:
@@ -208,7 +228,7 @@ def _even(rng: np.random.Generator) -> Iterable[tuple[str, Registration, str]]:
             yield name, register(case.model, case.at, case.places, surface, case.targets), "with an edge"
 
 
-def _on_ct(pair: CTPair, seeds: int) -> Iterable[dict[str, Any]]:
+def _on_ct(pair: CTPair, seeds: int) -> Iterable[Placing]:
     """Other errors of other picked points, each time; the set's own alignment is the truth."""
     depth, confidence = configured_depth(pair)
     surface = Surface.of_depth(depth, confidence, pair.evaluated, pair.pair.camera)
@@ -218,37 +238,42 @@ def _on_ct(pair: CTPair, seeds: int) -> Iterable[dict[str, Any]]:
         yield _registered(case, surface)
 
 
-def _joined_in_picture(pixels: F32, points: F64) -> F64:
+def _joined_in_picture(pixels: F32, points: F64) -> I32:
     """Triangles [T, 3] of neighbours in the picture (Delaunay) that are neighbours on the surface, too."""
     width, height = np.ceil(pixels.max(0)).astype(int) + 2
     mesh = cv2.Subdiv2D((0, 0, int(width), int(height)))
     numbers = {tuple(np.round(pixel, 3)): number for number, pixel in enumerate(pixels)}
     mesh.insert([tuple(map(float, pixel)) for pixel in pixels])
-    corners = np.round(mesh.getTriangleList().reshape(-1, 3, 2), 3)
+    corners = np.round(np.asarray(mesh.getTriangleList(), np.float32).reshape(-1, 3, 2), 3)
     found = [[numbers.get(tuple(corner), -1) for corner in triangle] for triangle in corners]
     triangles = np.array([triangle for triangle in found if min(triangle) >= 0], np.int32)
     sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
     lengths = np.linalg.norm(sides, axis=2).max(1)
-    return triangles[lengths < 4 * np.median(lengths)]
+    near: I32 = triangles[lengths < 4 * np.median(lengths)]
+    return near
 
 
-def _mm(lengths: F64 | None) -> list[float | None]:
-    return [rounded(1e3 * each) for each in (() if lengths is None else lengths)]
+def _mm(lengths: F64) -> list[float]:
+    return [rounded(1e3 * each) for each in lengths]
 
 
-def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _summary(placings: list[Placing]) -> dict[str, Any]:
     """Of all targets of all seeds."""
-    said: dict[str, Any] = {"seeds": len(rows)}
-    said["verdicts"] = {v: sum(row["verdict"] == v for row in rows) for v in ("good", "doubtful", "refused")}
+    said: dict[str, Any] = {"seeds": len(placings)}
+    verdicts = [each.verdict for each in placings]
+    said["verdicts"] = {verdict: verdicts.count(verdict) for verdict in get_args(Verdict)}
     for name in ("by_pairs", "fitted", "open3d"):
-        errors = np.array([each for row in rows for each in row.get(f"{name}_mm", ())])
+        errors = np.array([error for each in placings for error in each.errors_mm.get(name, ())])
         said[name] = {"median_mm": rounded(np.median(errors)), "p90_mm": rounded(np.quantile(errors, 0.9))}
-    for name, told in (("by_pairs", "told_by_pairs_mm"), ("fitted", "told_mm")):
+    for name in ("by_pairs", "fitted"):
         pairs = [
-            pair for row in rows for pair in zip(row.get(f"{name}_mm", ()), row.get(told, ()), strict=True)
+            pair
+            for each in placings
+            if name in each.told_mm
+            for pair in zip(each.errors_mm[name], each.told_mm[name], strict=True)
         ]
-        said[name]["told_mm"] = rounded(np.median([each for _, each in pairs]))
-        said[name]["within_told"] = rounded(np.mean([error <= each for error, each in pairs]))
+        said[name]["told_mm"] = rounded(np.median([told for _, told in pairs]))
+        said[name]["within_told"] = rounded(np.mean([error <= told for error, told in pairs]))
     return said
 
 
