@@ -157,9 +157,10 @@ def _trace_row(
             row = min(max(np.int64(down * f4(rows)), 0), rows - 1)
             column = min(max(np.int64(across * f4(columns)), 0), columns - 1)
             was = source_depth[row, column]
-            if was == f4(0) or abs(was - c) >= f4(SAME) * c:
+            surface = _between(source_depth, across, down)
+            if was == f4(0) or not abs(surface - c) < f4(SAME) * c:
                 break
-            z += was - c  # the source knows its surface finer: look again where the ray meets that
+            z += surface - c  # the source knows its surface finer: look again where the ray meets that
         if not near:
             u = v = f4(NOWHERE)
         elif (unmoved and lag < f4(LITTLE)) or was == f4(0) or abs(was - c) < f4(SAME) * c:

@@ -84,7 +84,7 @@ def hidden_source(hidden: Gaussians, now_ns: int, frames: Sequence[SeenFrame]) -
     """
     seen = []
     for frame in frames:
-        if 0 < now_ns - frame.t_capture_ns <= OLDEST * 1e9:  # also after a pause
+        if len(frame.gaussians) and 0 < now_ns - frame.t_capture_ns <= OLDEST * 1e9:  # also after a pause
             rows, known = frame.rows_of(hidden.ids)
             seen.append((frame, rows, known & frame.shows[rows]))
     counts = [np.count_nonzero(shown) for _, _, shown in seen]

@@ -57,7 +57,7 @@ class SmallDrawings:
             [4, h, w]: metres along the axes of that frame's camera, and the coverage by tissue that it knew;
             None: not at all.
         """
-        if gaussians.means is since.gaussians.means:
+        if gaussians.means is since.gaussians.means or not len(since.gaussians):
             return None
         rows, known = since.rows_of(gaussians.ids)
         moved = gaussians.means - since.gaussians.means[rows]

@@ -386,9 +386,11 @@ class Pipeline:
         return mapped
 
     def _lend(self, mapped: Mapped, pair: RectifiedPair, observation: Observation, judged: Judgement) -> None:
-        """Note which pictures views may have their detail from. One in another light lends none."""
+        """Note which pictures views may have their detail from. One in another light lends none, nor one in
+        which the model knows nothing."""
         self.seen = ()
-        if self._detail is None or not judged.learn or judged.gain is not None:
+        known = len(mapped.snapshot.gaussians) > 0
+        if self._detail is None or not known or not judged.learn or judged.gain is not None:
             return
         now = SeenFrame(
             pair.t_capture_ns, observation.camera, mapped.snapshot.gaussians,

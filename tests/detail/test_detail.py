@@ -10,7 +10,7 @@ from places import SESSION
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import EVERY, MATCHED, MOST, OLDEST, Matched, Memory, hidden_source
-from sags_node.detail.motion import gaussians_at
+from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.detail.share import Share
 from sags_node.evaluation import metrics
@@ -213,7 +213,9 @@ def test_hidden_tissue_comes_from_the_newest_frame_that_saw_it_in_the_light_of_n
         return None if source is None else source.frame
 
     assert chosen(3, newer, old) is newer
-    assert chosen(3, blind, old) is old
+    empty = replace(seen(2), gaussians=gaussians(0))
+    assert chosen(3, blind, old) is chosen(3, empty, old) is old
+    assert SmallDrawings().motion(hidden, CAMERA, empty) is None
     assert hidden_source(gaussians(first_id=1000), 3, [newer, old]) is None
     assert chosen(round(OLDEST * 1e9) + 2, newer, old) is newer  # after a pause
     darker = hidden_source(replace(hidden, colors=0.5 * hidden.colors), 3, [old])
