@@ -26,7 +26,7 @@ LINES = {
     "sags_node": 1680,
     "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
-    "sags_node/cli": 3166,
+    "sags_node/cli": 3168,
     "sags_node/config": 1352,
     "sags_node/detail": 929,
     "sags_node/engine": 4071,
@@ -49,10 +49,10 @@ LINES = {
     "sags_node/rig": 1169,
     "sags_node/ros": 332,
     "sags_node/sources": 5666,
-    "sags_node/terminal": 335,
+    "sags_node/terminal": 345,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5462,
-    "tests": 45324,
+    "tests": 45342,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

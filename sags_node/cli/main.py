@@ -7,6 +7,7 @@ import logging
 import os
 import shlex
 import signal
+import sys
 import tempfile
 from collections.abc import Callable
 from importlib.metadata import distribution
@@ -110,6 +111,7 @@ def begin(verbose: bool, form: str) -> None:
     level = logging.INFO if verbose else logging.WARNING
     signal.signal(signal.SIGINT, interrupt)  # also where a script's `&` had it ignored: kill -INT ends it
     signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
+    sys.unraisablehook = interrupt.unraisable
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # so is the end of the terminal, but for nohup
         signal.signal(signal.SIGHUP, interrupt)
     console.quiet = form == "json"

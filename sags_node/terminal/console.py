@@ -120,13 +120,23 @@ class _Interrupt:
         now = time.monotonic()
         if _loses_exceptions(frame) and (self._waits_until is None or now < self._waits_until):
             self._waits_until = self._waits_until or now + LONGEST_WAIT
-            # To this thread, the main one: it may be waiting by then, and must wake.
-            again = threading.Timer(LOOK_AGAIN, signal.pthread_kill, (threading.get_ident(), number))
-            again.daemon = True
-            again.start()
+            self._again(number)
             return
         self._waits_until = None
         raise KeyboardInterrupt
+
+    def unraisable(self, lost: sys.UnraisableHookArgs) -> None:
+        """Send a Ctrl-C again that was lost all the same, as in ZeroMQ: for `sys.unraisablehook`."""
+        if lost.exc_type is KeyboardInterrupt:
+            self._again(signal.SIGINT)
+        else:
+            sys.__unraisablehook__(lost)
+
+    def _again(self, number: int) -> None:
+        """To this thread, the main one: it may be waiting by then, and must wake."""
+        again = threading.Timer(LOOK_AGAIN, signal.pthread_kill, (threading.get_ident(), number))
+        again.daemon = True
+        again.start()
 
 
 def _loses_exceptions(frame: FrameType | None) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import shlex
@@ -38,7 +39,7 @@ def test_ctrl_c_ends_a_measured_run(
     if command[0] == "demo":
         command = [*command, "--out", str(tmp_path / "demo")]
     process = start([*command, phantom_session, "source.rate:=2"], TMPDIR=temporary)
-    wait_for(process, lambda: any(temporary.glob("sags-eval-*/*.frame")))
+    wait_for(process, lambda: any(temporary.glob("sags-eval-*/*.*")))
     stdout, stderr = stopped(process)
     assert process.returncode == 130 and "stopped" in stderr and stdout == ""
     assert not any(temporary.iterdir())
@@ -94,6 +95,23 @@ def test_a_ctrl_c_while_modules_are_loaded_is_one_word(
     assert process.stdout is not None and process.stdout.readline() == "loading\n"
     stdout, stderr = stopped(process)
     assert process.returncode == 130 and (stdout, stderr) == ("", "stopped\n")
+
+
+def test_a_ctrl_c_that_c_code_loses_comes_through_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As calls of ZeroMQ may: what is raised in them is told as ignored."""
+
+    @ctypes.CFUNCTYPE(None)
+    def called() -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(sys, "unraisablehook", interrupt.unraisable)
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            called()
+            time.sleep(10)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_ctrl_c_in_a_finaliser_comes_through_after_it() -> None:
