@@ -22,6 +22,7 @@ from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 
 LESSON_EVERY = 4  # frames: what lessons teach changes slowly, and each costs a small view
 LOOKED_AT = 4  # px: every so many along both axes tell how well pictures are carried
+COMPARED = 8  # px, how sharp a picture is beside the model
 AROUND = np.ones((5, 5), np.uint8)  # px of the working size: what is seen there is made as if hidden, too
 UNSURE = 0.2  # of the way that hidden tissue has moved: so much of it nobody saw
 ANOTHER_EYE = 0.5  # of what the right eye taught: it has a light of its own, which no other view has
@@ -213,15 +214,17 @@ def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool
 def _loss_by_pixel(frame: SeenFrame, drawn: U8) -> float:
     """How much worse than the model a picture is one pixel out of place: its change by pixel over the model's
     error, root mean squares over tissue. Squared, it is the ratio of what either adds to the error."""
-    _, picture, where = _sampled(frame.camera, frame.picture(), frame.sure_tissue > 0)
-    beside = frame.picture()[LOOKED_AT // 2 :: LOOKED_AT, LOOKED_AT // 2 + 1 :: LOOKED_AT]
-    _, model, _ = _sampled(frame.camera, drawn, frame.mask)
-    where = where[:, : beside.shape[1]]
+    height, width = drawn.shape[:2]
+    size = -(-width // COMPARED), -(-height // COMPARED)
+    where = cv2.resize(frame.sure_tissue, size, interpolation=cv2.INTER_NEAREST).astype(f4)
+    picture = frame.picture()
+    seen, beside = picture[::COMPARED, ::COMPARED], picture[::COMPARED, 1::COMPARED]
+    beside = np.pad(beside, ((0, 0), (0, size[0] - beside.shape[1]), (0, 0)), mode="edge")
     change, error = (
-        np.square(picture[:, : where.shape[1]][where].astype(f4) - other[:, : where.shape[1]][where]).sum()
-        for other in (beside, model)
+        float(np.einsum("ijk,ijk,ij->", off, off, where))
+        for off in (seen.astype(f4) - other for other in (beside, drawn[::COMPARED, ::COMPARED]))
     )
-    return float(np.sqrt(change / max(error, f4(1))))
+    return float(np.sqrt(change / max(error, 1.0)))
 
 
 def _in_light_of(drawn: U8, picture: U8, where: Bool) -> U8:
