@@ -47,7 +47,7 @@ def _by_protocol(own: Callable[..., None], protocol: str | None, **arguments: An
 
 
 def _with_lerobot(own: Callable[..., None], lerobot_version: Version, **arguments: Any) -> None:
-    from sags_node.export.played import KINDS, Kind
+    from sags_node.tools.export.played import KINDS, Kind
 
     def made(folder: Path, rate: float, size: tuple[int, int]) -> Any:
         from sags_lab.lerobot.dataset import LeRobot

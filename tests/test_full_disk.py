@@ -18,11 +18,11 @@ from tiny_archive import write_tiny_session
 
 from sags_lab.lerobot.dataset import merge
 from sags_node.cli.launching import write_json
+from sags_node.clients.overlay.save import Output
 from sags_node.errors import SagsError
-from sags_node.fitting import start
 from sags_node.model.ply import write_ply
-from sags_node.overlay.save import Output
 from sags_node.rig.hand_eye import HandEye, save_hand_eye
+from sags_node.tools.fitting import start
 
 DISK = 400 << 10  # bytes
 NO_SPACE = "No space left on device"

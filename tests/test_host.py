@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sags_node import doctor, host
+from sags_node import host
+from sags_node.tools import doctor
 
 
 def made(root: Path, **files: str) -> Path:

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from numbered_pictures import HEIGHT, WIDTH, picture, recordings
 
+from sags_node.bags.pictures import decode_file
+from sags_node.clients.overlay.save import Output
 from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.media import picture_file
 from sags_node.media.picture_file import claimed_size, is_whole, native_output
-from sags_node.overlay.save import Output
-from sags_node.recording.pictures import decode_file
 from sags_node.sources.numbered import open_numbered
 from sags_node.sources.pictures import read_picture
 from sags_node.sources.source import open_source

@@ -13,7 +13,7 @@ import pytest
 from places import ROOT
 
 from sags_node.cli.launching import write_json
-from sags_node.evaluation.provenance import provenance, revision
+from sags_node.tools.evaluation.provenance import provenance, revision
 
 RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
 # They measure time, bytes or memory. `soak` judges single pictures of a phantom that never ends.

@@ -16,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "out/wheel"
-NEEDED = ("sags_node/py.typed", "sags_node/bridge/web_page/index.html")
+NEEDED = ("sags_node/py.typed", "sags_node/clients/bridge/web_page/index.html")
 
 
 def run(*command: object, folder: Path | None = None) -> str:

@@ -26,9 +26,9 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.plots import check_plots
 from sags_node.files import whole
 from sags_node.terminal.console import progress, show
+from sags_node.tools.evaluation.plots import check_plots
 
 
 @click.command("kernels")
@@ -225,7 +225,7 @@ def bench_ablation(
     python -m benchmarks ablation launch/d4d_pull.yaml --out benchmarks/results/ablation_d4d.json
     """
     from benchmarks.quality import ablation
-    from sags_node.evaluation.measure import MeasureOptions
+    from sags_node.tools.evaluation.measure import MeasureOptions
 
     options = MeasureOptions(hold_out, lpips_weights=lpips_weights)
     session = step_by_step(launch, "ablation")

@@ -26,9 +26,9 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.plots import check_plots
 from sags_node.files import whole
 from sags_node.terminal.console import progress, show
+from sags_node.tools.evaluation.plots import check_plots
 
 if TYPE_CHECKING:
     from benchmarks.node.endurance import Order

@@ -20,7 +20,7 @@ from benchmarks.gpu.drawing import measure_drawing, parity
 from benchmarks.gpu.refining import measure_case
 from sags_node.engine import device
 from sags_node.engine.gpu import runtime
-from sags_node.evaluation.provenance import machine_name
+from sags_node.tools.evaluation.provenance import machine_name
 
 Row = dict[str, Any]
 SECONDS = 420.0  # after which nothing new begins

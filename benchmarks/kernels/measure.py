@@ -11,9 +11,9 @@ from benchmarks.kernels.adam import measure_adam
 from benchmarks.kernels.contention import measure_contention, measure_rhythm
 from benchmarks.kernels.pictures import measure_losses
 from benchmarks.kernels.rasterizing import RasterCase, measure_rasterizer
-from sags_node.evaluation.provenance import machine_name
 from sags_node.kernels.peak import Peak, measure_peak, peak_row
 from sags_node.kernels.threads import configure_threads
+from sags_node.tools.evaluation.provenance import machine_name
 
 Advance = Callable[[int, int, str], None]  # done, total, what comes next
 

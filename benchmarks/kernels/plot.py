@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from sags_node.evaluation.plots import as_svg, new_figure
+from sags_node.tools.evaluation.plots import as_svg, new_figure
 
 WIDTH, HEAD, BAR, NAMED = 860, 70, 28, 17  # px
 

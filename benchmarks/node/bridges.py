@@ -26,14 +26,14 @@ from websockets.sync.connection import Connection
 
 from benchmarks.node.crowd import STARTING, STATUS, STOPPING, Advance, node_beside, watched
 from benchmarks.node.processes import cpu_seconds
+from sags_node.bags.pictures import header_stamp
 from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import percentiles
 from sags_node.messaging.cdr import COMPRESSED
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import IMAGE, POINT_CLOUD
 from sags_node.processes import end
-from sags_node.recording.pictures import header_stamp
+from sags_node.quality.metrics import percentiles
 from sags_node.ros.graph import Graph
 
 PICTURES = ("/sags/left/image_rect_color", "/sags/left/render/image")

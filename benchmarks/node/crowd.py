@@ -21,12 +21,12 @@ from rich.table import Table
 
 from benchmarks.node.neighbours import everything, give_way
 from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import percentiles
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.received import ReceivedText, TopicName
 from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.processes import end
+from sags_node.quality.metrics import percentiles
 
 PICTURES = ("left/render/image", "left/render/depth")
 SMALL = ("tf", "anchors", "status")  # what each of the many listens to

@@ -17,15 +17,15 @@ import numpy as np
 from rich.table import Table
 
 from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import as_float, psnr
-from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.receipt import Receipt
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.mapped import SETTLED
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.processes import resident_mb
+from sags_node.quality.metrics import as_float, psnr
+from sags_node.tools.evaluation.provenance import machine_name
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import U8, StereoFrame
 
 Order = Literal["there-and-back", "wrap", "walk"]

@@ -15,15 +15,15 @@ from typing import Any
 
 from benchmarks.kernels.contention import burning_core
 from benchmarks.node.neighbours import NS, find_browser, overlay, reader, viewer
-from sags_node.evaluation import live
-from sags_node.evaluation.measure import MeasureOptions, Measurer
-from sags_node.evaluation.receipt import Receipt
-from sags_node.evaluation.run import STATUS, TOPICS, Run
-from sags_node.evaluation.session import again
-from sags_node.evaluation.summary import summarise
 from sags_node.messaging.address import NodeAddress
 from sags_node.pipeline.session import open_session
 from sags_node.pipeline.warm_up import warm_up
+from sags_node.tools.evaluation import live
+from sags_node.tools.evaluation.measure import MeasureOptions, Measurer
+from sags_node.tools.evaluation.receipt import Receipt
+from sags_node.tools.evaluation.run import STATUS, TOPICS, Run
+from sags_node.tools.evaluation.session import again
+from sags_node.tools.evaluation.summary import summarise
 from sags_node.vision.rectify import Rectifier
 
 Row = dict[str, Any]

@@ -32,8 +32,6 @@ from benchmarks.node.crowd import Advance, node_beside
 from benchmarks.node.endurance import SIGNIFICANT, slope, trends
 from benchmarks.node.processes import descriptors, threads
 from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import psnr
-from sags_node.evaluation.provenance import machine_name
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freezes import Freezes
 from sags_node.messaging.received import ReceivedImage, TopicName
@@ -41,6 +39,8 @@ from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, Meta
 from sags_node.processes import end, resident_mb
+from sags_node.quality.metrics import psnr
+from sags_node.tools.evaluation.provenance import machine_name
 
 EACH_FRAME = "tf"  # the smallest topic that is sent with every frame
 HIGH_WATER = 1000  # frames may wait while a picture is compared

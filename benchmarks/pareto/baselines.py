@@ -15,13 +15,13 @@ import numpy as np
 from benchmarks.quality.sgbm import JudgedSGBM
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.measure import FrameRow, MeasureOptions, Progress
-from sags_node.evaluation.run import MappedFrame, Run
-from sags_node.evaluation.summary import summarise
-from sags_node.evaluation.warp import right_figures, right_pixels
 from sags_node.pipeline.session import Session
+from sags_node.quality import metrics
 from sags_node.sources.source import open_source
+from sags_node.tools.evaluation.measure import FrameRow, MeasureOptions, Progress
+from sags_node.tools.evaluation.run import MappedFrame, Run
+from sags_node.tools.evaluation.summary import summarise
+from sags_node.tools.evaluation.warp import right_figures, right_pixels
 from sags_node.types import Bool
 from sags_node.vision.rectify import Rectifier
 

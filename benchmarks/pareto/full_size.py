@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
-from sags_node.evaluation import metrics
-from sags_node.evaluation.measure import FrameRow, MeasureOptions, Progress
-from sags_node.evaluation.run import MappedFrame, Run
-from sags_node.evaluation.summary import summarise
 from sags_node.pipeline.session import Session
+from sags_node.quality import metrics
 from sags_node.sources.source import open_source
+from sags_node.tools.evaluation.measure import FrameRow, MeasureOptions, Progress
+from sags_node.tools.evaluation.run import MappedFrame, Run
+from sags_node.tools.evaluation.summary import summarise
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
 

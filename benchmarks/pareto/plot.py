@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sags_node.evaluation.plots import as_png, new_figure
+from sags_node.tools.evaluation.plots import as_png, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields, replace
 
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import UsageError
-from sags_node.evaluation.measure import MeasureOptions
 from sags_node.mapping.devices import ALL_SKIPS, Skips
 from sags_node.mapping.ladder import RUNGS
+from sags_node.tools.evaluation.measure import MeasureOptions
 
 PARTS = ("budgets", "resolutions", "gaussians", "skips")
 # Parts for those who ask: each rung of the ladder, one step a frame; and live on hosts with less to give.

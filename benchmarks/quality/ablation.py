@@ -19,18 +19,18 @@ from rich.table import Table
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.lpips import Lpips
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.receipt import Receipt
-from sags_node.fitting.clip import Clip, ClipFrame, read_clip
-from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import score, score_between, score_depth, score_tracks
-from sags_node.fitting.settings import ONLINE, PAPER, FitSettings, with_changes
 from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline.session import Session
+from sags_node.quality import metrics
+from sags_node.tools.evaluation.lpips import Lpips
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.provenance import machine_name
+from sags_node.tools.evaluation.receipt import Receipt
+from sags_node.tools.fitting.clip import Clip, ClipFrame, read_clip
+from sags_node.tools.fitting.fit import Fit
+from sags_node.tools.fitting.score import score, score_between, score_depth, score_tracks
+from sags_node.tools.fitting.settings import ONLINE, PAPER, FitSettings, with_changes
 from sags_node.types import Bool
 
 AHEAD = 3  # last frames that nothing is learnt from

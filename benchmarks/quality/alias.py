@@ -18,15 +18,15 @@ from benchmarks.quality.alias_truth import AliasTruth, Shot
 from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
-from sags_node.evaluation.metrics import psnr
-from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.receipt import Receipt
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import smoothing_variances
+from sags_node.quality.metrics import psnr
+from sags_node.tools.evaluation.provenance import machine_name
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, Camera, Gaussians, Observation, StereoFrame
 
 SIZES = (0.25, 0.5, 1.0, 2.0, 4.0)

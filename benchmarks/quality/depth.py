@@ -16,15 +16,15 @@ from benchmarks.quality.depth_regions import regions_of
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config.schema import OnnxConfig, StereoConfig, VisionConfig
 from sags_node.errors import SagsError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.receipt import Receipt
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomFrame, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
+from sags_node.quality import metrics
 from sags_node.sources.source import open_source
+from sags_node.tools.evaluation.provenance import machine_name
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, Bool, Camera, RectifiedPair, StereoFrame
 from sags_node.vision.onnx_depth import NetworkDepth
 from sags_node.vision.rectify import Rectifier

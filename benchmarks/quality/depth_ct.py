@@ -24,11 +24,11 @@ from benchmarks.quality.depth import (
 )
 from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError
-from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project, unproject
 from sags_node.rig import read_rig
 from sags_node.sources.pictures import read_picture
+from sags_node.tools.evaluation.provenance import machine_name
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, U8, Bool, RectifiedPair, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth

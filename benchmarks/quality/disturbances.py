@@ -13,14 +13,14 @@ import numpy as np
 from benchmarks.disturbances import DISTURBANCES, Disturbance, Scene, Taken, disturbed
 from benchmarks.quality.tracking import true_points
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.receipt import Receipt
 from sags_node.findings import by_code
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
+from sags_node.quality import metrics
 from sags_node.sources.source import open_source
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I64, U8, AnchorStates, Bool, FrameResult, RenderedView, StereoFrame
 from sags_node.vision.tissue import TissueMask
 

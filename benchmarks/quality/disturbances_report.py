@@ -11,7 +11,7 @@ from rich.table import Table
 
 from benchmarks.kernels.report import new_table
 from benchmarks.quality.disturbances import Shot
-from sags_node.evaluation.gallery import Picture, depth_range, depth_tile, shrunk
+from sags_node.quality.gallery import Picture, depth_range, depth_tile, shrunk
 from sags_node.types import U8
 
 _COLUMNS = {

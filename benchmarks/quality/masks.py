@@ -10,13 +10,13 @@ from rich.table import Table
 
 from sags_node.config.schema import TissueConfig
 from sags_node.errors import SagsError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.receipt import Receipt
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
+from sags_node.quality import metrics
 from sags_node.sources.source import open_source
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import Bool, FrameResult, Reference, StereoFrame
 from sags_node.vision.tissue import TissueMask
 

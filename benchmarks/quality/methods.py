@@ -17,14 +17,14 @@ from rich.table import Table
 from sags_node.config.schema import MappingMethod
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.metrics import as_float, psnr
-from sags_node.evaluation.run import MappedFrame, Run
-from sags_node.evaluation.session import evaluate, measure, run_step
 from sags_node.mapping.mapper import Mapper
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.pipeline.warm_up import warm_up
+from sags_node.quality.metrics import as_float, psnr
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.run import MappedFrame, Run
+from sags_node.tools.evaluation.session import evaluate, measure, run_step
 from sags_node.types import U8
 
 METHODS: tuple[MappingMethod, ...] = ("nodes", "sags")

@@ -19,7 +19,6 @@ from benchmarks.quality.tracking_report import reliability_tables
 from sags_lab.protocols.point_tracks import SURE
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -27,6 +26,7 @@ from sags_node.phantom.scene import Phantom, PhantomFrame
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.pipeline.warm_up import warm_up
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F64, AnchorStates, Bool, Camera, FrameResult, StereoFrame
 
 Scenario = Literal["covered", "dark", "turned away"]

@@ -16,17 +16,17 @@ from rich.table import Table
 
 from benchmarks.quality.depth import Advance, rounded
 from benchmarks.quality.depth_ct import CTPair, configured_depth, read_ct_pair
+from sags_node.clients.registration.register import Registration, Verdict, register
+from sags_node.clients.registration.rigid import kabsch
+from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.config.schema import LaunchConfig
-from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import invert, project, transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import warm_up
-from sags_node.registration.register import Registration, Verdict, register
-from sags_node.registration.rigid import kabsch
-from sags_node.registration.surfaces import MIRROR, Shape, Surface
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I32, Camera, StereoFrame
 
 SEEDS = 20

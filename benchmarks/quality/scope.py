@@ -17,9 +17,6 @@ from rich.table import Table
 
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.receipt import Receipt
-from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -28,6 +25,9 @@ from sags_node.phantom.motion import BREATH
 from sags_node.phantom.scene import Phantom, PhantomFrame, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import warm_up
+from sags_node.quality import metrics
+from sags_node.tools.evaluation.receipt import Receipt
+from sags_node.tools.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.types import F32, F64, Bool, Camera, StereoFrame
 
 Motion = Literal["sway", "zoom", "orbit"]

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.config.schema import StereoConfig
-from sags_node.evaluation import metrics
 from sags_node.geometry import disparity_to_depth
+from sags_node.quality import metrics
 from sags_node.types import F32, U8, Bool, Camera, GrayPyramid, RectifiedPair
 from sags_node.vision.pyramid import inner, level, pyramids
 from sags_node.vision.stereo import StereoDepth

@@ -26,14 +26,14 @@ from sags_lab.protocols.point_tracks import (
 )
 from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.errors import SagsError
-from sags_node.evaluation.metrics import percentiles
-from sags_node.evaluation.receipt import Receipt
 from sags_node.geometry import project, transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
 from sags_node.pipeline.warm_up import warm_up
+from sags_node.quality.metrics import percentiles
+from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I64, AnchorStates, Bool, FrameResult, StereoFrame
 
 SPACING = 34  # px between anchors

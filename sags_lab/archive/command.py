@@ -28,9 +28,9 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.plots import check_plots, has_plots
 from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
+from sags_node.tools.evaluation.plots import check_plots, has_plots
 
 if TYPE_CHECKING:
     from sags_lab.archive.manifest import Recording
@@ -202,7 +202,7 @@ def run(
     from sags_lab.archive.segments import check_frames
     from sags_lab.archive.store import REPORT, RESULTS, Store
     from sags_lab.archive.work import Plan, needs
-    from sags_node.evaluation.provenance import revision
+    from sags_node.tools.evaluation.provenance import revision
 
     path, overrides = words_of(source)
     if path is None:
@@ -310,7 +310,7 @@ def show_one(out: str, id: str, verbose: bool, json_out: bool) -> None:
     check_installed()
     from sags_lab.archive.results import of_one
     from sags_lab.archive.store import Store
-    from sags_node.evaluation.figures import verdict
+    from sags_node.tools.evaluation.figures import verdict
 
     found = of_one(Store(out), id)
     if json_out:

@@ -16,7 +16,7 @@ from sags_lab.archive.process import Limits
 from sags_lab.archive.store import RECORDINGS
 from sags_lab.archive.work import Outcome, Plan, work
 from sags_node.errors import SagsError
-from sags_node.evaluation.provenance import revision
+from sags_node.tools.evaluation.provenance import revision
 
 SHORT = 4  # the shorter length is so many times shorter
 HOUR = 3600.0  # s

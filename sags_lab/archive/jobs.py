@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sags_node.evaluation.figures import flat
+from sags_node.tools.evaluation.figures import flat
 
 FIGURES, LOG = "figures.json", "log.txt"  # of a recording's folder: stdout and stderr of the command
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from sags_lab.archive.store import RECORDINGS, REPORT, Store
-from sags_node.evaluation.page import page, picture_uri, plot_grid
-from sags_node.evaluation.plots import Series, line_plot
+from sags_node.tools.evaluation.page import page, picture_uri, plot_grid
+from sags_node.tools.evaluation.plots import Series, line_plot
 
 BLUE = "#2166ac"
 SPREAD = {  # column -> title

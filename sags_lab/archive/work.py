@@ -23,7 +23,7 @@ from sags_lab.archive.manifest import Recording
 from sags_lab.archive.process import PROGRAM, Ended, Limits, run_limited
 from sags_lab.archive.store import FAILED, RECORDINGS, Store
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.provenance import machine_name, revision
+from sags_node.tools.evaluation.provenance import machine_name, revision
 
 State = Literal["done", "failed", "refused", "no space"]
 NO_SPACE = os.strerror(errno.ENOSPC)

@@ -32,9 +32,9 @@ from sags_lab.lerobot.form import (
 )  # fmt: skip
 from sags_lab.lerobot.stats import Stats, Sums
 from sags_node.errors import UsageError
-from sags_node.export.played import depth_of, new_folder, points_of
 from sags_node.files import whole
 from sags_node.media.video_file import VideoFile
+from sags_node.tools.export.played import depth_of, new_folder, points_of
 from sags_node.types import AnchorStates, FrameResult, RectifiedPair
 
 if TYPE_CHECKING:

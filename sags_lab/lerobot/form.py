@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from sags_lab.lerobot.stats import Stats, merged
 from sags_node.errors import UsageError
-from sags_node.export.played import TRACKS
+from sags_node.tools.export.played import TRACKS
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -18,11 +18,11 @@ from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
-from sags_node.evaluation import metrics
 from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_posed
 from sags_node.pipeline.warm_up import warm_up
+from sags_node.quality import metrics
 from sags_node.sources.pictures import list_pictures
 from sags_node.sources.truth import load_npy
 from sags_node.types import F32, Bool, FrameResult

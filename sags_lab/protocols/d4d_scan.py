@@ -10,10 +10,10 @@ import numpy as np
 
 from sags_lab.protocols.d4d_files import Scan, instruments_are_white, matrix_in, read_tools
 from sags_node import geometry
+from sags_node.clients.overlay.mesh_files import parse_mesh
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
-from sags_node.overlay.mesh_files import parse_mesh
 from sags_node.types import F32, F64, Bool, Camera
 
 LARGEST_CLOUD = 1 << 30  # bytes

@@ -9,9 +9,9 @@ import click
 
 from sags_node.cli.launching import check_files, words_of, write_json
 from sags_node.errors import UsageError
-from sags_node.evaluation.figures import flat
 from sags_node.terminal import text
 from sags_node.terminal.console import progress, show
+from sags_node.tools.evaluation.figures import flat
 
 protocol_option = click.option(
     "--protocol",

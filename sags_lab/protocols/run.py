@@ -27,14 +27,14 @@ from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.metrics import resample_nearest
-from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
 from sags_node.media.video import Video
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_posed, rig_of
 from sags_node.pipeline.warm_up import warm_up
+from sags_node.quality.metrics import resample_nearest
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.session import evaluate
 from sags_node.types import F64, StereoRig
 
 LEAST_POSES = 3  # to align

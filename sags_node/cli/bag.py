@@ -34,8 +34,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.terminal.console import console, on_stop_signals, progress, show
 
 if TYPE_CHECKING:
+    from sags_node.clients.recording.recorder import RecordOptions
     from sags_node.messaging.address import NodeAddress
-    from sags_node.recording.recorder import RecordOptions
 
 DATA_LOST = 3  # exit code
 
@@ -135,11 +135,11 @@ def record(
             "a recording is recorded as a whole: no --snapshot-mode, --stdin, --seconds, --endpoint"
         )
 
+    from sags_node.clients.recording.bag_writer import Limits
+    from sags_node.clients.recording.recorder import Recorder, RecordOptions
     from sags_node.findings import by_code, by_stage
     from sags_node.messaging.stream import check_topic
-    from sags_node.recording.bag_writer import Limits
-    from sags_node.recording.recorder import Recorder, RecordOptions
-    from sags_node.recording.state import findings
+    from sags_node.node.recorder_state import findings
     from sags_node.terminal.console import tell as warn
     from sags_node.terminal.notices import Notices
 
@@ -246,8 +246,8 @@ def play(
     sags bag play out/case1 --rate 0.5 --loop
     sags bag play out/case1 --clock 100
     """
+    from sags_node.clients.recording.player import Player, PlayOptions
     from sags_node.config.schema import PublishConfig
-    from sags_node.recording.player import Player, PlayOptions
 
     options = PlayOptions(
         topics=tuple(say.plain(name, ns) for name in topics),
@@ -271,7 +271,7 @@ def info(path: Path, json_out: bool) -> None:
 
     Reads it through, so a damaged file is found here: rosbag2 folders, .mcap, .db3 and ROS 1 .bag files.
     """
-    from sags_node.recording.info import bag_info
+    from sags_node.clients.recording.info import bag_info
 
     found = bag_info(path)
     show(found if json_out else say.info_table(found))
@@ -286,7 +286,7 @@ def recover(path: Path, out: Path, json_out: bool) -> None:
 
     Everything up to the damage, and every intact chunk after it. Exit code 3 when something was lost.
     """
-    from sags_node.recording.recover import recover as save
+    from sags_node.clients.recording.recover import recover as save
 
     done = save(path, out)
     show(done if json_out else say.recovered_text(done))

@@ -31,7 +31,7 @@ def plain(name: str, ns: str) -> str:
 
 def recorded_table(summary: Mapping[str, Any]) -> Table:
     """What a recorder wrote and what it could not."""
-    from sags_node.recording.state import SILENT_SECONDS  # brings NumPy along, which --help does not need
+    from sags_node.node.recorder_state import SILENT_SECONDS  # brings NumPy along, which --help does not need
 
     table = text.table("topic", "messages", "dropped", "lost")
     for name, row in summary["topics"].items():

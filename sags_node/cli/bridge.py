@@ -168,7 +168,7 @@ def openigtlink(send: str, ready: Ready, stop: threading.Event, **options: Any) 
     Needs: pip install 'sags-node[bridges]'
     """
     _check_installed("pyigtl", "pyigtl", "openigtlink")
-    from sags_node.bridge.openigtlink import IgtlOptions, run_openigtlink
+    from sags_node.clients.bridge.openigtlink import IgtlOptions, run_openigtlink
 
     chosen = tuple(name for name in send.split(",") if name)
     os.nice(NICENESS)
@@ -203,7 +203,7 @@ def web(ready: Ready, stop: threading.Event, **options: Any) -> None:
     Needs: pip install 'sags-node[bridges]'
     """
     _check_installed("websockets", "websockets", "web")
-    from sags_node.bridge.web import WebOptions, run_web
+    from sags_node.clients.bridge.web import WebOptions, run_web
 
     run_web(WebOptions(**options), ready, stop)
 
@@ -231,7 +231,7 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
 
     unixfdsink, for dVRK's sockets, needs GStreamer 1.24.
     """
-    from sags_node.bridge.gst import GstOptions, run_gst
+    from sags_node.clients.bridge.gst import GstOptions, run_gst
     from sags_node.messaging.address import NodeAddress
 
     stop = threading.Event()
@@ -264,13 +264,13 @@ def foxglove(layout: Path | None, ready: Ready, stop: threading.Event, **options
     """
     _check_installed("foxglove", "foxglove-sdk", "foxglove")
     if layout is not None:
-        from sags_node.bridge.foxglove_layout import layout_of
+        from sags_node.clients.bridge.foxglove_layout import layout_of
 
         check_file(layout)
         with whole(layout) as partial:
             partial.write_text(layout_of(options["node"].ns, options["overlay"].ns), encoding="utf-8")
         return
-    from sags_node.bridge.foxglove import FoxgloveOptions, run_foxglove
+    from sags_node.clients.bridge.foxglove import FoxgloveOptions, run_foxglove
 
     os.nice(NICENESS)
     run_foxglove(FoxgloveOptions(**options), ready, stop)
@@ -324,7 +324,7 @@ def ros2(
         _check_open(f"--interface {interface}", insecure)
     from pydantic import ValidationError
 
-    from sags_node.bridge.ros2 import Ros2Options, run_ros2
+    from sags_node.clients.bridge.ros2 import Ros2Options, run_ros2
     from sags_node.config.schema import RosGraph
     from sags_node.ros.graph import where
 

@@ -30,7 +30,7 @@ from sags_node.terminal import text
 from sags_node.terminal.console import console, progress, show
 
 if TYPE_CHECKING:
-    from sags_node.calibration.boards import Board
+    from sags_node.tools.calibration.boards import Board
 
 OUT = ("-o", "--out", "--output")
 EYES = Path("eyes.png")
@@ -121,7 +121,7 @@ def check(
     sags calib check /data/pair --images /data/pair/left.png /data/pair/right.png
     sags calib check launch/v4l2.yaml source.left:=/dev/video-left
     """
-    from sags_node.calibration.check import check_calibration
+    from sags_node.tools.calibration.check import check_calibration
 
     if session is not None and images:
         raise UsageError("--session and --images: one of them is enough")
@@ -151,9 +151,9 @@ def convert(
     sags calib convert stereo_calib/ -o calib/mine --size 1280x720 --unit mm
     sags calib convert calibrationdata.tar.gz -o calib/mine
     """
-    from sags_node.calibration.check import read_calibration
     from sags_node.checks import refuse_errors
     from sags_node.rig import check_rig, eye_files, resized_rig, save_rig
+    from sags_node.tools.calibration.check import read_calibration
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
@@ -193,9 +193,9 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
     """
     import cv2
 
-    from sags_node.calibration.eyes import look
     from sags_node.config.launch_file import load_launch
     from sags_node.rig import load_rig
+    from sags_node.tools.calibration.eyes import look
 
     config = load_launch(*split(launch))
     check_file(out, force or out == EYES)
@@ -248,8 +248,8 @@ def stereo(
         --marker-mm 3.7 --dictionary 4X4_50 -o calib/my_rig
     sags calib stereo --live launch/v4l2.yaml --squares 10x7 --square-mm 4.5 -o calib/my_rig
     """
-    from sags_node.calibration.stereo import calibrate_folders, report_table, summarise
     from sags_node.rig import eye_files, save_rig
+    from sags_node.tools.calibration.stereo import calibrate_folders, report_table, summarise
 
     if (live is None) != (len(folders) == 2) or (live is not None and folders):
         raise UsageError("give two folders, LEFT_FOLDER RIGHT_FOLDER, or --live LAUNCH")
@@ -290,10 +290,10 @@ def hand_eye(
     sags calib hand-eye case.mcap rig:=calib/my_rig robot.kind:=bag robot.topic:=/ECM/measured_cp \\
         --squares 10x7 --square-mm 4.5 -o calib/my_rig
     """  # fmt: skip
-    from sags_node.calibration.hand_eye import calibrate_hand_eye, hand_eye_table, summarise_hand_eye
     from sags_node.config.launch_file import load_launch
     from sags_node.pipeline.session import rig_of
     from sags_node.rig.hand_eye import FILE, save_hand_eye
+    from sags_node.tools.calibration.hand_eye import calibrate_hand_eye, hand_eye_table, summarise_hand_eye
 
     path, overrides = split(launch)
     config = load_launch(path, overrides)
@@ -315,7 +315,7 @@ def _board(
     dictionary: str | None,
     legacy: bool,
 ) -> Board:
-    from sags_node.calibration.boards import Charuco, Chessboard
+    from sags_node.tools.calibration.boards import Charuco, Chessboard
 
     if min(squares) < 4:
         raise UsageError(f"--squares {squares[0]}x{squares[1]}: a board needs 4 squares along each side")
@@ -331,8 +331,8 @@ def _board(
 
 
 def _grab(live: Path, board: Board, folder: Path, count: int) -> tuple[Path, Path]:
-    from sags_node.calibration.live import grab_views
     from sags_node.config.launch_file import load_launch
+    from sags_node.tools.calibration.live import grab_views
 
     with console.status("starting the source (Ctrl-C: enough views)") as status:
 

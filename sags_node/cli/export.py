@@ -98,10 +98,10 @@ def export(
     sags export launch/d4d_pull.yaml --sequence out/frames
     sags export launch/d4d_pull.yaml --depth out/depth --tracks out/tracks.npz
     """
-    from sags_node.export import export as work
-    from sags_node.export import scene as source
-    from sags_node.export import sequence as many
-    from sags_node.export.played import KINDS, new_folder, write_played
+    from sags_node.tools.export import export as work
+    from sags_node.tools.export import scene as source
+    from sags_node.tools.export import sequence as many
+    from sags_node.tools.export.played import KINDS, new_folder, write_played
 
     played, targets = (
         {kind: file for kind in kinds if (file := files.get(kind)) is not None}

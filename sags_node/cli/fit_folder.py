@@ -16,20 +16,20 @@ from sags_node.cli.launching import write_json
 from sags_node.config.schema import DeviceName, EndoNerfSource
 from sags_node.engine.device import choose_device
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.lpips import BACKBONE, Lpips
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.provenance import machine_name
-from sags_node.evaluation.receipt import Receipt
 from sags_node.files import check_results, is_result
-from sags_node.fitting import checkpoint
-from sags_node.fitting.clip import read_clip
-from sags_node.fitting.fit import Fit
-from sags_node.fitting.score import published, score, score_between, score_depth, score_tracks
-from sags_node.fitting.settings import FitSettings, Schedule
 from sags_node.kernels.threads import configure_threads
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
 from sags_node.terminal import text
+from sags_node.tools.evaluation.lpips import BACKBONE, Lpips
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.provenance import machine_name
+from sags_node.tools.evaluation.receipt import Receipt
+from sags_node.tools.fitting import checkpoint
+from sags_node.tools.fitting.clip import read_clip
+from sags_node.tools.fitting.fit import Fit
+from sags_node.tools.fitting.score import published, score, score_between, score_depth, score_tracks
+from sags_node.tools.fitting.settings import FitSettings, Schedule
 from sags_node.types import Bool, StereoFrame
 
 log = logging.getLogger(__name__)

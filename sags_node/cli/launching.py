@@ -19,7 +19,7 @@ from sags_node.terminal.console import console, progress, show
 if TYPE_CHECKING:
     from sags_node.config.schema import Source
     from sags_node.engine.device import Device
-    from sags_node.pipeline.session import Session
+    from sags_node.pipeline.session import Guess, Session
 
 
 Command = Callable[..., Any]
@@ -90,7 +90,7 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     path, overrides = words_of(arguments)
     if path is None or is_launch(Path(path)) or known_recording(Path(path)) is not None:
         return path, overrides
-    from sags_node.importing.check import overrides_of
+    from sags_node.tools.importing.check import overrides_of
 
     return path, [*overrides_of(Path(path)), *overrides]
 
@@ -124,11 +124,11 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
     return path, overrides
 
 
-def open_launched(path: str | None, overrides: Sequence[str], guess: bool = False) -> Session:
+def open_launched(path: str | None, overrides: Sequence[str], guess: Guess | None = None) -> Session:
     """Open a session and make its kernels ready; says what is played, what takes long and what it runs on.
 
     Args:
-        guess: a calibration, where there is none, see `open_session`.
+        guess: makes a calibration where there is none, see `open_session`.
     """
     from sags_node.mapping.devices import device_of
     from sags_node.pipeline.session import at_best_scale, open_session
@@ -190,7 +190,7 @@ def check_files(*files: Path | None, force: bool | None = None) -> None:
 
 def show_outcome(summary: Mapping[str, Any], report: Path | None, verbose: bool, json_out: bool) -> None:
     """Print what a measured run was worth, where its report is, and if asked for all of its figures."""
-    from sags_node.evaluation.figures import flat, groups, headings, verdict
+    from sags_node.tools.evaluation.figures import flat, groups, headings, verdict
 
     if json_out:
         show(dict(summary))
@@ -237,7 +237,7 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         SagsError: it cannot be written.
     """
     if file is not None:
-        from sags_node.evaluation.provenance import provenance
+        from sags_node.tools.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
         lines = json.dumps({"provenance": provenance()} | dict(rows), indent=1)

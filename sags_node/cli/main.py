@@ -44,8 +44,8 @@ from sags_node.cli.register import register
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.plots import check_plots
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
+from sags_node.tools.evaluation.plots import check_plots
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
@@ -159,12 +159,13 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     from sags_node.messaging.content import health_fields
     from sags_node.node.node import Node
     from sags_node.node.service_manager import ServiceManager
+    from sags_node.tools.calibration.guess import guess_rig
 
     manager = ServiceManager(os.environ)
     path, overrides = split(launch)
     if path is None and isinstance(load_launch(None, overrides).source, PhantomSource):
         overrides = ["source.loop:=true", *overrides]
-    session = open_launched(path, overrides, guess=True)
+    session = open_launched(path, overrides, guess_rig)
     with stop_signals() as stop:
         node = Node(session.config, session.rig, session.source, manager=manager)
         where = escape(", ".join(node.endpoints))
@@ -195,9 +196,9 @@ def demo(launch: tuple[str, ...], seconds: float, out: Path, verbose: bool, json
     The node publishes over real sockets; `sags overlay` runs as its own process and consumes. The report
     shows input, render, depth and error side by side and figures over time. Default: the built-in phantom.
     """
-    from sags_node.demo import VIDEO, run_demo
-    from sags_node.evaluation.report import check_report
     from sags_node.pipeline.session import open_session
+    from sags_node.tools.demo import VIDEO, run_demo
+    from sags_node.tools.evaluation.report import check_report
 
     no_cameras = "sags demo plays recordings; for cameras use sags run and sags overlay"
     path, overrides = split_recording(launch, no_cameras)
@@ -306,7 +307,7 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     With a launch file also what it names: pictures, calibration, devices, networks. No camera is opened.
     """
     from sags_node.config.launch_file import load_launch
-    from sags_node.doctor import as_rows, examine
+    from sags_node.tools.doctor import as_rows, examine
 
     rows = as_rows(examine(load_launch(*split(launch))))
     show_findings(rows, json_out, "something the node needs is missing")
@@ -331,7 +332,7 @@ def import_folder(folder: Path, overrides: tuple[str, ...], json_out: bool) -> N
     """
     from dataclasses import asdict
 
-    from sags_node.importing.check import check_folder as look_over
+    from sags_node.tools.importing.check import check_folder as look_over
 
     rows = [asdict(finding) for finding in look_over(folder, overrides)]
     show_findings(rows, json_out, f"{folder} cannot be played as it is")

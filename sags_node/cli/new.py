@@ -47,8 +47,8 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
     """
     from sags_node.checks import is_wrong
     from sags_node.config.launch_file import load_launch, tree_of, written_in
-    from sags_node.doctor import examine
-    from sags_node.importing.proposal import propose
+    from sags_node.tools.doctor import examine
+    from sags_node.tools.importing.proposal import propose
 
     words = [*also, *said]
     named = [Path(word) for word in words if ":=" not in word]

@@ -27,8 +27,8 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
-from sags_node.evaluation.plots import check_plots
 from sags_node.terminal.console import console, progress, show
+from sags_node.tools.evaluation.plots import check_plots
 
 HOLD_OUT = 8  # every so many frames, as in the literature
 
@@ -99,10 +99,10 @@ def evaluate(
     sags eval launch/d4d_pull.yaml --pace step --iterations 2 --report out/d4d
     """
     from sags_node.config.launch_file import load_launch
-    from sags_node.evaluation.measure import MeasureOptions
-    from sags_node.evaluation.report import check_report, write_report
-    from sags_node.evaluation.session import Pace
-    from sags_node.evaluation.session import evaluate as measure
+    from sags_node.tools.evaluation.measure import MeasureOptions
+    from sags_node.tools.evaluation.report import check_report, write_report
+    from sags_node.tools.evaluation.session import Pace
+    from sags_node.tools.evaluation.session import evaluate as measure
 
     path, overrides = split(launch)
     if warm_up is not None:
@@ -213,8 +213,8 @@ def fit(
     """
     from sags_node.cli.fit_folder import check_fit, device_of, figures_table, fit_session, fit_verdict
     from sags_node.config.launch_file import load_launch
-    from sags_node.evaluation.measure import MeasureOptions
-    from sags_node.fitting.settings import MONOCULAR, PRESETS, with_changes
+    from sags_node.tools.evaluation.measure import MeasureOptions
+    from sags_node.tools.fitting.settings import MONOCULAR, PRESETS, with_changes
 
     no_cameras = "live cameras cannot be fitted; record them first, then fit the recording"
     path, overrides = split_recording(dataset, no_cameras)

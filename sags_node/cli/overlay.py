@@ -77,7 +77,7 @@ def overlay(json_out: bool, **options: Any) -> None:
     needs is stale. The node may be started later and restarted. docs/overlay.md describes the scene file,
     docs/wire.md what is published.
     """
-    from sags_node.overlay.run import OverlayOptions, run_overlay
+    from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 
     def tell(said: str) -> None:
         console.print(escape(said), soft_wrap=True)

@@ -10,11 +10,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from sags_node.clients.recording.recorder import Recorder, RecordOptions
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.node.node import Node
 from sags_node.pipeline.session import Session
-from sags_node.recording.recorder import Recorder, RecordOptions
 from sags_node.terminal.console import stop_signals
 from sags_node.types import FrameResult
 

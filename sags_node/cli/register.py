@@ -67,8 +67,8 @@ def register(
     """
     import yaml
 
-    from sags_node.overlay.registering import register_live
-    from sags_node.overlay.scene import read_pairs
+    from sags_node.clients.overlay.registering import register_live
+    from sags_node.clients.overlay.scene import read_pairs
 
     check_files(out, force=force)
     said, scene = register_live(model, scale, read_pairs(points), node, seconds, out)

@@ -49,7 +49,7 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     """
     if importlib.util.find_spec("viser") is None:
         raise UsageError("sags view needs viser; install it with: pip install 'sags-node[viewer]'")
-    from sags_node.viewer.run import run_viewer
+    from sags_node.clients.viewer.run import run_viewer
 
     os.nice(NICENESS)
 

@@ -65,7 +65,7 @@ REMEMBER_EVERY = 2.0  # s, while none is
 RECALL_RADIUS = 10  # px, around where the tissue around it says that it is
 SURE = 0.3  # s: what was found so lately is remembered
 LOST = 1.0  # s out of sight from which on an anchor is looked for everywhere
-TOLD = 0.2  # s for which one without tissue is said to be lost before it is looked for: frames are missed
+TOLD = 0.2  # s that one is reported lost before it may be found again: clients miss frames
 
 _NOBODY = -1  # in the place of a Gaussian's id
 _SIDE = 2 * PATCH_RADIUS + 1

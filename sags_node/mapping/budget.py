@@ -22,7 +22,7 @@ class FramePlan:
     """What one frame gets, decided when it begins."""
 
     rung: Rung  # at most
-    state: RungState | None  # which rung that is and why; None: it is none of a ladder
+    state: RungState | None  # which rung that is and why; None: there is no ladder
     depth: bool  # may be matched
 
 
@@ -35,7 +35,7 @@ class Budget(Protocol):
 
     @property
     def plan(self) -> FramePlan:
-        """Of the frame that began last."""
+        """The plan of the current frame."""
 
     def start(self, waited: float = 0.0) -> FramePlan:
         """A new frame begins, `waited` seconds after it came."""

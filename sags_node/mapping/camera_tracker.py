@@ -44,9 +44,11 @@ class CameraTracker:
     disagree for long, the camera is lost again and what was learnt since is undone. When lit frames have
     shown one other scene for `GIVE_UP_NS`, a new model is begun at the last pose.
 
-    Attributes:
-        lost: why the camera is lost; None: it is not.
+    Attributes: see `Localizer`.
     """
+
+    unsure = ""
+    by_picture = True
 
     def __init__(
         self, tissue_map: TissueMap, surface: SurfaceTracker, draw: Callable[[Camera], RenderedView]

@@ -18,7 +18,7 @@ from sags_node.types import F32, I32, U8, Bool, Observation
 from sags_node.vision.depth_grid import depth_at, grid_of
 
 HOLE_ALPHA = 0.4  # below this a tissue pixel is a hole; 0.8 would count the gaps between small Gaussians
-RESIDUAL_NEW_SURFACE = 0.2  # summed over RGB: with a surface in front of the model, content is new
+RESIDUAL_NEW_SURFACE = 0.2  # RGB residual, summed: above it a pixel nearer than the model is new surface
 RESIDUAL_DETAIL = 0.45  # summed over RGB: with the right depth, detail is missing
 GRID = 4  # px between candidates
 MAX_INSERTED = 1500  # per frame: a budget, and a brake on runaway insertion

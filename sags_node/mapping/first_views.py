@@ -49,8 +49,8 @@ class FirstViews:
         self._kept.clear()
 
     def pose(self, observation: Observation, about: F64) -> F64 | None:
-        """Where the camera is by the oldest picture that tells, [4, 4]; None: none does. Later ones hold what
-        the older ones left over.
+        """The camera's pose [4, 4] by the oldest view with enough matches; None: none has. Later ones hold
+        what the older ones left over.
 
         Args:
             observation: a frame that was taken in; its camera says where the tissue is now.

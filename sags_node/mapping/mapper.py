@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import Enum, auto
 
 import numpy as np
 
@@ -32,6 +33,15 @@ FOCUS = 0.2  # of the picture: shows most for its time on pulled tissue and on a
 FIRST_RATES = LearningRates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
+
+
+class Kind(Enum):
+    """What a frame is to the mapper."""
+
+    FIRST = auto()  # there is no model yet
+    ODD = auto()  # its colours are not the tissue's: the model only follows the motion
+    STILL = auto()  # nothing has moved, and it is drawn as large as the frame before
+    MOVED = auto()  # as most are
 
 
 class Mapper:
@@ -96,14 +106,15 @@ class Mapper:
         self._frames += 1
         before, self._scale = self._scale, budget.plan.rung.scale
         self._note_depth(observation)
-        if self.map.deformation is None:
-            counts = self._initialise(observation, budget)
-        elif not learn:
-            counts = self._follow_only(observation, tracks)
-        elif still and self._scale == before:
-            counts = self._touch_up(observation, budget, most_steps(still, self._frames))
-        else:
-            counts = self._follow(observation, tracks, budget)
+        match self._kind(learn, still and self._scale == before):
+            case Kind.FIRST:
+                counts = self._initialise(observation, budget)
+            case Kind.ODD:
+                counts = self._follow_only(observation, tracks)
+            case Kind.STILL:
+                counts = self._touch_up(observation, budget, most_steps(still, self._frames))
+            case Kind.MOVED:
+                counts = self._follow(observation, tracks, budget)
         assert self._view is not None
         forecast = self._forecast(observation.t_capture_ns, still > 0)
         snapshot = snapshot_of(
@@ -114,6 +125,13 @@ class Mapper:
             limit = self._limit(budget)
             self._split = split_where_room(self.model, observation, self._view, limit) > 0
         return mapped
+
+    def _kind(self, learn: bool, still: int | bool) -> Kind:
+        if self.map.deformation is None:
+            return Kind.FIRST
+        if not learn:
+            return Kind.ODD
+        return Kind.STILL if still else Kind.MOVED
 
     def pace(self, unhurried: bool) -> None:
         """Whether there is time for several steps a frame. They are shorter then."""

@@ -41,7 +41,7 @@ class Agreement:
 
     @property
     def is_contradiction(self) -> bool:
-        """Whether it is not half as good as it must be at first: moved tissue agrees better."""
+        """Tell whether it is below half of what is accepted at first: moved tissue agrees better."""
         unlike = self.correlation < LEAST_CORRELATION / 2
         return unlike or (self.near is not None and self.near < LEAST_NEAR / 2)
 

@@ -22,12 +22,11 @@ class PoseRefiner:
     given, and a correction of its place follows the picture more slowly than tissue breathes: what is quick
     is the tissue's motion. Where the picture cannot tell, the correction stays.
 
-    Attributes:
-        lost: never; for a tracker that may be, see `CameraTracker`.
-        unsure: why the picture could not tell in the last frame; empty: it could.
+    Attributes: see `Localizer`. It is never `lost`.
     """
 
     lost: str | None = None
+    by_picture = True
 
     def __init__(self, tissue_map: TissueMap) -> None:
         self.unsure = ""

@@ -37,10 +37,10 @@ from sags_node.node.allowance import Allowance, Pace
 from sags_node.node.health import Statistics, in_a_line, why_missed
 from sags_node.node.latest import Latest
 from sags_node.node.operations import NodeState, Operations
+from sags_node.node.recorder import RecorderProcess
 from sags_node.node.service_manager import ServiceManager
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
-from sags_node.recording.child import RecorderProcess
 from sags_node.sources.clock import CaptureClock, FrameRate
 from sags_node.sources.source import Source, findings_of
 from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig

@@ -26,6 +26,7 @@ from sags_node.mapping.budget import Budget, FramePlan
 from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, make_refiner
+from sags_node.mapping.given_camera import GivenCamera, Localizer
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
@@ -64,7 +65,7 @@ if TYPE_CHECKING:
 
 UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
 GAP = 3.0  # usual steps between two frames: beyond, frames have failed to come
-NOTICED_LATE = HALVING  # m: what was measured before matches are found to be wrong may be wrong by so much
+NOTICED_LATE = HALVING  # m, error assumed of depth from before wrong matches were found
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +131,7 @@ class Pipeline:
         self._detail = Detail(Lessons()) if config.publish.detail else None
         self._memory, self._matched = Memory(), Matched()
         self._right, self._right_views = RightView(), 0
-        self._camera: CameraTracker | PoseRefiner | None = None  # None: its pose is given, or fixed
+        self._camera: Localizer = GivenCamera(follows=vision.pose == "session")
         if vision.pose == "estimate":
             self._camera = CameraTracker(self.map, self._surface, self._draw_model)
         elif vision.pose == "refine":
@@ -187,8 +188,7 @@ class Pipeline:
         found = [*self.depth.findings]
         for watcher in self._watchers:
             found += watcher.findings
-        lost = None if self._camera is None else self._camera.lost
-        if lost is not None:
+        if (lost := self._camera.lost) is not None:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
         if not self.metric:
@@ -229,11 +229,9 @@ class Pipeline:
         # 1. Watch: may this frame be trusted? One that may not is held, an equal one is the last again.
         right = pair.right is not None and (request.right or self._config.publish.right is True)
         with clock("watch"):
-            judged, repeats = self._watch(frame, pair, right)
-        if judged.hold and self.newest is not None:
-            return self._held(frame, pair, clock, judged.stage, judged.hold, unseen(pair))
-        if repeats:
-            return self._repeated(frame, pair, clock)
+            judged = self._watch(frame, pair, right)
+        if self.newest is not None and (judged.hold or judged.repeats):
+            return self._carried_on(frame, pair, judged, unseen(pair), clock)
         if judged.is_new_scene:
             self._forget()
         # 2. Segment: where is tissue? Cover, and drops on the lens, are none.
@@ -251,8 +249,9 @@ class Pipeline:
         # 5. Locate the camera, where its pose is not given.
         with clock("pose"):
             pair, observation, tracks = self._located(pair, observation, still, tracks)
-        if self._camera is not None and self._camera.lost and self.newest is not None:
-            return self._held(frame, pair, clock, "pose", self._camera.lost, observation)
+        if self._camera.lost and self.newest is not None:
+            judged = replace(judged, hold=self._camera.lost, stage="pose")
+            return self._carried_on(frame, pair, judged, observation, clock)
         # 6. Map: deform, refine, add and prune Gaussians.
         with clock("map"):
             mapped = self._mapped(observation, tracks, budget, still, judged.learn, right)
@@ -262,7 +261,7 @@ class Pipeline:
             views = {"left": self._left_eye(mapped.view, pair, request.left or right)}
             if right:
                 views["right"] = self._right_eye(mapped, observation, pair, seen, judged, by_both)
-        if not still:  # which tells nothing of what a moving frame costs
+        if not still:  # still frames are cheap: they would bias the cost
             budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
         with clock("anchors"):
             self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
@@ -276,43 +275,39 @@ class Pipeline:
 
     def _rectified(self, frame: StereoFrame) -> RectifiedPair:
         """Until its pose is found, its camera is where it was last, or as it is given."""
-        if self._config.vision.pose == "session":
-            return self.rectifier(frame)
-        pose = None if self._camera is None else self._camera.guess(frame.T_world_cam)
-        return self.rectifier(replace(frame, T_world_cam=pose))
+        return self.rectifier(replace(frame, T_world_cam=self._camera.guess(frame.T_world_cam)))
 
-    def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool) -> tuple[Judgement, bool]:
-        """What all watchers together say of a frame, and whether it equals the last one."""
+    def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool) -> Judgement:
+        """What all watchers together say of a frame."""
         if self._reset_due and frame.pose_problem is None:
             self._forget()
         last = self.newest
         lacks_right = right and last is not None and "right" not in last.views  # somebody has just come
         equal = last is not None and self._skips.duplicates and not lacks_right and is_repeat(pair, last.pair)
         evidence = Evidence(frame, pair, last, equal, self.depth.eyes_are_late)
-        judged = Judgement()
+        judged = Judgement(repeats=equal)
         for watcher in self._watchers:
             judged = watcher.judge(evidence, judged)
-        return judged, equal
+        return judged
 
-    def _repeated(self, frame: StereoFrame, pair: RectifiedPair, clock: Stopwatch) -> FrameResult:
-        assert self.newest is not None
-        self.anchors.age(pair.t_capture_ns, equal=not self._freeze.findings)
-        return repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, self.anchors.states())
-
-    def _held(
-        self, frame: StereoFrame, pair: RectifiedPair, clock: Stopwatch, what: str, why: str,
-        observation: Observation,
+    def _carried_on(
+        self, frame: StereoFrame, pair: RectifiedPair, judged: Judgement, observation: Observation,
+        clock: Stopwatch,
     ) -> FrameResult:  # fmt: skip
-        """For a frame that something (`what`) forbids to take in: the last model, and nothing is learnt from
-        the picture. The tissue moves meanwhile, and the depth is less and less sure."""
+        """The last result, for a frame that is not mapped: it equals the last one, or it is held. Then its
+        picture teaches nothing; the tissue moves meanwhile, and the depth is less and less sure."""
         assert self.newest is not None
+        if not judged.hold:
+            self.anchors.age(pair.t_capture_ns, equal=not self._freeze.findings)
+            return repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, self.anchors.states())
         self._still.forget()
         seconds = max(0, pair.t_capture_ns - self.newest.pair.t_capture_ns) * 1e-9
         self._unwatched = UNWATCHED * seconds
         self.anchors.age(pair.t_capture_ns, held=True)
         last = repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, self.anchors.states())
         held = doubted(last, self._unwatched)
-        return replace(held, observation=observation, skipped={what: why}, held=why, hurried=False)
+        skipped = {judged.stage: judged.hold}
+        return replace(held, observation=observation, skipped=skipped, held=judged.hold, hurried=False)
 
     def _note_gap(self, t_capture_ns: int) -> None:
         """Where no frame has come for longer than is usual, nobody watched the tissue."""
@@ -331,7 +326,7 @@ class Pipeline:
         """For how many frames nothing has moved."""
         if not self._skips.still:
             return 0
-        if self._camera is not None:  # an estimated pose tells nothing that the pictures do not
+        if self._camera.by_picture:
             pair = replace(pair, camera=self.rectifier.camera)
         return self._still(pair)
 
@@ -359,9 +354,7 @@ class Pipeline:
     def _located(
         self, pair: RectifiedPair, observation: Observation, still: int, tracks: Tracks | None
     ) -> tuple[RectifiedPair, Observation, Tracks | None]:
-        if self._camera is None:
-            return pair, observation, tracks
-        if not still:
+        if not (still and self._camera.by_picture):
             tracks = self._camera.locate(observation, self._last, tracks)
         camera = replace(pair.camera, T_world_cam=self._camera.pose)
         return replace(pair, camera=camera), replace(observation, camera=camera), tracks
@@ -381,8 +374,7 @@ class Pipeline:
         mapped = self.mapper.update(observation, tracks, budget, still, learn, right)
         if not still or begins:  # a still frame is passed over: slow motion adds up until seen
             self._last = Drawn(observation, mapped.view)
-        if self._camera is not None:
-            self._camera.learn(observation, mapped.view)
+        self._camera.learn(observation, mapped.view)
         return mapped
 
     def _lend(self, mapped: Mapped, pair: RectifiedPair, observation: Observation, judged: Judgement) -> None:
@@ -440,7 +432,7 @@ class Pipeline:
     def _skipped(self, measured: Measured) -> dict[str, str]:
         """What was left out of a frame that was mapped, and why."""
         skipped = {"mask": self.tissue.problem} if self.tissue.problem else {}
-        if isinstance(self._camera, PoseRefiner) and self._camera.unsure:
+        if self._camera.unsure:
             skipped["refine"] = self._camera.unsure
         return {**skipped, **measured.skipped}
 

@@ -55,6 +55,6 @@ def doubted(held: FrameResult, error: float) -> FrameResult:
 
 
 def unseen(pair: RectifiedPair) -> Observation:
-    """Of a picture of which nothing may be used."""
+    """The observation of a frame without a usable pixel."""
     shape = pair.left.shape[:2]
     return observe(pair, np.zeros(shape, np.bool_), Measured.nothing(shape))

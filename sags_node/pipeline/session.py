@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sags_node.calibration.guess import guess_rig
+from sags_node.config import schema
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import (
     BagSource,
@@ -30,6 +30,8 @@ from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
 
 log = logging.getLogger(__name__)
+
+Guess = Callable[[schema.Source], StereoRig]  # from the pictures of a source
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +58,13 @@ def open_session(
     launch: Path | str | None,
     overrides: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
-    guess: bool = False,
+    guess: Guess | None = None,
 ) -> Session:
     """Read a launch file or session folder (None: the built-in phantom) and open what it names.
 
     Args:
         progress: called with (frames done, frames in all) while the phantom is rendered for the first time.
-        guess: where no calibration is named, play with a guessed one, see `guess_rig`.
+        guess: makes a calibration where none is named; None: that is an error.
 
     Raises:
         UsageError: a wrong key, value or path.
@@ -117,14 +119,14 @@ def lacks_rig(config: LaunchConfig) -> bool:
 
 
 def rig_to_play(
-    config: LaunchConfig, progress: Callable[[int, int], None] | None = None, guess: bool = False
+    config: LaunchConfig, progress: Callable[[int, int], None] | None = None, guess: Guess | None = None
 ) -> StereoRig:
     """The calibration that `open_session` plays with, its arguments as there."""
     if isinstance(config.source, PhantomSource):
         from sags_node.phantom import cached_session
 
         return load_rig(cached_session(config.source, progress) / "calib")
-    return guess_rig(config.source) if guess and lacks_rig(config) else rig_of(config)
+    return guess(config.source) if guess is not None and lacks_rig(config) else rig_of(config)
 
 
 def rig_of(config: LaunchConfig) -> StereoRig:

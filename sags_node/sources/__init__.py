@@ -1,4 +1,4 @@
 """Where frames come from: recordings, cameras, data sets, network streams.
 
-Imports config, kernels, media, messaging, phantom, recording, rig and ros.
+Imports bags, config, kernels, media, messaging, phantom, rig and ros.
 """

@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sags_node.bags.bag import BagMessage, read_messages
+from sags_node.bags.camera_info import Said, changes, in_force, read_eye
+from sags_node.bags.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.topics import CAMERA_INFO
-from sags_node.recording.bag import BagMessage, read_messages
-from sags_node.recording.camera_info import Said, changes, in_force, read_eye
-from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.rig import accept_rig
 from sags_node.sources.bag_stamps import DIFFER_FIX, Key, judge_stamps, pair_messages
 from sags_node.sources.layout import Layout

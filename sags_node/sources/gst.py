@@ -146,7 +146,7 @@ class Pipeline:
             sink.begin(said, descriptors[0])
             return
         picture = sink.take(said)
-        self._process.download(said["sink"], said["slot"])
+        self._process.release(said["sink"], said["slot"])
         if picture is not None:
             self._arrived.append(picture)
 

@@ -110,8 +110,8 @@ class GstProcess:
         """Play a file from its first picture on; live pipelines play anyway."""
         self._tell(START)
 
-    def download(self, sink: int, slot: int) -> None:
-        """A picture has been copied."""
+    def release(self, sink: int, slot: int) -> None:
+        """Give a slot back whose picture was copied."""
         self._tell(bytes((sink, slot)))
 
     def _tell(self, message: bytes) -> None:

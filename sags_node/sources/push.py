@@ -6,13 +6,13 @@ from functools import partial
 
 import cv2
 
+from sags_node.bags.pictures import ENCODINGS, decode_picture
 from sags_node.config.schema import PushSource
 from sags_node.errors import SagsError
 from sags_node.messaging.cdr import COMPRESSED
 from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.topics import IMAGE
 from sags_node.messaging.wire import Message, WireError
-from sags_node.recording.pictures import ENCODINGS, decode_picture
 from sags_node.sources.sent import SentPictures
 from sags_node.types import U8, Finding
 

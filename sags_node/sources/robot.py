@@ -11,13 +11,13 @@ from typing import Any, Self
 
 import numpy as np
 
+from sags_node.bags.bag import read_messages
 from sags_node.config.schema import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import TF
 from sags_node.messaging.wire import Message
-from sags_node.recording.bag import read_messages
 from sags_node.rig.hand_eye import FILE, read_hand_eye
 from sags_node.ros.endpoints import Delivery, Reader
 from sags_node.ros.graph import Graph

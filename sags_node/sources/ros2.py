@@ -8,12 +8,12 @@ import time
 from collections.abc import Iterator, Mapping
 from functools import partial
 
+from sags_node.bags.camera_info import read_eye, same
+from sags_node.bags.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.config.schema import Ros2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import CAMERA_INFO
-from sags_node.recording.camera_info import read_eye, same
-from sags_node.recording.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.rig import accept_rig, already_rectified
 from sags_node.ros.endpoints import Reader
 from sags_node.ros.graph import Graph, receive_buffer

@@ -13,9 +13,9 @@ from command_line import figures_of
 
 from benchmarks.__main__ import main
 from benchmarks.quality import ablation
-from sags_node.fitting import start
-from sags_node.fitting.fit import Fit
-from sags_node.fitting.settings import FieldShape
+from sags_node.tools.fitting import start
+from sags_node.tools.fitting.fit import Fit
+from sags_node.tools.fitting.settings import FieldShape
 
 
 def test_all_variants_are_measured_on_the_same_frames(

@@ -13,12 +13,12 @@ from benchmarks.pareto import settings as pareto_settings
 from benchmarks.pareto.measure import non_dominated, why_default
 from benchmarks.pareto.settings import HURRIED_RULES, skip_settings, time_settings
 from sags_node.config.launch_file import load_launch
-from sags_node.evaluation import metrics
-from sags_node.evaluation.warp import right_pixels, warp_to_right
 from sags_node.mapping.devices import Skips
 from sags_node.mapping.ladder import RUNGS
+from sags_node.quality import metrics
 from sags_node.rig import load_rig
 from sags_node.sources.source import open_source
+from sags_node.tools.evaluation.warp import right_pixels, warp_to_right
 from sags_node.vision.rectify import Rectifier
 
 RULES = {"skip_duplicates", "skip_depth", "skip_still"}

@@ -23,7 +23,7 @@ pytest.importorskip("websockets", reason="no gateway without: pip install 'sags-
 
 from websockets.sync.server import ServerConnection, serve
 
-from sags_node.bridge.web import WebOptions, run_web
+from sags_node.clients.bridge.web import WebOptions, run_web
 from sags_node.messaging.address import NodeAddress
 
 pytestmark = [pytest.mark.live, pytest.mark.beside]

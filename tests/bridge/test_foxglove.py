@@ -27,8 +27,8 @@ pytest.importorskip("websockets", reason="no peer without the package websockets
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from sags_node.bridge.foxglove import CLICKED, FoxgloveOptions, clicked, outputs, run_foxglove
-from sags_node.bridge.foxglove_layout import layout_of
+from sags_node.clients.bridge.foxglove import CLICKED, FoxgloveOptions, clicked, outputs, run_foxglove
+from sags_node.clients.bridge.foxglove_layout import layout_of
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.subscriber import Subscriber
 

@@ -14,11 +14,11 @@ from command_line import refused
 from gstreamer import need_gstreamer
 from waiting import repeating, until
 
-from sags_node.bridge.gst import GstOptions, run_gst
+from sags_node.clients.bridge.gst import GstOptions, run_gst
+from sags_node.clients.overlay.draw import color_key
+from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
-from sags_node.overlay.draw import color_key
-from sags_node.overlay.stream import OverlayStream
 
 pytestmark = pytest.mark.live
 

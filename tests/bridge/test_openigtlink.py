@@ -21,12 +21,12 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-
 
 from pyigtl.messages import PointMessage
 
-from sags_node.bridge import igtl
-from sags_node.bridge.igtl import MAX_BODY_BYTES
-from sags_node.bridge.igtl_peers import Peers
-from sags_node.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
+from sags_node.clients.bridge import igtl
+from sags_node.clients.bridge.igtl import MAX_BODY_BYTES
+from sags_node.clients.bridge.igtl_peers import Peers
+from sags_node.clients.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
+from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.geometry import invert, transform, unproject
-from sags_node.overlay.stream import OverlayStream
 
 pytestmark = pytest.mark.live
 

@@ -12,8 +12,8 @@ import pytest
 from made_messages import meta
 from simulation import START_NS, World
 
-from sags_node.bridge import gst, relay
-from sags_node.bridge.relay import LEAD, LOOK, MAX_AGE, Output, Relay, Source
+from sags_node.clients.bridge import gst, relay
+from sags_node.clients.bridge.relay import LEAD, LOOK, MAX_AGE, Output, Relay, Source
 from sags_node.messaging import address
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freshness import Freshness

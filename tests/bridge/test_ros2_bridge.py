@@ -17,10 +17,10 @@ from ros_peers import DOMAIN, KEPT, Listener, listener
 from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
 from waiting import until
 
-from sags_node.bridge import ros2
-from sags_node.bridge.compressed import LARGEST, Compressor
-from sags_node.bridge.ros2 import PACE, Pace, Ros2Options, offers, run_ros2
-from sags_node.bridge.ros2_requests import asks
+from sags_node.clients.bridge import ros2
+from sags_node.clients.bridge.compressed import LARGEST, Compressor
+from sags_node.clients.bridge.ros2 import PACE, Pace, Ros2Options, offers, run_ros2
+from sags_node.clients.bridge.ros2_requests import asks
 from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics

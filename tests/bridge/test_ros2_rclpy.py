@@ -23,7 +23,7 @@ from running_node import RunningNode
 from synthetic import at_frame, stream
 from waiting import until
 
-from sags_node.bridge.ros2 import Ros2Options, run_ros2
+from sags_node.clients.bridge.ros2 import Ros2Options, run_ros2
 from sags_node.config.schema import RosGraph
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import Received, ReceivedCloud, TopicName

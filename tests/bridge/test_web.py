@@ -26,9 +26,9 @@ pytest.importorskip("websockets", reason="no gateway without: pip install 'sags-
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from sags_node.bridge import web as gateway
-from sags_node.bridge.relay import MAX_AGE
-from sags_node.bridge.web import LONGEST_MESSAGE, MOST_PEERS, WebOptions, run_web
+from sags_node.clients.bridge import web as gateway
+from sags_node.clients.bridge.relay import MAX_AGE
+from sags_node.clients.bridge.web import LONGEST_MESSAGE, MOST_PEERS, WebOptions, run_web
 from sags_node.messaging import content
 
 pytestmark = pytest.mark.live

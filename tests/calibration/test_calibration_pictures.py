@@ -16,11 +16,6 @@ import pytest
 from command_line import ran
 from places import ROOT
 
-from sags_node.calibration.check import check_pictures, judge
-from sags_node.calibration.matches import match_eyes
-from sags_node.calibration.pictures import pairs_of_files, pairs_of_session
-from sags_node.calibration.principal_points import judge_known_depths
-from sags_node.calibration.rows import judge_scale, rectified_rows
 from sags_node.checks import Finding
 from sags_node.config.launch_file import load_launch
 from sags_node.config.units import UNITS
@@ -29,6 +24,11 @@ from sags_node.geometry import invert
 from sags_node.rig import check_rig, load_rig, read_rig, rectified_rig, rectify_eyes, save_rig
 from sags_node.rig.check import size_made_for
 from sags_node.sources.pictures import read_picture
+from sags_node.tools.calibration.check import check_pictures, judge
+from sags_node.tools.calibration.matches import match_eyes
+from sags_node.tools.calibration.pictures import pairs_of_files, pairs_of_session
+from sags_node.tools.calibration.principal_points import judge_known_depths
+from sags_node.tools.calibration.rows import judge_scale, rectified_rows
 from sags_node.types import F64, U8, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 

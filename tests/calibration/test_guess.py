@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sags_node.calibration.guess import guess_rig, with_equal_rows
-from sags_node.calibration.matches import match_eyes
-from sags_node.calibration.rows import rectified_rows
 from sags_node.config.launch_file import load_launch
 from sags_node.pipeline.session import rig_of
 from sags_node.rig import GUESSED_FOV, guessed_rig
+from sags_node.tools.calibration.guess import guess_rig, with_equal_rows
+from sags_node.tools.calibration.matches import match_eyes
+from sags_node.tools.calibration.rows import rectified_rows
 from sags_node.types import U8
 
 SIZE = (480, 384)

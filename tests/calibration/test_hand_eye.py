@@ -15,15 +15,10 @@ from command_line import figures_of
 from drawn_boards import charuco_print, known_rig
 from places import ROOT
 
-from sags_node.calibration.boards import StereoView
-from sags_node.calibration.hand_eye_solve import solve_hand_eye
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.session import evaluate
-from sags_node.fitting.clip import read_clip
 from sags_node.geometry import invert, matrix_to_quat
 from sags_node.messaging import cdr, topics
 from sags_node.phantom.board import draw, fine_rays
@@ -34,6 +29,11 @@ from sags_node.rig import save_rig
 from sags_node.rig.hand_eye import HandEye, read_hand_eye, save_hand_eye
 from sags_node.sources.pose_track import NoPoseError, PoseTrack
 from sags_node.sources.robot import open_robot, rectified
+from sags_node.tools.calibration.boards import StereoView
+from sags_node.tools.calibration.hand_eye_solve import solve_hand_eye
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.session import evaluate
+from sags_node.tools.fitting.clip import read_clip
 from sags_node.types import F32, F64, Bool, Camera, Gaussians, StereoRig
 
 S, MS = 1_000_000_000, 1_000_000
@@ -294,7 +294,7 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
         monkeypatch.setattr(made, "forward", noted)
         return made
 
-    monkeypatch.setattr("sags_node.evaluation.measure.make_rasterizer", noting)
+    monkeypatch.setattr("sags_node.tools.evaluation.measure.make_rasterizer", noting)
     session = open_session(recording, [*played, "source.frames:=4"])
     clip = read_clip(session, lambda number: number == 1)
     measured = evaluate(recording, [*played, "source.frames:=4"], MeasureOptions(hold_out=4), iterations=0)

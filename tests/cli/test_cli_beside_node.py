@@ -17,11 +17,11 @@ import pytest
 from command_line import RUN_HERE, figures_of, pure_json, refused, sags, start, stopped, wait_for
 from places import ROOT
 
+from sags_node.clients.overlay import run as overlay
 from sags_node.config.schema import LIVE_PARAMETERS
 from sags_node.messaging import introspection as topic
 from sags_node.messaging.received import ReceivedText
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.overlay import run as overlay
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 

@@ -61,9 +61,9 @@ def test_a_ctrl_c_that_comes_while_a_kernel_is_loaded_is_one_too(monkeypatch: py
     def broken(*arguments: object) -> None:
         raise SystemError("broken")
 
-    monkeypatch.setattr("sags_node.doctor.examine", interrupted)
+    monkeypatch.setattr("sags_node.tools.doctor.examine", interrupted)
     assert CliRunner().invoke(main, ["doctor"]).exit_code == 130
-    monkeypatch.setattr("sags_node.doctor.examine", broken)
+    monkeypatch.setattr("sags_node.tools.doctor.examine", broken)
     assert isinstance(CliRunner().invoke(main, ["doctor"]).exception, SystemError)
 
 

@@ -23,9 +23,9 @@ from user_files import videos
 
 from sags_node.cli.main import main
 from sags_node.errors import SagsError
-from sags_node.evaluation.report import check_report
 from sags_node.files import check_file, check_results, whole
 from sags_node.terminal import console as terminal
+from sags_node.tools.evaluation.report import check_report
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 
@@ -292,7 +292,7 @@ def test_doctor_looks_at_all_that_a_launch_file_names(user_files: Path, what: st
 def test_doctor_asks_for_the_packages_that_a_launch_file_needs(
     user_files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sags_node.doctor.find_spec", lambda name: None)
+    monkeypatch.setattr("sags_node.tools.doctor.find_spec", lambda name: None)
     code, checks = doctor(user_files, str(ROOT / "launch/ros2.yaml"))
     assert code == 1 and "cyclonedds" in checks["source"]["found"] and "[ros2]" in checks["source"]["fix"]
 
@@ -406,7 +406,7 @@ def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
     code = (
         f"import sys; from sags_node.cli.main import main\n"
         f"for command in {commands}: main(command, standalone_mode=False)\n"
-        f"import sags_node.overlay.run, sags_node.messaging.introspection, sags_node.demo\n"
+        f"import sags_node.clients.overlay.run, sags_node.messaging.introspection, sags_node.tools.demo\n"
         f"print(sorted({{'torch', 'open3d', 'onnxruntime'}} & set(sys.modules)))"
     )
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -11,10 +11,10 @@ import pytest
 import yaml
 from places import ROOT
 
+from sags_node.bags.bag import storage_files
 from sags_node.config.launch_file import load_launch
 from sags_node.config.yaml_reader import MOST_VALUES, parse_yaml, read_yaml
 from sags_node.errors import UsageError
-from sags_node.recording.bag import storage_files
 from sags_node.rig import load_rig, read_rig
 
 LONGEST = 300  # characters of a message, without the name of the file
@@ -112,7 +112,7 @@ def as_opencv(text: str, folder: Path) -> object:
 
 
 def as_scene(text: str, folder: Path) -> object:
-    from sags_node.overlay.scene import read_scene
+    from sags_node.clients.overlay.scene import read_scene
 
     (folder / "scene.yaml").write_text(text)
     return read_scene(folder / "scene.yaml")

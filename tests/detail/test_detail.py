@@ -13,13 +13,13 @@ from sags_node.detail.memory import EVERY, MATCHED, MOST, OLDEST, Matched, Memor
 from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.detail.share import Share
-from sags_node.evaluation import metrics
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.session import evaluate
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.quality import metrics
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.session import evaluate
 from sags_node.types import F32, U8, Camera, Gaussians, Shown
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0

@@ -12,7 +12,6 @@ import pytest
 import warp as wp
 from click.testing import CliRunner
 
-from sags_node import doctor
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, MappingConfig
@@ -21,6 +20,7 @@ from sags_node.engine.device import choose_device, find_gpu
 from sags_node.errors import UsageError
 from sags_node.mapping import devices as mapping_devices
 from sags_node.mapping.ladder import GPU_RUNGS
+from sags_node.tools import doctor
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from engine_scenes import round_gaussians
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.evaluation.moments import Seen, carried
+from sags_node.tools.evaluation.moments import Seen, carried
 from sags_node.types import F32, Camera, Gaussians
 
 WIDTH, HEIGHT, DEPTH, FOCAL = 96, 64, 0.1, 100.0

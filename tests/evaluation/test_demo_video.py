@@ -7,10 +7,10 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sags_node.demo import Shown
+from sags_node.clients.overlay.draw import over
+from sags_node.clients.overlay.save import Layers, read_layers
 from sags_node.media.video_file import VideoFile
-from sags_node.overlay.draw import over
-from sags_node.overlay.save import Layers, read_layers
+from sags_node.tools.demo import Shown
 from sags_node.types import U8
 
 RATE, HEIGHT, WIDTH = 30.0, 64, 81

@@ -22,16 +22,16 @@ from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation import plots
-from sags_node.evaluation.figures import MEANS, POOLED
-from sags_node.evaluation.measure import MeasureOptions, Measurer
-from sags_node.evaluation.plots import Series, line_plot
-from sags_node.evaluation.receipt import Receipt
-from sags_node.evaluation.report import write_report
-from sags_node.evaluation.run import MappedFrame, Run
-from sags_node.evaluation.session import evaluate
-from sags_node.evaluation.summary import STAGES, summarise
 from sags_node.rig import save_rig
+from sags_node.tools.evaluation import plots
+from sags_node.tools.evaluation.figures import MEANS, POOLED
+from sags_node.tools.evaluation.measure import MeasureOptions, Measurer
+from sags_node.tools.evaluation.plots import Series, line_plot
+from sags_node.tools.evaluation.receipt import Receipt
+from sags_node.tools.evaluation.report import write_report
+from sags_node.tools.evaluation.run import MappedFrame, Run
+from sags_node.tools.evaluation.session import evaluate
+from sags_node.tools.evaluation.summary import STAGES, summarise
 from sags_node.types import (
     Camera,
     Eye,

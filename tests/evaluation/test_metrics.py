@@ -11,13 +11,13 @@ import pytest
 from engine_scenes import round_gaussians, rows
 
 from sags_node.errors import UsageError
-from sags_node.evaluation import metrics
-from sags_node.evaluation.flicker import FRAMES, Flicker
-from sags_node.evaluation.lpips import Lpips
-from sags_node.evaluation.moments import VELOCITY_SHARE, extrapolated
-from sags_node.evaluation.run import MappedFrame, RunFacts
-from sags_node.evaluation.tracking import PointTracks
 from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.quality import metrics
+from sags_node.tools.evaluation.flicker import FRAMES, Flicker
+from sags_node.tools.evaluation.lpips import Lpips
+from sags_node.tools.evaluation.moments import VELOCITY_SHARE, extrapolated
+from sags_node.tools.evaluation.run import MappedFrame, RunFacts
+from sags_node.tools.evaluation.tracking import PointTracks
 from sags_node.types import Camera, Gaussians, Snapshot
 
 

@@ -11,13 +11,13 @@ import pytest
 from golden import Golden, Tolerance, compare, read_golden, write_golden
 from places import ROOT, SESSION
 
-from sags_node.evaluation.calibration import STEP_MM
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.tools.evaluation.calibration import STEP_MM
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.session import evaluate
 from sags_node.types import FrameResult
 
 # Another CPU rounds otherwise, and rounding decides now and then whether a Gaussian is inserted.

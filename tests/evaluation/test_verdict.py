@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from sags_node.evaluation.figures import TABLE, flat, groups, headings, verdict
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.summary import STAGES, summarise
+from sags_node.tools.evaluation.figures import TABLE, flat, groups, headings, verdict
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.summary import STAGES, summarise
 
 TIMES = {"p50": 38.6, "p90": 60.0, "p99": 96.9, "max": 313.8}
 

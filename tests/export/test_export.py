@@ -18,13 +18,6 @@ from splat_files import splats_of
 from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError
-from sags_node.export import export
-from sags_node.export import scene as export_scene
-from sags_node.export import surface as export_surface
-from sags_node.export.orbit import orbit
-from sags_node.export.scene import Scene, from_node, from_session
-from sags_node.export.surface_files import Surface
-from sags_node.fitting import start
 from sags_node.geometry import project, unproject
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
@@ -34,6 +27,13 @@ from sags_node.model.constant_colours import with_constant_colours
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.tools.export import export
+from sags_node.tools.export import scene as export_scene
+from sags_node.tools.export import surface as export_surface
+from sags_node.tools.export.orbit import orbit
+from sags_node.tools.export.scene import Scene, from_node, from_session
+from sags_node.tools.export.surface_files import Surface
+from sags_node.tools.fitting import start
 from sags_node.types import SH_DEGREE_0
 
 pytestmark = pytest.mark.usefixtures("run_dir")

@@ -15,9 +15,9 @@ from tiny_archive import TINY_FRAMES, write_tiny_session
 from sags_lab.lerobot.dataset import merge
 from sags_lab.lerobot.form import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, TISSUE, Version
 from sags_lab.lerobot.stats import Sums, merged
-from sags_node.export.played import DEPTH_UNIT, TRACKS
 from sags_node.pipeline.session import open_session
 from sags_node.rig import read_rig
+from sags_node.tools.export.played import DEPTH_UNIT, TRACKS
 from sags_node.types import RectifiedPair
 from sags_node.vision.rectify import Rectifier
 

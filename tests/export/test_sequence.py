@@ -12,9 +12,9 @@ import open3d
 import pytest
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.export import sequence
-from sags_node.export.scene import Scene
 from sags_node.model.ply import write_ply
+from sags_node.tools.export import sequence
+from sags_node.tools.export.scene import Scene
 from sags_node.types import Camera, Gaussians
 
 CAMERA = Camera(64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), np.eye(4))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from sags_node.evaluation import metrics
 from sags_node.field.losses import LossWeights, compare, dissimilarity, total_variation
+from sags_node.quality import metrics
 
 HEIGHT, WIDTH = 17, 23
 TERMS = [field.name for field in dataclasses.fields(LossWeights)]

@@ -20,12 +20,12 @@ from sags_node.errors import UsageError
 from sags_node.field import twins
 from sags_node.field.adam import RowAdam
 from sags_node.field.canvas import smoothing
-from sags_node.fitting.clip import Clip, read_clip
-from sags_node.fitting.fit import Fit
-from sags_node.fitting.settings import PAPER, FieldShape
 from sags_node.model import columns
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.pipeline.session import open_session
+from sags_node.tools.fitting.clip import Clip, read_clip
+from sags_node.tools.fitting.fit import Fit
+from sags_node.tools.fitting.settings import PAPER, FieldShape
 
 SETTINGS = dataclasses.replace(
     PAPER, warm_up=0, iterations=8, max_gaussians=400, batch_size=1,

@@ -18,20 +18,20 @@ from command_line import figures_of
 
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
-from sags_node.evaluation.metrics import psnr
 from sags_node.field.decoder import Decoder
 from sags_node.field.losses import compare
 from sags_node.field.model import FADE_NS, LOOK_BACK_NS
-from sags_node.fitting import checkpoint, start
-from sags_node.fitting.clip import Clip, read_clip
-from sags_node.fitting.fit import Fit
-from sags_node.fitting.refined import RefinedModel
-from sags_node.fitting.score import score, score_between, score_depth, score_tracks
-from sags_node.fitting.settings import FieldShape, FitSettings, Units
-from sags_node.fitting.start import follow_online
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.pipeline.session import open_session
+from sags_node.quality.metrics import psnr
+from sags_node.tools.fitting import checkpoint, start
+from sags_node.tools.fitting.clip import Clip, read_clip
+from sags_node.tools.fitting.fit import Fit
+from sags_node.tools.fitting.refined import RefinedModel
+from sags_node.tools.fitting.score import score, score_between, score_depth, score_tracks
+from sags_node.tools.fitting.settings import FieldShape, FitSettings, Units
+from sags_node.tools.fitting.start import follow_online
 from sags_node.types import F32
 
 SMALL = FitSettings(

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sags_node.errors import SagsError
-from sags_node.fitting.residuals import Residuals, Steps
 from sags_node.model import columns
+from sags_node.tools.fitting.residuals import Residuals, Steps
 from sags_node.types import F32
 
 TIMES = np.array([100, 200, 400])

@@ -7,11 +7,19 @@ from pathlib import Path
 import pytest
 
 from sags_node.errors import UsageError
-from sags_node.fitting.field import marked, row_rates
-from sags_node.fitting.score import published
-from sags_node.fitting.settings import ONLINE, PRESETS, RELEASED, FieldShape, RowRates, Units, with_changes
-from sags_node.fitting.start import PATH_EVERY
 from sags_node.model import columns
+from sags_node.tools.fitting.field import marked, row_rates
+from sags_node.tools.fitting.score import published
+from sags_node.tools.fitting.settings import (
+    ONLINE,
+    PRESETS,
+    RELEASED,
+    FieldShape,
+    RowRates,
+    Units,
+    with_changes,
+)
+from sags_node.tools.fitting.start import PATH_EVERY
 
 SH_0 = 0.28209479  # of a spherical harmonic of degree 0, which their colour rate is of
 

@@ -36,6 +36,11 @@ from simulated_node import Socket
 from stamped_videos import write
 from synthetic import plane_result
 
+from sags_node.bags.pictures import decode_file
+from sags_node.clients.overlay.mesh import mesh_of
+from sags_node.clients.overlay.scene import ObjectSpec
+from sags_node.clients.recording.info import bag_info
+from sags_node.clients.recording.recover import recover
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError
@@ -45,11 +50,6 @@ from sags_node.messaging.control import ControlServer
 from sags_node.messaging.received import ReceivedImage, interpret
 from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
 from sags_node.messaging.wire import decode, encode
-from sags_node.overlay.mesh import mesh_of
-from sags_node.overlay.scene import ObjectSpec
-from sags_node.recording.info import bag_info
-from sags_node.recording.pictures import decode_file
-from sags_node.recording.recover import recover
 from sags_node.rig.check import check_rig
 from sags_node.rig.read import read_rig
 from sags_node.sources.bags import read_rig as read_bag_rig

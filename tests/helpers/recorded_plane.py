@@ -12,10 +12,10 @@ from typing import Any
 from synthetic import at_frame, plane_result, publisher, stream
 from waiting import until
 
+from sags_node.bags.bag import BagMessage, read_messages
+from sags_node.clients.recording.recorder import Recorder, RecordOptions
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
-from sags_node.recording.bag import BagMessage, read_messages
-from sags_node.recording.recorder import Recorder, RecordOptions
 from sags_node.types import FrameResult
 
 RATE = 30.0  # Hz

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from places import SESSION
 
-from sags_node.evaluation import metrics
-from sags_node.evaluation.metrics import as_float
 from sags_node.pipeline.session import Session, open_session
+from sags_node.quality import metrics
+from sags_node.quality.metrics import as_float
 from sags_node.types import U8, FrameResult, Observation, StereoFrame
 
 NOISE = 2.0  # grey levels, standard deviation

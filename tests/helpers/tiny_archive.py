@@ -11,8 +11,8 @@ from sags_lab.archive.process import Limits
 from sags_lab.archive.store import RESULTS, Store
 from sags_lab.archive.work import Outcome, Plan, work
 from sags_node.config.schema import PhantomSource
-from sags_node.evaluation.provenance import revision
 from sags_node.phantom import write_session
+from sags_node.tools.evaluation.provenance import revision
 
 TINY_FRAMES = 6
 

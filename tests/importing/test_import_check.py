@@ -19,9 +19,9 @@ from sags_node.checks import Finding
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.importing.check import check_folder, overrides_of
-from sags_node.importing.pictures import combing, lit_box
 from sags_node.pipeline.session import open_session
+from sags_node.tools.importing.check import check_folder, overrides_of
+from sags_node.tools.importing.pictures import combing, lit_box
 from sags_node.types import U8
 
 WIDTH, HEIGHT, FRAMES, DISPARITY = 160, 120, 4, 9

@@ -16,8 +16,8 @@ from user_files import write_video
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import VideosSource
 from sags_node.errors import UsageError
-from sags_node.importing.proposal import propose
 from sags_node.sources.source import open_source
+from sags_node.tools.importing.proposal import propose
 from sags_node.types import U8
 
 FRAMES = 6

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from places import SESSION
 
-from sags_node.evaluation.metrics import as_float
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.exposure import LARGEST, exposure_gain
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.quality.metrics import as_float
 from sags_node.types import FrameResult, StereoFrame
 
 SIZE = 96

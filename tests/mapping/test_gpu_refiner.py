@@ -21,7 +21,6 @@ from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.engine.gpu.rasterizer import DeviceRasterizer
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import UsageError
-from sags_node.evaluation.metrics import as_float
 from sags_node.mapping import densify, exposure, mapper
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import StepBudget
@@ -34,6 +33,7 @@ from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.pipeline import warm_up
 from sags_node.pipeline.pipeline import Pipeline
+from sags_node.quality.metrics import as_float
 from sags_node.rig import rectified_rig
 from sags_node.types import F32, Camera, Observation, RenderedView, Snapshot, StereoFrame, StereoRig
 

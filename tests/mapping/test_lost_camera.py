@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from sags_node.engine.rasterizer.rasterize import rasterize
-from sags_node.evaluation.metrics import as_float
 from sags_node.geometry import invert
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential
@@ -22,6 +21,7 @@ from sags_node.phantom import PhantomScene, write_session
 from sags_node.phantom.scene import Phantom
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
+from sags_node.quality.metrics import as_float
 from sags_node.types import F64, FrameResult, Observation, RenderedView, StereoFrame
 
 SHAPE = PhantomScene(seconds=8, width=320, height=256, still_tissue=True)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sags_node.evaluation.metrics import as_float
 from sags_node.mapping import densify, initialise
 from sags_node.mapping.motion import HALVINGS, found, scene_flow
 from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
+from sags_node.quality.metrics import as_float
 from sags_node.types import Bool, Camera, Colours, Observation, RenderedView
 from sags_node.vision.margin import ClearOfInstruments, clear_of_instruments
 

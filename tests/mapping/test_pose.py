@@ -12,9 +12,6 @@ from places import SESSION
 from recorded_session import both, psnr
 
 from sags_node.engine.rasterizer.rasterize import rasterize
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.session import evaluate
-from sags_node.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.findings import by_code
 from sags_node.geometry import invert, project
 from sags_node.mapping.budget import StepBudget
@@ -24,6 +21,9 @@ from sags_node.mapping.keyframes import Keyframes
 from sags_node.phantom import PhantomScene, write_session
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.session import evaluate
+from sags_node.tools.evaluation.trajectory import RigidOdometry, trajectory_errors
 from sags_node.types import F32, F64, Camera, FrameResult, StereoFrame
 
 BASELINE = 0.0043

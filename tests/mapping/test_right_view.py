@@ -9,8 +9,6 @@ import pytest
 from places import SESSION
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
-from sags_node.evaluation import metrics
-from sags_node.evaluation.warp import warp_to_right
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
@@ -18,6 +16,8 @@ from sags_node.mapping.right_view import FADING, RightView
 from sags_node.messaging import published
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.quality import metrics
+from sags_node.tools.evaluation.warp import warp_to_right
 from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians
 
 FRAMES = 10

@@ -16,7 +16,6 @@ from places import SESSION
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
-from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.geometry import project
 from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.mapping.budget import StepBudget
@@ -25,6 +24,7 @@ from sags_node.mapping.sags_mapper import FORGOTTEN_NS, KEPT_NS, WINDOW_NS, Sags
 from sags_node.model import columns
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_posed, open_session
+from sags_node.quality.metrics import as_float, psnr
 from sags_node.types import F32, Camera, FrameResult, StereoFrame
 
 RUNG = Rung(12_000)

@@ -10,7 +10,6 @@ from places import SESSION
 
 from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.rasterizer.smoothing import bake_filter
-from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.geometry import project, unproject
 from sags_node.mapping import densify, initialise, split
 from sags_node.mapping.budget import StepBudget
@@ -18,6 +17,7 @@ from sags_node.mapping.split import split_worst
 from sags_node.model.gaussians import GaussianModel
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.quality.metrics import as_float, psnr
 from sags_node.types import F32, F64, Bool, Camera, Colours, FrameResult, Observation, RenderedView
 
 HEIGHT, WIDTH, DEPTH = 60, 80, 0.08

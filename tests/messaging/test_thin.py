@@ -16,6 +16,7 @@ from synthetic import HEIGHT, WIDTH, plane_result
 from thin_sender import making, node_sockets
 from waiting import until
 
+from sags_node.clients.recording.recorder import Recorder, RecordOptions
 from sags_node.errors import UsageError
 from sags_node.messaging import content, thin, topics
 from sags_node.messaging.address import NodeAddress
@@ -25,7 +26,6 @@ from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, Topi
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
-from sags_node.recording.recorder import Recorder, RecordOptions
 
 pytestmark = pytest.mark.live
 

@@ -15,13 +15,13 @@ from synthetic import HEIGHT, WIDTH, health, publisher, stream
 from waiting import repeating
 
 from sags_node.cli.main import main
+from sags_node.clients.overlay.draw import color_key
+from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.introspection import topic_echo, topic_figures, topic_list
 from sags_node.messaging.wire import Message
-from sags_node.overlay.draw import color_key
-from sags_node.overlay.stream import OverlayStream
 
 pytestmark = pytest.mark.live
 

@@ -24,7 +24,6 @@ from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
 from benchmarks.quality.alias_truth import moved, resized
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
 from sags_node.engine.rasterizer.smoothing import bake_filter
-from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapped import Mapped
@@ -35,6 +34,7 @@ from sags_node.model.alias_free import FILTER_VARIANCE, smoothing_variances
 from sags_node.model.constant_colours import with_constant_colours
 from sags_node.model.gaussians import GaussianModel
 from sags_node.model.ply import write_ply
+from sags_node.quality.metrics import as_float, psnr
 from sags_node.types import F32, SH_DEGREE_0, Camera, Gaussians, Observation
 
 VIEW = camera(moved=True)

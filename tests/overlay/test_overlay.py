@@ -25,14 +25,14 @@ from test_overlay_drawing import KEY, centre
 from waiting import until
 
 from sags_node.client import FrameSender
+from sags_node.clients.overlay.draw import color_key
+from sags_node.clients.overlay.run import UNSEEN, OverlayOptions, run_overlay
 from sags_node.geometry import project
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.overlay.draw import color_key
-from sags_node.overlay.run import UNSEEN, OverlayOptions, run_overlay
 from sags_node.sources.pictures import read_picture
 from sags_node.types import Camera
 

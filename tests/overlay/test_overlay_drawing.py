@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sags_node.clients.overlay.draw import NEAREST, UNDER, Body, Placed, color_key, draw, over
+from sags_node.clients.overlay.durations import REMEMBERED, Durations
+from sags_node.clients.overlay.frame import TissueFrame
+from sags_node.clients.overlay.mesh import Mesh
+from sags_node.clients.overlay.raster import fill
+from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.geometry import quat_to_matrix
-from sags_node.overlay.draw import NEAREST, UNDER, Body, Placed, color_key, draw, over
-from sags_node.overlay.durations import REMEMBERED, Durations
-from sags_node.overlay.frame import TissueFrame
-from sags_node.overlay.mesh import Mesh
-from sags_node.overlay.raster import fill
-from sags_node.overlay.stream import OverlayStream
 from sags_node.types import Camera
 
 K = np.array([[300.0, 0, 80], [0, 300, 60], [0, 0, 1]])
@@ -231,7 +231,7 @@ def test_a_blank_overlay_says_why_for_some_seconds(tmp_path: Path, monkeypatch: 
     """The first picture is empty, at once, and so are those after 5.5 s; a new reason is said again."""
     now = 0.0
     with OverlayStream("overlay", tmp_path, KEY) as stream, monkeypatch.context() as patched:
-        patched.setattr("sags_node.overlay.stream.time.monotonic", lambda: now)
+        patched.setattr("sags_node.clients.overlay.stream.time.monotonic", lambda: now)
         shown = {}
         for tenths in range(200):
             now = tenths / 10

@@ -13,14 +13,14 @@ import pytest
 from flat_scene import Scene, camera_in_front, flat_means, flat_scene
 from synthetic import BASELINE, NORMAL, plane_depth, plane_result
 
+from sags_node.clients.overlay.frame import Anchor, TissueFrame
+from sags_node.clients.overlay.held import HeldObject, Pinner, Request
+from sags_node.clients.overlay.pose import on_surface, surface_normal
+from sags_node.clients.overlay.scene import ObjectSpec
+from sags_node.clients.registration.rigid import on_a_line, rigid_fit
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, quat_to_matrix, transform
 from sags_node.mapping.anchors import Anchors
-from sags_node.overlay.frame import Anchor, TissueFrame
-from sags_node.overlay.held import HeldObject, Pinner, Request
-from sags_node.overlay.pose import on_surface, surface_normal
-from sags_node.overlay.scene import ObjectSpec
-from sags_node.registration.rigid import on_a_line, rigid_fit
 
 # ---- poses -----------------------------------------------------------------------------------------------
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from command_line import refused
 
-from sags_node.overlay.mesh import LEAN, mesh_of
-from sags_node.overlay.polygons import triangulate
-from sags_node.overlay.scene import SHAPES, ObjectSpec, built_in
+from sags_node.clients.overlay.mesh import LEAN, mesh_of
+from sags_node.clients.overlay.polygons import triangulate
+from sags_node.clients.overlay.scene import SHAPES, ObjectSpec, built_in
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -13,16 +13,16 @@ import yaml
 from command_line import figures_of, refused
 from running_node import RunningNode
 
+from sags_node.clients.overlay.run import OverlayOptions, run_overlay
+from sags_node.clients.overlay.scene import read_scene
+from sags_node.clients.registration.certainty import nine_of_ten, of_pairs, picking_error
+from sags_node.clients.registration.register import Registration, register
+from sags_node.clients.registration.rigid import kabsch, rigid_fit
+from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.geometry import project, transform
 from sags_node.messaging.address import NodeAddress
-from sags_node.overlay.run import OverlayOptions, run_overlay
-from sags_node.overlay.scene import read_scene
 from sags_node.phantom import write_session
 from sags_node.phantom.scene import Phantom, PhantomScene
-from sags_node.registration.certainty import nine_of_ten, of_pairs, picking_error
-from sags_node.registration.register import Registration, register
-from sags_node.registration.rigid import kabsch, rigid_fit
-from sags_node.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.types import F64, I32, Camera
 
 WIDTH, HEIGHT = 320, 256

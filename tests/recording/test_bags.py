@@ -14,22 +14,22 @@ from bag_files import KINDS, MS, ROS1, ROS2, START, picture, play
 from mcap.records import Schema
 from mcap.writer import Writer as McapWriter
 
-from sags_node.calibration.check import read_calibration
+from sags_node.bags import rosbag1_check
+from sags_node.bags.bag import read_messages
+from sags_node.bags.pictures import decode_picture
+from sags_node.clients.recording.bag_writer import BagWriter, Limits
+from sags_node.clients.recording.info import bag_info
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.importing.check import check_folder
 from sags_node.messaging import cdr
 from sags_node.pipeline.session import open_session
-from sags_node.recording import rosbag1_check
-from sags_node.recording.bag import read_messages
-from sags_node.recording.bag_writer import BagWriter, Limits
-from sags_node.recording.info import bag_info
-from sags_node.recording.pictures import decode_picture
 from sags_node.rig import save_rig
 from sags_node.sources.bags import read_rig
 from sags_node.sources.pairing import pair
 from sags_node.sources.replay import Replay
+from sags_node.tools.calibration.check import read_calibration
+from sags_node.tools.importing.check import check_folder
 from sags_node.types import StereoFrame
 
 COUNT = 10

@@ -12,8 +12,8 @@ import pytest
 from bag_files import KINDS
 from fuzzing import BAGS, TARGETS, bounded_memory
 
+from sags_node.clients.recording.info import bag_info
 from sags_node.errors import SagsError, UsageError
-from sags_node.recording.info import bag_info
 
 
 @pytest.fixture(autouse=True)

@@ -16,8 +16,8 @@ from benchmarks.node.processes import children
 from sags_node.errors import SagsError
 from sags_node.findings import by_stage
 from sags_node.messaging.content import health_answer
-from sags_node.recording import child
-from sags_node.recording.child import RecorderProcess
+from sags_node.node import recorder as child
+from sags_node.node.recorder import RecorderProcess
 from sags_node.types import NodeHealth
 
 pytestmark = pytest.mark.live

@@ -16,12 +16,12 @@ from rosbags.highlevel import AnyReader
 from synthetic import plane_result, publisher, stream
 from waiting import until
 
+from sags_node.bags.bag import read_messages
+from sags_node.bags.pictures import decode_picture
+from sags_node.clients.recording.recorder import RecordOptions
 from sags_node.messaging import cdr
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.topics import TOPICS
-from sags_node.recording.bag import read_messages
-from sags_node.recording.pictures import decode_picture
-from sags_node.recording.recorder import RecordOptions
 
 pytestmark = pytest.mark.live
 

@@ -20,6 +20,13 @@ from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publi
 from waiting import until
 
 from sags_node.cli.bag_text import recorded_table
+from sags_node.clients.recording import recorder as recorder_module
+from sags_node.clients.recording.backlog import Arrived, Backlog
+from sags_node.clients.recording.bag_writer import BagWriter
+from sags_node.clients.recording.info import bag_info
+from sags_node.clients.recording.player import Player, PlayOptions
+from sags_node.clients.recording.recorder import Recorder, RecordOptions
+from sags_node.clients.recording.recover import recover
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.findings import by_stage
@@ -28,14 +35,7 @@ from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, encode
-from sags_node.recording import recorder as recorder_module
-from sags_node.recording.backlog import Arrived, Backlog
-from sags_node.recording.bag_writer import BagWriter
-from sags_node.recording.info import bag_info
-from sags_node.recording.player import Player, PlayOptions
-from sags_node.recording.recorder import Recorder, RecordOptions
-from sags_node.recording.recover import recover
-from sags_node.recording.state import LOW_SECONDS, SILENT_SECONDS, findings
+from sags_node.node.recorder_state import LOW_SECONDS, SILENT_SECONDS, findings
 
 pytestmark = pytest.mark.live
 

@@ -21,6 +21,8 @@ from recorded_plane import by_topic
 from rosbags.highlevel import AnyReader
 from waiting import until
 
+from sags_node.bags.bag import read_messages
+from sags_node.clients.recording.info import bag_info
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
@@ -29,8 +31,6 @@ from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import TOPICS
 from sags_node.phantom import write_session
 from sags_node.pipeline.session import open_session
-from sags_node.recording.bag import read_messages
-from sags_node.recording.info import bag_info
 
 pytestmark = pytest.mark.live
 

@@ -15,11 +15,11 @@ from mcap_ros2.decoder import DecoderFactory
 from recorded_plane import by_topic, content, record_plane
 from rosbags.highlevel import AnyReader
 
+from sags_node.bags.bag import read_messages
+from sags_node.clients.recording.bag_writer import Limits
+from sags_node.clients.recording.info import bag_info
+from sags_node.clients.recording.player import Player, PlayOptions
 from sags_node.config.schema import PublishConfig
-from sags_node.recording.bag import read_messages
-from sags_node.recording.bag_writer import Limits
-from sags_node.recording.info import bag_info
-from sags_node.recording.player import Player, PlayOptions
 
 
 @pytest.fixture(scope="module")

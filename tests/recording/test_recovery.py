@@ -13,11 +13,11 @@ import yaml
 from command_line import refused, sags
 from recorded_plane import content
 
+from sags_node.bags.bag import BagMessage, read_messages
+from sags_node.clients.recording.bag_writer import BagWriter
+from sags_node.clients.recording.info import bag_info
+from sags_node.clients.recording.recover import recover
 from sags_node.errors import SagsError
-from sags_node.recording.bag import BagMessage, read_messages
-from sags_node.recording.bag_writer import BagWriter
-from sags_node.recording.info import bag_info
-from sags_node.recording.recover import recover
 
 
 def recovered(file: bytes, tmp_path: Path, name: str) -> tuple[dict[str, Any] | None, list[BagMessage]]:

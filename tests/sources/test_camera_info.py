@@ -13,11 +13,11 @@ import pytest
 from bag_files import BASELINE, HEIGHT, MS, ROS2, START, WIDTH, Row, eye_of, picture, play
 
 from sags_node.errors import UsageError
-from sags_node.importing.check import check_folder, overrides_of
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig, save_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.sources.rectified import named_rectified
+from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.types import Eye, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 

@@ -19,11 +19,11 @@ from sags_node.cli.main import main
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import UsageError
-from sags_node.importing.check import check_folder
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.sources.source import findings_of, open_source
+from sags_node.tools.importing.check import check_folder
 from sags_node.types import U8, StereoFrame
 
 WIDTH, HEIGHT, FOCAL = 160, 128, 150.0

@@ -24,14 +24,14 @@ from pydantic import ValidationError
 from sending import sending
 from waiting import until
 
-from sags_node.calibration.eyes import look
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import GeometryConfig, GstSource, LaunchConfig
-from sags_node.doctor import examine
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources import gst_child, gst_library
 from sags_node.sources.gst import Sink, open_pipeline
 from sags_node.sources.gst_process import GstProcess, in_words
+from sags_node.tools.calibration.eyes import look
+from sags_node.tools.doctor import examine
 from sags_node.types import StereoFrame
 
 pytestmark = pytest.mark.live

@@ -18,6 +18,9 @@ from recorded_plane import by_topic, record_plane
 from synthetic import HEIGHT, WIDTH, plane_result
 from waiting import until
 
+from sags_node.clients.overlay.run import OverlayOptions, run_overlay
+from sags_node.clients.recording.info import bag_info
+from sags_node.clients.recording.player import Player, PlayOptions
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr
@@ -28,9 +31,6 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage
 from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.overlay.run import OverlayOptions, run_overlay
-from sags_node.recording.info import bag_info
-from sags_node.recording.player import Player, PlayOptions
 
 pytestmark = pytest.mark.live
 PHASE = 24  # times that a clock is told before the player is paused, and goes on

@@ -22,12 +22,12 @@ from stamped_videos import write
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import UsageError
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.session import evaluate
 from sags_node.geometry import invert, project, unproject
-from sags_node.importing.check import check_folder
 from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.session import evaluate
+from sags_node.tools.importing.check import check_folder
 from sags_node.types import F32, F64, U8, StereoFrame
 from sags_node.vision.rectify import Rectifier
 

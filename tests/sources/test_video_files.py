@@ -12,13 +12,13 @@ import pytest
 from stamped_videos import number_in, numbered, write
 from test_sources import Clock, replay
 
-from sags_node.calibration.guess import guess_rig
 from sags_node.config import schema as cfg
 from sags_node.errors import SagsError, UsageError
-from sags_node.importing.check import check_folder
 from sags_node.media.video import Video
 from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source
+from sags_node.tools.calibration.guess import guess_rig
+from sags_node.tools.importing.check import check_folder
 from sags_node.types import U8, StereoFrame
 
 COUNT = 50

@@ -9,8 +9,8 @@ import pytest
 from synthetic import health, publisher, stream
 from waiting import until
 
+from sags_node.clients.viewer.feed import TOPICS, Feed
 from sags_node.messaging.address import NodeAddress
-from sags_node.viewer.feed import TOPICS, Feed
 
 pytestmark = pytest.mark.live
 

@@ -21,18 +21,18 @@ import pytest
 from click.testing import CliRunner
 
 from sags_node.cli.main import main
+from sags_node.clients.viewer import splats as viewer_splats
+from sags_node.clients.viewer.feed import Moment, Status
+from sags_node.clients.viewer.history import GAP, History
+from sags_node.clients.viewer.pictures import Sheet
+from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.config.schema import PhantomSource
-from sags_node.evaluation.gallery import Picture
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.phantom import write_session
+from sags_node.quality.gallery import Picture
 from sags_node.types import SH_DEGREE_0, Camera
-from sags_node.viewer import splats as viewer_splats
-from sags_node.viewer.feed import Moment, Status
-from sags_node.viewer.history import GAP, History
-from sags_node.viewer.pictures import Sheet
-from sags_node.viewer.splats import Splats, splats_of
 
 pytestmark = [pytest.mark.live, pytest.mark.alone]
 
@@ -261,7 +261,7 @@ def test_only_its_own_page_may_connect(view: RunningView) -> None:
 
 @needs_viser
 def test_an_anchor_that_is_seen_and_not_recognised_has_a_colour_of_its_own() -> None:
-    from sags_node.viewer.scene import HIDDEN, SEEN, UNSURE, anchor_color
+    from sags_node.clients.viewer.scene import HIDDEN, SEEN, UNSURE, anchor_color
 
     rows = [(1.0, 0.9), (0.2, 0.5), (1.0, 0.49), (0.0, 0.9), (0.0, 0.0)]
     colors = [anchor_color({"visibility": seen, "confidence": sure}) for seen, sure in rows]

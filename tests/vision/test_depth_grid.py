@@ -11,13 +11,13 @@ import pytest
 from sags_node.confidence import HALVING, SURE, confidence_of, error_of
 from sags_node.config.schema import StereoConfig
 from sags_node.engine.rasterizer.confidence import with_confidence
-from sags_node.evaluation import calibration
 from sags_node.geometry import unproject
 from sags_node.mapping import densify
 from sags_node.mapping.depth_memory import DRIFT, UNSEEN, remember
 from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
 from sags_node.phantom.scene import Phantom, PhantomScene
+from sags_node.tools.evaluation import calibration
 from sags_node.types import Camera, Colours, DepthGrid, Observation, RectifiedPair, RenderedView, StereoFrame
 from sags_node.vision.depth_grid import JUMP, SLOPE, depth_grid
 from sags_node.vision.rectify import Rectifier

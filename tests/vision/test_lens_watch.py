@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from places import SESSION
 
-from sags_node.evaluation.metrics import as_float
 from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
+from sags_node.quality.metrics import as_float
 from sags_node.types import F32, U8, Bool, FrameResult, StereoFrame
 
 FIRST, COUNT, AFTER = 6, 8, 6  # frames, at 10 Hz: before, with a drop, after

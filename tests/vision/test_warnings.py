@@ -18,10 +18,10 @@ from rich.console import Console
 from synthetic import health, plane_result, publisher, stream
 
 from sags_node.cli.foreground import run_node
-from sags_node.evaluation.measure import FrameRow, MeasureOptions
-from sags_node.evaluation.report import warning_table
-from sags_node.evaluation.run import RunFacts
-from sags_node.evaluation.summary import summarise
+from sags_node.clients.overlay.draw import color_key, draw
+from sags_node.clients.overlay.frame import TissueFrame
+from sags_node.clients.overlay.mark import draw_mark, headlines
+from sags_node.clients.viewer.feed import Moment, Status
 from sags_node.findings import STAGES, by_code, by_stage, in_words
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.cdr import decode
@@ -31,14 +31,14 @@ from sags_node.messaging.received import ReceivedText
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.node.health import MOST_LEFT_OUT, WINDOW, Statistics
 from sags_node.node.node import HEALTH_PERIOD, Node
-from sags_node.overlay.draw import color_key, draw
-from sags_node.overlay.frame import TissueFrame
-from sags_node.overlay.mark import draw_mark, headlines
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.terminal.notices import Notices
+from sags_node.tools.evaluation.measure import FrameRow, MeasureOptions
+from sags_node.tools.evaluation.report import warning_table
+from sags_node.tools.evaluation.run import RunFacts
+from sags_node.tools.evaluation.summary import summarise
 from sags_node.types import Camera, Finding, NodeHealth
-from sags_node.viewer.feed import Moment, Status
 
 BLACK = Finding("right_eye_black", "the right picture is black: check the light")
 ROWS = Finding("rows_differ", "rows of the eyes differ by 1.2 px: the calibration no longer fits")
@@ -260,7 +260,9 @@ def test_topic_echo_tells_of_warnings_whatever_the_topic(tmp_path: Path) -> None
 
 
 def test_the_viewer_shows_them_below_the_status() -> None:
-    panel = pytest.importorskip("sags_node.viewer.panel", reason="viser is not installed (extra: viewer)")
+    panel = pytest.importorskip(
+        "sags_node.clients.viewer.panel", reason="viser is not installed (extra: viewer)"
+    )
     status = Status("running", warning_codes={BLACK.code: f"<b>{BLACK.text}"})
     shown = panel.status_line(Moment(None, status))
     assert f"&lt;b&gt;{BLACK.text}" in shown and BLACK.code in shown and "sags-warning" in shown

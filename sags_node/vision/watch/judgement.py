@@ -24,6 +24,7 @@ class Judgement:
 
     hold: str = ""  # why nothing of it is taken in; empty: it is
     stage: str = "picture"  # what that is about
+    repeats: bool = False  # it shows the same as the frame mapped last
     no_stereo: str = ""  # why its eyes are not matched; empty: they are
     learn: bool = True  # else it is followed, and not learnt
     is_new_scene: bool = False  # it shows another scene for good: begin a new model

@@ -33,8 +33,8 @@ from sags_lab.archive.results import write_results  # noqa: E402
 from sags_lab.archive.run import Tally, about, run  # noqa: E402
 from sags_lab.archive.store import Store  # noqa: E402
 from sags_lab.archive.work import Plan, work  # noqa: E402
-from sags_node.evaluation.provenance import revision  # noqa: E402
 from sags_node.phantom import PhantomScene, write_session  # noqa: E402
+from sags_node.tools.evaluation.provenance import revision  # noqa: E402
 
 SESSIONS = 12  # that are written
 KINDS: tuple[dict[str, Any], ...] = (

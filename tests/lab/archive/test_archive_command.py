@@ -13,9 +13,9 @@ from tiny_archive import TINY_FRAMES
 from sags_lab.archive import cluster as cluster_module
 from sags_lab.archive.costs import Cost, of_an_hour
 from sags_lab.archive.manifest import Recording, write_manifest
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.session import evaluate
 from sags_node.kernels.threads import configure_threads
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.session import evaluate
 
 SETTINGS = ("mapping.max_gaussians:=2000", "source.frames:=4")
 

@@ -22,16 +22,16 @@ from sags_lab.archive.store import RECORDINGS, Store
 from sags_lab.archive.work import Plan, work
 from sags_node.config.schema import DvrkSource, FoldersSource
 from sags_node.errors import UsageError
-from sags_node.evaluation.measure import MeasureOptions
-from sags_node.evaluation.provenance import revision
-from sags_node.evaluation.session import evaluate
-from sags_node.fitting.clip import play
 from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline.session import open_session
 from sags_node.sources import replay
 from sags_node.sources.bags import BagPairs
 from sags_node.sources.pictures import Pairs
 from sags_node.sources.replay import Replay
+from sags_node.tools.evaluation.measure import MeasureOptions
+from sags_node.tools.evaluation.provenance import revision
+from sags_node.tools.evaluation.session import evaluate
+from sags_node.tools.fitting.clip import play
 
 WHOLE = Recording("case1", "/data", weight=100.0)
 STEPS = ("engine.threads:=1", "mapping.iterations:=1", "mapping.max_gaussians:=2000")

@@ -8,7 +8,7 @@ import pytest
 
 from sags_lab.protocols import arithmetic
 from sags_lab.protocols.point_tracks import average_jaccard, calibration_error, reliability, shares_within
-from sags_node.evaluation import metrics
+from sags_node.quality import metrics
 
 
 def test_stir_counts_the_nearest_end_up_to_and_with_each_threshold() -> None:

@@ -1,0 +1,279 @@
+"""Messages out of any bag: rosbag2 folders (MCAP, db3), single .mcap and .db3 files, ROS 1 .bag files.
+
+Whatever the file, a message is ROS 2 CDR. MCAP is read by `mcap_file`, record by record, so that neither a
+false length nor an index that lies can take memory; db3 and ROS 1 files are read by `rosbags`.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from sags_node.bags import mcap_file, rosbag1_check
+from sags_node.bags.mcap_file import MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head, Inner
+from sags_node.config.launch_file import BAG_SUFFIXES as SUFFIXES
+from sags_node.config.launch_file import UNFINISHED
+from sags_node.config.yaml_reader import read_yaml
+from sags_node.errors import SagsError, UsageError
+from sags_node.files import open_file
+from sags_node.messaging import cdr
+
+MAX_METADATA_BYTES = 4 << 20
+METADATA = "metadata.yaml"
+RELATIVE = {"sags_units": "relative"}  # metadata of a channel whose lengths have no unit
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    topic: str  # as written, usually with a leading slash
+    type: str  # ROS 2 name, e.g. sensor_msgs/msg/Image
+    log_ns: int  # when it was recorded
+    publish_ns: int
+    sequence: int  # 0 where the format has none
+    data: bytes | memoryview  # CDR
+    relative: bool = False  # its lengths have no unit: it is of a node that nobody has calibrated
+
+
+def read_messages(
+    path: Path, topics: Collection[str] | None = None, start_ns: int = 0
+) -> Iterator[BagMessage]:
+    """The messages of a bag in the order of the file.
+
+    Args:
+        topics: only these; None: all.
+        start_ns: leave out what was recorded before.
+
+    Raises:
+        UsageError: there is no bag at `path`, or it is of a form that is not read.
+        SagsError: it is damaged; says where and how to fix it.
+    """
+    files, unpack = storage_files(path)
+    for file in files:
+        with _explained(file):
+            if file.suffix == ".mcap":
+                found = _read_mcap(file, topics, start_ns)
+            else:
+                found = _read_with_rosbags(file, topics, start_ns)
+            for message in found:
+                yield _unpacked(message) if unpack else message
+
+
+def storage_files(path: Path) -> tuple[list[Path], bool]:
+    """The files of a bag in order, and whether each message in them is compressed (zstd).
+
+    Raises:
+        UsageError: there is no bag, its metadata cannot be read, or whole files are compressed.
+    """
+    if not path.is_dir():
+        if not path.is_file():
+            raise UsageError(f"recording {path} does not exist; check the path")
+        if path.name.endswith(UNFINISHED):
+            raise UsageError(
+                f"{path} was not closed: its recorder was killed; with ROS 1 at hand: rosbag reindex {path}, "
+                f"then mv {path} {path.with_suffix('')}"
+            )
+        if path.suffix not in SUFFIXES:
+            raise UsageError(f"{path} is not a recording; what is read: folders, {', '.join(SUFFIXES)}")
+        return [path], False
+    if not (path / METADATA).is_file():
+        files = files_in(path, ".mcap") or files_in(path, ".db3")
+        if not files:
+            raise UsageError(
+                f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
+            )
+        return files, False
+    information = _metadata(path / METADATA)
+    mode = str(information.get("compression_mode") or "").lower()
+    if mode == "file":
+        raise UsageError(f"{path} is compressed file by file; unpack it first: ros2 bag convert, or zstd -d")
+    names = information.get("relative_file_paths")
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise UsageError(f"{path / METADATA} names no files; remove it to read the files beside it")
+    files = [path / Path(name).name for name in names]  # a name cannot lead out of the folder
+    for file in files:
+        if not file.is_file() or file.suffix not in (".mcap", ".db3"):
+            raise UsageError(f"{path / METADATA} names {file.name}, which is not a .mcap or .db3 file there")
+    return files, mode == "message"
+
+
+def files_in(folder: Path, suffix: str) -> list[Path]:
+    """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
+    return sorted(folder.glob(f"*{suffix}"), key=lambda file: (_number(file.stem), file.name))
+
+
+def _number(stem: str) -> int:
+    digits = stem.rpartition("_")[2]
+    return int(digits) if digits.isdecimal() and len(digits) < 10 else 0
+
+
+def _metadata(file: Path) -> dict[str, Any]:
+    tree = read_yaml(file, "description of a bag", MAX_METADATA_BYTES)
+    information = tree.get("rosbag2_bagfile_information") if isinstance(tree, dict) else None
+    if not isinstance(information, dict):
+        raise UsageError(f"{file} has no rosbag2_bagfile_information; it does not describe a bag")
+    return information
+
+
+@contextmanager
+def _explained(file: Path) -> Iterator[None]:
+    """Say which file, and how to fix it."""
+    try:
+        yield
+    except OSError as error:
+        raise SagsError(f"cannot read {file}: {error.strerror}") from None
+    except DamagedError as error:
+        fix = f"save what is whole with: sags bag recover {shlex.quote(str(file))} -o OUT"
+        if file.suffix != ".mcap":
+            fix = "copy it again, or fix it with its own tools (rosbag reindex, sqlite3 .recover)"
+        raise SagsError(f"{file} is {error}; {fix}") from None
+
+
+# ---- MCAP ------------------------------------------------------------------------------------------------
+
+
+def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
+    size = file.stat().st_size
+    channels = Channels()
+    with open_file(file) as opened:
+        if opened.read(len(MAGIC)) != MAGIC:
+            raise DamagedError(0, "it does not begin as an MCAP file")
+        for head in mcap_file.heads(opened, size, len(MAGIC)):
+            if head.opcode == Opcode.CHUNK and mcap_file.chunk_times(opened, head)[1] < start_ns:
+                # Its channels may be needed later: they stand only where they are first used.
+                channels.missed.append(head)
+                continue
+            for record in records_of(opened, head):
+                if not isinstance(record, Entry):
+                    channels.add(record)
+                    continue
+                if not channels.describe(record.channel_id):
+                    channels.read_missed(opened)
+                channel, schema = channels.of(record, head.position)
+                if record.log_ns >= start_ns and (topics is None or channel.topic in topics):
+                    if channel.message_encoding != "cdr":
+                        raise UsageError(
+                            f"{file}: topic {channel.topic} is encoded as {channel.message_encoding!r}; only "
+                            "ROS 2 messages (cdr) are read"
+                        )
+                    yield BagMessage(
+                        channel.topic,
+                        schema.name,
+                        record.log_ns,
+                        record.publish_ns,
+                        record.sequence,
+                        record.data,
+                        unitless(channel),
+                    )
+
+
+def unitless(channel: Channel) -> bool:
+    """Whether lengths have no unit in the messages of a channel."""
+    return bool(RELATIVE.items() <= channel.metadata.items())
+
+
+def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
+    """Schemas, channels and messages of one record of the file, which may be a chunk of them.
+
+    Raises:
+        DamagedError: it is not what it says.
+    """
+    if head.opcode == Opcode.CHUNK:
+        data = mcap_file.unpack_chunk(mcap_file.read_content(file, head), head.position)
+        yield from mcap_file.inner_records(data, head.position)
+    elif head.opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+        record = mcap_file.parse(head.opcode, memoryview(mcap_file.read_content(file, head)), head.position)
+        assert record is not None
+        yield record
+
+
+class Channels:
+    """What the messages of an MCAP file belong to."""
+
+    def __init__(self) -> None:
+        self.missed: list[Head] = []  # chunks that were passed over unread
+        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, Schema] = {}
+
+    def add(self, record: Schema | Channel) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        else:
+            self._channels[record.id] = record
+
+    def read_missed(self, file: BinaryIO) -> None:
+        for head in self.missed:
+            for record in records_of(file, head):
+                if not isinstance(record, Entry):
+                    self.add(record)
+        self.missed.clear()
+
+    def describe(self, channel_id: int) -> bool:
+        """Whether channel and schema are known; a schema stands only where the first of its channels does."""
+        channel = self._channels.get(channel_id)
+        return channel is not None and channel.schema_id in self._schemas
+
+    def of(self, entry: Entry, position: int) -> tuple[Channel, Schema]:
+        """Channel and schema of a message.
+
+        Raises:
+            DamagedError: the file does not describe them.
+        """
+        channel = self._channels.get(entry.channel_id)
+        schema = None if channel is None else self._schemas.get(channel.schema_id)
+        if channel is None or schema is None:
+            raise DamagedError(position, f"a message of channel {entry.channel_id}, which nothing describes")
+        return channel, schema
+
+
+# ---- db3 and ROS 1 ---------------------------------------------------------------------------------------
+
+
+def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
+    from rosbags import rosbag1, rosbag2
+
+    ros1, log = file.suffix == ".bag", Path(f"{file}-wal")
+    if log.is_file() and log.stat().st_size:  # `rosbags` would pass over it
+        raise SagsError(
+            f"{log} holds messages that {file.name} lacks: its recorder was killed or still runs; "
+            f'then: sqlite3 {file} "PRAGMA wal_checkpoint(TRUNCATE)"'
+        )
+    positions = rosbag1_check.chunk_positions(file) if ros1 else frozenset()
+    reader: Any = rosbag1.Reader(file) if ros1 else rosbag2.Reader(file)
+    with _damage_as_one_error(), reader:
+        if ros1 and not {info.pos for info in reader.chunk_infos} <= positions:
+            raise DamagedError(0, "its index points to places where no chunk is")
+        wanted = [c for c in reader.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        for connection, log_ns, raw in reader.messages(connections=wanted, start=start_ns):
+            if len(raw) > MAX_RECORD_BYTES:
+                raise DamagedError(0, f"a message of {len(raw)} bytes on {connection.topic}")
+            data = cdr.from_ros1(raw, connection.msgtype) if ros1 else raw
+            yield BagMessage(connection.topic, connection.msgtype, log_ns, log_ns, 0, data)
+
+
+@contextmanager
+def _damage_as_one_error() -> Iterator[None]:
+    """Damaged bytes meet asserts, look-ups and unpacking in `rosbags`: any exception there is about them."""
+    try:
+        yield
+    except (SagsError, OSError):
+        raise
+    except (Exception, MemoryError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise DamagedError(0, said or type(error).__name__) from None
+
+
+def _unpacked(message: BagMessage) -> BagMessage:
+    """The message of a bag whose messages are compressed one by one."""
+    data = mcap_file.unpack(message.data, b"zstd", MAX_RECORD_BYTES, 0)
+    if len(data) > MAX_RECORD_BYTES:
+        raise DamagedError(0, f"a message on {message.topic} unpacks to more than 256 MB")
+    return replace(message, data=data)

@@ -1,7 +1,0 @@
-"""`sags bridge`: what a node sends, in the words of other systems (extra `bridges`).
-
-`relay` is the loop that bridges share; `openigtlink`, `foxglove`, `ros2`, `web` and `gst` are what it speaks
-to.
-
-Imports config, media, messaging, overlay, recording, ros and sources.
-"""

@@ -1,0 +1,1 @@
+"""Programs that use a running node, by its sockets and files alone."""

@@ -1,0 +1,7 @@
+"""`sags bridge`: what a node sends, in the words of other systems (extra `bridges`).
+
+`relay` is the loop that bridges share; `openigtlink`, `foxglove`, `ros2`, `web` and `gst` are what it speaks
+to.
+
+Imports bags, config, media, messaging, overlay, ros and sources.
+"""

@@ -1,0 +1,331 @@
+"""`sags bridge foxglove`: every topic of a node, live in Foxglove, by its WebSocket.
+
+The messages are the node's own: ROS 2 CDR, byte for byte, stamped with the time of capture. Pictures are
+offered as H.264 too, for thin links.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import foxglove
+import numpy as np
+from foxglove.channels import CompressedVideoChannel
+from foxglove.messages import CompressedVideo, Timestamp
+from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener, WebSocketServer
+
+from sags_node.clients.bridge.options import ServerOptions
+from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source, silent
+from sags_node.clients.bridge.requests import Requests
+from sags_node.errors import SagsError
+from sags_node.messaging import cdr, topics
+from sags_node.messaging.received import Frame, Received, ReceivedCloud, ReceivedImage, ReceivedText
+from sags_node.types import U8
+
+VIDEO = "/h264"
+FIGURES = "/figures"  # the node's status as JSON, for plots
+CLICKED = "/clicked_point"  # where Foxglove's 3D panel publishes the point that was clicked
+SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class FoxgloveOptions(ServerOptions):
+    """How `sags bridge foxglove` runs."""
+
+    port: int = 8765  # Foxglove's default
+    rate: float | None = None  # Hz of each topic; default: all that come
+    pin: bool = False  # let peers pin anchors
+
+
+def outputs(options: FoxgloveOptions) -> list[Output]:
+    """One channel for each topic of the node and of an overlay, and one more for each picture as H.264."""
+    period = 0.0 if options.rate is None else 1 / options.rate
+    offered = [(options.node.ns, topic) for topic in topics.TOPICS]
+    offered += [(options.overlay.ns, topic) for topic in topics.OVERLAY_TOPICS]
+    channels = [
+        Output(
+            f"/{topics.full_name(ns, topic.name)}", (Source(ns, topic.name),), period, lengths=topic.in_metres
+        )
+        for ns, topic in offered
+    ]
+    if importlib.util.find_spec("av") is not None:
+        pictures = [(ns, topic) for ns, topic in offered if _is_picture(topic)]
+        channels += [
+            Output(f"/{topics.full_name(ns, topic.name)}{VIDEO}", (Source(ns, topic.name),), period)
+            for ns, topic in pictures
+        ]
+    status = (Source(options.node.ns, "status"),)
+    return [*channels, Output(f"/{options.node.ns}{FIGURES}", status)]
+
+
+def _is_picture(topic: topics.Topic) -> bool:
+    """Something to look at, in colour."""
+    return topic.type == topics.IMAGE and topic.content.startswith("rgb")
+
+
+def run_foxglove(options: FoxgloveOptions, ready: Callable[[str, int], None], stop: threading.Event) -> None:
+    """Serve Foxglove until `stop` is set. The node may come later and be restarted.
+
+    Args:
+        ready: called with the host and the port once peers can connect.
+
+    Raises:
+        UsageError: wrong keys.
+        SagsError: the port cannot be bound, or an endpoint is malformed.
+    """
+    offered = outputs(options)
+    with (
+        closing(Foxglove(options, offered)) as bridge,
+        closing(Relay((options.node, options.overlay), offered, bridge, options.max_age)) as relay,
+    ):
+        ready(options.host, bridge.port)
+        relay.run(stop)
+
+
+class Foxglove(Outlet):
+    """The outlet: one channel for each output.
+
+    Raises:
+        SagsError: the port cannot be bound.
+    """
+
+    def __init__(self, options: FoxgloveOptions, offered: Sequence[Output]) -> None:
+        self._requests = Requests(options.node)
+        self._missing: dict[str, str] = {}
+        self._server: WebSocketServer | None = None
+        self._shown: dict[str, Received] = {}  # by output
+        self._audience = _Audience(self._welcome, self._pin if options.pin else None)
+        self._context = foxglove.Context()  # channels vanish with the last name for it
+        self._ways = {output.name: _way(output, self._context) for output in offered}
+        self._server = _served(options, self._context, self._audience, backlog=len(offered))
+
+        self.port = self._server.port
+
+    def close(self) -> None:
+        if self._server is not None:
+            self._server.stop()
+        self._requests.close()
+
+    # ---- out -----------------------------------------------------------------------------------------------
+
+    def wants(self, output: Output) -> bool:
+        return self._audience.looks_at(output.name)
+
+    def send(self, output: Output, frame: Frame) -> bool:
+        received = frame[output.sources[0].topic]
+        self._shown[output.name] = received
+        self._ways[output.name].show(received, self._audience.has_grown(output.name))
+        return True
+
+    def blank(self, output: Output, reason: str) -> None:
+        """Foxglove goes on showing what came last, so something empty must come."""
+        self._ways[output.name].blank(self._shown.pop(output.name), reason)
+
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
+        gone = self._missing.keys() - missing.keys()
+        self._missing = dict(missing)
+        if self._server is not None and gone:
+            self._server.remove_status(list(gone))
+        self._welcome()
+
+    # ---- in ------------------------------------------------------------------------------------------------
+
+    def _pin(self, data: bytes) -> None:
+        """Pin what was clicked in the 3D panel; on a thread of the server."""
+        place = clicked(data)
+        if place is None:
+            self._say(None, "a clicked point must be a JSON PointStamped in the frame 'world'")
+        else:
+            self._requests.ask("add_anchor", dict(zip("xyz", place, strict=True)), self._say)
+
+    def _say(self, result: dict[str, Any] | None, words: str) -> None:
+        self._publish(words, is_problem=result is None, about="request")
+
+    def _welcome(self) -> None:
+        """Tell everybody what is missing: who comes later has not heard it."""
+        for name, reason in self._missing.items():
+            self._publish(f"{name}: {reason}", is_problem=True, about=name)
+
+    def _publish(self, words: str, is_problem: bool, about: str) -> None:
+        level = foxglove.StatusLevel.Warning if is_problem else foxglove.StatusLevel.Info
+        if self._server is not None:
+            self._server.publish_status(words, level, about)
+
+
+class _Audience(ServerListener):
+    """Who looks at what; called from threads of the server.
+
+    Args:
+        welcome: called when a client has begun to look at something.
+        pin: called with what clients publish on `CLICKED`; None: they may not.
+    """
+
+    def __init__(self, welcome: Callable[[], None], pin: Callable[[bytes], None] | None) -> None:
+        self._welcome, self._pin = welcome, pin
+        self._lock = threading.Lock()
+        self._looking: Counter[str] = Counter()
+        self._grown: set[str] = set()
+        self._clicks: set[tuple[int, int]] = set()  # client and channel
+
+    def looks_at(self, topic: str) -> bool:
+        with self._lock:
+            return self._looking[topic] > 0
+
+    def has_grown(self, topic: str) -> bool:
+        """Whether somebody has begun to look since this was asked last."""
+        with self._lock:
+            grown = topic in self._grown
+            self._grown.discard(topic)
+            return grown
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        with self._lock:
+            self._looking[channel.topic] += 1
+            self._grown.add(channel.topic)
+        self._welcome()
+
+    def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
+        with self._lock:
+            self._looking[channel.topic] -= 1
+
+    def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
+        if channel.topic == CLICKED and channel.encoding == "json":
+            self._clicks.add((client.id, channel.id))
+
+    def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
+        self._clicks.discard((client.id, client_channel_id))
+
+    def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
+        if self._pin is not None and (client.id, client_channel_id) in self._clicks:
+            self._pin(data)
+
+
+class _Way(Protocol):
+    """How one output reaches its channel."""
+
+    def show(self, received: Received, grown: bool) -> None:
+        """Send it; `grown`: somebody has begun to look."""
+        ...
+
+    def blank(self, shown: Received, reason: str) -> None:
+        """Send something empty in its place, where it is something to look at."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Messages:
+    """One message for each that comes: the node's own, or its status as JSON."""
+
+    channel: foxglove.Channel
+    made_of: Callable[[Received], bytes | str]
+    empty_of: Callable[[Received, int, str], bytes | str | None]
+
+    def show(self, received: Received, grown: bool) -> None:
+        self.channel.log(self.made_of(received), log_time=received.stamp_ns)
+
+    def blank(self, shown: Received, reason: str) -> None:
+        now_ns = time.time_ns()
+        if (empty := self.empty_of(shown, now_ns, reason)) is not None:
+            self.channel.log(empty, log_time=now_ns)
+
+
+class _Video:
+    """Pictures in H.264."""
+
+    def __init__(self, output: Output, context: foxglove.Context) -> None:
+        from sags_node.clients.bridge.h264 import (
+            Encoder,  # PyAV may be missing where there are no such outputs
+        )
+
+        self._channel = CompressedVideoChannel(output.name, context=context)
+        self._encoder = Encoder()
+
+    def show(self, received: Received, grown: bool) -> None:
+        assert isinstance(received, ReceivedImage)
+        self._send(received.array, received.stamp_ns, grown)
+
+    def blank(self, shown: Received, reason: str) -> None:
+        assert isinstance(shown, ReceivedImage)
+        self._send(np.zeros_like(shown.array), time.time_ns(), key=True)
+
+    def _send(self, picture: U8, stamp_ns: int, key: bool) -> None:
+        data = self._encoder.encode(picture, key)
+        stamp = Timestamp(*divmod(stamp_ns, SECOND_NS))
+        frame = CompressedVideo(timestamp=stamp, frame_id=cdr.LEFT_FRAME, data=data, format="h264")
+        self._channel.log(frame, log_time=stamp_ns)
+
+
+def _way(output: Output, context: foxglove.Context) -> _Way:
+    if output.name.endswith(VIDEO):
+        return _Video(output, context)
+    if output.name.endswith(FIGURES):
+        channel = foxglove.Channel(output.name, schema={"type": "object"}, context=context)
+        return _Messages(channel, _text_of, lambda shown, now_ns, reason: silent(reason))
+    topic = topics.find(output.sources[0].topic)
+    assert topic is not None  # `outputs` takes them from there
+    schema = foxglove.Schema(name=topic.type, encoding="ros2msg", data=cdr.definition(topic.type).encode())
+    channel = foxglove.Channel(output.name, schema=schema, message_encoding="cdr", context=context)
+    return _Messages(channel, Received.ros, empty_of)
+
+
+def _text_of(received: Received) -> str:
+    assert isinstance(received, ReceivedText)  # so is the topic's type
+    return received.text
+
+
+def _served(
+    options: FoxgloveOptions, context: foxglove.Context, audience: _Audience, backlog: int
+) -> WebSocketServer:
+    """The server; a client that is slow gets at most `backlog` old messages, about those of a frame."""
+    try:
+        return foxglove.start_server(
+            name=f"SAGS {options.node.ns}",
+            host=options.host,
+            port=options.port,
+            context=context,
+            server_listener=audience,
+            message_backlog_size=backlog,
+            capabilities=[Capability.ClientPublish] if options.pin else [],
+            supported_encodings=["json"] if options.pin else None,
+        )
+    except (RuntimeError, OSError) as error:
+        raise SagsError(options.not_bound(error)) from None
+
+
+def empty_of(shown: Received, now_ns: int, reason: str) -> bytes | None:
+    """The CDR of a message without content, in place of what is shown; None for what may stand: a pose, or a
+    camera, is nothing to look at."""
+    if isinstance(shown, ReceivedImage):
+        nothing = np.nan if shown.array.dtype == np.float32 else 0
+        frame = cdr.RIGHT_FRAME if "/right/" in shown.topic else cdr.LEFT_FRAME
+        empty = cdr.image(np.full_like(shown.array, nothing), shown.meta.encoding, now_ns, frame)
+    elif isinstance(shown, ReceivedCloud):
+        fields = shown.meta.encoding.split(",")
+        empty = cdr.point_cloud(np.empty((0, len(fields)), np.float32), fields, now_ns)
+    elif isinstance(shown, ReceivedText):
+        empty = cdr.string(silent(reason))
+    elif shown.meta.type == topics.DIAGNOSTICS:
+        empty = cdr.diagnostics([cdr.Status("node", 3, reason, {})], now_ns)
+    else:
+        return None
+    return empty.cdr()
+
+
+def clicked(data: bytes) -> tuple[float, float, float] | None:
+    """The place (m, world) in a JSON PointStamped from anybody."""
+    try:
+        said = json.loads(data)
+        if said["header"]["frame_id"] != cdr.WORLD_FRAME:
+            return None
+        x, y, z = (float(said["point"][axis]) for axis in "xyz")
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return (x, y, z) if np.isfinite((x, y, z)).all() else None

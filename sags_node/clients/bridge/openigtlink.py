@@ -1,0 +1,322 @@
+"""`sags bridge openigtlink`: pictures, surface, anchors and camera for 3D Slicer, PLUS and others.
+
+Lengths are millimetres. Directions are those of Slicer (RAS): an optical frame with x right, y down and z
+forward is turned to R = -x, A = -y, S = z, so that Slicer's axial view shows a picture upright. This holds
+for the world and for the camera; they are no directions of a patient.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sags_node.clients.bridge import igtl
+from sags_node.clients.bridge.compressed import over_black
+from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
+from sags_node.clients.bridge.options import ServerOptions
+from sags_node.clients.bridge.pins import Pin, Pins, Release
+from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source
+from sags_node.clients.bridge.requests import Requests
+from sags_node.clients.bridge.surface import surface_of
+from sags_node.clients.overlay.draw import over
+from sags_node.confidence import SURE_OF_ANCHOR
+from sags_node.errors import UsageError
+from sags_node.messaging.received import (
+    Frame,
+    ReceivedCameraInfo,
+    ReceivedCloud,
+    ReceivedImage,
+    ReceivedRos,
+    TopicName,
+)
+from sags_node.messaging.wire import WireError
+from sags_node.types import F64, U8, Camera
+
+PICTURE = TopicName("left/image_rect_color", ReceivedImage)
+RENDER = TopicName("left/render/image", ReceivedImage)
+DEPTH = TopicName("left/render/depth", ReceivedImage)
+CONFIDENCE = TopicName("left/render/depth_confidence", ReceivedImage)
+INFO = TopicName("left/camera_info", ReceivedCameraInfo)
+POSE = TopicName("tf", ReceivedRos)
+ANCHORS = TopicName("anchors", ReceivedCloud)
+OVERLAY = TopicName("left/overlay/image", ReceivedImage)
+
+RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # of an optical frame; its own inverse
+PLANE = 100.0  # mm before the camera: where a picture lies in 3D
+SEEN, UNSURE, HIDDEN = (60, 220, 60, 255), (240, 160, 40, 255), (230, 60, 60, 255)  # RGBA of anchors
+LEAST_SEEN = 0.5  # of an anchor's visibility
+STATE, ANSWER, PIN, REQUEST = "SagsState", "SagsAnswer", "SagsPin", "SagsRequest"
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class IgtlOptions(ServerOptions):
+    """How `sags bridge openigtlink` runs."""
+
+    port: int = 18944  # Slicer's default
+    send: tuple[str, ...] = ()  # names of outputs; default: all
+    rate: float = 10.0  # Hz
+    surface_rate: float = 2.0  # Hz
+    surface_step: int = 16  # px
+
+
+def outputs(options: IgtlOptions) -> list[Output]:
+    """What peers get, one device each: "Sags" and the name.
+
+    Raises:
+        UsageError: `send` names something else.
+    """
+    node, overlay = options.node.ns, options.overlay.ns
+
+    def of_node(*names: str) -> tuple[Source, ...]:
+        return tuple(Source(node, name) for name in names)
+
+    often, seldom = 1 / options.rate, 1 / options.surface_rate
+    overlaid = (Source(overlay, OVERLAY), *of_node(PICTURE, INFO))
+    surface = of_node(DEPTH, CONFIDENCE, INFO, POSE)
+    offered = {
+        "picture": Output("Picture", of_node(PICTURE, INFO), often),
+        "render": Output("Render", of_node(RENDER, INFO), often),
+        "overlay": Output("Overlay", overlaid, often, optional=True),
+        "surface": Output("Surface", surface, seldom, pulse=Source(node, POSE), lengths=True),
+        "anchors": Output("Anchors", of_node(ANCHORS), often, lengths=True),
+        "camera": Output("LeftCamera", of_node(POSE), often, lengths=True),
+    }
+    unknown = [name for name in options.send if name not in offered]
+    if unknown:
+        raise UsageError(f"--send {unknown[0]}: there is {', '.join(offered)}")
+    return [offered[name] for name in options.send or offered]
+
+
+def run_openigtlink(options: IgtlOptions, ready: Callable[[str, int], None], stop: threading.Event) -> None:
+    """Serve OpenIGTLink peers until `stop` is set. The node may come later and be restarted.
+
+    Args:
+        ready: called with the host and the port once peers can connect.
+
+    Raises:
+        UsageError: wrong keys, or something that cannot be sent.
+        SagsError: the port cannot be bound, or an endpoint is malformed.
+    """
+    offered = outputs(options)
+    if importlib.util.find_spec("crcmod._crcfunext") is None:
+        log.warning(
+            "crcmod was installed without a C compiler: pictures take seconds; install gcc, then crcmod anew"
+        )
+    with (
+        closing(OpenIgtLink(options)) as bridge,
+        closing(Relay((options.node, options.overlay), offered, bridge, options.max_age)) as relay,
+    ):
+        ready(options.host, bridge.port)
+        relay.run(stop)
+
+
+class OpenIgtLink(Outlet):
+    """The outlet: packs each message once, for all peers.
+
+    Raises:
+        SagsError: the port cannot be bound.
+    """
+
+    def __init__(self, options: IgtlOptions) -> None:
+        self._step, self._max_age = options.surface_step, options.max_age
+        # Of pictures that are shown: one without light, and its place.
+        self._shapes: dict[str, tuple[U8, F64]] = {}
+        self._pins = Pins()
+        self._answers: deque[Callable[[], list[Release]]] = deque()  # for the peers' thread
+        self._now_ns = options.node.now_ns
+        listener = options.listen(MOST_PEERS)
+        self.port = int(listener.getsockname()[1])
+        self._requests = Requests(options.node)
+        self._peers = Peers(listener, self._hear, self._idle)
+        self._peers.start()
+
+    def close(self) -> None:
+        self._peers.close()
+        self._requests.close()
+
+    # ---- out -----------------------------------------------------------------------------------------------
+
+    def wants(self, output: Output) -> bool:
+        """OpenIGTLink has no subscriptions: who is connected gets all."""
+        return len(self._peers) > 0
+
+    def send(self, output: Output, frame: Frame) -> bool:
+        stamp_ns = frame[output.sources[0].topic].stamp_ns
+        device, seconds = f"Sags{output.name}", stamp_ns * 1e-9
+        try:
+            made = self._made(output.name, frame, device, seconds)
+        except WireError:
+            made = None
+        if made is not None:
+            self._peers.send(device, made, valid=self._max_age - (self._now_ns() - stamp_ns) * 1e-9)
+        return made is not None
+
+    def blank(self, output: Output, reason: str) -> None:
+        device, seconds = f"Sags{output.name}", time.time()
+        if output.name in self._shapes:
+            dark, T = self._shapes.pop(output.name)
+            self._peers.send(device, igtl.image(device, seconds, _written(dark, reason), T))
+        elif output.name == "Surface":
+            self._peers.send(
+                device, igtl.surface(device, seconds, np.empty((0, 3)), np.empty((0, 3), np.int64))
+            )
+        elif output.name == "Anchors":
+            self._peers.send(device, igtl.points(device, seconds, np.empty((0, 3)), [], []))
+
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
+        words = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
+        if missing or not shows:
+            code, words = igtl.NOT_READY, words or "waiting for the node's first message"
+        else:
+            code, words = igtl.OK, "all is new"
+        self._peers.greet(STATE, igtl.status(STATE, time.time(), code, words))
+
+    def _made(self, name: str, frame: Frame, device: str, seconds: float) -> bytes | None:
+        """The message of an output; None when what came does not fit together."""
+        if name == "Anchors":
+            return _anchors(frame[ANCHORS], device, seconds)
+        if name == "LeftCamera":
+            return igtl.transform(device, seconds, RAS @ _in_mm(frame[POSE].pose()) @ RAS)
+        if name == "Surface":
+            return self._surface(frame, device, seconds)
+        drawn, info = PICTURES[name], frame[INFO]
+        size = (info.height, info.width)
+        if any(frame[topic].array.shape != (*size, channels) for topic, channels in drawn.channels.items()):
+            return None
+        picture, T = drawn.draw(frame), _before_camera(info.K)
+        self._shapes[name] = (np.zeros_like(picture), T)
+        return igtl.image(device, seconds, picture, T)
+
+    def _surface(self, frame: Frame, device: str, seconds: float) -> bytes | None:
+        depth, confidence, info = frame[DEPTH].array, frame[CONFIDENCE].array, frame[INFO]
+        if not depth.shape == confidence.shape == (info.height, info.width):
+            return None
+        camera = Camera(info.width, info.height, info.K, frame[POSE].pose())
+        places, triangles = surface_of(camera, depth, confidence, self._step)
+        return igtl.surface(device, seconds, _ras(places), triangles)
+
+    # ---- in, on the peers' thread --------------------------------------------------------------------------
+
+    def _hear(self, said: igtl.Said) -> None:
+        if said.kind == "POINT" and said.device == PIN:
+            self._release(self._pins.hear(said.points, time.monotonic()))
+        elif said.kind == "STRING" and said.device == REQUEST:
+            request = request_of(said.text)
+            if request is None:
+                self._say("say: pin U V, or: remove NUMBER")
+            else:
+                self._requests.ask(*request, lambda _, words: self._say(words))
+
+    def _idle(self) -> None:
+        """Pin what has come to rest, and take in what was answered."""
+        for pin in self._pins.due(time.monotonic()):
+            place = (RAS[:3, :3] @ pin.place) * 1e-3
+            args = dict(zip("xyz", place.tolist(), strict=True))
+            self._requests.ask("add_anchor", args, partial(self._pinned, pin))
+        while self._answers:
+            self._release(self._answers.popleft()())
+
+    def _pinned(self, pin: Pin, result: dict[str, Any] | None, words: str) -> None:
+        """On the thread of the requests."""
+        self._say(f"{pin.name}: {words}")
+        if result is not None:
+            self._answers.append(partial(self._pins.pinned, pin, int(result["id"])))
+
+    def _release(self, released: Sequence[Release]) -> None:
+        for release in released:
+            self._requests.ask("remove_anchor", {"id": release.anchor}, lambda _, words: self._say(words))
+
+    def _say(self, words: str) -> None:
+        self._peers.send(ANSWER, igtl.string(ANSWER, time.time(), words))
+
+
+def request_of(text: str) -> tuple[str, dict[str, float]] | None:
+    """The operation and arguments that a STRING asks for: `pin U V` or `remove NUMBER`."""
+    number = r"-?\d{1,5}(?:\.\d{1,6})?"
+    if (pin := re.fullmatch(rf"\s*pin\s+({number})\s+({number})\s*", text)) is not None:
+        return "add_anchor", {"u": float(pin[1]), "v": float(pin[2])}
+    if (remove := re.fullmatch(r"\s*remove\s+(\d{1,9})\s*", text)) is not None:
+        return "remove_anchor", {"id": int(remove[1])}
+    return None
+
+
+# ---- what is sent ----------------------------------------------------------------------------------------
+
+
+def _overlaid(frame: Frame) -> U8:
+    """The picture with the overlay over it."""
+    return over(frame[PICTURE].array, frame[OVERLAY].array)
+
+
+def _anchors(cloud: ReceivedCloud, device: str, seconds: float) -> bytes | None:
+    """The anchors whose place is known, by number. Orange: not sure of; red: hidden."""
+    rows = cloud.points
+    if not {"id", "visibility", "confidence"} <= set(rows.dtype.names or ()):
+        return None
+    places = cloud.xyz().astype(np.float64)
+    known = np.isfinite(places).all(axis=1)
+    names = [f"anchor {number}" for number in rows["id"][known]]
+    colors = [
+        HIDDEN if row["visibility"] < LEAST_SEEN else SEEN if row["confidence"] >= SURE_OF_ANCHOR else UNSURE
+        for row in rows[known]
+    ]
+    return igtl.points(device, seconds, _ras(places[known]), names, colors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """How an IMAGE is made."""
+
+    channels: Mapping[TopicName[ReceivedImage], int]  # of the pictures that it is made of
+    draw: Callable[[Frame], U8]
+
+
+PICTURES = {
+    "Picture": _Picture({PICTURE: 3}, lambda frame: frame[PICTURE].array),
+    "Render": _Picture({RENDER: 4}, lambda frame: over_black(frame[RENDER].array)),
+    "Overlay": _Picture({PICTURE: 3, OVERLAY: 4}, _overlaid),
+}
+
+
+def _ras(places: F64) -> F64:
+    """World coordinates [N, 3] in m as Slicer's, in mm."""
+    turned: F64 = 1e3 * places @ RAS[:3, :3]
+    return turned
+
+
+def _in_mm(T: F64) -> F64:
+    scaled = T.copy()
+    scaled[:3, 3] *= 1e3
+    return scaled
+
+
+def _before_camera(K: F64) -> F64:
+    """Where a picture lies: from (column, row, 0, 1) to mm in the camera's axes, at a distance of `PLANE`."""
+    T = np.eye(4)
+    T[0, 0], T[1, 1] = PLANE / K[0, 0], PLANE / K[1, 1]
+    T[:3, 3] = [-PLANE * K[0, 2] / K[0, 0], -PLANE * K[1, 2] / K[1, 1], PLANE]
+    placed: F64 = RAS @ T
+    return placed
+
+
+def _written(dark: U8, reason: str) -> U8:
+    """A picture without light that says why."""
+    scale = max(dark.shape[0] / 1000, 0.4)
+    written = dark.copy()
+    place, font = (8, dark.shape[0] // 2), cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(written, reason, place, font, scale, (255, 170, 0), 1, cv2.LINE_AA)
+    return written

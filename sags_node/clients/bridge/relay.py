@@ -1,0 +1,231 @@
+"""The loop that all bridges share: what peers ask for is taken from the node, and the newest is passed on.
+
+What has become too old is taken back, with the reason. The node never waits for a bridge, and the loop never
+waits for a peer.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from sags_node.clients.bridge.feed import EVERY_SECOND, SILENT_AFTER, Feed
+from sags_node.clients.bridge.options import MAX_AGE
+from sags_node.messaging import topics
+from sags_node.messaging.address import NodeAddress
+from sags_node.messaging.received import Frame
+from sags_node.messaging.wire import Meta
+
+LOOK = 0.04  # s; how soon it is noticed that something has become too old
+LEAD = 0.2  # s before it is due that a rare output's topics are asked for: a subscription takes up to 0.1 s
+NO_UNIT = "its lengths have no unit, as nobody has calibrated the eyes; docs/calibration.md"
+GRACE = 0.5  # s for the first message of what was asked for, before it is said that none comes
+
+
+class Source(NamedTuple):
+    """A topic of one sender."""
+
+    ns: str
+    topic: str
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """One thing that a bridge offers to its peers.
+
+    Attributes:
+        name: by which peers know it.
+        sources: the topics that it is made of, all of one frame. The first one leads.
+        period: s between two, at least.
+        pulse: for an output with a long period: a small topic of the same sender that comes with every frame.
+            Between two of this output only that is asked for, and tells that the sender goes on.
+        optional: it is not missed before it has come once.
+        lengths: it is of lengths, which peers take for metres: nothing is passed on while they have no unit.
+    """
+
+    name: str
+    sources: tuple[Source, ...]
+    period: float = 0.0
+    pulse: Source | None = None
+    optional: bool = False
+    lengths: bool = False
+
+
+class Outlet(Protocol):
+    """What a bridge speaks to, and what most of them do; all is called from the thread of the loop."""
+
+    def wants(self, output: Output) -> bool:
+        """Whether any peer asks for it."""
+        return True
+
+    def send(self, output: Output, frame: Frame) -> bool:
+        """Pass a new one on to those who ask for it; False where this frame has nothing for it."""
+        ...
+
+    def blank(self, output: Output, reason: str) -> None:
+        """Take back what was sent: it is not new any more."""
+        return None
+
+    def report(self, missing: Mapping[str, str], shows: bool) -> None:
+        """Hear what is asked for and does not come, output -> reason, and whether anything does; called when
+        that changes."""
+        return None
+
+
+@dataclass(slots=True)
+class _Course:
+    """How one output that peers ask for is doing."""
+
+    since: float  # monotonic s; when they began to
+    due: float = 0.0  # monotonic s; of the next one
+    sent: Meta | None = None  # of the leading message
+    shown_ns: int | None = None  # capture time of what is shown; None: nothing is
+    reason: str | None = None  # why nothing is
+
+
+class Relay:
+    """Passes topics on to one outlet.
+
+    Args:
+        senders: a node, and others such as an overlay.
+        max_age: s since capture; what is older is taken back.
+
+    Raises:
+        UsageError: a sender's keys do not fit.
+        SagsError: an endpoint is malformed.
+    """
+
+    def __init__(
+        self,
+        senders: Sequence[NodeAddress],
+        outputs: Sequence[Output],
+        outlet: Outlet,
+        max_age: float = MAX_AGE,
+    ) -> None:
+        self._outputs, self._outlet, self._max_age = outputs, outlet, max_age
+        self._arrived = threading.Event()
+        self._courses: dict[str, _Course] = {}
+        self._reported: tuple[dict[str, str], bool] | None = None
+        self._senders = {sender.ns: sender for sender in senders}
+        self._feeds: dict[str, Feed] = {}
+        try:
+            for ns, sender in self._senders.items():
+                self._feeds[ns] = Feed(self._topics(ns), sender, max_age, self._arrived.set)
+        except BaseException:
+            self.close()
+            raise
+
+    def run(self, stop: threading.Event) -> None:
+        """Pass on until `stop` is set."""
+        while not stop.is_set():
+            self.step()
+            self.wait()
+
+    def wait(self) -> None:
+        """Until something comes, and no longer than `LOOK`."""
+        self._arrived.wait(LOOK)
+        self._arrived.clear()
+
+    def step(self) -> None:
+        """Ask for what is wanted now, and pass on what is new."""
+        now = time.monotonic()
+        wanted = [output for output in self._outputs if self._outlet.wants(output)]
+        names = {output.name for output in wanted}
+        self._courses = {name: course for name, course in self._courses.items() if name in names}
+        for output in wanted:
+            self._courses.setdefault(output.name, _Course(since=now))
+        asked = {source for output in wanted for source in self._asked(output, now)}
+        for ns, feed in self._feeds.items():
+            feed.ask(source.topic for source in asked if source.ns == ns)
+        for output in wanted:
+            self._pass_on(output, self._courses[output.name], now)
+        missing = {name: course.reason for name, course in self._courses.items() if course.reason is not None}
+        shows = any(course.shown_ns is not None for course in self._courses.values())
+        if self._reported != (missing, shows):
+            self._reported = missing, shows
+            self._outlet.report(missing, shows)
+
+    def close(self) -> None:
+        for feed in self._feeds.values():
+            feed.close()
+
+    # ---- one output ----------------------------------------------------------------------------------------
+
+    def _pass_on(self, output: Output, course: _Course, now: float) -> None:
+        problem = self._problem(output, course)
+        if problem is None and now >= course.due:
+            frame = self._frame(output)
+            leading = course.sent if frame is None else frame[output.sources[0].topic].meta
+            if frame is not None and leading is not None and leading != course.sent:
+                course.due = max(course.due + output.period, now)
+                course.sent = leading
+                if self._outlet.send(output, frame):
+                    course.shown_ns, course.reason = leading.stamp_ns, None
+        if problem is not None and course.shown_ns is not None:
+            course.shown_ns = course.sent = None
+            self._outlet.blank(output, problem)
+            course.reason = problem
+        elif course.shown_ns is None and not output.optional and now - course.since > GRACE:
+            course.reason = problem or "no whole frame came"
+
+    def _problem(self, output: Output, course: _Course) -> str | None:
+        """Why what is shown, or would be now, must not be."""
+        for source in output.sources if output.pulse is None else (output.pulse,):
+            problem = self._feeds[source.ns].problem(source.topic)
+            if problem is not None:
+                return f"{topics.full_name(*source)}: {problem}"
+        first = output.sources[0]
+        leading = self._feeds[first.ns].latest(first.topic) if output.lengths else None
+        if leading is not None and not leading.metric:
+            return f"{topics.full_name(*first)}: {NO_UNIT}"
+        if course.shown_ns is None or not _is_periodic(output):
+            return None
+        seconds = any(source.topic in EVERY_SECOND for source in output.sources)
+        limit = output.period + LEAD + (SILENT_AFTER if seconds else self._max_age)
+        age = (self._senders[output.sources[0].ns].now_ns() - course.shown_ns) * 1e-9
+        return f"no whole frame for {age:.1f} s" if age > limit else None
+
+    def _frame(self, output: Output) -> Frame | None:
+        """The newest frame of which everything came and is new."""
+        first = output.sources[0]
+        leading = self._feeds[first.ns].latest(first.topic)
+        if leading is None:
+            return None
+        whole = Frame()
+        for ns, feed in self._feeds.items():
+            names = [source.topic for source in output.sources if source.ns == ns]
+            part = feed.frame(names, leading.stamp_ns) if names else Frame()
+            if part is None or any(feed.problem(name) is not None for name in names):
+                return None
+            whole.update(part)
+        return whole
+
+    def _asked(self, output: Output, now: float) -> tuple[Source, ...]:
+        """The topics to ask for now."""
+        if output.pulse is None:
+            return output.sources
+        soon = now >= self._courses[output.name].due - LEAD
+        return (output.pulse, *output.sources) if soon else (output.pulse,)
+
+    def _topics(self, ns: str) -> list[str]:
+        sources = [
+            source
+            for output in self._outputs
+            for source in (*output.sources, *([] if output.pulse is None else [output.pulse]))
+        ]
+        return list(dict.fromkeys(source.topic for source in sources if source.ns == ns))
+
+
+def silent(reason: str) -> str:
+    """What a topic of texts says instead of what has been taken back."""
+    return json.dumps({"state": "silent", "reason": reason})
+
+
+def _is_periodic(output: Output) -> bool:
+    """Whether its leading topic repeats, so that silence means stale."""
+    topic = topics.find(output.sources[0].topic)
+    return topic is None or topic.periodic

@@ -1,0 +1,363 @@
+"""Objects held by anchors: pinned once, then placed in every frame by where the node says its anchors are."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from sags_node.clients.overlay.frame import Anchor, TissueFrame
+from sags_node.clients.overlay.pose import on_surface, surface_normal
+from sags_node.clients.overlay.scene import ObjectSpec
+from sags_node.clients.registration.rigid import on_a_line, rigid_fit
+from sags_node.confidence import LEAST
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import invert, transform
+from sags_node.messaging.control import ControlClient
+from sags_node.types import F64
+
+LEAST_ANCHORS = 3  # for a rigid fit
+FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
+MISFIT = (
+    0.003  # m, of an anchor from where its object's shape has it: nine of ten are found within half of it
+)
+NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
+GOODBYE = 0.5  # s for the node to take anchors back at the end
+
+Request = dict[str, Any]
+
+log = logging.getLogger(__name__)
+
+
+class Pinner:
+    """Asks the node for anchors in the background: an answer takes a frame or longer.
+
+    Args:
+        connect: a new connection to the node's control socket; raises `SagsError`.
+    """
+
+    def __init__(self, connect: Callable[[], ControlClient]) -> None:
+        self._connect = connect
+        self._worker = ThreadPoolExecutor(1, "sags-pinner")
+        self._held: list[int] = []  # ids of anchors that are ours; only the worker uses it
+
+    def pin(self, requests: Sequence[Request]) -> Future[list[int]]:
+        """Ids of new anchors, all or none; or the node's `SagsError`."""
+        return self._worker.submit(self._pin, requests)
+
+    def remove(self, ids: Sequence[int]) -> None:
+        """Give anchors back, as far as the node is still there."""
+        self._worker.submit(self._remove, list(ids))
+
+    def forget(self, ids: Sequence[int]) -> None:
+        """The node that had these anchors is gone; in another one they may be somebody else's."""
+        self._worker.submit(self._disown, list(ids))
+
+    def close(self) -> None:
+        """Give all anchors back, and wait for that."""
+        self._worker.submit(lambda: self._remove(self._held.copy()))
+        self._worker.shutdown()
+
+    def _pin(self, requests: Sequence[Request]) -> list[int]:
+        added: list[int] = []
+        with self._connect() as client:
+            try:
+                for request in requests:
+                    added.append(int(client.request("add_anchor", request)["id"]))
+            except SagsError:
+                for anchor in added:
+                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
+                raise
+        self._held += added
+        return added
+
+    def _remove(self, ids: list[int]) -> None:
+        self._disown(ids)
+        if not ids:
+            return
+        try:
+            with self._connect() as client:
+                for anchor in ids:
+                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
+        except SagsError:
+            return  # the node is gone, and its anchors with it
+
+    def _disown(self, ids: list[int]) -> None:
+        self._held = [anchor for anchor in self._held if anchor not in ids]
+
+
+class HeldObject:
+    """One object of a scene.
+
+    Attributes:
+        reason: why it has no place in the newest frame; None: it has.
+        is_sure: enough of the anchors that place it are, and its shape fits them.
+        unsure: why it is not; None: it is, or it has no place.
+        error: how badly its anchors fit its rigid shape (m, RMS); 0 with one anchor.
+
+    Args:
+        repin: after the model or the node was started anew, pin it once more at the same pixels and places.
+        ahead: how far ahead of its frames it is placed, ms or `auto`, see `add_anchor`.
+        corners: [2, 3] m, between which all of it lies, in its own coordinates; None: nobody looks whether it
+            lies at its anchors.
+    """
+
+    def __init__(
+        self,
+        spec: ObjectSpec,
+        where: str,
+        pinner: Pinner,
+        repin: bool,
+        ahead: float | str = 0.0,
+        corners: F64 | None = None,
+    ) -> None:
+        self.spec = spec
+        self.reason: str | None = None
+        self.is_sure = False
+        self.unsure: str | None = None
+        self.error = 0.0
+        self.times_pinned = 0
+        self._where = where  # what its anchors are called in messages
+        self._pinner = pinner
+        self._repin = repin
+        self._asked = {} if ahead == 0 else {"ahead_ms": ahead}
+        self._pinning: Future[list[int]] | None = None
+        self._ids: list[int] = []
+        self._session = ""  # of the node in which it was pinned
+        self._states: list[Anchor] = []
+        self._model: F64 | None = None  # [k, 3] m, points of the object that lie at the anchors
+        self._right = np.zeros(3)  # where the picture's x axis pointed when it was pinned
+        self._normal: F64 | None = None
+        self._lost: str | None = None
+        self._corners = corners
+        self._refused: str | None = None  # for good
+        self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
+        self._held_s: float | None = None  # of the newest frame in which its anchors were known
+        self._began_anew = False  # the recording did, since it was lost
+
+    def place(self, frame: TissueFrame) -> F64 | None:
+        """The pose [4, 4] of the object in the world, or None and a `reason`. Pins it when it is not yet.
+
+        Raises:
+            UsageError: a pixel to pin it to lies outside the picture.
+        """
+        T, self.reason = None, self._unready(frame)
+        if self.reason is None:
+            T, self.reason = self._held(frame, [frame.anchors.get(anchor) for anchor in self._ids])
+        if T is None or self.is_sure:
+            self.unsure = None
+        elif self.unsure is None:
+            self.unsure = "its anchors were not recognised lately"
+        return T
+
+    def _unready(self, frame: TissueFrame) -> str | None:  # noqa: PLR0911, one return per reason
+        """Why its anchors do not hold it, or not yet."""
+        if self._refused is not None:
+            return self._refused
+        if self._lost is not None and not self._may_pin_again(frame):
+            return self._lost
+        if self._ids and frame.session != self._session:
+            self._pinner.forget(self._ids)
+            return self._lose("the node was started anew")
+        if not self._ids:
+            return self._pin(frame)
+        states = [frame.anchors.get(anchor) for anchor in self._ids]
+        known = [state for state in states if state is not None]
+        if self._model is None and len(known) < len(states):
+            return "being pinned"  # the anchors come with one of the next frames
+        self._states = known
+        if not any(np.isfinite(state.place).all() for state in known):
+            self._pinner.remove(self._ids)
+            return self._lose("the model was started anew" if known else "its anchors were removed")
+        self._held_s = frame.recorded_s
+        if self._model is None:
+            self._begin(frame, known)
+        if self._refused is not None:
+            self._pinner.remove(self._ids)
+            self._ids, self._states = [], []
+        return self._refused
+
+    @property
+    def ahead_s(self) -> float:
+        """How far ahead of the frame it was placed last."""
+        return max((state.ahead for state in self._states), default=0.0)
+
+    def status(self) -> dict[str, Any]:
+        """For people and programs: what it is, why it is not drawn, and how its anchors do."""
+        return {
+            "name": self.spec.name,
+            "reason": self.reason,
+            "sure": self.reason is None and self.is_sure,
+            "unsure": self.unsure,
+            "pinned": self.times_pinned,
+            "error_mm": round(1e3 * self.error, 3),
+            "anchors": [
+                {
+                    "id": anchor,
+                    "visibility": round(state.visibility, 2),
+                    "confidence": round(state.confidence, 2),
+                    "depth_confidence": round(state.depth_confidence, 2),
+                }
+                for anchor, state in zip(self._ids, self._states, strict=False)
+            ],
+        }
+
+    # ---- pinning -------------------------------------------------------------------------------------------
+
+    def _lose(self, why: str) -> str:
+        self._ids, self._states, self._model, self._normal = [], [], None, None
+        self._lost, self._began_anew = f"lost: {why}", False
+        return self._lost
+
+    def _may_pin_again(self, frame: TissueFrame) -> bool:
+        """Asked for, or the recording loops and has come again to where it was pinned: its pixels then show
+        the same tissue."""
+        now, held, begun = frame.recorded_s, self._held_s, self._begun_s
+        if now is not None and held is not None and now < held:
+            self._began_anew = True
+        return self._repin or (self._began_anew and now is not None and begun is not None and now >= begun)
+
+    def _pin(self, frame: TissueFrame) -> str:
+        if self._pinning is None:
+            requests = self._requests(frame)
+            if isinstance(requests, str):
+                return requests
+            requests = [request | self._asked for request in requests]
+            self._pinning, self._session = self._pinner.pin(requests), frame.session
+            self._begun_s = frame.recorded_s if self._begun_s is None else self._begun_s
+        elif self._pinning.done():
+            done, self._pinning = self._pinning, None
+            error = done.exception()
+            if isinstance(error, SagsError):
+                return str(error)
+            self._ids, self._lost = done.result(), None
+            self.times_pinned += 1
+        return "being pinned"
+
+    def _requests(self, frame: TissueFrame) -> list[Request] | str:
+        """What to ask the node for, or why not in this frame."""
+        height, width = frame.depth.shape
+        if not self.spec.anchors:
+            pixel = _middle(frame)
+            return "no tissue in the picture" if pixel is None else [{"u": pixel[0], "v": pixel[1]}]
+        requests: list[Request] = []
+        for anchor in self.spec.anchors:
+            if anchor.pixel is None:
+                requests.append(dict(zip("xyz", anchor.place or (), strict=True)))
+                continue
+            u, v = anchor.pixel
+            if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                raise UsageError(
+                    f"{self._where} {u:g} {v:g} lies outside the left picture of {width}x{height} px"
+                )
+            if not frame.tissue[round(v), round(u)]:
+                return f"pixel {u:g} {v:g} shows no tissue: an instrument, or vision.tissue.exclude"
+            if not np.isfinite(frame.depth[round(v), round(u)]):
+                return f"no depth at pixel {u:g} {v:g}"
+            requests.append({"u": u, "v": v})
+        return requests
+
+    # ---- placing -------------------------------------------------------------------------------------------
+
+    def _begin(self, frame: TissueFrame, states: Sequence[Anchor]) -> None:
+        """From this frame on the object is fixed to its anchors."""
+        T_world_cam = frame.camera.T_world_cam
+        self._right = T_world_cam[:3, 0].copy()
+        said = [anchor.at for anchor in self.spec.anchors]
+        places = np.stack([state.place for state in states])
+        if said and said[0] is not None:
+            at = np.array(said, np.float64)
+            self._model = at * self._unit(at, places)
+        elif len(states) < LEAST_ANCHORS:
+            self._model = np.zeros((1, 3))
+        else:
+            in_camera = self.spec.coordinates == "camera"
+            self._model = np.asarray(transform(invert(T_world_cam), places)) if in_camera else places
+        far = self._distance(self._model)
+        if far > 0:
+            hint = f"is `at` in the file's units, and is scale: {self.spec.scale:g} right?"
+            if not said or said[0] is None:
+                hint = "the origin of its coordinates is far from it; say `at`"
+                if len(states) >= LEAST_ANCHORS:
+                    hint = (
+                        f"are the file's coordinates those of the {self.spec.coordinates}? If not, say `at`"
+                    )
+            self._refused = f"it lies {1e3 * far:.3g} mm from its anchors: {hint}"
+
+    def _unit(self, at: F64, places: F64) -> float:
+        """m for one of what every `at` [k, 3] is in, by what lies at the anchors (at [k, 3], m)."""
+        scale = 1.0 if self.spec.file is None else self.spec.scale
+        if self.spec.at_units is not None or scale == 1:
+            return scale if self.spec.at_units != "m" else 1.0
+        if len(at) >= LEAST_ANCHORS:  # how far they are apart
+            wide, there = (float(np.linalg.norm(points - points.mean(0))) for points in (at, places))
+            in_metres = abs(wide - there) < abs(scale * wide - there)
+        else:
+            in_metres = bool(at.any()) and self._distance(at) == 0
+        if in_metres:
+            log.warning(
+                "%s: `at` is read in metres; say at_units: m, or give the file's units", self.spec.name
+            )
+        return 1.0 if in_metres else scale
+
+    def _distance(self, points: F64) -> float:
+        """From the object to the nearest of its points [k, 3], m; 0: it is as near as an object may be."""
+        if self._corners is None:
+            return 0.0
+        low, high = self._corners
+        aside = np.maximum(np.maximum(low - points, points - high), 0)
+        distance = float(np.linalg.norm(aside, axis=1).min())
+        return distance if distance > np.linalg.norm(high - low) + FAR else 0.0
+
+    def _held(self, frame: TissueFrame, states: Sequence[Anchor | None]) -> tuple[F64 | None, str | None]:
+        assert self._model is not None
+        holding = {i: state for i, state in enumerate(states) if state is not None and state.holds}
+        chosen = {i: state for i, state in holding.items() if state.depth_confidence >= LEAST}
+        if len(chosen) < min(len(holding), len(states), LEAST_ANCHORS):
+            return None, "the depth at its anchors is not known well enough"
+        if len(states) < LEAST_ANCHORS:
+            return self._on_surface(frame, list(chosen.values()))
+        model = self._model[list(chosen)]
+        if len(chosen) < LEAST_ANCHORS:
+            return None, f"{len(chosen)} of its {len(states)} anchors hold it, {LEAST_ANCHORS} are needed"
+        if on_a_line(model):
+            return None, "the anchors that hold it lie on a line"
+        weights = np.array([state.confidence * state.depth_confidence for state in chosen.values()])
+        places = np.stack([state.place for state in chosen.values()])
+        T, self.error = rigid_fit(model, places, weights)
+        off = np.linalg.norm(transform(T, model) - places, axis=1)
+        sure = model[[state.is_sure for state in chosen.values()] & (off <= MISFIT)]
+        self.is_sure = len(sure) >= LEAST_ANCHORS and not on_a_line(sure)
+        self.unsure = None
+        if off.max() > MISFIT:
+            self.unsure = (
+                f"an anchor is {1e3 * off.max():.1f} mm from where its shape has it: check `at` and scale, "
+                "unless the tissue was bent"
+            )
+        return T, None
+
+    def _on_surface(self, frame: TissueFrame, holding: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
+        assert self._model is not None
+        if not holding:
+            return None, "its anchor was not recognised for too long"
+        self.is_sure, self.unsure = holding[0].is_sure, None
+        normal = surface_normal(frame, holding[0].place)
+        if normal is not None and self._normal is not None:
+            normal = NORMAL_MEMORY * self._normal + (1 - NORMAL_MEMORY) * normal
+            normal /= np.linalg.norm(normal)
+        self._normal = self._normal if normal is None else normal
+        if self._normal is None:
+            return None, "no surface at its anchor"
+        return on_surface(holding[0].place, self._model[0], self._normal, self._right), None
+
+
+def _middle(frame: TissueFrame) -> tuple[float, float] | None:
+    """The pixel (u, v) with tissue and depth nearest to the middle of the tissue."""
+    rows, columns = np.nonzero(frame.tissue & np.isfinite(frame.depth))
+    if len(rows) == 0:
+        return None
+    best = int(np.argmin(np.hypot(columns - np.median(columns), rows - np.median(rows))))
+    return float(columns[best]), float(rows[best])

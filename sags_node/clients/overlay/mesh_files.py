@@ -1,0 +1,193 @@
+"""Vertices and triangles of PLY, OBJ and STL files, points of PLY, PCD and XYZ files; nothing else of them.
+
+Such files come from anywhere. Open3D's readers do not look at the length of a line or at the corners of a
+polygon, and end the process where something is wrong. trimesh's draw what came until a file broke off, and a
+vertex 0 of OBJ as the last one. Here Python and numpy read every number, and all must be there.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sags_node.clients.overlay.polygons import triangulate
+from sags_node.errors import UsageError
+from sags_node.types import F64, I32
+
+STL_START, STL_TRIANGLE = 84, 50  # bytes of a binary STL file
+_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_PLY_PROPERTY = re.compile(r"property\s+(?:list\s+(\w+)\s+)?(\w+)\s+(\S+)")
+_PLY_CORNERS = ("vertex_indices", "vertex_index")
+
+Shape = tuple[F64, I32]
+Face = Sequence[int]
+
+
+def parse_mesh(file: Path, data: bytes) -> Shape:
+    """Points [V, 3] and triangles [T, 3], none of a cloud of points, in the content of a file.
+
+    Raises:
+        UsageError: it cannot be followed to its end, or a face names a vertex that is not there.
+    """
+    parse = {".ply": _ply, ".obj": _obj, ".stl": _stl, ".pcd": _pcd, ".xyz": _xyz}[file.suffix.lower()]
+    try:
+        points, faces = parse(data)
+        triangles = triangulate(points, faces)
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError, struct.error) as error:
+        why = str(error).partition("\n")[0][:100] or "it ends too early"
+        raise UsageError(f"{file} is damaged: {why}; open it in a mesh viewer") from None
+    return points, triangles
+
+
+def _rows(lines: Sequence[bytes]) -> F64:
+    """Points [V, 3]: the first three words of each line."""
+    return np.array([[float(word) for word in line.split()[:3]] for line in lines]).reshape(-1, 3)
+
+
+# ---- PLY -------------------------------------------------------------------------------------------------
+
+
+class _Numbers:
+    """The body of a PLY file, one number after the other."""
+
+    def __init__(self, form: str, body: bytes) -> None:
+        self._order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
+        self._words = [] if self._order else body.split()
+        self._body = body.partition(b"\n")[2]
+        self._at = 0
+
+    def table(self, kinds: Sequence[str], rows: int) -> F64:
+        """So many rows of numbers of these types, [rows, kinds]."""
+        at = self._at
+        if not self._order:
+            self._at += rows * len(kinds)
+            words = self._words[at : self._at]
+            return np.array([float(word) for word in words]).reshape(rows, len(kinds))
+        row = np.dtype([(str(number), self._order + kind) for number, kind in enumerate(kinds)])
+        self._at += rows * row.itemsize
+        values = np.frombuffer(self._body, row, rows, at)
+        return np.column_stack([values[name].astype(np.float64) for name in row.names or ()])
+
+    def take(self, kind: str, count: int) -> list[float]:
+        """The next numbers, all of one type."""
+        if count < 0:
+            raise ValueError(f"a list of {count} numbers")
+        at = self._at
+        if not self._order:
+            self._at += count
+            if self._at > len(self._words):
+                raise ValueError("it ends too early")
+            return [float(word) for word in self._words[at : self._at]]
+        kind = self._order + kind
+        self._at += count * np.dtype(kind).itemsize
+        values: list[float] = np.frombuffer(self._body, kind, count, at).tolist()
+        return values
+
+
+def _ply(data: bytes) -> tuple[F64, list[Face]]:
+    header, _, body = data.partition(b"end_header")
+    points: F64 = np.zeros((0, 3))
+    faces: list[Face] = []
+    first, *elements = re.split(r"^element\s+", header.decode("ascii"), flags=re.MULTILINE)
+    form = re.search(r"^format\s+(\w+)", first, re.MULTILINE)
+    if form is None:
+        raise ValueError("its header names no format")
+    numbers = _Numbers(form[1], body)
+    for element in elements:
+        head, *lines = element.splitlines()
+        name, count = head.split()
+        found = [match.groups() for match in map(_PLY_PROPERTY.match, lines) if match is not None]
+        names = [called for _, _, called in found]
+        kinds = [(length and _PLY_TYPES[length], _PLY_TYPES[kind]) for length, kind, _ in found]
+        if all(length is None for length, _ in kinds):
+            table = numbers.table([kind for _, kind in kinds], int(count))
+            if name == "vertex":
+                points = table[:, [names.index(axis) for axis in "xyz"]]
+            continue
+        corners = next((number for number, called in enumerate(names) if called in _PLY_CORNERS), None)
+        for _ in range(int(count)):
+            row = [
+                numbers.take(kind, 1 if length is None else int(numbers.take(length, 1)[0]))
+                for length, kind in kinds
+            ]
+            if name == "face" and corners is not None:
+                faces.append([int(corner) for corner in row[corners]])
+    return points, faces
+
+
+# ---- OBJ, STL --------------------------------------------------------------------------------------------
+
+
+def _obj(data: bytes) -> tuple[F64, list[Face]]:
+    lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
+    vertices: list[bytes] = []
+    faces: list[Face] = []
+    for line in map(bytes.strip, lines):
+        if line.startswith((b"v ", b"v\t")):
+            vertices.append(line[2:])
+        elif line.startswith((b"f ", b"f\t")):
+            said = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
+            if 0 in said:
+                raise ValueError("a face names vertex 0, and the first one is 1")
+            faces.append([number - 1 if number > 0 else len(vertices) + number for number in said])
+    return _rows(vertices), faces
+
+
+def stl_triangles(start: bytes, size: int) -> int | None:
+    """How many triangles a binary STL file of so many bytes claims; None: it is one of text."""
+    claimed = int.from_bytes(start[STL_START - 4 : STL_START], "little")
+    is_text = start.lstrip().lower().startswith(b"solid") and size != STL_START + claimed * STL_TRIANGLE
+    return None if is_text else claimed
+
+
+def _stl(data: bytes) -> tuple[F64, list[Face]]:
+    claimed = stl_triangles(data[:STL_START], len(data))
+    if claimed is None:
+        words = data.lower().split()
+        places = [number for number, word in enumerate(words) if word == b"vertex"]
+        corners = np.array([[float(word) for word in words[at + 1 : at + 4]] for at in places])
+    else:
+        corners = np.frombuffer(data, _STL_TRIANGLE, claimed, STL_START)["corners"].astype(np.float64)
+    corners = corners.reshape(-1, 3, 3)
+    # Each triangle brings its corners; those in the same place are one vertex.
+    points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    faces: list[Face] = list(numbers.reshape(-1, 3).tolist())
+    return points, faces
+
+
+# ---- points ----------------------------------------------------------------------------------------------
+
+
+def _pcd(data: bytes) -> tuple[F64, list[Face]]:
+    """Of the forms ascii and binary (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
+    header, _, rest = data.partition(b"\nDATA ")
+    form, _, body = rest.partition(b"\n")
+    said = {line.split()[0]: line.split()[1:] for line in header.decode("ascii").splitlines() if line.strip()}
+    names, count = said["FIELDS"], int(said["POINTS"][0])
+    repeats = [int(number) for number in said.get("COUNT", ["1"] * len(names))]
+    if form.strip() == b"ascii":
+        first = dict(zip(names, np.cumsum([0, *repeats]).tolist(), strict=False))
+        rows = [line.split() for line in body.splitlines() if line.strip()]
+        if len(rows) != count:
+            raise ValueError(f"it has {len(rows)} points of {count}")
+        points = np.array([[float(row[first[axis]]) for axis in "xyz"] for row in rows])
+        return points.reshape(-1, 3), []
+    kinds = [kind.lower() + size for kind, size in zip(said["TYPE"], said["SIZE"], strict=True)]
+    fields = zip(kinds, repeats, strict=True)
+    row = np.dtype([(str(number), f"<{kind}", (times,)) for number, (kind, times) in enumerate(fields)])
+    values = np.frombuffer(body, row, count)
+    axes = [values[str(names.index(axis))][:, 0].astype(np.float64) for axis in "xyz"]
+    return np.column_stack(axes), []
+
+
+def _xyz(data: bytes) -> tuple[F64, list[Face]]:
+    return _rows([line for line in data.splitlines() if line.strip() and not line.startswith(b"#")]), []

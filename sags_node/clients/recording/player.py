@@ -1,0 +1,201 @@
+"""Publishes a bag on the wire again, as a node would: same sockets, same messages, stamped as if live."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections import OrderedDict
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from sags_node.bags.bag import BagMessage, read_messages
+from sags_node.clients.recording.outgoing import COMPRESSED_SUFFIX, original_stamp, outgoing
+from sags_node.config.schema import PublishConfig
+from sags_node.errors import SagsError
+from sags_node.files import check_name
+from sags_node.messaging import cdr, topics
+from sags_node.messaging.publisher import Publisher
+
+POLL_SECONDS = 0.02  # how soon pause and stop are noticed
+STAMPS_KEPT = 64
+CLOCK_TOPIC = topics.PLAYER_TOPICS[0].name
+FRAME_TYPES = (topics.IMAGE, topics.POINT_CLOUD, topics.CAMERA_INFO, topics.TF)
+
+
+@dataclass(frozen=True, slots=True)
+class PlayOptions:
+    """The flags of `ros2 bag play`. Seconds are those of the recording, but for `delay`.
+
+    Attributes:
+        topics, exclude: without leading slash and namespace; no topics: all.
+        remap: from old to new name, the same way.
+        clock_hz: how often to publish the recording's time; None: never.
+    """
+
+    rate: float = 1.0
+    loop: bool = False
+    delay: float = 0.0
+    start_offset: float = 0.0
+    playback_duration: float | None = None
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    remap: dict[str, str] = field(default_factory=dict)
+    clock_hz: float | None = None
+
+
+class PlayClock:
+    """Runs from `first_ns` of the recording on, `rate` times as fast as the wall clock.
+
+    `at` is a time of `time.monotonic`, s.
+    """
+
+    def __init__(self, first_ns: int, rate: float) -> None:
+        self._first_ns = first_ns
+        self._rate = rate
+        self._started, self._started_ns = time.monotonic(), time.time_ns()
+
+    def pause(self, seconds: float) -> None:
+        """The last `seconds` did not count."""
+        self._started += seconds
+        self._started_ns += round(seconds * 1e9)
+
+    def until(self, recorded_ns: int, at: float) -> float:
+        """Seconds from `at` until a moment of the recording is due; negative when it was."""
+        return self._started + (recorded_ns - self._first_ns) * 1e-9 / self._rate - at
+
+    def wall_ns(self, recorded_ns: int) -> int:
+        """When, on the wall clock, a moment of the recording is due."""
+        return self._started_ns + round((recorded_ns - self._first_ns) / self._rate)
+
+    def moment_ns(self, at: float) -> int:
+        """The moment of the recording that is due at `at`."""
+        return self._first_ns + round((at - self._started) * self._rate * 1e9)
+
+
+class Player:
+    """Call `play` once. `stop` and `toggle_pause` may be called from any thread or signal handler."""
+
+    def __init__(
+        self, path: Path, options: PlayOptions, config: PublishConfig, ns: str = "sags", paused: bool = False
+    ) -> None:
+        self._path = path
+        self._options = options
+        self._config = config
+        self._ns = ns
+        self._stopping = threading.Event()
+        self._paused = paused
+        self._sent = 0
+        self._clock_due = 0.0
+        self._frames: OrderedDict[int, int] = OrderedDict()  # original stamp -> number of the frame
+        self._frame_count = 0
+
+    def stop(self) -> None:
+        self._stopping.set()
+
+    def toggle_pause(self) -> None:
+        self._paused = not self._paused
+
+    def play(self) -> dict[str, Any]:
+        """Publish until the bag ends or `stop`; returns messages, passes and seconds.
+
+        Raises:
+            UsageError: there is no bag, its name is no text, or an endpoint is open to others without keys.
+            SagsError: the bag is damaged, an endpoint is taken, or nothing in the bag was asked for.
+        """
+        began = time.monotonic()
+        passes = 0
+        offered = (*topics.TOPICS, *topics.PLAYER_TOPICS)
+        session, recording = uuid.uuid4().hex, self._path.absolute()
+        check_name(recording)
+        with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
+            self._delay(publisher)
+            while not self._stopping.is_set():
+                self._play_once(publisher, epoch=passes)
+                passes += 1
+                if not self._sent and not self._stopping.is_set():
+                    raise SagsError(f"{self._path} holds no message that was asked for; see sags bag info")
+                if not self._options.loop:
+                    break
+        return {"messages": self._sent, "passes": passes, "seconds": round(time.monotonic() - began, 3)}
+
+    def _play_once(self, publisher: Publisher, epoch: int) -> None:
+        options = self._options
+        first_ns = 0
+        clock = PlayClock(0, options.rate)
+        for message in read_messages(self._path):
+            if not first_ns:
+                first_ns = message.log_ns + round(options.start_offset * 1e9)
+                clock = PlayClock(first_ns, options.rate)
+            after = (message.log_ns - first_ns) * 1e-9
+            if after < 0 or not self._is_wanted(message):
+                continue
+            if options.playback_duration is not None and after > options.playback_duration:
+                return
+            self._wait_for(message.log_ns, clock, publisher, epoch)
+            if self._stopping.is_set():
+                return
+            original = original_stamp(message)
+            stamp_ns = clock.wall_ns(original)
+            name, content = outgoing(message, stamp_ns)
+            number = self._frame_number(original) if content.type in FRAME_TYPES else -1
+            name = name.removeprefix(f"{self._ns}/")
+            content = replace(content, relative=message.relative)
+            publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, epoch)
+            self._sent += 1
+
+    def _delay(self, publisher: Publisher) -> None:
+        """Serve subscriptions before playing begins."""
+        began = time.monotonic()
+        while not self._stopping.is_set():
+            left = began + self._options.delay - time.monotonic()
+            if left <= 0:
+                return
+            publisher.poll(int(min(POLL_SECONDS, left) * 1e3))
+
+    def _wait_for(self, recorded_ns: int, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+        """Serve subscriptions until a moment of the recording is due, and playing is not paused."""
+        before = time.monotonic()
+        while not self._stopping.is_set():
+            now = time.monotonic()
+            if self._paused:
+                clock.pause(now - before)
+            before = now
+            self._tell_time(now, clock, publisher, epoch)
+            left = clock.until(recorded_ns, now)
+            if left <= 0 and not self._paused:
+                return
+            wait = POLL_SECONDS if self._paused else min(POLL_SECONDS, left)
+            if self._options.clock_hz is not None:
+                wait = min(wait, self._clock_due - now)
+            publisher.poll(int(max(wait, 0.0) * 1e3))
+
+    def _tell_time(self, now: float, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+        """Publish the clock when that is due, also while playing is paused."""
+        hz = self._options.clock_hz
+        if hz is None or now < self._clock_due:
+            return
+        self._clock_due += 1 / hz
+        if self._clock_due < now:  # the first time, or this machine is too busy for so many
+            self._clock_due = now + 1 / hz
+        moment_ns = clock.moment_ns(now)
+        publisher.publish_content(CLOCK_TOPIC, cdr.clock(moment_ns), -1, clock.wall_ns(moment_ns), epoch)
+
+    def _is_wanted(self, message: BagMessage) -> bool:
+        name = message.topic.lstrip("/").removesuffix(COMPRESSED_SUFFIX).removeprefix(f"{self._ns}/")
+        options = self._options
+        if not cdr.knows(message.type):
+            return False  # it could not be described to anybody
+        if options.clock_hz is not None and name == CLOCK_TOPIC:
+            return False  # there is one clock
+        return (not options.topics or name in options.topics) and name not in options.exclude
+
+    def _frame_number(self, stamp_ns: int) -> int:
+        """Number frames by their stamps."""
+        if stamp_ns not in self._frames:
+            self._frames[stamp_ns] = self._frame_count
+            self._frame_count += 1
+            if len(self._frames) > STAMPS_KEPT:
+                self._frames.popitem(last=False)
+        return self._frames[stamp_ns]

@@ -1,0 +1,161 @@
+"""A model placed by pairs of points and by its surface, with the errors to expect and a plain verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from sags_node.clients.registration.certainty import nine_of_ten, of_pairs, picking_error
+from sags_node.clients.registration.rigid import kabsch, on_a_line
+from sags_node.clients.registration.surface_fit import fit_surface
+from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
+from sags_node.geometry import Array, invert, transform
+from sags_node.types import F64, Bool
+
+LEAST_PAIRS, MOST_PAIRS = 3, 20
+OTHER_UNIT = 1.3  # times too large or too small: no picking is so wrong
+UNITS = {1000: "mm for m", 100: "cm for m", 10: "mm for cm", 25.4: "mm for inch"}
+MATCHED = 0.003  # m: nearer to the model the surface is the model's
+NEAR = 0.010  # m: farther from it the surface is something else
+
+# Beyond the first a registration is doubtful, beyond the second it is refused, and why; mm, or a share in %.
+LIMITS = (
+    (4.0, 10.0, "the pairs fit each other to {:.1f} mm only: pick the worst of them again"),
+    # Five picked pairs hold it better than a surface on which it slides that far.
+    (0.6, 1.0, "its shape is even (a plane, ball or tube), it slides by {:.1f} mm: show more, with an edge"),
+    (40.0, 70.0, "{:.0f} % of the surface before it do not match: is the organ deformed or covered?"),
+    (1.5, 4.0, "the surface is {:.1f} mm off: is the organ deformed, or another one?"),
+    (5.0, 15.0, "errors up to {:.1f} mm are expected: add pairs, farther apart"),
+)
+FREELY = 0.1  # m: no organ slides farther
+MIRRORED = (
+    "it fits as its mirror image only, so the file has the other handedness: turn one of its axes round"
+)
+UNSEEN = "no surface was measured where the pairs put the model: check them, and that it is in sight"
+Verdict = Literal["good", "doubtful", "refused"]
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """Where the model lies. Lengths in m; None: it was not come to."""
+
+    verdict: Verdict
+    reason: str = ""  # and its remedy; empty: it is good
+    T_world_model: F64 | None = None  # [4, 4]
+    fiducials: F64 | None = None  # [k] how far each pair is off by the pairs alone
+    expected_by_pairs: F64 | None = None  # [t] at each target, nine of ten, by the pairs alone
+    expected: F64 | None = None  # [t] the same after the surface fit
+    moved: F64 | None = None  # [t] how far the surface fit moved each target
+    residual: tuple[float, float] | None = None  # of the surface to the model: median, nine of ten
+    share: float = 0.0  # of the surface in line with the model that lies within `MATCHED` of it
+    matched: Bool | None = None  # [N] which points of the surface these are
+
+    def figures(self, targets: F64) -> dict[str, Any]:
+        """For people and programs, in mm; without what was not come to. `targets` [t, 3] are told as they
+        are."""
+        said: dict[str, Any] = {"verdict": self.verdict, "reason": self.reason or None}
+        if self.fiducials is not None:
+            said["fiducial_mm"] = _in_mm(_rms(self.fiducials))
+            said["pairs_mm"] = [_in_mm(each) for each in self.fiducials]
+        if self.residual is not None:
+            told = [self.expected_by_pairs, self.expected, self.moved]
+            rows: Any = zip(targets.tolist(), *told, strict=True)
+            keys = "at", "expected_by_pairs_mm", "expected_mm", "moved_mm"
+            said["targets"] = [dict(zip(keys, [at, *map(_in_mm, row)], strict=True)) for at, *row in rows]
+            said["residual_median_mm"], said["residual_p90_mm"] = map(_in_mm, self.residual)
+            said["share"] = round(self.share, 3)
+        return said
+
+
+def register(model: Shape, at: F64, places: F64, surface: Surface, targets: F64) -> Registration:
+    """Place a model on the tissue.
+
+    Args:
+        at: [k, 3] points of the model (m), that lie at `places` [k, 3] (m, world).
+        targets: [t, 3] points of the model (m) whose error is told.
+    """
+    if not LEAST_PAIRS <= len(at) <= MOST_PAIRS:
+        return Registration("refused", f"{len(at)} pairs: give {LEAST_PAIRS} to {MOST_PAIRS}, far apart")
+    if on_a_line(at) or on_a_line(places):
+        return Registration("refused", "the points lie on a line, about which it could turn: add one aside")
+    apart, there = (float(np.linalg.norm(points - points.mean(0))) for points in (at, places))
+    if not 1 / OTHER_UNIT < apart / there < OTHER_UNIT:
+        return Registration("refused", _wrong_unit(apart / there))
+    found = _placed(model, at, places, surface, targets)
+    if found.verdict == "good":
+        return found
+    if _placed(model.mirrored(), at * MIRROR, places, surface, targets * MIRROR).verdict == "good":
+        return replace(found, verdict="refused", reason=MIRRORED)
+    return found
+
+
+def _wrong_unit(factor: float) -> str:
+    """What is wrong with a model that is `factor` times as large as where its points were picked."""
+    times, verb = (factor, "divide") if factor > 1 else (1 / factor, "multiply")
+    said = f"the model is {times:.3g} times too {'large' if factor > 1 else 'small'} for where its points lie"
+    unit = min(UNITS, key=lambda each: abs(np.log(times / each)))
+    if not 1 / OTHER_UNIT < times / unit < OTHER_UNIT:
+        return f"{said}: the pairs do not belong together, or --scale is wrong"
+    return f"{said}, as {UNITS[unit]}: {verb} --scale by {unit:g}"
+
+
+def _placed(model: Shape, at: F64, places: F64, surface: Surface, targets: F64) -> Registration:
+    T, centre = kabsch(at, places, np.full(len(at), 1 / len(at))), places.mean(0)
+    residuals, before = places - transform(T, at), transform(T, targets)
+    picked = picking_error(residuals)
+    pairs = of_pairs(transform(T, at) - centre, picked)
+    told = _expected(pairs, before - centre, np.zeros(3))
+    found = Registration("good", "", T, np.linalg.norm(residuals, axis=1), told)
+    fit = fit_surface(model, surface, at, places, picked, T)
+    if fit is None:
+        return replace(found, verdict="refused", reason=UNSEEN)
+    T, counted = fit
+    after, view = transform(T, targets), centre - surface.eye
+    bias = float(np.median(counted.errors)) * view / np.linalg.norm(view)
+    eye, local = transform(invert(T), surface.eye), transform(invert(T), surface.points)
+    side = model.facing(eye)
+    distances = np.linalg.norm(side.nearest(local)[0] - local, axis=1)
+    in_line = side.hides(eye, local)
+    near = distances[in_line & (distances < NEAR)]
+    matched = in_line & (distances < MATCHED)
+    if not matched.any():
+        return replace(found, verdict="refused", reason=UNSEEN)
+    found = replace(
+        found,
+        T_world_model=T,
+        expected=_expected(pairs + counted.information(), after - centre, bias),
+        moved=np.linalg.norm(after - before, axis=1),
+        residual=(float(np.median(near)), float(np.quantile(near, 0.9))),
+        share=float(matched.sum() / in_line.sum()),
+        matched=matched,
+    )
+    return _judged(found, counted.slide())
+
+
+def _expected(information: F64, arms: Array, bias: F64) -> F64:
+    """Nine of ten errors at targets [t, 3]; `bias` [3] is what all depths may be wrong by at once."""
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
+    return np.array([nine_of_ten(covariance, arm, bias) for arm in arms])
+
+
+def _judged(found: Registration, slide: float) -> Registration:
+    """With the worst of what speaks against it; of equals, the first."""
+    assert found.fiducials is not None and found.expected is not None and found.residual is not None
+    slide = min(slide, FREELY)
+    lengths = _rms(found.fiducials), slide, 0.1 * (1 - found.share), found.residual[0], found.expected.max()
+    verdict: Verdict
+    for number, verdict in ((1, "refused"), (0, "doubtful")):
+        for value, (*limits, said) in zip(1e3 * np.array(lengths), LIMITS, strict=True):
+            if value > limits[number]:
+                return replace(found, verdict=verdict, reason=said.format(value))
+    return found
+
+
+def _rms(lengths: F64) -> float:
+    return float(np.sqrt(np.mean(np.square(lengths))))
+
+
+def _in_mm(metres: float) -> float:
+    return round(1e3 * float(metres), 2)

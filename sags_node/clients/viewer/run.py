@@ -1,0 +1,85 @@
+"""Brings what the node shows to the browser, at the rate that node, machine and browser can take."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+
+import viser
+
+from sags_node.clients.viewer.feed import Feed, Moment
+from sags_node.clients.viewer.panel import Asker, Panel
+from sags_node.clients.viewer.scene import Scene
+from sags_node.clients.viewer.server import serving
+from sags_node.messaging.address import THE_NODE, NodeAddress
+from sags_node.messaging.node_clock import NodeClock
+
+RATE = 4.0  # Hz, at first
+IDLE_WAIT = 0.25  # s between looks for a browser
+BROWSER_TIME = 2.0  # s that a browser may take to show an update
+
+
+def run_viewer(
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    insecure: bool = False,
+    node: NodeAddress = THE_NODE,
+    ready: Callable[[str, int], None] = lambda url, port: None,
+    *,
+    stop: threading.Event,
+) -> None:
+    """Serve the viewer until `stop` is set.
+
+    Args:
+        node: it need not run yet. With both `endpoint` and `control` its clock is asked for, too.
+        ready: called with the address and the port once browsers can connect.
+
+    Raises:
+        UsageError: `host` is no loopback address and `insecure` is not given, or the node's keys do not fit.
+        SagsError: the port cannot be bound, or the node's endpoint is malformed.
+    """
+    remote = node.endpoint is not None and node.control is not None
+    feed = Feed(node, NodeClock.at(node) if remote else None)
+    try:
+        with serving(host, port, insecure) as (server, url):
+            scene = Scene(server)
+            panel = Panel(server, scene, Asker(node), node.ns, RATE)
+            server.on_client_connect(scene.look)
+            ready(url, server.get_port())
+            with redirect_stdout(sys.stderr):  # what viser has to say; stdout is for machines
+                _follow(server, feed, scene, panel, stop)
+    finally:
+        feed.close()
+
+
+def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:
+    """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows."""
+    while not stop.is_set():
+        if not server.get_clients():
+            scene.show(Moment())
+            stop.wait(IDLE_WAIT)
+            continue
+        began = time.monotonic()
+        moment = feed.now()
+        scene.show(moment)
+        panel.show(moment)
+        sent = time.monotonic()
+        for client in server.get_clients().values():
+            _await(client)
+        answered = time.monotonic()
+        # Half of the browser's time at most is for taking in updates; the rest is the user's.
+        stop.wait(max(began + 1 / panel.rate - answered, answered - sent))
+
+
+def _await(client: viser.ClientHandle) -> None:
+    """Wait until a browser has shown all that was sent: it answers what is asked behind it.
+
+    Without this a slow browser piles up updates: viser has no other sign of life.
+    """
+    try:
+        client.local_storage.get_item("sags-view", timeout=BROWSER_TIME)
+    except (TimeoutError, RuntimeError):  # too slow, gone, or a browser without storage: it has had its time
+        pass

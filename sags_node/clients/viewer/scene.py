@@ -1,0 +1,163 @@
+"""The 3D scene in the browser: Gaussians, the left camera with its picture, and anchors.
+
+Its unit is the millimetre, because viser keeps covariances as float16: those of tissue in square metres
+would vanish. Its axes are the node's world: x right, y down, z away from the first left camera (OpenCV).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from sags_node.clients.viewer.feed import Moment
+from sags_node.clients.viewer.splats import Splats, splats_of
+from sags_node.confidence import SURE_OF_ANCHOR
+from sags_node.geometry import matrix_to_quat, transform
+from sags_node.types import U8, Camera
+
+UNIT = 1e-3  # m
+FRUSTUM = 12.0  # mm deep
+PICTURE_WIDTH = 240  # px, of the picture in the frustum
+JPEG_QUALITY = 80
+STEP = 4096  # splats
+NEAR = 1.0  # mm; nothing closer is drawn
+ANCHOR_SIZE = 1.5  # mm
+SEEN, UNSURE, HIDDEN = (255, 220, 0), (255, 90, 0), (150, 150, 150)  # colours of an anchor
+ASIDE = np.array([18.0, -16.0, -22.0])  # mm from the left camera, where the overview is drawn from
+USUAL_DEPTH = 80.0  # mm, to look at before any depth is known
+
+
+class Scene:
+    """Shows moments; what is not new is taken away."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.splats: Splats | None = None  # those shown
+        self.camera: Camera | None = None
+        self._server = server
+        self._drawn_splats: viser.GaussianSplatHandle | None = None
+        self._frustum: viser.CameraFrustumHandle | None = None
+        self._anchors: viser.PointCloudHandle | None = None
+        self._labels: dict[int, viser.LabelHandle] = {}
+        self._depth = USUAL_DEPTH  # mm, of the tissue
+        server.scene.set_up_direction("-y")
+        server.initial_camera.up = (0.0, -1.0, 0.0)
+        server.initial_camera.near = NEAR
+        server.initial_camera.position = ASIDE
+        server.initial_camera.look_at = np.array([0.0, 0.0, self._depth])
+
+    def show(self, moment: Moment) -> None:
+        """Bring the scene up to date in one step."""
+        if moment.model is not None and (known := moment.model.depth[moment.model.depth > 0]).size:
+            self._depth = float(np.median(known)) / UNIT
+        with self._server.atomic():
+            self._show_splats(None if moment.splats is None else splats_of(moment.splats))
+            self._show_camera(moment.camera, moment.picture)
+            self._show_anchors(moment.anchors)
+
+    def look(self, client: viser.ClientHandle, through: bool = False) -> None:
+        """Turn a browser to the tissue: from aside, or as the left camera sees it."""
+        pose = np.eye(4) if self.camera is None else self.camera.T_world_cam
+        eye = np.zeros(3) if through else ASIDE
+        with client.atomic():
+            client.camera.position = transform(pose, eye * UNIT) / UNIT
+            client.camera.look_at = transform(pose, np.array([0.0, 0.0, self._depth]) * UNIT) / UNIT
+            client.camera.up_direction = -pose[:3, 1]
+            client.camera.near = 1.1 * FRUSTUM if through else NEAR  # not at the picture in the frustum
+            if through and self.camera is not None:
+                client.camera.fov = _fov(self.camera)
+
+    def _show_splats(self, splats: Splats | None) -> None:
+        """A browser builds its buffers anew when the number changes, so it is filled up to a round one. Each
+        time viser 1.1.1 reports there `computeBoundingSphere(): Computed radius is NaN`. That is of its own
+        flat quad, not of what is sent: nothing is culled then."""
+        self.splats = splats
+        if splats is None or len(splats.means) == 0:
+            if self._drawn_splats is not None:
+                self._drawn_splats.remove()
+            self._drawn_splats = None
+            return
+        count = len(splats.means)
+        filled = np.minimum(np.arange(-(-count // STEP) * STEP), count - 1)  # the last one again and again
+        opacities = np.where(np.arange(len(filled)) < count, splats.opacities[filled], 0)
+        content = (
+            splats.means[filled] / UNIT,
+            splats.covariances(UNIT)[filled],
+            splats.colors[filled],
+            opacities[:, None],
+        )
+        if self._drawn_splats is None:
+            self._drawn_splats = self._server.scene.add_gaussian_splats("/splats", *content)
+        else:
+            self._drawn_splats.set_gaussians(*content)
+
+    def _show_camera(self, camera: Camera | None, picture: U8 | None) -> None:
+        self.camera = camera
+        if camera is None or picture is None:
+            if self._frustum is not None:
+                self._frustum.remove()
+            self._frustum = None
+            return
+        height = max(1, round(camera.height * PICTURE_WIDTH / camera.width))
+        small = cv2.resize(picture, (PICTURE_WIDTH, height), interpolation=cv2.INTER_AREA)
+        if self._frustum is None:
+            self._frustum = self._server.scene.add_camera_frustum(
+                "/left_camera",
+                fov=_fov(camera),
+                aspect=camera.width / camera.height,
+                scale=_frustum_scale(camera),
+                thickness=0.1,
+                color=(230, 230, 230),
+                jpeg_quality=JPEG_QUALITY,
+                format="jpeg",
+                image=small,
+            )
+        else:
+            self._frustum.image = small
+        self._frustum.wxyz = matrix_to_quat(camera.T_world_cam[:3, :3])
+        self._frustum.position = camera.T_world_cam[:3, 3] / UNIT
+
+    def _show_anchors(self, anchors: NDArray[Any] | None) -> None:
+        """Anchors that have a place, as numbered points."""
+        rows = () if anchors is None else anchors[np.isfinite(anchors["x"])]
+        places = {int(row["id"]): np.array([row[axis] for axis in "xyz"]) / UNIT for row in rows}
+        for gone in self._labels.keys() - places.keys():
+            self._labels.pop(gone).remove()
+        for anchor, place in places.items():
+            if anchor not in self._labels:
+                self._labels[anchor] = self._server.scene.add_label(f"/anchors/{anchor}", str(anchor))
+            self._labels[anchor].position = place
+        if self._anchors is not None and not places:
+            self._anchors.remove()
+            self._anchors = None
+        if places:
+            self._anchors = self._server.scene.add_point_cloud(
+                "/anchor_points",
+                np.array(list(places.values())),
+                np.array([anchor_color(row) for row in rows], np.uint8),
+                point_size=ANCHOR_SIZE,
+                point_shape="circle",
+                precision="float32",
+            )
+
+
+def anchor_color(row: Any) -> tuple[int, int, int]:
+    """Grey while the left eye does not see it; orange where it is seen and not recognised."""
+    if row["visibility"] == 0:
+        return HIDDEN
+    return SEEN if row["confidence"] >= SURE_OF_ANCHOR else UNSURE
+
+
+def _fov(camera: Camera) -> float:
+    """Vertical field of view, radians."""
+    return 2 * math.atan(camera.height / (2 * float(camera.K[1, 1])))
+
+
+def _frustum_scale(camera: Camera) -> float:
+    """viser keeps the volume of frustums alike, not their depth; this makes one `FRUSTUM` deep."""
+    half_height = math.tan(_fov(camera) / 2)
+    return FRUSTUM * math.cbrt(half_height * half_height * camera.width / camera.height / 3)

@@ -1,4 +1,0 @@
-"""How right a run was: metrics, truth, summaries, reports.
-
-Imports config, detail, engine, kernels, mapping, messaging, model, phantom, pipeline, sources and vision.
-"""

@@ -1,4 +1,0 @@
-"""Offline fit of the deformable model to a whole clip.
-
-Imports config, engine, evaluation, field, kernels, mapping, model and pipeline.
-"""

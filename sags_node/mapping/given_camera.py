@@ -1,0 +1,72 @@
+"""Where the camera is: what says so, and the simplest that does: its poses are given, or it stands still."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from sags_node.mapping.motion import Drawn, Tracks
+from sags_node.types import F64, Observation, RenderedView
+
+
+class Localizer(Protocol):
+    """Says where the camera is, frame by frame.
+
+    Attributes:
+        lost: why the camera is lost; None: it is not.
+        unsure: why the picture could not tell in the last frame; empty: it could, or it was not asked.
+        by_picture: the pose follows from the pictures, so that it tells nothing that they do not.
+    """
+
+    lost: str | None
+    unsure: str
+    by_picture: bool
+
+    @property
+    def pose(self) -> F64:
+        """`T_world_cam` [4, 4] of the last frame."""
+
+    def guess(self, given: F64 | None) -> F64 | None:
+        """The pose of a frame before it is looked at; None: that of a camera that stands still.
+
+        Args:
+            given: what its session says.
+        """
+
+    def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
+        """Find the pose of a frame whose camera is as guessed, or be `lost`.
+
+        Args:
+            last: the frame before, and `tracks` from it to this one; None: there is no model yet.
+
+        Returns:
+            Where the Gaussians are found in it.
+        """
+
+    def learn(self, observation: Observation, view: RenderedView) -> None:
+        """Learn from a frame that was taken in."""
+
+
+class GivenCamera:
+    """A `Localizer` that takes the poses of the session, if it `follows` them, and is never lost."""
+
+    lost: str | None = None
+    unsure = ""
+    by_picture = False
+
+    def __init__(self, follows: bool) -> None:
+        self._follows = follows
+        self.pose: F64 = np.eye(4)
+
+    def guess(self, given: F64 | None) -> F64 | None:
+        """What is given, or None."""
+        return given if self._follows else None
+
+    def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
+        """Take the pose as it is."""
+        self.pose = observation.camera.T_world_cam
+        return tracks
+
+    def learn(self, observation: Observation, view: RenderedView) -> None:
+        """Nothing is learnt."""

@@ -1,0 +1,319 @@
+"""A recorder in a process of its own, started by the node: whatever the disk does, the node does not feel it.
+
+The child is `sags bag record --stdin`: it ends when its standard input does, so also when the node is killed.
+A disk may hang, so nothing here waits for the child without a limit.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import shlex
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Literal
+
+import msgspec
+
+from sags_node.errors import SagsError
+from sags_node.node import recorder_state as state
+from sags_node.processes import KILL_SECONDS, end
+from sags_node.types import Finding
+
+START_SECONDS = 60.0  # for the child to load and to open its file
+SNAPSHOT_SECONDS = 60.0  # to write what the ring holds
+FINISH_SECONDS = 60.0  # to write what waits and the index
+PATIENCE = 1.0  # s until a node that ends says what it waits for
+
+log = logging.getLogger(__name__)
+
+
+class _Request(msgspec.Struct, forbid_unknown_fields=True):
+    """The arguments of `start_recording`."""
+
+    path: str
+    topics: list[str] = []
+    compression: Literal["none", "jpeg", "png"] = "none"
+    max_cache_mb: float | None = None
+    snapshot_seconds: float | None = None
+    max_bag_size: int | None = None
+    max_bag_duration: float | None = None
+
+
+class RecorderProcess:
+    """One recording at a time. Each method gives a future at once, for the control socket.
+
+    Args:
+        ns: of the node.
+        endpoint: where the child subscribes; ipc, so that it needs no keys. None: recording is refused.
+    """
+
+    def __init__(self, ns: str, endpoint: str | None) -> None:
+        self._ns = ns
+        self._endpoint = endpoint
+        self._child: _Child | None = None
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
+
+    def start(self, args: Mapping[str, Any]) -> Future[Any]:
+        """Record to the new folder `path`; the answer is `{"recording": folder}`."""
+        return self._worker.submit(self._start, args)
+
+    def snapshot(self) -> Future[Any]:
+        """Write the last seconds of a recording with `snapshot_seconds`; the answer names the folder."""
+        return self._worker.submit(self._snapshot)
+
+    def stop(self) -> Future[Any]:
+        """Finish the recording; the answer is its summary."""
+        return self._worker.submit(self._stop)
+
+    def status(self) -> dict[str, Any] | None:
+        """How the recording goes, as the recorder said it last, and under `ended` why it has ended by itself.
+        None: nothing is being recorded. Any thread may call this."""
+        child = self._child
+        if child is None or not child.has_begun:
+            return None
+        return {"folder": str(child.folder), **child.progress, "ended": child.ended}
+
+    def findings(self) -> Iterator[Finding]:
+        """What a person should know of the recording. Any thread may call this."""
+        said = self.status()
+        if said is not None and said["ended"] is not None:
+            text = f"the recording to {said['folder']} has ended: {said['ended']}; begin another one"
+            yield Finding("recording_ended", text)
+        elif said is not None and "seconds" in said:
+            yield from state.findings(said)
+
+    def close(self) -> None:
+        """Finish a recording that is still running. A Ctrl-C meanwhile ends it at once."""
+        child = self._child
+        try:
+            if child is not None:
+                self._wait_for(self._worker.submit(self._stop_if_running), child)
+        except BaseException:
+            if child is not None:
+                child.kill()
+            raise
+        finally:
+            self._worker.shutdown(wait=False)  # each of its requests has its time limit
+
+    def _wait_for(self, stopped: Future[Any], child: _Child) -> None:
+        try:
+            try:
+                stopped.result(PATIENCE)
+            except TimeoutError:
+                log.warning("waiting for the recorder of %s; Ctrl-C breaks off", child.folder)
+                stopped.result(SNAPSHOT_SECONDS + FINISH_SECONDS + KILL_SECONDS)  # what waits before it, too
+        except (SagsError, TimeoutError) as error:
+            log.warning("%s", error)
+
+    def _start(self, args: Mapping[str, Any]) -> Any:
+        if self._child is not None and self._child.is_running:
+            raise SagsError("a recording is running already; stop_recording ends it")
+        if self._endpoint is None:
+            raise SagsError("recording needs the node's ipc socket; start the node with publish.ipc:=true")
+        try:
+            request = msgspec.convert(dict(args), _Request)
+        except msgspec.ValidationError as error:
+            raise SagsError(f"{error}; start_recording takes path and what sags bag record takes") from None
+        folder = Path(request.path).absolute()
+        command = [sys.executable, "-m", "sags_node", "bag", "record", "--stdin", "--json"]
+        command += ["--endpoint", self._endpoint, "--ns", self._ns, "--compression", request.compression]
+        command += ["-o", str(folder)]
+        for name in request.topics:
+            command += ["--topics", name]
+        for option, value in (
+            ("--max-cache", request.max_cache_mb),
+            ("--snapshot-mode", request.snapshot_seconds),
+            ("--max-bag-size", request.max_bag_size),
+            ("--max-bag-duration", request.max_bag_duration),
+        ):
+            if value is not None:
+                command += [option, str(value)]
+        self._child = _Child(command, folder, has_ring=request.snapshot_seconds is not None)
+        try:
+            answer = self._child.answer(START_SECONDS)
+            self._child.has_begun = True
+            return answer
+        except SagsError:  # it has said why, and ends
+            self._child.kill()
+            self._child = None
+            raise
+        except TimeoutError:
+            self._child.kill()
+            raise SagsError(
+                f"the recorder did not begin in {START_SECONDS:g} s; does the disk of {folder} answer?"
+            ) from None
+
+    def _snapshot(self) -> Any:
+        child = self._running()
+        if not child.has_ring:
+            raise SagsError(
+                "this recording writes all that comes and keeps nothing for a snapshot; begin one with "
+                "start_recording with snapshot_seconds"
+            )
+        child.ask("snapshot")
+        try:
+            return child.answer(SNAPSHOT_SECONDS)
+        except TimeoutError:
+            raise SagsError(
+                f"no snapshot came from the recorder in {SNAPSHOT_SECONDS:g} s; does the disk of "
+                f"{child.folder} answer?"
+            ) from None
+
+    def _stop(self) -> Any:
+        child = self._running()
+        self._child = None
+        try:
+            return child.finish(FINISH_SECONDS)
+        except TimeoutError:
+            child.kill()
+            raise SagsError(
+                f"the recorder did not finish in {FINISH_SECONDS:g} s and was ended; save what it wrote "
+                f"with: sags bag recover {shlex.quote(str(child.folder))} -o OUT"
+            ) from None
+
+    def _stop_if_running(self) -> None:
+        if self._child is not None:  # a request that came before may have stopped it
+            self._stop()
+
+    def _running(self) -> _Child:
+        if self._child is None:
+            raise SagsError("nothing is being recorded; start_recording {path} begins")
+        return self._child
+
+
+class _Child:
+    """The command and what it answers, line by line.
+
+    Args:
+        folder: of the recording.
+        has_ring: it was started to take snapshots.
+
+    Raises:
+        SagsError: it cannot be started.
+    """
+
+    def __init__(self, command: list[str], folder: Path, has_ring: bool) -> None:
+        if any("\0" in part for part in command):
+            raise SagsError("path and topics cannot hold a zero character")
+        self.folder = folder
+        self.has_ring = has_ring
+        self.has_begun = False
+        self.progress: dict[str, Any] = {}  # once a second
+        self.ended: str | None = None  # why, where nobody has asked for it
+        self._errors = tempfile.TemporaryFile(
+            "w+", errors="replace"
+        )  # a pipe that is full would stop the child
+        self._lines: SimpleQueue[dict[str, Any] | None] = SimpleQueue()  # None: there will be no more
+        pipe = subprocess.PIPE
+        try:
+            self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self._errors, text=True)
+        except OSError as error:
+            raise SagsError(f"the recorder cannot be started: {error.strerror}") from None
+        threading.Thread(target=self._listen, name="recorder-lines", daemon=True).start()
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.poll() is None
+
+    def ask(self, line: str) -> None:
+        """Send a line; answers to earlier ones that came too late are forgotten."""
+        while not self._lines.empty() and self._next_line(0.0) is not None:
+            pass
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{line}\n")
+            self._process.stdin.flush()
+        except OSError:
+            pass  # it has ended; `answer` says why
+
+    def answer(self, seconds: float) -> Any:
+        """The next line it says.
+
+        Raises:
+            SagsError: it has ended instead.
+            TimeoutError: it says nothing.
+        """
+        return self._said(self._next_line(seconds))
+
+    def finish(self, seconds: float) -> Any:
+        """Let it end; the last line it says.
+
+        Raises:
+            SagsError: it has failed.
+            TimeoutError: it does not end.
+        """
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.close()
+        except OSError:
+            pass  # it has ended already
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError from None
+        said = None
+        while (line := self._next_line(KILL_SECONDS)) is not None:
+            said = line
+        summary = self._said(said)
+        if self._process.returncode != 0:
+            raise SagsError(self.ended)
+        return summary
+
+    def kill(self) -> None:
+        """End it at once. What it wrote can be recovered."""
+        if not end(self._process, grace=0.0):
+            log.warning("the recorder of %s cannot be ended; does its disk answer?", self.folder)
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        error = None
+        try:
+            for line in self._process.stdout:
+                said = json.loads(line)
+                if "progress" in said:
+                    self.progress = said["progress"]
+                else:
+                    error = said.get("error")
+                    self._lines.put(said)
+        except ValueError:  # no JSON
+            log.exception("the recorder of %s says what nobody understands", self.folder)
+        finally:
+            self.ended = error or self._last_words()
+            self._lines.put(None)
+
+    def _next_line(self, seconds: float) -> dict[str, Any] | None:
+        """None when there will be no more, however often it is asked."""
+        try:
+            line = self._lines.get(timeout=seconds)
+        except Empty:
+            raise TimeoutError from None
+        if line is None:
+            self._lines.put(None)
+        return line
+
+    def _said(self, said: dict[str, Any] | None) -> Any:
+        """What it says; a failure where it says `error`, or nothing more."""
+        if said is None:
+            raise SagsError(self.ended)
+        if "error" in said:
+            raise SagsError(said["error"])
+        return said
+
+    def _last_words(self) -> str:
+        """Of a recorder that ended without a line on stdout."""
+        try:
+            self._process.wait(KILL_SECONDS)
+        except subprocess.TimeoutExpired:
+            return "the recorder closed its output and did not end"
+        self._errors.seek(0)
+        said = " ".join(self._errors.read().split())
+        if said:
+            return f"the recorder failed: {said}"
+        return f"the recorder was ended; save what it wrote with: sags bag recover {self.folder} -o OUT"

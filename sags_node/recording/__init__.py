@@ -1,4 +1,0 @@
-"""Recordings in MCAP: written, read, played, recovered.
-
-Imports config, media, messaging and rig.
-"""

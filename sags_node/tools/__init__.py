@@ -1,0 +1,1 @@
+"""Work on recordings, with the node's pipeline inside."""

@@ -1,0 +1,205 @@
+"""`sags calib check`: a calibration, alone or against the pictures it is for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sags_node.checks import Finding, is_wrong
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import LaunchConfig, PhantomSource
+from sags_node.errors import SagsError, UsageError
+from sags_node.phantom import cached_session
+from sags_node.rig import (
+    already_rectified,
+    check_eyes,
+    check_pair,
+    find_form,
+    read_rig,
+    rectifies,
+    unknown_form,
+    with_unit,
+)
+from sags_node.sources.pictures import size_text
+from sags_node.sources.rectified import as_named, as_pictures_come
+from sags_node.sources.source import recorded_rig
+from sags_node.tools.calibration.guess import first_pairs
+from sags_node.tools.calibration.matches import match_eyes
+from sags_node.tools.calibration.pictures import Pair, pairs_of_files, pairs_of_session
+from sags_node.tools.calibration.principal_points import judge_known_depths
+from sags_node.tools.calibration.rows import Rows, judge_matches, judge_rectified, judge_scale, rectified_rows
+from sags_node.types import F32, StereoFrame, StereoRig
+from sags_node.vision.rectify import Rectifier
+from sags_node.vision.row_error import measure_rows
+
+Progress = Callable[[int, int], None]
+GOOD_ROWS = (0.7, 2.0)  # px of the full picture, median and 90 %
+FIRST_PAIRS = 2  # that tell whether pictures were rectified
+DISPARITY_MARGIN = 4.0  # px beyond those of matched points
+
+
+def check_calibration(
+    path: Path,
+    session: Path | None = None,
+    images: Sequence[tuple[Path, Path]] = (),
+    overrides: Sequence[str] = (),
+    size: tuple[int, int] | None = None,
+    metres: float | None = None,
+    progress: Progress | None = None,
+) -> list[Finding]:
+    """Look over a calibration, or the one a session uses, and compare it with pictures where there are some.
+
+    Args:
+        path: a calibration of any known form, or a session, which is then compared with its own pictures.
+        session: launch file or session folder whose pictures are used.
+        images: pairs of files or of folders.
+        overrides: `key:=value` of the session.
+        size, metres: as in `read_rig`.
+
+    Raises:
+        UsageError: a path is wrong, or nothing known is there.
+        SagsError: pictures cannot be read.
+    """
+    own = None if find_form(path) is not None else _launched(path, overrides)
+    config = own if session is None else load_launch(session, overrides)
+    pairs: list[Pair] = []
+    depths: Sequence[F32 | None] = ()
+    if images:
+        pairs = pairs_of_files(images)
+    elif config is not None:
+        pairs, depths = pairs_of_session(config, progress)
+    if pairs and size is None:
+        size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+    if own is not None:
+        rig = _rig_of(own, size, metres)
+    elif config is not None:
+        rig = as_pictures_come(read_rig(path, size, metres), config.model_copy(update={"rig": path}))
+    else:
+        rig = as_named(read_rig(path, size, metres), *(file for pair in images for file in pair))
+    return judge(rig, pairs, depths, metres)
+
+
+def read_calibration(path: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+    """`read_rig`, also of the calibration that a session uses."""
+    known = find_form(path) is not None
+    return read_rig(path, size, metres) if known else _rig_of(_launched(path, ()), size, metres)
+
+
+def judge(
+    rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = (), metres: float | None = None
+) -> list[Finding]:
+    """Look over a calibration, and compare it with raw pictures where there are some."""
+    findings = check_eyes(rig)
+    if is_wrong(findings):
+        return findings
+    findings += check_pair(rig, metres)
+    if rig.left.P[0, 3] == rig.right.P[0, 3]:  # without a baseline pictures tell nothing
+        return findings
+    return findings + (check_pictures(rig, pairs, depths) if pairs else [])
+
+
+def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
+    """What raw pictures say of a rig whose numbers are sound.
+
+    Args:
+        depths: what is known of each pair's depth, [H, W] m of the left rectified picture, 0 unknown.
+    """
+    size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+    if size != (rig.left.width, rig.left.height):
+        return [_wrong_size(rig, size)]
+    found = [match_eyes(*pair) for pair in pairs]
+    matches = np.concatenate(found)
+    rectified = judge_rectified(rig, matches)
+    if rectified:
+        rig = already_rectified(rig)
+    findings = rectified + judge_matches(rig, matches)
+    if findings[-1].level == "ok":
+        rows = rectified_rows(rig, matches)
+        findings.append(_check_rows(rig, pairs, rows))
+        findings += judge_scale(rig, rows)
+        if depths:
+            findings += judge_known_depths(rig, found, depths)
+    return findings
+
+
+def rectified_before(config: LaunchConfig) -> bool:
+    """Whether the first pictures of a session show that they were rectified, though their names do not say
+    so; False where they cannot be read."""
+    try:
+        rig = _rig_of(config, None, None)
+        if config.rectified is not None or not rectifies(rig):
+            return False
+        matches = [match_eyes(*pair) for pair in first_pairs(config.source, FIRST_PAIRS)[2]]
+    except SagsError:  # whoever plays it says so
+        return False
+    return bool(matches) and bool(judge_rectified(rig, np.concatenate(matches)))
+
+
+def _launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
+    if not path.exists():
+        raise UsageError(unknown_form(path))
+    try:
+        return load_launch(path, overrides)
+    except UsageError as error:
+        if (path / "launch.yaml").exists():
+            raise
+        raise UsageError(f"{unknown_form(path)}. Nor is it a session: {error}") from None
+
+
+def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+    """The calibration that a session would use, not judged yet."""
+    if isinstance(config.source, PhantomSource):
+        return read_rig(cached_session(config.source) / "calib")
+    if config.rig is not None:
+        return as_pictures_come(read_rig(config.rig, size, metres), config)
+    rig = recorded_rig(config.source, judged=False)
+    if rig is None:
+        raise UsageError("the session names no calibration: set rig to its folder")
+    return as_pictures_come(with_unit(rig, metres), config)
+
+
+def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:
+    calibrated = rig.left.width, rig.left.height
+    ratio = size[0] / calibrated[0]
+    what = f"the calibration is for {size_text(*calibrated)} px, the pictures are {size_text(*size)}"
+    if ratio != size[1] / calibrated[1]:
+        fix = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
+        return Finding("error", what, fix)
+    fix = (
+        f"calibrate at {size_text(*size)}, or if the pictures are only resized, not cropped: "
+        f"sags calib convert PATH -o FOLDER --scale {ratio:g}"
+    )
+    return Finding("error", f"{what}, {ratio:.3g} times as large", fix, {"scale": ratio})
+
+
+def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
+    """Dense rows of the rectified pictures: finer than those of matched points, where these fit roughly."""
+    rectifier = Rectifier(rig, rig.left.width, rig.left.height)
+    smallest, largest = np.percentile(rows.disparities, [2, 98])
+    measured = []
+    for left, right in pairs:
+        pair = rectifier(StereoFrame(0, 0, 0, left, right))
+        assert pair.right is not None  # this frame has one
+        error = measure_rows(pair.left, pair.right, smallest - DISPARITY_MARGIN, largest + DISPARITY_MARGIN)
+        if error is not None:
+            measured.append(error)
+    if not measured:
+        return Finding("warning", "too little matches densely to measure rows", "give sharper pictures")
+    median, p90, matched = (float(figure) for figure in np.median(measured, axis=0))
+    figures = {"row_median_px": round(median, 3), "row_p90_px": round(p90, 3), "matched": round(matched, 3)}
+    what = f"rows agree to {median:.2f} px (median), {p90:.2f} px (90 %), over {matched:.0%} of the picture"
+    if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
+        return Finding("ok", what, "", figures)
+    fix = "depth suffers: calibrate again, with the scope as it is used"
+    if rows.scale_differs:  # that is said next, and what is left is no turn
+        return Finding("warning", what, fix, figures)
+    pitch, roll = rows.turn
+    lower = float(np.median(rows.errors))
+    turned = (
+        f"; as if one eye were turned by {pitch:.2f} degrees up or down, {roll:.2f} about its axis, or the "
+        f"right one's principal point lay {abs(lower):.1f} px {'lower' if lower > 0 else 'higher'}"
+    )
+    turn = {"pitch_deg": pitch, "roll_deg": roll, "row_offset_px": round(lower, 3)}
+    return Finding("warning", what + turned, fix, figures | turn)

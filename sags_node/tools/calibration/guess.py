@@ -1,0 +1,78 @@
+"""A rig for eyes that nobody has calibrated: usual optics, and the rows that their own pictures show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from sags_node.config.schema import RecordedSource, Source
+from sags_node.errors import SagsError
+from sags_node.rig import guessed_rig
+from sags_node.sources.replay import Replay
+from sags_node.sources.source import open_source
+from sags_node.tools.calibration.matches import match_eyes
+from sags_node.tools.calibration.pictures import Pair
+from sags_node.tools.calibration.rows import FEWEST_MATCHES, rectified_rows
+from sags_node.types import F64, Eye, StereoRig
+
+LOOKED_AT = 4  # frames, and
+EVERY = 10  # between them
+ROUNDS = 3  # a turn moves columns too, and these the rows
+
+
+def guess_rig(source: Source) -> StereoRig:
+    """A rig for the pictures of a source, with depth up to a factor that nobody knows; not `metric`.
+
+    Raises:
+        SagsError: it gives no frame.
+    """
+    (width, height), pixel_aspect, pairs = first_pairs(source)
+    return with_equal_rows(guessed_rig(width, height, pixel_aspect), pairs)
+
+
+def with_equal_rows(rig: StereoRig, pairs: Sequence[Pair]) -> StereoRig:
+    """The rig with its right eye turned and zoomed until the rows of pictures agree; as it is where too
+    little matches to tell."""
+    matches = np.concatenate([np.empty((0, 4)), *(match_eyes(*pair) for pair in pairs)])
+    if len(matches) < FEWEST_MATCHES:
+        return rig
+    for _ in range(ROUNDS):
+        rows = rectified_rows(rig, matches)
+        pitch, roll = np.radians(rows.turn)
+        scale = rows.scale if rows.scale_differs else 0.0
+        rig = replace(rig, right=_turned(rig.right, pitch, roll, 1 + scale))
+    return rig
+
+
+def _turned(eye: Eye, pitch: float, roll: float, scale: float) -> Eye:
+    """An eye whose points lie higher by `pitch` + `roll` x at distance 1, and picture is `scale` as large."""
+    turn: F64 = cv2.Rodrigues(np.array([pitch, 0.0, -roll]))[0]
+    K = np.diag([scale, scale, 1.0]) @ eye.K
+    K[:2, 2] = eye.K[:2, 2]
+    return replace(eye, K=K, R=turn @ eye.R)
+
+
+def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int], float, list[Pair]]:
+    """Width and height of an eye's picture, px, those of its pixels as a ratio, and some pairs; none where
+    there is one eye.
+
+    Raises:
+        SagsError: it gives no frame.
+    """
+    if isinstance(source, RecordedSource):
+        source = source.model_copy(update={"pace": "step", "loop": False, "warm_up": 0})
+    size, pairs = None, list[Pair]()
+    with open_source(source, references=False) as opened:
+        pixel_aspect = opened.pairs.pixel_aspect if isinstance(opened, Replay) else 1.0
+        for index, frame in enumerate(opened):
+            size = size or (frame.left.shape[1], frame.left.shape[0])
+            if frame.right is not None and index % EVERY == 0:
+                pairs.append((frame.left, frame.right))
+            if frame.right is None or len(pairs) == count:
+                break
+    if size is None:
+        raise SagsError("no calibration, and not one frame came that could tell a size; set rig")
+    return size, pixel_aspect, pairs

@@ -1,0 +1,260 @@
+"""Hand-eye calibration from views of a board that lies still, with the offset of the two clocks.
+
+First the rotations (Park and Martin, T-RA 1994), for each offset that is possible: the one at which the turns
+of the robot and of the camera agree best. Then everything together: the camera on the hand, the board in the
+base, and the offset, so that the corners of all views fall on those that both eyes saw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+
+from sags_node.errors import SagsError
+from sags_node.geometry import invert
+from sags_node.rig.hand_eye import HandEye
+from sags_node.tools.calibration.boards import StereoView
+from sags_node.types import F32, F64, I64, StereoRig
+
+PoseAt = Callable[[int], F64 | None]  # the robot's pose [4, 4] at its own time, ns; None: not known
+
+FEWEST_VIEWS = 10
+LARGEST_OFFSET_NS = 500_000_000
+OFFSET_STEP_NS = 10_000_000
+MOST_PAIRS = 400  # of views, whose relative turns are compared
+# Of a numeric derivative: m and rad; and s, between two poses motion is straight.
+STEPS = np.array([1e-6] * 12 + [1e-3])
+ROUNDS = 30
+UNSURE = (0.005, np.radians(1.0))  # m, rad: beyond it the motion does not tell enough
+LEAST_TURN = np.radians(0.5)  # root mean square: a board's turn is seen to a tenth of it
+_TURN = "turn the scope about two different axes, by 20 degrees and more"
+LARGEST_ERROR = 5.0  # px: beyond it the poses are not those of this camera
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeSolution:
+    """The calibration, and what is known of its quality."""
+
+    hand_eye: HandEye
+    errors: F64  # [V] px, root mean square of each view, both eyes
+    names: list[str]  # of the views used
+    position_error: float  # m, standard deviation of the camera's place on the hand
+    rotation_error: float  # rad
+    offset_error_ns: float
+
+
+def solve_hand_eye(
+    views: Sequence[StereoView], stamps: Sequence[int], points: F32, rig: StereoRig, pose_at: PoseAt
+) -> HandEyeSolution:
+    """Find how the left raw camera sits on the hand.
+
+    Args:
+        views: of one board that lies still.
+        stamps: when each was taken, by the pictures' clock, ns.
+        points: [N, 3] m, the board's corners by id.
+
+    Raises:
+        SagsError: there are too few views with poses, the scope was not turned enough, or nothing fits.
+    """
+    pose_at = cache(pose_at)  # steps that leave the offset ask again
+    boards = np.stack([_board_pose(view, points, rig) for view in views])
+    offset = _coarse_offset(boards, stamps, pose_at)
+    known = [i for i, stamp in enumerate(stamps) if _around(pose_at, stamp + offset)]
+    _enough(len(known), len(views))
+    views, boards, stamps = [views[i] for i in known], boards[known], [stamps[i] for i in known]
+    hands = np.stack([_known(pose_at(stamp + offset)) for stamp in stamps])
+    _turned_enough(_turns(hands, boards)[1])
+    X = _linear(hands, boards)
+    Z = hands[0] @ X @ boards[0]
+    residuals = _Residuals(views, stamps, points, rig, pose_at, X, Z, offset)
+    parameters, covariance, spread = _least_squares(residuals)
+    X, _, offset = residuals.unpacked(parameters)
+    corners = residuals(parameters).reshape(-1, 2)
+    ends = np.cumsum([2 * len(view.ids) for view in views])
+    errors = np.array([np.sqrt(np.mean(np.sum(part**2, 1))) for part in np.split(corners, ends[:-1])])
+    if np.sqrt(np.mean(errors**2)) > LARGEST_ERROR:
+        raise SagsError(
+            f"the poses fit the pictures only to {np.sqrt(np.mean(errors**2)):.1f} px: the board must lie "
+            "still, the poses must be of what carries this camera, and the rig must fit the scope"
+        )
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0)) * spread
+    turn, place, clock = np.linalg.norm(deviations[:3]), np.linalg.norm(deviations[3:6]), deviations[12]
+    if not (place < UNSURE[0] and turn < UNSURE[1]):
+        raise SagsError(
+            f"the motion does not tell where the camera sits (to {place * 1e3:.1f} mm, "
+            f"{np.degrees(turn):.2f} degrees): {_TURN}"
+        )
+    names = [view.name for view in views]
+    return HandEyeSolution(HandEye(X, offset), errors, names, float(place), float(turn), float(clock * 1e9))
+
+
+def _enough(count: int, of: int) -> None:
+    if count < FEWEST_VIEWS:
+        raise SagsError(
+            f"{count} of {of} views of the board have a pose of the robot; {FEWEST_VIEWS} are needed, "
+            "60 are good"
+        )
+
+
+def _turned_enough(turns: F64) -> None:
+    """Turns [P, 3] must go about two axes: about one alone nothing tells how far the camera sits along it."""
+    second = np.linalg.svd(turns, compute_uv=False)[1] / np.sqrt(len(turns))
+    if second < LEAST_TURN:
+        raise SagsError(
+            f"the scope is turned by {np.degrees(second):.2f} degrees about its second axis, which does not "
+            f"tell where the camera sits: {_TURN}"
+        )
+
+
+def _known(T: F64 | None) -> F64:
+    assert T is not None
+    return T
+
+
+def _around(pose_at: PoseAt, t_ns: int) -> bool:
+    """Whether the pose is known also for the steps of the search."""
+    reach = 2 * OFFSET_STEP_NS
+    return all(pose_at(t_ns + step) is not None for step in (-reach, 0, reach))
+
+
+def _board_pose(view: StereoView, points: F32, rig: StereoRig) -> F64:
+    """Board to left raw camera [4, 4] m."""
+    eye = rig.left
+    _, turn, place = cv2.solvePnP(
+        points[view.ids], view.left, eye.K, eye.distortion, flags=cv2.SOLVEPNP_ITERATIVE
+    )
+    return _rigid(np.concatenate([turn.ravel(), place.ravel()]))
+
+
+def _coarse_offset(boards: F64, stamps: Sequence[int], pose_at: PoseAt) -> int:
+    """The offset at which the turns of robot and camera agree best, ns."""
+    best, least, most = 0, np.inf, 0
+    for offset in range(-LARGEST_OFFSET_NS, LARGEST_OFFSET_NS + 1, OFFSET_STEP_NS):
+        poses = [pose_at(stamp + offset) for stamp in stamps]
+        known = [i for i, pose in enumerate(poses) if pose is not None]
+        most = max(most, len(known))
+        if len(known) < max(FEWEST_VIEWS, 0.5 * len(stamps)):
+            continue
+        robot, camera = _turns(np.stack([_known(poses[i]) for i in known]), boards[known])
+        R = _rotation(robot, camera)
+        residual = float(np.mean(np.sum((robot - camera @ R.T) ** 2, 1)))
+        if residual < least:
+            best, least = offset, residual
+    if least == np.inf:
+        _enough(min(most, FEWEST_VIEWS - 1), len(stamps))
+    return best
+
+
+def _pairs(count: int) -> tuple[I64, I64]:
+    first, second = np.triu_indices(count, 1)
+    step = max(1, len(first) // MOST_PAIRS)
+    return first[::step], second[::step]
+
+
+def _turns(hands: F64, boards: F64) -> tuple[F64, F64]:
+    """Rotation vectors [P, 3] from one view to another: of the hand and of the camera, in their own axes."""
+    first, second = _pairs(len(hands))
+    hand = np.swapaxes(hands[first, :3, :3], 1, 2) @ hands[second, :3, :3]
+    camera = boards[first, :3, :3] @ np.swapaxes(boards[second, :3, :3], 1, 2)
+    return _logarithms(hand), _logarithms(camera)
+
+
+def _logarithms(R: F64) -> F64:
+    return np.stack([cv2.Rodrigues(one)[0].ravel() for one in R])
+
+
+def _rotation(robot: F64, camera: F64) -> F64:
+    """The rotation [3, 3] that turns the camera's vectors into the robot's (Kabsch)."""
+    U, _, Vt = np.linalg.svd(robot.T @ camera)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))])
+    rotation: F64 = U @ sign @ Vt
+    return rotation
+
+
+def _linear(hands: F64, boards: F64) -> F64:
+    """A first hand-eye transform [4, 4]: A X = X B for the motions A of the hand and B of the camera."""
+    first, second = _pairs(len(hands))
+    A, B = np.linalg.inv(hands[first]) @ hands[second], boards[first] @ np.linalg.inv(boards[second])
+    X = np.eye(4)
+    X[:3, :3] = _rotation(*_turns(hands, boards))
+    right = B[:, :3, 3] @ X[:3, :3].T - A[:, :3, 3]
+    X[:3, 3] = np.linalg.lstsq((A[:, :3, :3] - np.eye(3)).reshape(-1, 3), right.ravel(), rcond=None)[0]
+    return X
+
+
+@dataclass(frozen=True, slots=True)
+class _Residuals:
+    """How far all corners are from where the parameters put them, px, left eye and right eye.
+
+    Parameters [13]: a small motion of the camera on the hand (turn, place), one of the board, and the
+    offset's difference from the first one, s.
+    """
+
+    views: Sequence[StereoView]
+    stamps: Sequence[int]
+    points: F32
+    rig: StereoRig
+    pose_at: PoseAt
+    X: F64  # where the search begins: camera to hand, board to base, and the offset, ns
+    Z: F64
+    offset: int
+
+    def unpacked(self, parameters: F64) -> tuple[F64, F64, int]:
+        X, Z = self.X @ _rigid(parameters[:6]), self.Z @ _rigid(parameters[6:12])
+        return X, Z, self.offset + round(parameters[12] * 1e9)
+
+    def __call__(self, parameters: F64) -> F64:
+        X, Z, offset = self.unpacked(parameters)
+        eye_base, parts = invert(X), []
+        for view, stamp in zip(self.views, self.stamps, strict=True):
+            hand = self.pose_at(stamp + offset)
+            if hand is None:  # the search has left what is known: no place for it
+                return np.full(sum(4 * len(view.ids) for view in self.views), 1e3)
+            left = eye_base @ invert(hand) @ Z
+            points = self.points[view.ids].astype(np.float64)
+            for eye, T, seen in (
+                (self.rig.left, left, view.left),
+                (self.rig.right, self.rig.T_right_left @ left, view.right),
+            ):
+                drawn, _ = cv2.projectPoints(points, T[:3, :3], T[:3, 3], eye.K, eye.distortion)
+                parts.append((drawn.reshape(-1, 2) - seen).ravel())
+        return np.concatenate(parts)
+
+
+def _least_squares(residuals: _Residuals) -> tuple[F64, F64, float]:
+    """Levenberg and Marquardt: parameters [13], their covariance for residuals of 1 px, residuals' spread."""
+    parameters, damping = np.zeros(len(STEPS)), 1e-3
+    now = residuals(parameters)
+    for _ in range(ROUNDS):
+        J = np.stack(
+            [(residuals(parameters + d) - residuals(parameters - d)) / (2 * d.sum()) for d in np.diag(STEPS)],
+            1,
+        )
+        normal = J.T @ J
+        while damping < 1e9:
+            change = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -J.T @ now)
+            then = residuals(parameters + change)
+            gain = now @ now - then @ then
+            if gain >= 0:
+                break
+            damping *= 10
+        else:
+            break
+        converged = gain < 1e-9 * (now @ now)
+        parameters, now, damping = parameters + change, then, damping * 0.1
+        if converged:
+            break
+    spread = float(np.sqrt(now @ now / max(1, len(now) - len(parameters))))
+    return parameters, np.linalg.pinv(normal, rcond=1e-15), spread
+
+
+def _rigid(parameters: F64) -> F64:
+    """[4, 4] of a rotation vector and a translation [6]."""
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(parameters[:3])[0]
+    T[:3, 3] = parameters[3:6]
+    return T

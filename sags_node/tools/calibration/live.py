@@ -1,0 +1,96 @@
+"""Taking pictures of a board from a running source: only views that add something, held still."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node.config.schema import LaunchConfig
+from sags_node.errors import SagsError, UsageError
+from sags_node.files import whole, writing
+from sags_node.sources.source import open_source
+from sags_node.tools.calibration.boards import Board, StereoView, find_in_both
+from sags_node.types import F32, U8
+
+NEW_AT = 0.06  # of the diagonal: how far common corners must have moved from every view taken before
+STILL_AT = 0.004  # of the diagonal, since the frame before
+
+
+def grab_views(
+    config: LaunchConfig,
+    board: Board,
+    folder: Path,
+    count: int,
+    tell: Callable[[int, str], None] = lambda taken, what: None,
+) -> tuple[Path, Path]:
+    """Take views of the board until there are `count`, the source ends or Ctrl-C.
+
+    Args:
+        folder: new or empty; gets `left/` and `right/` with a PNG for each view.
+        tell: called for each frame with the number of views and what to do.
+
+    Returns:
+        Both picture folders.
+
+    Raises:
+        UsageError: the folder holds something, or the source has no right eye.
+        SagsError: no view was taken, or the source fails.
+    """
+    sides = folder / "left", folder / "right"
+    if folder.exists() and any(folder.iterdir()):
+        raise UsageError(f"{folder} is not empty; name a new folder, or calibrate from the pictures in it")
+    with writing(folder):
+        for side in sides:
+            side.mkdir(parents=True)
+    taken: list[StereoView] = []
+    before: StereoView | None = None
+    try:
+        with open_source(config.source, references=False) as source:
+            for frame in source:
+                if frame.right is None:
+                    raise UsageError("the session has no right eye; a stereo calibration needs both")
+                view = find_in_both(board, f"{len(taken):04d}.png", frame.left, frame.right)
+                advice = _advice(view, before, taken, float(np.hypot(*frame.left.shape[:2])))
+                before = view
+                if view is not None and not advice:
+                    _write(sides, view.name, (frame.left, frame.right))
+                    taken.append(view)
+                tell(len(taken), advice or "taken")
+                if len(taken) >= count:
+                    break
+    except KeyboardInterrupt:
+        tell(len(taken), "stopped")
+    if not taken:
+        raise SagsError("no view was taken: the whole board must be seen by both eyes and held still")
+    return sides
+
+
+def _advice(
+    view: StereoView | None, before: StereoView | None, taken: list[StereoView], diagonal: float
+) -> str:
+    """What keeps this frame from being a new view; empty: nothing."""
+    if view is None:
+        return "show the whole board to both eyes"
+    if before is None or _moved(view, before) > STILL_AT * diagonal:
+        return "hold it still"
+    if any(_moved(view, old) < NEW_AT * diagonal for old in taken):
+        return "move or tilt it"
+    return ""
+
+
+def _moved(view: StereoView, other: StereoView) -> float:
+    """Root mean square motion of the corners that both show, px; infinite where there are none."""
+    _, here, there = np.intersect1d(view.ids, other.ids, return_indices=True)
+    if not len(here):
+        return np.inf
+    motion: F32 = view.left[here] - other.left[there]
+    return float(np.sqrt(np.mean(np.sum(np.square(motion), -1))))
+
+
+def _write(sides: tuple[Path, Path], name: str, pair: tuple[U8, U8]) -> None:
+    for side, picture in zip(sides, pair, strict=True):
+        with whole(side / name) as partial:
+            partial.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())

@@ -1,0 +1,338 @@
+"""`sags doctor`: is everything here that the node needs, and all that a launch file names."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import getpass
+import glob
+import importlib.metadata
+import os
+import platform
+import socket
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+from sags_node import host
+from sags_node.checks import Finding, Level, parted
+from sags_node.config.schema import (
+    GstSource,
+    Guarded,
+    LaunchConfig,
+    OnnxConfig,
+    PhantomSource,
+    PushRobot,
+    PushSource,
+    RecordedSource,
+    Ros2Robot,
+    Ros2Source,
+    RosGraph,
+    V4l2Source,
+)
+from sags_node.engine.device import find_gpu, has_gpu
+from sags_node.errors import SagsError, UsageError
+from sags_node.kernels.cache import cache_root
+from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
+from sags_node.pipeline.session import lacks_rig, rig_of
+from sags_node.rig.hand_eye import read_hand_eye
+from sags_node.ros.graph import domain_of
+from sags_node.sources.gst import whole_launch
+from sags_node.sources.gst_process import ELEMENTS, check_launch, installed
+from sags_node.sources.layout import Layout
+from sags_node.sources.pictures import size_text
+from sags_node.sources.robot import hand_eye_file
+from sags_node.tools.importing.check import played
+from sags_node.vision.onnx_session import OnnxSession
+
+Look = tuple[str, Finding]  # what was looked at, and what was found
+REQUIRED = (
+    "numpy torch opencv-contrib-python-headless pyzmq open3d onnxruntime numba rosbags mcap msgspec "
+    "pydantic pyyaml click rich"
+).split()
+CORES = 2  # for the rate of a camera
+ENOUGH_MEMORY = 2e9  # bytes: about twice what a node takes
+TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
+TIME_KEEPERS = {"chronyd", "ntpd", "phc2sys", "ptp4l", "systemd-timesyn"}  # as far as /proc tells names
+OPEN3D_LIBRARIES = {
+    "usb-1.0": "libusb-1.0-0",
+    "GL": "libgl1",
+    "EGL": "libegl1",
+    "gomp": "libgomp1",
+    "X11": "libx11-6",
+}
+
+
+def examine(config: LaunchConfig) -> list[Look]:
+    """Look at everything, in the order a newcomer meets the problems."""
+    publish = config.publish
+    return [
+        ("Python", Finding("ok", platform.python_version())),
+        *((name, _package(name)) for name in REQUIRED),
+        *((package, _library(name, package)) for name, package in OPEN3D_LIBRARIES.items()),
+        ("CPU", check_cores()),
+        ("CPU governor", check_governor()),
+        ("memory", check_memory()),
+        ("GPU", check_gpu(config)),
+        ("kernel cache", _kernel_cache()),
+        *((endpoint, _port(endpoint, publish)) for endpoint in (*publish.data, publish.control) if endpoint),
+        *(() if publish.key is None else [("keys", _keys(publish.key, publish.allow))]),
+        ("clock", _clock()),
+        ("cameras", Finding("ok", ", ".join(sorted(glob.glob("/dev/video*"))) or "none")),
+        ("GStreamer", _gstreamer(config)),
+        ("SAGS_DATA", _recordings()),
+        *_launched(config),
+    ]
+
+
+def as_rows(looks: Iterable[Look]) -> list[dict[str, str]]:
+    return [{"name": name, "level": each.level, "found": each.what, "fix": each.fix} for name, each in looks]
+
+
+def _launched(config: LaunchConfig) -> list[Look]:
+    """What the launch file names: pictures, calibration, the robot, networks."""
+    source, robot, vision = config.source, config.robot, config.vision
+    looks: list[Look] = []
+    if isinstance(source, RecordedSource) and not isinstance(source, PhantomSource):
+        for each in played(config):
+            name, _, rest = each.what.partition(": ")
+            of_rig = name.startswith("calibration")
+            looks.append(("calibration", replace(each, what=rest)) if of_rig else ("source", each))
+    if isinstance(source, V4l2Source):
+        right = () if source.right is None or source.geometry.layout != "separate" else (source.right,)
+        looks += [(path, _device(path)) for path in (source.left, *right)]
+    if isinstance(source, GstSource):
+        said = _tried(lambda: check_launch(whole_launch(source)[0]), "GStreamer takes it")
+        looks.append(("source", said))
+    for section, part in (("source", source), ("robot", robot)):
+        if isinstance(part, PushSource | PushRobot):
+            looks.append((part.endpoint, _port(part.endpoint, part, section)))
+        if isinstance(part, Ros2Source | Ros2Robot):
+            looks.append((section, _ros(section, part)))
+    comes_with_pictures = isinstance(source, Ros2Source) and config.rig is None
+    judged = any(name == "calibration" for name, _ in looks)
+    uncalibrated = False
+    with suppress(SagsError):  # a recording that cannot be read was said
+        uncalibrated = not isinstance(source, PhantomSource) and lacks_rig(config)
+    if uncalibrated:
+        fix = "depth has no unit without one; sags calib stereo makes one, then set rig"
+        looks.append(("calibration", Finding("warning", "no calibration", fix)))
+    elif not (isinstance(source, PhantomSource) or comes_with_pictures or judged):
+        looks.append(("calibration", _tried(lambda: _check_rig(config), "can be used")))
+    if robot is not None:
+        looks.append(("hand-eye", _tried(lambda: read_hand_eye(hand_eye_file(config)), "can be used")))
+    if vision.onnx.path is not None:
+        looks.append(("depth network", _tried(lambda: OnnxSession(vision.onnx), "loads")))
+    if vision.tissue.method == "onnx":
+        tissue = OnnxConfig(path=vision.tissue.path)
+        looks.append(("tissue network", _tried(lambda: OnnxSession(tissue, "vision.tissue"), "loads")))
+    return looks
+
+
+def _tried(look: Callable[[], object], found: str) -> Finding:
+    try:
+        look()
+    except SagsError as error:
+        return parted("error", str(error))
+    return Finding("ok", found)
+
+
+def _check_rig(config: LaunchConfig) -> None:
+    """Read the calibration. Where the size of a camera's pictures is known without it, compare it.
+
+    Raises:
+        SagsError: it cannot be used.
+    """
+    rig, source = rig_of(config), config.source
+    if isinstance(source, V4l2Source):
+        size = Layout(source.geometry).size(source.width, source.height, source.left)
+        if size != (rig.left.width, rig.left.height):
+            raise UsageError(
+                f"{config.rig} is for {size_text(rig.left.width, rig.left.height)} px, an eye's pictures are "
+                f"{size_text(*size)}; set source.width, source.height or source.geometry, or calibrate anew"
+            )
+
+
+def _device(path: str) -> Finding:
+    if not os.path.exists(path):
+        return Finding("error", "no such camera", "plug it in, or name another one: ls /dev/video*")
+    if not os.access(path, os.R_OK | os.W_OK):
+        return Finding("error", "this user may not use it", f"sudo usermod -aG video {getpass.getuser()}")
+    return Finding("ok", "is there")
+
+
+def _ros(section: str, config: RosGraph) -> Finding:
+    if find_spec("cyclonedds") is None:
+        return Finding("error", "cyclonedds is not installed", "pip install 'sags-node[ros2]'")
+    there = sorted(each.name for each in Path("/sys/class/net").iterdir())
+    if config.interface not in there:
+        remedy = f"set {section}.interface to one of {', '.join(there)}"
+        return Finding("error", f"there is no network interface {config.interface}", remedy)
+    return Finding("ok", f"ROS 2 over {config.interface}, domain {domain_of(config)}")
+
+
+def _package(name: str) -> Finding:
+    try:
+        return Finding("ok", importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding("error", "not installed", "run `make setup`")
+
+
+def _library(name: str, package: str) -> Finding:
+    if ctypes.util.find_library(name):
+        return Finding("ok", "installed")
+    return Finding("warning", "missing", f"Open3D needs it: sudo apt-get install {package}")
+
+
+def check_cores(root: Path = host.ROOT) -> Finding:
+    cores, there, quota = len(os.sched_getaffinity(0)), os.cpu_count() or 1, host.core_quota(root)
+    found = f"{cores} core{'s' * (cores != 1)}, {platform.machine()}"
+    if cores < there:
+        found += f"; the machine has {there}"
+    if quota is not None:
+        found += f"; the time of {quota:.3g} granted"
+    if cores < CORES:
+        fix = "camera rate needs two cores" + "; give this process more (taskset, cpuset)" * (cores < there)
+        return Finding("warning", found, fix)
+    if quota is not None and quota < min(cores, CORES):
+        # Threads use the quota up at once, and then all of them stand still until the next period.
+        fix = "give the container or unit two cores or more (CPUQuota=, --cpus), or none to share"
+        return Finding("warning", found, fix)
+    return Finding("ok", found)
+
+
+def check_governor(root: Path = host.ROOT) -> Finding:
+    found = host.governors(root)
+    if not found:
+        return Finding("ok", "not known")
+    said = ", ".join(sorted(found))
+    if found == {"performance"}:
+        return Finding("ok", said)
+    level: Level = "warning" if "powersave" in found else "ok"
+    return Finding(level, said, "for even times: sudo cpupower frequency-set -g performance")
+
+
+def check_memory(root: Path = host.ROOT) -> Finding:
+    amounts = host.memory(root)
+    free = amounts.get("MemAvailable", 0)
+    swap, used = amounts.get("SwapTotal", 0), amounts.get("SwapTotal", 0) - amounts.get("SwapFree", 0)
+    swapped = f"{used / 1e9:.1f} of {swap / 1e9:.1f} GB swap used" if swap else "no swap"
+    found = f"{free / 1e9:.1f} GB free, {swapped}"
+    if free < ENOUGH_MEMORY or used > free:  # it would not all fit, were it needed again
+        fix = "close other programs" + ": what is swapped out misses frames" * bool(swap)
+        return Finding("warning", found, fix)
+    return Finding("ok", found)
+
+
+def check_gpu(config: LaunchConfig) -> Finding:
+    """Whether Warp can draw there. A machine without one is no worse for it, unless one is wanted."""
+    if config.device == "cpu":
+        return Finding("ok", f"not used: device is {config.device}")
+    found = find_gpu()
+    if found.kind == "cuda":
+        from sags_node.engine.gpu.runtime import driver
+
+        version = importlib.metadata.version("warp-lang")
+        return Finding("ok", f"{found.name}, driver's CUDA {driver()}, Warp {version}")
+    level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
+    return Finding(level, f"not used: {found.reason}", found.fix if level != "ok" else "")
+
+
+def _kernel_cache() -> Finding:
+    root = cache_root()
+    if root is not None:
+        return Finding("ok", str(root))
+    fix = "kernels will be compiled at every start; set NUMBA_CACHE_DIR to a folder of yours"
+    return Finding("warning", "no folder can be written", fix)
+
+
+def _port(endpoint: str, config: Guarded, section: str = "publish") -> Finding:
+    try:
+        check_endpoint(endpoint, config, section)
+    except UsageError as error:
+        return Finding("error", "cannot be used", str(error))
+    address, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    if endpoint.startswith("ipc:") or port == "*":
+        return Finding("ok", "needs no port of its own")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address.replace("*", ""), int(port)))
+            return Finding("ok", "free")
+        except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
+            keys = "publish.data and publish.control" if section == "publish" else f"{section}.endpoint"
+            fix = f"stop the other node, or set {keys} to another port"
+            return Finding("warning", str(error), fix)
+
+
+def _keys(key: Path, allow: Sequence[Path]) -> Finding:
+    try:
+        read_key_pair(key)
+        allowed = read_allow_list(allow)
+    except UsageError as error:
+        return Finding("error", "cannot be used", str(error))
+    return Finding("ok", f"{key}; may connect: {', '.join(map(str, allowed.values()))}")
+
+
+class _Timex(ctypes.Structure):
+    """The head of what adjtimex(2) tells; the kernel writes 208 bytes."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),  # us
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_char * 256),
+    )
+
+
+def _clock() -> Finding:
+    """Whether anything sets this machine's clock right. Clients on other machines ask the node for its clock,
+    so one that nobody keeps is no fault."""
+    by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
+    timex = _Timex()
+    if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) in (-1, TIME_ERROR):
+        fix = "to compare stamps with other machines': sudo apt-get install chrony"
+        return Finding("ok", f"kept by {by}; not synchronised", fix)
+    return Finding("ok", f"kept by {by}; synchronised to within {timex.maxerror * 1e-3:.0f} ms")
+
+
+def _running() -> set[str]:
+    """Names of the processes here."""
+    names = set()
+    for comm in Path("/proc").glob("[0-9]*/comm"):
+        with suppress(OSError):  # it has ended meanwhile
+            names.add(comm.read_text().strip())
+    return names
+
+
+def _gstreamer(config: LaunchConfig) -> Finding:
+    """Which elements are there; it starts GStreamer, in a process of its own."""
+    wanted: Level = "error" if isinstance(config.source, GstSource) else "ok"
+    if ctypes.util.find_library("gstapp-1.0") is None:
+        packages = " ".join(sorted(name for name in set(ELEMENTS.values()) if " " not in name))
+        fix = f"for source.kind gst: sudo apt-get install gstreamer1.0-tools {packages}"
+        return Finding(wanted, "not installed", fix)
+    try:
+        version, missing = installed()
+    except SagsError as error:
+        return Finding(wanted, "does not start", str(error))
+    if not missing:
+        return Finding("ok", version)
+    without = ", ".join(missing)
+    fix = "; ".join(f"{name}: {package}" for name, package in missing.items())
+    return Finding("ok", f"{version}, without {without}", fix)
+
+
+def _recordings() -> Finding:
+    folder = os.environ.get("SAGS_DATA")
+    if folder is None:
+        return Finding("ok", "not set: launch files look in ../shared/data beside the checkout")
+    if Path(folder).is_dir():
+        return Finding("ok", folder)
+    fix = "set it to the folder of your recordings; without any, sags run plays the phantom"
+    return Finding("warning", f"{folder} is no folder", fix)

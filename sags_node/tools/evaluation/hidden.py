@@ -1,0 +1,96 @@
+"""What is shown of tissue that is hidden: boxes of a recording are taken from the node for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from sags_node.config.schema import LaunchConfig
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
+from sags_node.quality import metrics
+from sags_node.sources.source import Source
+from sags_node.types import F32, U8, Bool, RectifiedPair, RenderedView, StereoFrame, StereoRig
+from sags_node.vision.tissue import TissueMask
+
+PLACES = ((0.3, 0.3), (0.5, 0.65), (0.7, 0.35))  # of width and height: the middles of the boxes
+SIZE = (0.19, 0.2)  # of width and height
+TIMES = ((0.15, 0.5), (0.35, 2.0))  # when boxes are hidden: share of the recording before, s
+
+
+class Curtain(TissueMask):
+    """A tissue mask with boxes taken out while it is `drawn`."""
+
+    drawn: Bool | None = None  # [h, w] the boxes
+
+    def __call__(self, frame: StereoFrame, pair: RectifiedPair, expected: RenderedView | None = None) -> Bool:
+        self.whole = super().__call__(frame, pair, expected)
+        return self.whole if self.drawn is None else self.whole & ~self.drawn
+
+
+def measure_hidden(
+    config: LaunchConfig,
+    rig: StereoRig,
+    source: Source,
+    frames: int,
+    progress: Callable[[str, int], None],
+) -> dict[int, dict[str, float]]:
+    """Play a recording with boxes of it hidden; figures of those pixels by frame number.
+
+    `psnr` of what is shown there, `model_psnr` of the model alone, `copy_psnr` of the last picture in which
+    they were seen, shown again; dB, each the mean over the boxes.
+
+    Args:
+        frames: of the recording.
+    """
+    pipeline = Pipeline(config, rig)
+    curtain = Curtain(config.vision.tissue, pipeline.rectifier)
+    pipeline.tissue = curtain
+    camera = pipeline.rectifier.camera
+    budget, boxes = pipeline.make_budget(), _boxes(camera.width, camera.height)
+    every = np.logical_or.reduce(boxes)
+    found: dict[int, dict[str, float]] = {}
+    before: F32 | None = None  # the last picture that showed the boxes
+    until = 0
+    with source as playing:
+        for number, frame in enumerate(playing):
+            now = frame.t_capture_ns
+            for share, seconds in TIMES:
+                if number == round(share * frames):
+                    until = now + round(seconds * 1e9)
+            curtain.drawn = every if now < until else None
+            result = pipeline.process(frame, budget, FrameRequest(left=True))
+            truth = metrics.as_float(result.pair.left)
+            if curtain.drawn is None:
+                before = truth
+            elif before is not None and not result.held:
+                view = result.views["left"]
+                pictures = {
+                    "psnr": metrics.as_float(_small(view)),
+                    "model_psnr": metrics.as_float(view.rgb),
+                    "copy_psnr": before,
+                }
+                where = [box & curtain.whole for box in boxes]
+                found[frame.frame_id] = {
+                    name: float(np.mean([metrics.psnr(picture, truth, box) for box in where if box.any()]))
+                    for name, picture in pictures.items()
+                }
+            progress("hiding tissue", number + 1)
+    return found
+
+
+def _boxes(width: int, height: int) -> list[Bool]:
+    boxes = []
+    for x, y in PLACES:
+        box = np.zeros((height, width), np.bool_)
+        rows = slice(round((y - SIZE[1] / 2) * height), round((y + SIZE[1] / 2) * height))
+        box[rows, round((x - SIZE[0] / 2) * width) : round((x + SIZE[0] / 2) * width)] = True
+        boxes.append(box)
+    return boxes
+
+
+def _small(view: RenderedView) -> U8:
+    """What consumers are shown of a view, in the size that is worked at."""
+    size = view.camera.width, view.camera.height
+    return view.rgb if view.shown is None else cv2.resize(view.shown.rgb, size, interpolation=cv2.INTER_AREA)

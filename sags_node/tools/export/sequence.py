@@ -1,0 +1,119 @@
+"""`sags export --sequence`: a splat file for every frame, and a video that plays in a loop.
+
+Each file appears when it is complete, and stays. So an export that was ended, by a full disk or by Ctrl-C,
+goes on when the same command is given again: frames that are there are not written anew.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.errors import SagsError, UsageError
+from sags_node.files import check_folder, whole, writing
+from sags_node.media.video_file import VideoFile
+from sags_node.model.ply import write_ply
+from sags_node.tools.export.orbit import picture_of
+from sags_node.tools.export.scene import Advance, Scene
+
+ABOUT = "sequence.json"
+LOOP = "loop.mp4"
+FRAME = "frame_{:05d}.ply"
+QUALITY = 98  # of the pictures kept for the way back, JPEG
+
+
+def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
+    """Before any work: is the folder new, or that of the same export?
+
+    Args:
+        about: what is exported, as JSON.
+        force: files of another export may be replaced; they are removed.
+
+    Raises:
+        UsageError: the folder holds something else.
+        SagsError: it cannot be written to.
+    """
+    check_folder(folder)
+    stored = folder / ABOUT
+    if stored.is_file():
+        try:
+            same = json.loads(stored.read_text(encoding="utf-8")) == about
+        except (OSError, ValueError):
+            same = False
+        if not same and not force:
+            raise UsageError(f"{folder} holds another sequence; choose another folder, or add --force")
+        if not same:
+            with writing(folder):
+                for file in (*folder.glob("frame_*.ply"), folder / LOOP, stored):
+                    file.unlink(missing_ok=True)
+    elif any(folder.iterdir()) and not force:
+        raise UsageError(f"{folder} is not empty; choose another folder, or add --force")
+    with whole(stored) as partial:
+        partial.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+
+
+def write_sequence(
+    folder: Path, scenes: Iterable[Scene], rate: float, count: int | None, advance: Advance
+) -> list[dict[str, Any]]:
+    """Write `frame_NNNNN.ply` for every scene that shows something, and `loop.mp4`: there and back.
+
+    Args:
+        rate: pictures per second.
+        count: how many scenes there will be, where that is known.
+
+    Returns:
+        As `export.export`; `holds` counts frames and pictures.
+
+    Raises:
+        SagsError: nothing is shown, or a file cannot be written; what was written stays.
+    """
+    written = kept = size = pictures = 0
+    with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-", dir=folder) as passing:
+        rasterizer, camera = None, None
+        for number, scene in enumerate(scenes):
+            advance(number + 1, count, f"writing frames, {kept} were there")
+            if len(scene.gaussians) == 0:
+                continue
+            path = folder / FRAME.format(number)
+            if path.exists():
+                kept += 1
+            else:
+                try:
+                    write_ply(path, scene.gaussians)
+                except SagsError as error:
+                    said = f"{written + kept} frames are there; the same command goes on with the others"
+                    raise SagsError(f"{error}: {said}") from None
+                written += 1
+            size += path.stat().st_size
+            if rasterizer is None or camera is None:
+                camera = scene.camera
+                rasterizer = make_rasterizer("numba", camera.width, camera.height)
+            picture, _ = picture_of(rasterizer, scene.gaussians, scene.camera)
+            jpeg = cv2.imencode(
+                ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+            )
+            (Path(passing) / f"{pictures}.jpg").write_bytes(jpeg[1].tobytes())
+            pictures += 1
+        if camera is None:
+            raise SagsError("no frame shows anything to make a model of")
+        loop = folder / LOOP
+        order = [*range(pictures), *range(pictures - 2, 0, -1)]
+        with whole(loop) as partial:
+            video = VideoFile(partial, rate, (camera.width, camera.height))
+            for done, number in enumerate(order):
+                read = cv2.imread(str(Path(passing) / f"{number}.jpg"))
+                if read is None:
+                    raise SagsError(f"a picture in {passing} was removed; export again")
+                video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB))
+                advance(done + 1, len(order), "writing the video")
+            video.finish()
+    return [
+        {"file": str(folder / FRAME.format(0)), "kind": "sequence", "holds": written + kept, "bytes": size},
+        {"file": str(loop), "kind": "loop", "holds": len(order), "bytes": loop.stat().st_size},
+    ]

@@ -1,0 +1,336 @@
+"""The offline fit: canonical Gaussians and the deformation field, learnt from a clip's training frames.
+
+`paper`: Adam on everything against the paper's loss. `online`: the start knows where the tissue went and how
+it looked; what is left are small corrections of the field and of single Gaussians (`fitting.residuals`), by
+squared colour residuals and the closed-form colour step, as the online mapper does.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sags_node.engine.adam import AdamState
+from sags_node.engine.losses.tissue import tissue_loss
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
+from sags_node.field.adam import RowAdam
+from sags_node.field.canvas import Canvas
+from sags_node.field.decoder import Decoder
+from sags_node.field.deformation import Deltas, Field, NodeField
+from sags_node.field.hexplane import for_clip
+from sags_node.field.losses import compare
+from sags_node.field.model import DeformableModel, Rates
+from sags_node.mapping.optimiser import LearningRates
+from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
+from sags_node.model import columns
+from sags_node.model.exposure import Exposure
+from sags_node.tools.fitting.clip import Clip, ClipFrame
+from sags_node.tools.fitting.density import Density
+from sags_node.tools.fitting.field import make_box, make_field, marked, row_rates, unit_row
+from sags_node.tools.fitting.refined import RefinedModel
+from sags_node.tools.fitting.residuals import Residuals
+from sags_node.tools.fitting.settings import FitSettings
+from sags_node.tools.fitting.start import Progress, follow_online, learn_paths, pooled_rows, remainder
+from sags_node.types import F32, Gaussians
+
+REFINE_RATES = LearningRates()  # the mapper's, gentle: the start is good
+REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
+REFINE_RELAXATION = 1.6  # of the colour step: a frame is seen again after many others
+REFINE_DECAY = 0.1
+
+
+class Fit:
+    """A model being fitted: `start`, then `iterate` until `done`."""
+
+    def __init__(self, clip: Clip, settings: FitSettings, device: str | None = None) -> None:
+        """
+        Args:
+            clip: what it learns from.
+            settings: of the fit.
+            device: on which Warp draws and torch keeps all that is learnt, and the pictures; not for
+                schedule = online. None: the kernels of the CPU.
+        """
+        self.clip = clip
+        self.settings = settings
+        self._device = torch.device(device or "cpu")
+        self.iteration = 0
+        self.seconds = 0.0  # spent on starting and iterating
+        self.pruned = self.split = 0
+        first = clip.train[0]
+        height, width = first.tissue.shape
+        self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
+        self._learning: Rasterizer | Canvas = self.rasterizer
+        if device is not None:
+            self._learning = Canvas(width, height, self._device, settings.antialias)
+        self._residual: float | Tensor = 0.0
+        unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
+        self._unseen = unseen if device is None else torch.from_numpy(unseen).to(self._device)
+        self._shown: dict[int, tuple[Tensor, ...]] = {}
+        self._v_planes = np.zeros((5, height, width), np.float32)
+        self._weight = np.zeros((height, width), np.float32)
+        self._rng = np.random.default_rng(settings.seed)
+        self._order: list[int] = []
+        known = first.depth[first.depth > 0]
+        pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
+        self._rates = row_rates(settings.rates, pixel)
+        self._decays = marked(settings.rates.decaying)
+        self._refine_rates = self._rates.copy()
+        self._refine_rates[columns.QUAT] = REFINE_RATES.quat
+        self._refine_rates[columns.COLOR] = 0  # which has its closed form
+        self._refine_rates[columns.LOGIT] = REFINE_RATES.opacity_logit
+
+    def start(self, progress: Progress) -> None:
+        """Make the model.
+
+        Raises:
+            SagsError: no frame has depth enough.
+        """
+        started = time.perf_counter()
+        settings, exposure = self.settings, self._make_exposure()
+        if settings.schedule == "paper":
+            on_device = self._device if isinstance(self._learning, Canvas) else None
+            rows = pooled_rows(self.clip, exposure, settings, on_device)
+            field = self._make_field(rows[:, columns.MEAN])
+            self.model = DeformableModel(rows, field, exposure, settings.antialias)
+        else:
+            rows, slopes, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
+            field = self._make_field(rows[:, columns.MEAN])
+            learn_paths(field, rows, paths, settings, progress)
+            residuals = remainder(field, rows, paths)
+            self.model = RefinedModel(rows, field, exposure, settings.antialias, slopes, residuals)
+        self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
+        self._density = self._make_density()
+        self.seconds += time.perf_counter() - started
+
+    @property
+    def residual(self) -> float:
+        """How much colours differed in the last iteration, as its loss counts it. Waits for the device."""
+        return float(self._residual)
+
+    @property
+    def warm_up(self) -> int:
+        """Iterations without deformation."""
+        return self.settings.warm_up if self.settings.schedule == "paper" else 0
+
+    @property
+    def done(self) -> bool:
+        return self.iteration >= self.total
+
+    @property
+    def total(self) -> int:
+        """Iterations in all."""
+        return self.warm_up + self.settings.iterations
+
+    def iterate(self) -> None:
+        """One step on one training frame."""
+        started = time.perf_counter()
+        if isinstance(self.model, RefinedModel):
+            self._refine(self.model)
+        else:
+            self._descend()
+        self.seconds += time.perf_counter() - started
+
+    def _descend(self) -> None:
+        """A step of the paper's schedule."""
+        deformed = self.iteration >= self.warm_up
+        drawings = []
+        for _ in range(self.settings.batch_size if deformed else 1):
+            frame = self._next_frame() if deformed else self.clip.train[0]
+            drawing = self.model.draw(self._learning, frame.t_capture_ns, frame.camera, deformed)
+            image, tissue, depth = self._tensors(frame)
+            found = compare(
+                drawing.planes, image, tissue, depth, self._unseen, self.settings.weights,
+                self.settings.color_softness,
+            )  # fmt: skip
+            drawing.differentiate(found.loss, found.weight)
+            self._density.observe(drawing.v_means, drawing.contribution)
+            drawings.append(drawing)
+        self._residual = found.terms["color"].detach()
+        share = self.settings.rate_share(*self._stage)
+        rates = Rates(
+            self._rates * np.float32(share) ** self._decays, self.settings.field_rates.scaled(share)
+        )
+        self.model.descend(drawings, rates)
+        self.iteration += 1
+        growth = self.settings.growth
+        if self.iteration % growth.every == 0 and self._progress() < growth.until:
+            pruned, split = self._density.adapt(self._rng)
+            self.pruned, self.split = self.pruned + pruned, self.split + split
+
+    def _refine(self, model: RefinedModel) -> None:
+        """A step of the joint refinement after the online pass."""
+        share, frame = REFINE_DECAY ** self._progress(), self._next_frame()
+        drawing = model.draw_to_refine(self.rasterizer, frame.t_capture_ns, frame.camera)
+        self._residual = tissue_loss(
+            drawing.planes.detach().numpy(), frame.image, frame.tissue, frame.depth, self._v_planes,
+            self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
+        )  # fmt: skip
+        drawing.differentiate(self._v_planes, self._weight)
+        model.refine(
+            drawing,
+            self._refine_rates * np.float32(share),
+            REFINE_RELAXATION * math.sqrt(share),  # less and less, so that frames average out
+            self.settings.field_rates.scaled(REFINE_FIELD_SHARE * share),
+        )
+        self.iteration += 1
+
+    def gaussians(self, frame: ClipFrame) -> Gaussians:
+        """The model at the time of a frame; after the last training frame it is a prediction."""
+        t_ns, last_ns = frame.t_capture_ns, self.clip.train[-1].t_capture_ns
+        if t_ns > last_ns:
+            return self.model.predict(t_ns, last_ns, [frame.camera])
+        around = self.clip.around(t_ns)
+        if around is None or self.settings.schedule == "paper":
+            return self.model.at(t_ns, [frame.camera])
+        before, after = around
+        return self.model.between(t_ns, before.t_capture_ns, after.t_capture_ns, [frame.camera])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All arrays that `restore` needs."""
+        model, deltas = self.model, self.model.field.deltas
+        found: dict[str, NDArray[Any]] = {
+            "rows": model.table,
+            "gains": model.exposure.gains,
+            "cells": _array(deltas.hexplane.cells),
+            "ids": model.ids,
+            "start": self._start_means,
+            "pull": _array(self._density.pull),
+            "seen": _array(self._density.seen),
+        }
+        remembered: dict[str, Sequence[AdamState | RowAdam]]
+        remembered = {"rows": [model.adam], "cells": [deltas.hexplane.adam]}
+        if isinstance(model.field, NodeField):
+            found |= {"index": _array(model.field.index), "weight": _array(model.field.weight)}
+        if isinstance(model, RefinedModel) and model.slopes is not None:
+            residuals = model.residuals
+            found |= {"residuals": residuals.values, "residuals.times": residuals.times_ns}
+            found["slopes"] = model.slopes.detach().numpy()
+            remembered["residuals"] = residuals.adam
+        for name, states in remembered.items():
+            found[f"{name}.moments"] = np.stack([_array(adam.moments) for adam in states])
+            found[f"{name}.shares"] = np.stack([_array(adam.shares) for adam in states])
+        for name, values in deltas.decoder.state_dict().items():
+            found[f"decoder.{name}"] = _array(values)
+        for number, state in deltas.optimizer.state_dict()["state"].items():
+            found |= {f"optimizer.{number}.{key}": _array(values) for key, values in state.items()}
+        return found
+
+    def state(self) -> dict[str, Any]:
+        """The rest of what `restore` needs."""
+        return {
+            "iteration": self.iteration,
+            "seconds": self.seconds,
+            "pruned": self.pruned,
+            "split": self.split,
+            "next_id": self.model.next_id,
+            "order": self._order,
+            "rng": self._rng.bit_generator.state,
+        }
+
+    def restore(self, state: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Go on from there, instead of `start`: the same bits as without the interruption."""
+        self._start_means, rows = arrays["start"], arrays["rows"]
+        field, exposure, smooth = (
+            self._make_field(self._start_means),
+            self._make_exposure(),
+            self.settings.antialias,
+        )
+        if self.settings.schedule == "online":
+            residuals = Residuals(arrays["residuals.times"], len(rows))
+            residuals.values[:] = arrays["residuals"]
+            remembered = zip(arrays["residuals.moments"], arrays["residuals.shares"], strict=True)
+            residuals.adam = [AdamState(*each) for each in remembered]
+            self.model = RefinedModel(rows, field, exposure, smooth, arrays["slopes"], residuals)
+        else:
+            self.model = DeformableModel(rows, field, exposure, smooth)
+        model, deltas = self.model, field.deltas
+        if isinstance(field, NodeField):
+            field.attach(torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["weight"]))
+        deltas.hexplane.cells.detach()[:] = self._tensor(arrays["cells"])
+        exposure.gains[:] = arrays["gains"]
+        model.adam, deltas.hexplane.adam = (
+            RowAdam(*(self._tensor(arrays[f"{name}.{part}"][0]) for part in ("moments", "shares")))
+            for name in ("rows", "cells")
+        )
+        model.ids, model.next_id = arrays["ids"], int(state["next_id"])
+        of_decoder = {
+            name: torch.from_numpy(arrays[f"decoder.{name}"]) for name in deltas.decoder.state_dict()
+        }
+        deltas.decoder.load_state_dict(of_decoder)
+        optimizer = deltas.optimizer.state_dict()
+        for name, values in arrays.items():
+            if name.startswith("optimizer."):
+                _, number, key = name.split(".")
+                optimizer["state"].setdefault(int(number), {})[key] = torch.from_numpy(values)
+        deltas.optimizer.load_state_dict(optimizer)
+        self._density = self._make_density()
+        self._density.pull, self._density.seen = map(self._tensor, (arrays["pull"], arrays["seen"]))
+        self.iteration, self._order = int(state["iteration"]), list(state["order"])
+        self.seconds = float(state["seconds"])
+        self.pruned, self.split = int(state["pruned"]), int(state["split"])
+        self._rng.bit_generator.state = state["rng"]
+
+    def _progress(self) -> float:
+        """How far the stage is, 0..1; each stage has its own schedule."""
+        done, of = self._stage
+        return done / max(1, of)
+
+    @property
+    def _stage(self) -> tuple[int, int]:
+        """Iterations of the stage that are done, and all it has."""
+        if self.iteration < self.warm_up:
+            return self.iteration, self.warm_up
+        return self.iteration - self.warm_up, self.settings.iterations
+
+    def _next_frame(self) -> ClipFrame:
+        """Every training frame once, in random order, then again."""
+        if not self._order:
+            self._order = self._rng.permutation(len(self.clip.train)).tolist()
+        return self.clip.train[self._order.pop()]
+
+    def _tensors(self, frame: ClipFrame) -> tuple[Tensor, ...]:
+        """Picture, tissue and depth of a frame on the device, where they stay."""
+        if frame.frame_id not in self._shown:
+            self._shown[frame.frame_id] = tuple(map(self._tensor, (frame.image, frame.tissue, frame.depth)))
+        return self._shown[frame.frame_id]
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
+
+    def _make_exposure(self) -> Exposure:
+        times = np.array([frame.t_capture_ns for frame in self.clip.train])
+        brightness = [
+            frame.image[frame.tissue].mean(axis=0) / 255 if frame.tissue.any() else np.zeros(3)
+            for frame in self.clip.train
+        ]
+        return Exposure(times, np.array(brightness, np.float32))
+
+    def _make_field(self, means: F32) -> Field:
+        """A new field over canonical means [N, 3] m, which decide where its box and its nodes are."""
+        settings = self.settings
+        times = [frame.t_capture_ns for frame in (*self.clip.train, *self.clip.test)]
+        shape = settings.shape
+        hexplane = for_clip(
+            make_box(means), min(times), max(times), shape.slots(len(times)), cells=shape.cells,
+            levels=shape.levels, channels=shape.channels, seed=settings.seed, space_range=shape.first_values,
+            device=self._device,
+        )  # fmt: skip
+        decoder = Decoder(
+            hexplane.features, settings.tokens, settings.block, seed=settings.seed, xavier=shape.xavier
+        )
+        return make_field(Deltas(hexplane, decoder, unit_row(shape.units)), means, settings.tokens)
+
+    def _make_density(self) -> Density:
+        return Density(self.model, self.settings.max_gaussians, self.settings.growth.share)
+
+
+def _array(values: Tensor | NDArray[Any]) -> NDArray[Any]:
+    found: NDArray[Any] = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
+    return found

@@ -1,0 +1,203 @@
+"""How good a fit is on frames it never saw, in the literature's figures and in honest ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sags_node.engine.rasterizer.views import colours_of, to_view
+from sags_node.files import whole
+from sags_node.quality import metrics
+from sags_node.tools.evaluation.lpips import Lpips
+from sags_node.tools.evaluation.moments import Seen, carried
+from sags_node.tools.evaluation.tracking import PointTracks
+from sags_node.tools.fitting.clip import ClipFrame
+from sags_node.tools.fitting.fit import Fit
+from sags_node.types import F32, F64
+
+Segments = dict[str, tuple[int, int]]  # first and last frame
+
+# EndoNeRF's two public clips: how many frames they have, and what was published for the held-out ones.
+# Pictures are multiplied by the tissue mask and averaged over all pixels (`paper_psnr`, dB).
+CLIPS: dict[str, tuple[int, dict[str, float]]] = {
+    "pulling": (63, {"SAGS": 38.3, "EndoGaussian": 37.2}),
+    "cutting": (156, {"SAGS": 39.5, "EndoGaussian": 38.4}),
+}
+
+
+def published(folder: Path | None, frames: int) -> dict[str, float]:
+    """Figures published for a clip, dB by the method's name; none for any other.
+
+    Args:
+        folder: of the recording in EndoNeRF's layout; None: it has another one.
+        frames: that were read of it.
+    """
+    for clip, (count, figures) in CLIPS.items():
+        if folder is not None and clip in folder.resolve().name.lower() and frames == count:
+            return figures
+    return {}
+
+
+def score(
+    fit: Fit,
+    frames: Sequence[ClipFrame],
+    segments: Segments,
+    lpips: Lpips | None = None,
+    pictures: Path | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> dict[str, Any]:
+    """Draw the model at each frame's time and compare.
+
+    Args:
+        fit: started.
+        frames: what to measure on.
+        segments: named stretches, whose means are given too.
+        lpips: measures LPIPS; None: it is left out.
+        pictures: an existing folder that takes the drawn frames, PNG.
+        progress: called with the frames done.
+
+    Returns:
+        Means over frames: `psnr` over tissue and `paper_psnr`, dB; `ssim` and `lpips`; the same for each
+        segment below its name; and `frames`, their number.
+
+    Raises:
+        SagsError: a picture cannot be written.
+    """
+    rows = []
+    for done, frame in enumerate(frames):
+        planes = fit.rasterizer.forward(fit.gaussians(frame), frame.camera)
+        picture = colours_of(planes)
+        rows.append(_figures(picture, frame, lpips))
+        if pictures is not None:
+            _write(pictures / f"{frame.frame_id:06d}.png", picture)
+        progress(done + 1)
+    return _summary(rows, segments)
+
+
+def score_between(
+    fit: Fit, frames: Iterable[ClipFrame], segments: Segments, lpips: Lpips | None = None
+) -> dict[str, Any] | None:
+    """What the two training pictures around a frame say of it.
+
+    Args:
+        fit: started.
+        frames: those between two training frames count.
+        segments: named stretches, whose means are given too.
+        lpips: measures LPIPS; None: it is left out.
+
+    Returns:
+        `carried`: both pictures carried along the model's motion, and their mean; `mean`: the mean of both as
+        they are, the baseline of everything that is shown between two frames. Each as `score` has it. None:
+        no frame lies between two.
+    """
+    rows: dict[str, list[dict[str, float]]] = {"carried": [], "mean": []}
+    for frame in frames:
+        around = fit.clip.around(frame.t_capture_ns)
+        if around is None:
+            continue
+        before, after = around
+        span = after.t_capture_ns - before.t_capture_ns
+        share = (frame.t_capture_ns - before.t_capture_ns) / span
+        seen = [
+            Seen(fit.gaussians(near), near.camera, metrics.as_float(near.image), near.tissue, weight)
+            for near, weight in ((before, 1 - share), (after, share))
+        ]
+        shown = carried(fit.rasterizer, fit.gaussians(frame), frame.camera, seen)
+        mean = sum(np.float32(each.weight) * each.picture for each in seen)
+        rows["carried"].append(_figures(shown, frame, lpips))
+        rows["mean"].append(_figures(np.asarray(mean), frame, lpips))
+    if not rows["mean"]:
+        return None
+    return {name: _summary(each, segments) for name, each in rows.items()}
+
+
+def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> dict[str, Any] | None:
+    """Depth of the model against the session's reference, `metrics.DepthErrors`, means over those frames
+    that have one and `frames`, their number; the same for each segment. None without a reference."""
+    rows = []
+    for frame in frames:
+        if frame.reference is None or frame.reference.depth is None:
+            continue
+        planes = fit.rasterizer.forward(fit.gaussians(frame), frame.camera)
+        depth = to_view(planes, frame.camera, frame.frame_id, frame.t_capture_ns).depth
+        height, width = frame.tissue.shape
+        reference = metrics.resample_nearest(frame.reference.depth, width, height)
+        errors = asdict(metrics.depth_errors(depth, reference, frame.tissue))
+        rows.append({"frame_id": frame.frame_id, **errors})
+    return _summary(rows, segments) if rows else None
+
+
+def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None:
+    """How well the model's Gaussians stay on true surface points, median over points and frames.
+
+    Args:
+        fit: started.
+        frames: in the order of time.
+
+    Returns:
+        `median_mm`, `p90_mm`, `median_px` and `lost`, points without a Gaussian to follow, summed over
+        frames; None if no frame knows such points.
+    """
+    tracks: PointTracks | None = None
+    errors_mm: list[F64] = []
+    errors_px: list[F64] = []
+    lost = 0
+    for frame in frames:
+        reference = frame.reference
+        if reference is None or reference.points is None or reference.points_visible is None:
+            continue
+        if tracks is None:
+            tracks = PointTracks(len(reference.points))
+        found = tracks.update(fit.gaussians(frame), reference.points, reference.points_visible, frame.camera)
+        errors_mm.append(found.errors_mm)
+        errors_px.append(found.errors_px)
+        lost += found.lost
+    if not errors_mm or sum(map(len, errors_mm)) == 0:
+        return None
+    mm, px = np.concatenate(errors_mm), np.concatenate(errors_px)
+    return {
+        "median_mm": round(float(np.median(mm)), 4),
+        "p90_mm": round(float(np.quantile(mm, 0.9)), 4),
+        "median_px": round(float(np.median(px)), 4),
+        "lost": lost,
+    }
+
+
+def _figures(shown: F32, frame: ClipFrame, lpips: Lpips | None) -> dict[str, float]:
+    truth = metrics.as_float(frame.image)
+    figures: dict[str, float] = {
+        "frame_id": frame.frame_id,
+        "psnr": metrics.psnr(shown, truth, frame.tissue),
+        "paper_psnr": metrics.paper_psnr(shown, truth, frame.tissue),
+        "ssim": metrics.ssim(shown, truth, frame.tissue),
+    }
+    if lpips is not None:
+        figures["lpips"] = lpips(shown, truth, frame.tissue)
+    return figures
+
+
+def _summary(rows: list[dict[str, float]], segments: Segments) -> dict[str, Any]:
+    found: dict[str, Any] = _means(rows)
+    for name, (first, last) in segments.items():
+        inside = [row for row in rows if first <= row["frame_id"] <= last]
+        if inside:
+            found[name] = _means(inside)
+    return found
+
+
+def _means(rows: list[dict[str, float]]) -> dict[str, Any]:
+    keys = {key: None for row in rows for key in row if key != "frame_id"}
+    values = {key: [row[key] for row in rows if key in row and np.isfinite(row[key])] for key in keys}
+    means = {key: round(float(np.mean(found)), 4) if found else None for key, found in values.items()}
+    return {"frames": len(rows), **means}
+
+
+def _write(path: Path, rgb: np.ndarray) -> None:
+    picture = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+    with whole(path) as partial:
+        partial.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())

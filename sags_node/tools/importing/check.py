@@ -1,0 +1,243 @@
+"""`sags import --check`: one folder looked over, from what it is to how it is played."""
+
+from __future__ import annotations
+
+import logging
+import re
+import shlex
+from collections.abc import Callable, Sequence
+from itertools import islice
+from logging.handlers import BufferingHandler
+from pathlib import Path
+
+from sags_node.checks import Finding, as_warnings, is_wrong, parted, refused
+from sags_node.config.launch_file import load_launch
+from sags_node.config.schema import (
+    EndoNerfSource,
+    LaunchConfig,
+    LiveSource,
+    PhantomSource,
+    RecordedSource,
+)
+from sags_node.errors import SagsError, UsageError
+from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
+from sags_node.rig import read_rig
+from sags_node.sources.endonerf import is_published
+from sags_node.sources.pictures import list_pictures, size_text
+from sags_node.sources.rectified import as_pictures_come
+from sags_node.sources.replay import Recording, Replay
+from sags_node.sources.source import open_source, recorded_rig
+from sags_node.sources.videos import VideoPairs
+from sags_node.tools.calibration.check import judge, rectified_before
+from sags_node.tools.calibration.guess import guess_rig
+from sags_node.tools.calibration.pictures import pairs_of_session
+from sags_node.tools.calibration.rows import RECTIFIED
+from sags_node.tools.importing import pictures, videos
+from sags_node.tools.importing.folder import Contents, both_eyes, calibration_of, override, recognise
+from sags_node.tools.importing.timing import LOOKED_AT, Timing
+from sags_node.types import U8
+from sags_node.vision.rectify import Rectifier
+
+MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
+MOST_SAID = 1 << 16  # lines in the log
+
+
+def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
+    """What a folder is, what is missing or odd, each with a way to fix it; the last says how to play it.
+
+    It is opened and played as `sags run` does it: what that refuses is an error here, with its words.
+
+    Args:
+        overrides: `key:=value` that it is to be played with.
+
+    Raises:
+        UsageError: it is no folder.
+    """
+    contents = recognise(folder)
+    fix = "" if contents.level == "ok" else contents.instead
+    found = [Finding(contents.level, f"{folder.name or folder} is {contents.what}", fix)]
+    if contents.left is not None:
+        found += _pictures(contents, contents.left)
+    if contents.videos:
+        found += _tried("videos", lambda: videos.look(contents.videos))
+    if contents.level == "error":
+        return found
+    launch: list[str] = []
+
+    def look() -> list[Finding]:
+        launch.extend([*overrides_of(folder), *overrides])
+        config = load_launch(folder, launch)
+        plays = played(config)
+        apart = any("clocks_differ_ms" in each.figures for each in plays)  # then rows tell of the clocks
+        judged = [] if apart else calibrated(config)
+        return plays + (judged if is_wrong(plays) else as_warnings(judged))
+
+    found = _once(found + _tried("frames", look))
+    if is_wrong(found):
+        return [*found, Finding("ok", f"to play it: when that is fixed: sags run {_quoted(folder)}")]
+    stands_for = f", which stands for {' '.join(map(_quoted, launch))}" if launch else ""
+    return [*found, Finding("ok", f"to play it: sags run {_quoted(folder)}{stands_for}")]
+
+
+def _quoted(word: Path | str) -> str:
+    """As a shell takes it; brackets stay, as no file is named like the lists in which they stand."""
+    return shlex.quote(str(word)) if shlex.quote(re.sub(r"[\[\]]", "", str(word)))[0] == "'" else str(word)
+
+
+def overrides_of(path: Path) -> list[str]:
+    """`key:=value` that play what a folder holds, or a video; none where it is played as it is.
+
+    Raises:
+        UsageError: nothing can be made of it.
+        SagsError: a video cannot be read.
+    """
+    contents = recognise(path)
+    if contents.config is not None:
+        return []
+    launch = contents.launch or (videos.launch_of(contents.videos) if contents.videos else ())
+    if not launch:
+        raise UsageError(f"{path} is {contents.what}; {contents.instead}")
+    form = calibration_of(path if path.is_dir() else path.parent)
+    if form is None:
+        return list(launch)
+    with_rig = [*launch, override("rig", form)]
+    return [*with_rig, RECTIFIED] if rectified_before(load_launch(path, with_rig)) else with_rig
+
+
+def _once(found: list[Finding]) -> list[Finding]:
+    """What is wrong is met by several who look; the first says it."""
+    said: set[str] = set()
+    kept = []
+    for finding in found:
+        why = finding.what.removeprefix(f"{finding.what.partition(': ')[0]}: ")
+        if finding.level == "ok" or why not in said:
+            kept.append(finding)
+        said.add(why)
+    return kept
+
+
+def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
+    """What some pictures show, before anything plays them."""
+    if contents.right is None and contents.config is None:
+        return _tried("pictures", lambda: _in_one_folder(left_folder))
+
+    def look() -> list[Finding]:
+        found = pictures.check_numbers({"left": left_folder, "right": contents.right})
+        left = _some(left_folder)
+        right = [] if contents.right is None else _some(contents.right)
+        found += pictures.check_both(left, right) if right else pictures.check_eye("left", left)
+        if contents.depth is not None:
+            source = None if contents.config is None else contents.config.source
+            clip = source if isinstance(source, EndoNerfSource) else None
+            unit = None if clip is None else clip.depth_unit
+            stated = clip is not None and clip.depth_unit == 1e-3 and is_published(clip)
+            size = left[0].shape[1], left[0].shape[0]
+            found += as_warnings(pictures.check_depth(contents.depth, size, unit, stated))
+        return found
+
+    return _tried("pictures", look)
+
+
+def _in_one_folder(folder: Path) -> list[Finding]:
+    """Where the names tell the eyes both are looked at, else what there is."""
+    apart = both_eyes(folder)
+    if not apart:
+        return pictures.check_eye("pictures", _some(folder))
+    left, right = (pictures.read_some([pair[eye] for pair in apart]).values() for eye in (0, 1))
+    return pictures.check_both(left, right)
+
+
+def _some(folder: Path) -> list[U8]:
+    return list(pictures.read_some(list_pictures(folder)).values())
+
+
+def played(config: LaunchConfig) -> list[Finding]:
+    """Whether frames come as `sags run` reads them, by the same code: all of both eyes, both at one time, and
+    of the calibration's size. What that says in the log is a finding, too."""
+    source = config.source
+    if not isinstance(source, RecordedSource):
+        return [
+            Finding("ok", f"source.kind {source.kind} is live: sags doctor and sags calib live look at it")
+        ]
+    source = source.model_copy(update={"pace": "step", "loop": False})
+    found = _tried("frames", lambda: _frames(source))
+    if is_wrong(found):
+        return found
+    what = "calibration" if config.robot is None else "calibration or robot"
+    return found + _tried(what, lambda: _fits(config.model_copy(update={"source": source})))
+
+
+def _frames(source: Recording | PhantomSource) -> list[Finding]:
+    """The first frame, and those in the middle: do masks mark something, are the eyes of one time?"""
+    with open_source(source, references=False) as opened:
+        count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
+        stamped, said, ends = [], [], []
+        if isinstance(opened, Replay):
+            stamped = list(opened.pairs.judged)
+            said = [
+                *(parted("warning", each) for each in opened.pairs.oddities),
+                *videos.check_pixels(opened.pairs.pixel_aspect),
+            ]
+            if isinstance(opened.pairs, VideoPairs):
+                ends = videos.check_ends(opened.pairs, (opened.first + count) * source.stride)
+    if first is None:
+        return [Finding("error", "not one frame can be read", "check the files")]
+    found = [Finding("ok", f"{count} frames of {size_text(*first.left.shape[1::-1])} px at {rate:g} Hz")]
+    found += [*said, *ends]
+    if is_wrong(found):
+        return found
+    timing, shares = Timing(), []
+    middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate
+    with open_source(source.model_copy(update={"start": middle}), references=False) as opened:
+        for frame in islice(opened, LOOKED_AT):
+            if frame.right is not None:
+                timing.add(frame.left, frame.right)
+            if frame.tissue is not None:
+                shares.append(1 - float(frame.tissue.mean()))
+    return [*found, *pictures.check_shares(shares), *(stamped or timing.findings())]
+
+
+def _fits(config: LaunchConfig) -> list[Finding]:
+    """Nothing, where a frame and the robot's poses are of the calibration."""
+    rig = rig_to_play(config, guess=guess_rig)
+    with open_posed(config, rig, references=False) as opened:
+        for frame in islice(opened, 1):
+            Rectifier(rig, rig.left.width, rig.left.height)(frame)
+    return []
+
+
+def calibrated(config: LaunchConfig) -> list[Finding]:
+    """The calibration with which it is played, against its pictures."""
+
+    def compare() -> list[Finding]:
+        source = config.source
+        one_eyed = isinstance(source, EndoNerfSource) and source.baseline is None
+        if config.one_camera or one_eyed or isinstance(source, LiveSource | PhantomSource):
+            return []
+        if lacks_rig(config):
+            return [Finding("warning", "no calibration lies beside the pictures", MAKE_ONE)]
+        pairs, depths = pairs_of_session(config)
+        size = pairs[0][0].shape[1], pairs[0][0].shape[0]
+        rig = recorded_rig(source) if config.rig is None else read_rig(config.rig, size)
+        assert rig is not None  # else it lacks one
+        judged = judge(as_pictures_come(rig, config), pairs, depths)
+        last = Finding("ok", f"calibration: {judged[-1].what}", "", judged[-1].figures)
+        return [each for each in judged if each.level != "ok"] or [last]  # all is well in one line
+
+    return _tried("calibration", compare)
+
+
+def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:
+    """What is found, what is said in the log meanwhile, and an error as a finding."""
+    log, said = logging.getLogger("sags_node"), BufferingHandler(MOST_SAID)
+    said.setLevel(logging.WARNING)
+    log.addHandler(said)
+    log.propagate = False
+    try:
+        found = look()
+    except SagsError as error:
+        found = [refused(what, error)]
+    finally:
+        log.propagate = True
+        log.removeHandler(said)
+    return [*(parted("warning", each.getMessage()) for each in said.buffer), *found]

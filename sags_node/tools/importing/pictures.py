@@ -1,0 +1,195 @@
+"""What is odd about the pictures of a recording: sizes, gaps, borders, interlacing, masks and depth."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sags_node.checks import Finding
+from sags_node.sources.names import numbers
+from sags_node.sources.pictures import list_pictures, read_picture, size_text
+from sags_node.tools.calibration.matches import match_eyes
+from sags_node.types import U8, Bool
+
+LOOKED_AT = 8  # pictures, spread over the folder
+COMB_STEP = 12  # grey levels that a row must differ from both neighbours, alike
+COMB_SHARE = 0.02  # of the pixels, and
+COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direction
+DARK = 12  # grey level of a border
+NARROWEST_BORDER = 4  # px
+GAP = 1.5  # times the usual step from number to number
+ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median
+DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0)  # m per count, the usual ones first
+FEWEST_MATCHES = 30
+RIGHT_FIRST = "source.geometry.first:=right"
+
+
+def check_numbers(named: Mapping[str, Path | None]) -> list[Finding]:
+    """How many pictures there are, and gaps in their numbers or times."""
+    files = {what: list_pictures(folder) for what, folder in named.items() if folder is not None}
+    found = []
+    for what, each in files.items():
+        steps = np.diff(np.array(numbers(each), np.float64))
+        if len(steps) and (odd := np.flatnonzero(steps > GAP * np.median(steps))).size:
+            where = f"{each[odd[0]].name} and {each[odd[0] + 1].name}"
+            fix = "frames are played evenly: fill the gap or split the recording there"
+            found.append(
+                Finding("warning", f"{what}: {odd.size} gaps in the numbers, first between {where}", fix)
+            )
+    counts = {len(each) for each in files.values()}
+    said = " and ".join(map(str, sorted(counts)))
+    return found or [Finding("ok", f"{said} pictures each, numbered without gaps")]
+
+
+def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path, U8]:
+    """Read pictures spread over the files, also the last and the smallest one: there copies break off.
+
+    Raises:
+        SagsError: one cannot be read.
+    """
+    chosen = set(files[:: max(1, -(-len(files) // LOOKED_AT))])
+    suspects = {files[-1], min(files, key=lambda file: file.stat().st_size)} - chosen
+    for file in suspects:
+        read_picture(file, flags)
+    return {file: read_picture(file, flags) for file in files if file in chosen}
+
+
+def check_eye(what: str, pictures: Collection[U8]) -> list[Finding]:
+    """Look at one eye's pictures [H, W, 3] RGB: sizes, black borders, interlacing."""
+    sizes = {picture.shape[1::-1] for picture in pictures}
+    if len(sizes) > 1:
+        said = " and ".join(size_text(*size) for size in sorted(sizes))
+        return [Finding("error", f"{what}: pictures of {said} px", "all pictures must have one size")]
+    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
+    found = []
+    x, y, width, height = lit_box(np.max(gray, axis=0))
+    if (width, height) != gray[0].shape[::-1]:
+        crop = f"source.geometry.crop:=[{x},{y},{width},{height}]"
+        fix = f"set {crop} (videos, cameras) or cut both eyes alike"
+        what_is = f"{what}: black borders; the picture is {size_text(width, height)} px at {x},{y}"
+        said = f"{what_is}, of {size_text(*gray[0].shape[::-1])}"
+        found.append(Finding("warning", said, fix, launch=(crop,)))
+    combs = [(combing(each), combing(np.ascontiguousarray(each.T))) for each in gray]
+    rows, columns = np.max([comb[0] for comb in combs]), np.median([comb[1] for comb in combs])
+    if rows > COMB_SHARE and rows > COMB_RATIO * columns:
+        fix = "videos: source.geometry.deinterlace:=top or bottom; folders: deinterlace before (ffmpeg bwdif)"
+        said = f"{what}: interlaced, {rows:.0%} of the pixels show combs"
+        found.append(Finding("warning", said, fix, launch=("source.geometry.deinterlace:=top",)))
+    return found or [
+        Finding("ok", f"{what}: {size_text(*gray[0].shape[::-1])} px, not interlaced, no borders")
+    ]
+
+
+def combing(gray: U8) -> float:
+    """Share of pixels of [H, W] that differ from the rows above and below alike: two fields in motion."""
+    middle = gray[1:-1].astype(np.int16)
+    above, below = middle - gray[:-2], middle - gray[2:]
+    return float(np.mean((np.minimum(above, below) > COMB_STEP) | (np.maximum(above, below) < -COMB_STEP)))
+
+
+def lit_box(brightest: U8) -> tuple[int, int, int, int]:
+    """x, y, width and height of what is not a black border; all of it where all is dark."""
+    columns, rows = (np.flatnonzero(np.percentile(brightest, 99, axis=axis) > DARK) for axis in (0, 1))
+    height, width = brightest.shape
+    if not len(columns) or not len(rows):
+        return 0, 0, width, height
+    left, right = (0 if edge < NARROWEST_BORDER else edge for edge in (columns[0], width - 1 - columns[-1]))
+    top, bottom = (0 if edge < NARROWEST_BORDER else edge for edge in (rows[0], height - 1 - rows[-1]))
+    return int(left), int(top), int(width - left - right), int(height - top - bottom)
+
+
+def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
+    """Of both eyes without a calibration: are they in order, and are rows aligned?"""
+    pairs = [(a, b) for a, b in zip(left, right, strict=False) if a.shape == b.shape]
+    if not pairs:
+        return [Finding("error", "the eyes' pictures have not one size", "resize both eyes alike")]
+    matches = np.concatenate([match_eyes(a, b) for a, b in pairs])
+    if len(matches) < FEWEST_MATCHES:
+        fix = "are they of one moment and of one scope? Sharper pictures with more texture tell more"
+        return [Finding("warning", f"only {len(matches)} points are found in both eyes", fix)]
+    across, down = (float(np.median(matches[:, k] - matches[:, k + 2])) for k in (0, 1))
+    rows = float(np.median(np.abs(matches[:, 1] - matches[:, 3])))
+    figures = {"disparity_px": round(across, 2), "rows_px": round(rows, 2)}
+    if np.mean(matches[:, 0] < matches[:, 2]) > 0.8:
+        fix = (
+            "exchange left and right, unless each picture was cut out elsewhere (then calibrate as they are)"
+        )
+        what = "points lie farther to the right in the right eye: eyes exchanged?"
+        return [Finding("warning", what, fix, figures, launch=(RIGHT_FIRST,))]
+    aligned = rows < 1 / 180 * pairs[0][0].shape[1]
+    what = f"disparity {across:.1f} px, rows {'agree' if aligned else 'differ'} ({down:+.1f} px)"
+    fix = "" if aligned else "not rectified: a calibration with distortion and rectification is needed"
+    return [Finding("ok" if aligned else "warning", what, fix, figures)]
+
+
+def check_both(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
+    """Look at each eye, and at how they belong together."""
+    return [*check_eye("left", left), *check_eye("right", right), *check_eyes(left, right)]
+
+
+def check_shares(shares: Sequence[float]) -> list[Finding]:
+    """What masks say of frames: the share of each that is instrument."""
+    if not shares:
+        return []
+    if not any(shares):
+        fix = "leave masks out, and tissue is found by colour (docs/networks.md)"
+        return [Finding("warning", f"masks: none of {len(shares)} marks an instrument", fix)]
+    return [Finding("ok", f"masks: {np.median(shares):.0%} of the picture is instrument")]
+
+
+def check_depth(
+    folder: Path, size: tuple[int, int], unit: float | None = None, stated: bool = False
+) -> list[Finding]:
+    """Kind, size and unit (m per count) of depth pictures; `stated`: whoever made them says that unit."""
+    medians = []
+    for file, depth in read_some(list_pictures(folder), cv2.IMREAD_UNCHANGED).items():
+        if (wrong := _no_depth(file, depth, size)) is not None:
+            return [wrong]
+        known: Bool = depth > 0
+        if known.any():
+            medians.append(float(np.median(depth[known])))
+            coarse = depth.dtype == np.uint8
+    if not medians:
+        return [Finding("error", "depth: no picture knows a pixel", "export it again")]
+    median = float(np.median(medians))
+    fitting = [one for one in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= median * one <= ENDOSCOPE_DEPTH[1]]
+    ask = "the files do not say it: ask who made them"
+    few = "only 8 bit"
+    if unit is not None and unit in fitting:
+        said = f"depth: {median * unit * 1e3:.0f} mm (median) with {unit:g} m per count"
+        if stated:
+            return [Finding("ok", f"{said}, as their author states")]
+        return [Finding("warning" if coarse else "ok", f"{said}; {few}" if coarse else said, ask)]
+    if not fitting:
+        what = f"depth: a median of {median:g} counts is no distance in an endoscope's view in any usual unit"
+        return [Finding("error", what, "is it a disparity, or inverse depth? Convert it to depth")]
+    distance = f"{median * fitting[0] * 1e3:.0f} mm with {fitting[0]:g} m per count"
+    found = [
+        Finding(
+            "ok" if unit is None else "warning",
+            f"depth: {median:g} counts (median): {distance}",
+            f"set source.depth_unit (EndoNeRF's layout) or source.reference.depth_unit to {fitting[0]:g}; "
+            f"{ask}",
+        )
+    ]
+    if coarse:
+        fix = "steps of a whole count: export 16 bit"
+        found.append(Finding("warning", f"depth: {few}", fix))
+    return found
+
+
+def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
+    """Why a picture cannot be depth."""
+    export = "export depth as grey PNG of 16 bit, e.g. in 1e-5 m"
+    if depth.ndim != 2:
+        what = f"depth: {file.name} has {depth.shape[2]} channels: it is coloured for people"
+        return Finding("error", what, export)
+    if depth.dtype.kind == "f":
+        return Finding("error", f"depth: {file.name} holds floating numbers, which are not read", export)
+    if depth.shape[::-1] != size:
+        what = f"depth: {file.name} is {size_text(*depth.shape[::-1])} px, the pictures {size_text(*size)}"
+        return Finding("error", what, "resize depth with nearest neighbour, never a mean")
+    return None

@@ -1,0 +1,133 @@
+"""`sags new`: how a recording or a camera is best played, by what its pictures show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sags_node.checks import Finding, is_wrong
+from sags_node.config.launch_file import known_recording, load_launch
+from sags_node.config.schema import EndoNerfSource, FoldersSource, LaunchConfig, LiveSource
+from sags_node.errors import UsageError
+from sags_node.sources.pictures import size_text
+from sags_node.tools.calibration.eyes import look
+from sags_node.tools.calibration.pictures import pairs_of_session
+from sags_node.tools.importing import pictures, videos
+from sags_node.tools.importing.check import calibrated, overrides_of, played
+from sags_node.tools.importing.folder import is_video, override
+
+DEVICES = Path("/dev")
+EYES = ("left", "right")
+SECONDS = 2.0  # that a camera is watched
+WHOLE = "source.geometry.layout:=over_under"  # takes any picture apart so that it can be put together again
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """What a launch file should say, and why."""
+
+    launch: list[str]  # key:=value
+    findings: list[Finding]
+
+
+def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
+    """Try a recording or cameras, and set what makes them well.
+
+    Args:
+        named: a folder, a video or a device; or two videos, folders or devices, the left eye first.
+        overrides: `key:=value` that the user wants.
+
+    Raises:
+        UsageError: what is named is not there or cannot be played, or it has a launch file already.
+        SagsError: it cannot be opened, or gives no pictures.
+    """
+    launch = [*_launch_of(named, overrides), *overrides]
+    config = load_launch(named[0], launch)
+    found = _opened(config)
+    if is_wrong(found):
+        return Proposal(launch, found)
+    looked = [] if isinstance(config.source, EndoNerfSource) else _looked_at(config)
+    fixes = list(dict.fromkeys(fix for finding in looked for fix in finding.launch))
+    if isinstance(config.source, FoldersSource):  # which know no geometry
+        fixes = [fix for fix in fixes if fix == pictures.RIGHT_FIRST]
+    if fixes:
+        launch, done = _with(launch, fixes)
+        found += [
+            replace(each, level="ok", fix=done[each.launch[0]])
+            for each in looked
+            if each.launch and each.launch[0] in done
+        ]
+        looked = _looked_at(load_launch(named[0], launch))
+    return Proposal(launch, [*found, *looked, *calibrated(load_launch(named[0], launch))])
+
+
+def _launch_of(named: Sequence[Path], overrides: Sequence[str]) -> list[str]:
+    if len(named) > 2:
+        raise UsageError("name one folder, video or device, or two of one kind: left and right")
+    if all(path.is_relative_to(DEVICES) for path in named):
+        return _of_cameras(named, overrides)
+    if len(named) == 2:
+        for kind, fits in (("videos", is_video), ("folders", Path.is_dir)):
+            if all(fits(path) for path in named):
+                left, right = (override(f"source.{eye}", path) for eye, path in zip(EYES, named, strict=True))
+                return [f"source.kind:={kind}", left, right]
+        raise UsageError(f"{named[0]} and {named[1]} are neither two videos nor two folders of pictures")
+    known = known_recording(named[0])
+    launch = overrides_of(named[0]) if known is None else list(_flat(known))
+    if not launch:
+        raise UsageError(f"{named[0]} has a launch file already: copy it, and change what should differ")
+    return launch
+
+
+def _flat(tree: Mapping[str, Any], within: str = "") -> Iterator[str]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{within}{key}.")
+        else:
+            yield override(f"{within}{key}", value)
+
+
+def _of_cameras(devices: Sequence[Path], overrides: Sequence[str]) -> list[str]:
+    launch = ["source.kind:=v4l2", override("source.left", devices[0])]
+    if len(devices) == 2:
+        return [*launch, override("source.right", devices[1])]
+    launch.append("source.right:=null")
+    if any(each.startswith(videos.LAYOUT) for each in overrides):
+        return launch
+    pairs, _ = pairs_of_session(load_launch(None, [*launch, *overrides, WHOLE]))
+    whole = [np.vstack(pair) for pair in pairs]
+    way = videos.way_of(whole)
+    if way is None:
+        raise UsageError(f"{devices[0]}: {videos.ONE_EYE}; name both devices, or set source.geometry.layout")
+    return [*launch, *videos.layout_of(way, whole)]
+
+
+def _opened(config: LaunchConfig) -> list[Finding]:
+    if not isinstance(config.source, LiveSource):
+        return played(config)
+    _, found = look(config, SECONDS)
+    size, rate = size_text(found["width"], found["height"]), found["frames_per_s"]
+    what = f"{size} px at {rate} Hz; the eyes are {found['skew_ms']} ms apart, {found['age_ms']} ms old"
+    return [Finding("ok", what)]
+
+
+def _looked_at(config: LaunchConfig) -> list[Finding]:
+    """What some of its pictures show, spread over it."""
+    pairs, _ = pairs_of_session(config)
+    return pictures.check_both(*zip(*pairs, strict=True))
+
+
+def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """The launch with its fixes, and in words what each of them did."""
+    keys = dict(each.split(":=", 1) for each in launch)
+    done = {fix: f"{fix} is set" for fix in fixes}
+    apart = keys.get("source.right") not in (None, "null")
+    if pictures.RIGHT_FIRST in done and apart:  # no geometry says which of two files is whose
+        keys["source.left"], keys["source.right"] = keys["source.right"], keys["source.left"]
+        done[pictures.RIGHT_FIRST] = "left and right are exchanged"
+        fixes = [fix for fix in fixes if fix != pictures.RIGHT_FIRST]
+    return [*(f"{key}:={value}" for key, value in keys.items()), *fixes], done
