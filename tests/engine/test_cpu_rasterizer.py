@@ -159,6 +159,21 @@ def test_view_is_normalised_by_coverage() -> None:
     assert drawn.rgb[0, 0, 0] == 128  # fresh arrays
 
 
+def test_a_pixel_between_gaussians_has_its_own_depth_where_all_beside_it_have_one() -> None:
+    planes = np.zeros((5, 6, 9), np.float32)
+    planes[3], planes[4] = 0.05 * 0.8, 0.8
+    planes[3:, 1, 1] = [0.06 * 0.2, 0.2]  # faint, and alone
+    planes[3:, 1, 3:5] = [[0.05 * 0.2], [0.2]]  # two beside each other: a hole
+    planes[3:, 3, 6] = 0  # nothing was drawn there
+    planes[3:, 4, 0] = [0.05 * 0.2, 0.2]  # at the border: nobody knows what lies beyond
+    holes = np.zeros((6, 9), bool)
+    holes[1, 3:5] = holes[3, 6] = holes[4, 0] = True
+    depth = to_view(planes, camera(width=9, height=6), 0, 0).depth
+    assert np.array_equal(depth == 0, holes)
+    assert depth[1, 1] == pytest.approx(0.06, rel=after(4))
+    assert depth[0] == pytest.approx(0.05, rel=after(4))
+
+
 def test_buffers_grow_when_a_picture_needs_more_pairs() -> None:
     """100 Gaussians that all cover all 54 tiles, from a fresh rasteriser with room for 4096 pairs."""
     view = camera(width=140, height=180, focal=150.0)

@@ -21,7 +21,8 @@ SOLID = f4(0.5)  # coverage from which on a depth is stated
 def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> RenderedView:
     """The picture that `planes` [5, h, w] of `Rasterizer.forward` show, in fresh arrays of the camera's size.
 
-    rgb = C / alpha held in 0..1, 0 where alpha < 0.001; depth = D / alpha (m) where alpha >= 0.5, else 0.
+    rgb = C / alpha held in 0..1, 0 where alpha < 0.001; depth = D / alpha (m) where alpha >= 0.5, or where it
+    is at all and all four pixels beside it have that, else 0.
     Planes of another size than the camera's are interpolated: depths, before they are divided, by straight
     lines, which invent no depth beyond those around; colours as bytes, when somebody asks for them.
     """
@@ -73,6 +74,8 @@ def _write_depths(sums: F32, coverage: F32, depth: F32, alpha: F32) -> None:
     for row in prange(len(sums)):
         y = np.int64(row)
         _write_depths_row(sums[y], coverage[y], depth[y], alpha[y])
+        if 0 < y < len(sums) - 1:
+            _fill_holes_row(sums[y], coverage[y - 1], coverage[y], coverage[y + 1], depth[y])
 
 
 @kernel
@@ -83,3 +86,14 @@ def _write_depths_row(sums: F32, coverage: F32, depth: F32, alpha: F32) -> None:
         quotient = sums[x] / coverage[x]
         depth[x] = quotient if solid else ZERO
         alpha[x] = min(max(coverage[x], ZERO), ONE)
+
+
+@kernel
+def _fill_holes_row(sums: F32, above: F32, coverage: F32, below: F32, depth: F32) -> None:
+    """States the depth of pixels between Gaussians that hardly touch each other: a new model has many."""
+    for i in range(1, sums.size - 1):
+        x = u8(i)
+        if FAINT < coverage[x] < SOLID:
+            beside = min(coverage[x - u8(1)], coverage[x + u8(1)])
+            if min(beside, above[x], below[x]) >= SOLID:
+                depth[x] = sums[x] / coverage[x]
