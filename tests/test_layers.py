@@ -64,7 +64,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1072,
     "sags_node/vision": 5463,
-    "tests": 45398,
+    "tests": 45399,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -20,6 +20,7 @@ from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.pipeline.session import open_session
+from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.tools.importing.pictures import combing, lit_box
 from sags_node.types import U8
@@ -179,7 +180,7 @@ def test_a_planted_oddity_is_named_with_its_fix(name: str, tmp_path: Path) -> No
 def is_refused(folder: Path) -> bool:
     """By `sags run`."""
     try:
-        with open_session(folder, overrides_of(folder), guess=True).source as source:
+        with open_session(folder, overrides_of(folder), guess=guess_rig).source as source:
             next(iter(source))
     except SagsError:
         return True
@@ -424,12 +425,12 @@ def test_a_video_that_is_cut_off_is_refused_by_check_and_run_alike(
     (error,) = [each for each in check_folder(tmp_path) if each.level == "error"]
     assert file.name in error.what and "is cut off" in error.what
     with pytest.raises(UsageError, match=r"is cut off.*copy it again"):
-        open_session(tmp_path, overrides_of(tmp_path), guess=True)
+        open_session(tmp_path, overrides_of(tmp_path), guess=guess_rig)
     remedy = error.fix.split()[-1]
     assert 50 < int(remedy.removeprefix("source.frames:=")) < 149
     assert "error" not in {each.level for each in check_folder(tmp_path, [remedy])}
     overrides = [*overrides_of(tmp_path), remedy, "source.pace:=step"]
-    with open_session(tmp_path, overrides, guess=True).source as source:
+    with open_session(tmp_path, overrides, guess=guess_rig).source as source:
         assert len(list(source)) == int(remedy.removeprefix("source.frames:="))
 
 
