@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 from recorded_session import both, frames_of, opened
-from watching import judged
 
 from sags_node.findings import by_code
 from sags_node.importing.check import check_folder, overrides_of
@@ -18,8 +17,7 @@ from sags_node.media.video import Video
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.types import U8
-from sags_node.vision.rectify import Rectifier
-from sags_node.vision.watch.color_watch import ColorWatch, is_blue
+from sags_node.vision.watch.color_watch import is_blue
 
 CODE = "red_blue_exchanged"
 
@@ -54,17 +52,6 @@ def test_a_folder_is_told_by_check_and_run_alike(eyes: str, tmp_path: Path) -> N
     if eyes == "exchanged":
         text = by_code(pipeline.warnings)[CODE]
         assert text == f"{said[0].what}; {said[0].fix}"
-
-
-def test_it_ends_with_its_cause() -> None:
-    session = opened("source.frames:=12")
-    watch, rectify = ColorWatch(), Rectifier(session.rig, *session.working_size)
-    codes = []
-    for number, frame in enumerate(frames_of(session)):
-        shown = both(frame, exchanged) if number < 6 else frame
-        judged(watch, shown, rectify(shown))
-        codes.append(bool(watch.findings))
-    assert codes[1:6] == [True] * 5 and not any(codes[9:])
 
 
 def real_pictures(data: Path) -> dict[str, list[U8]]:
