@@ -48,7 +48,7 @@ LINES = {
     "sags_node/registration": 466,
     "sags_node/rig": 1182,
     "sags_node/ros": 332,
-    "sags_node/sources": 5702,
+    "sags_node/sources": 5703,
     "sags_node/terminal": 345,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5509,

@@ -120,9 +120,9 @@ def _plain(folder: Path) -> Contents:
         )
         return Contents(what, "give the folder that holds the recording", "error")
     instead = f"check one of the folders in it: {', '.join(below[:8])}"
-    if len(eyes := [name for name in below if has_pictures(folder / name)]) > 1:
+    if len(likely := [name for name in below if has_pictures(folder / name)]) > 1:
         instead = (
-            f"name those of both eyes, the left one first: sags new LEFT RIGHT, of {', '.join(eyes[:8])}"
+            f"name those of both eyes, the left one first: sags new LEFT RIGHT, of {', '.join(likely[:8])}"
         )
     return Contents("nothing that is known", instead, "error")
 

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, cast
 import av
 import cv2
 import numpy as np
-from av.format import Flags
 from av.sidedata.sidedata import Type
 from av.stream import Discard, Disposition
 from av.video.reformatter import Colorspace, Interpolation, VideoReformatter
@@ -51,6 +50,7 @@ BROKEN = (av.FFmpegError, IndexError)  # where a file breaks off; where another 
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
 _MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
 DEEP = 16  # bits of a sample
+NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg
 HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ISO/IEC 23091-2
 SPLIT = "if each is an eye: ffmpeg -i OLD -map 0:v:0 -c copy left.mkv -map 0:v:1 -c copy right.mkv"
 
@@ -129,7 +129,7 @@ class Video:
         self.oddities = [f"{path}: {index.unused}"] if index.unused else []
         if self.tracks > 1:
             self.oddities.append(f"{path} holds {self.tracks} video tracks, and the first is shown; {SPLIT}")
-        if self._container.format.flags & Flags.no_timestamps.value:
+        if self._container.format.flags & NO_TIMES:
             self.oddities.append(
                 f"{path} is a stream without a container, which holds no times: nobody can tell its rate, or "
                 "whether it is whole; record it as MP4 or Matroska, or set source.rate"

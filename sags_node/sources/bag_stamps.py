@@ -53,7 +53,8 @@ def pair_messages(
 def taken(keys: Sequence[Key]) -> I64:
     """When pictures were taken, ns: their stamps, or when they were recorded where most stamps are repeated:
     then nobody stamped them one by one."""
-    came, stamps = np.array(keys, np.int64).T
+    both: I64 = np.array(keys, np.int64)
+    came, stamps = both[:, 0], both[:, 1]
     distinct = len(np.unique(stamps))
     return stamps if distinct > REPEATED * len(stamps) or distinct == len(np.unique(came)) else came
 
