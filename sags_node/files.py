@@ -18,6 +18,7 @@ from typing import BinaryIO
 
 from sags_node.errors import SagsError, UsageError
 
+SHOWN = "[!.]*"  # no hidden files: macOS puts `._NAME` beside each on foreign disks
 NO_TEXT = "holds bytes that are no UTF-8 text, so no other program can be told of it: rename it"
 LARGEST_RESULT = 64 << 20  # bytes of figures as JSON
 _checked: set[Path] = set()  # asked for without --force: what comes there before `whole` has ended stays

@@ -45,6 +45,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "network_failed": "network",
     "gpu_memory": "device",
     "gpu_failed": "device",
+    "red_blue_exchanged": "source",
     "no_frames": "source",
     "source_drops": "source",
     "two_senders": "source",

@@ -22,7 +22,7 @@ from sags_node.config.launch_file import BAG_SUFFIXES as SUFFIXES
 from sags_node.config.launch_file import UNFINISHED
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
-from sags_node.files import open_file
+from sags_node.files import SHOWN, open_file
 from sags_node.messaging import cdr
 
 MAX_METADATA_BYTES = 4 << 20
@@ -105,7 +105,7 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
 
 def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
-    return sorted(folder.glob(f"*{suffix}"), key=lambda file: (_number(file.stem), file.name))
+    return sorted(folder.glob(f"{SHOWN}{suffix}"), key=lambda file: (_number(file.stem), file.name))
 
 
 def _number(stem: str) -> int:

@@ -20,7 +20,7 @@ from sags_node.config.schema import (
 )
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import UsageError, brief
-from sags_node.files import check_name, open_file
+from sags_node.files import SHOWN, check_name, open_file
 
 S = TypeVar("S", bound=Section)
 
@@ -31,7 +31,7 @@ BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 UNFINISHED = ".bag.active"  # of ROS 1, while it is recorded
 VIDEO_SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".3gp", ".avi", ".mkv", ".webm", ".wmv", ".asf", ".flv", ".ogv", ".mxf", ".dv"),
-    *(".mpg", ".mpeg", ".vob", ".ts", ".mts", ".m2ts"),
+    *(".mpg", ".mpeg", ".vob", ".ts", ".mts", ".m2ts", ".h264", ".264", ".hevc", ".h265", ".265"),
 )
 SIDECAR_TYPE = "dvrk_data:video_sidecar@"
 SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
@@ -199,7 +199,7 @@ def _bag_of(path: Path) -> Path | None:
         return path
     if (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3")):
         return path
-    bags = [*path.glob("*.bag"), *path.glob(f"*{UNFINISHED}")]
+    bags = [*path.glob(f"{SHOWN}.bag"), *path.glob(f"{SHOWN}{UNFINISHED}")]
     return bags[0] if len(bags) == 1 else None
 
 

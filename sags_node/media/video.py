@@ -50,6 +50,9 @@ BROKEN = (av.FFmpegError, IndexError)  # where a file breaks off; where another 
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
 _MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
 DEEP = 16  # bits of a sample
+NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg
+HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ISO/IEC 23091-2
+SPLIT = "if each is an eye: ffmpeg -i OLD -map 0:v:0 -c copy left.mkv -map 0:v:1 -c copy right.mkv"
 
 
 class LostPictureError(SagsError):
@@ -78,6 +81,7 @@ class Video:
         is_even: stamps say no more than the rate.
         pixel_aspect: width of a pixel over its height.
         cut_off: why the file must have been longer; "": it is whole.
+        tracks: how many there are; the first is read.
         is_interlaced: the file says so of its first picture.
         oddities: what is to be said of the file, each with a remedy after a semicolon.
 
@@ -121,7 +125,20 @@ class Video:
         self.count = index.count if self.stamps is None else len(self.stamps)
         self.rate, self.is_even = self._find_rate()
         self.cut_off = index.cut_off
+        self.tracks = len(_tracks(self._container))
         self.oddities = [f"{path}: {index.unused}"] if index.unused else []
+        if self.tracks > 1:
+            self.oddities.append(f"{path} holds {self.tracks} video tracks, and the first is shown; {SPLIT}")
+        if self._container.format.flags & NO_TIMES:
+            self.oddities.append(
+                f"{path} is a stream without a container, which holds no times: nobody can tell its rate, or "
+                "whether it is whole; record it as MP4 or Matroska, or set source.rate"
+            )
+        if (tones := HDR.get(self._stream.codec_context.color_trc)) is not None:
+            self.oddities.append(
+                f"{path} has the tones of HDR ({tones}), which are shown as they are, with little contrast; "
+                "record SDR (BT.709), or convert it (ffmpeg's zscale and tonemap)"
+            )
         if (bits := _bits_used(first)) is not None:
             self.oddities.append(
                 f"{path} has samples of {DEEP} bits, of which its first picture uses {bits}: it may be "
@@ -278,7 +295,7 @@ def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
         container = av.open(f"file:{path}", options={"protocol_whitelist": "file"}, metadata_errors="ignore")
     except (av.FFmpegError, ValueError):
         raise UsageError(f"{path} cannot be read as a video; is it complete?") from None
-    streams = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+    streams = _tracks(container)
     if not streams:
         container.close()
         raise UsageError(f"{path} cannot be read as a video: it holds no pictures; is it the right file?")
@@ -292,6 +309,11 @@ def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
     return container, streams[0]
 
 
+def _tracks(container: InputContainer) -> list[av.VideoStream]:
+    """All but covers."""
+    return [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+
+
 @lru_cache(maxsize=16)
 def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
     """One pass over the packets of a file, which is told from an older one by its size (bytes) and time."""
@@ -302,12 +324,13 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         shown: list[int | None] = []
         keys: list[tuple[int, int, int]] = []
         ticks: list[int] = []  # when packets are decoded
-        total, is_broken = 0, False
+        total, latest, is_broken = 0, 0, False
         with suppress(*BROKEN):
             for packet in container.demux(stream):
                 is_broken = packet.is_corrupt or (is_broken and not packet.size)
                 total += packet.size > 0
                 ticks += [] if packet.dts is None else [packet.dts]
+                latest = max(latest, packet.dts or 0, packet.pts or 0)
                 if packet.size and not packet.is_discard:
                     shown.append(packet.pts)
                 if packet.is_keyframe and packet.pts is not None:
@@ -323,7 +346,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         unused = "" if are_few else _why_unused(known, base)
         is_used = not are_few and not unused
         pts = np.unique(known) if is_used else None
-        ends = 0.0 if not ticks else float((max(ticks) + np.diff(ticks).max(initial=0)) * base)
+        ends = 0.0 if not ticks else float((latest + np.diff(ticks).max(initial=0)) * base)
         missing = 0.0  # s
         if container.format.name == "avi":  # counts its beats, and writes one for each
             missing = float(stream.frames * base) - ends

@@ -53,6 +53,7 @@ from sags_node.vision.observe import observe
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
+from sags_node.vision.watch.color_watch import ColorWatch
 from sags_node.vision.watch.freeze_watch import FreezeWatch
 from sags_node.vision.watch.judgement import Evidence, Judgement, Watcher
 from sags_node.vision.watch.lens_watch import LensWatch
@@ -141,7 +142,7 @@ class Pipeline:
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._freeze = FreezeWatch(vision.tissue.exclude)
         self._watchers: tuple[Watcher, ...] = (
-            self._pose, self._freeze, PairWatch(), self._scene, LensWatch()
+            self._pose, self._freeze, PairWatch(), self._scene, LensWatch(), ColorWatch()
         )  # fmt: skip
         self._still = StillScene()
         self._reset_due = False

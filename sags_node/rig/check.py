@@ -23,6 +23,9 @@ OTHER_SIZES = (0.25, 1 / 3, 0.5, 2.0, 3.0, 4.0)  # of the picture that a calibra
 SAME_CENTRE = 0.12  # of the ratio of principal point to middle: how well both axes and eyes must agree
 LARGEST_RADIUS, RADII = 4.0, 4001  # at distance 1: 76 degrees from the axis
 WIDE = 90  # degrees from corner to corner: beyond it lenses are often calibrated by fisheye models
+EXCHANGE_FILES = (
+    "exchange left.yaml and right.yaml (of a bag or ROS 2: source.left_info and source.right_info)"
+)
 RECALIBRATE = "run the stereo calibration again and save both files from one run"
 
 
@@ -94,6 +97,9 @@ def _check_eyes(rig: StereoRig) -> list[Finding]:
     for file, eye in _eyes(rig):
         if not geometry.is_rotation(eye.R):
             found.append(Finding("error", f"{file}: rectification_matrix is not a rotation", RECALIBRATE))
+        if not eye.P.any():
+            what = f"{file}: projection_matrix is all zeros: the eyes were calibrated one by one, if at all"
+            return [Finding("error", what, "calibrate both together: sags calib stereo, then set rig")]
         for key, K in (("camera_matrix", eye.K), ("projection_matrix", eye.P[:, :3])):
             found += check_intrinsics(f"{file}: {key}", K, eye.width, eye.height)
         found += _check_distortion(file, eye) + _check_model(file, eye)
@@ -102,6 +108,9 @@ def _check_eyes(rig: StereoRig) -> list[Finding]:
 
 def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Finding]:
     """What is odd or wrong with `K` [3, 3] px of a picture; `where` names it."""
+    if np.any(K[2, :2] != 0):
+        what = f"{where} is transposed: its last row is {K[2, 0]:g} {K[2, 1]:g} {K[2, 2]:g}, not 0 0 1"
+        return [Finding("error", what, "write its columns as rows (MATLAB's cameraParameters are so)")]
     found = []
     for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
         if not 0.2 * width < focal < 20 * width:
@@ -198,7 +207,7 @@ def _check_order(rig: StereoRig) -> list[Finding]:
     left, right = float(rig.left.P[0, 3]) + 0.0, float(rig.right.P[0, 3]) + 0.0  # no minus before a zero
     what = f"projection_matrix[3] is {left:g} in left.yaml and {right:g} in right.yaml"
     if left < 0 and right == 0:
-        return [Finding("error", f"{what}: the eyes are exchanged", "exchange left.yaml and right.yaml")]
+        return [Finding("error", f"{what}: the eyes are exchanged", EXCHANGE_FILES)]
     if left != 0:
         return [Finding("error", what, "the left one must be 0: the left eye is the reference")]
     if right == 0:

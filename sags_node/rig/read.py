@@ -331,7 +331,9 @@ def _matrix(storages: Storages, key: str) -> F64:
     numbers = numbers_in(node)
     if numbers is None or numbers.size not in COUNTS[key]:
         what = f"{node.name()} is not a matrix of {_needed(key)} numbers"
-        raise UsageError(f"{file}: {what}; save the file again")
+        turn = key == "R" and numbers is not None and numbers.size == 3
+        fix = "of a rotation vector save cv2.Rodrigues(R)[0]" if turn else "save the file again"
+        raise UsageError(f"{file}: {what}; {fix}")
     return numbers
 
 

@@ -14,6 +14,7 @@ from sags_node.types import I64
 
 Key = tuple[int, int]  # when a message was recorded and its own stamp, ns: names it within its topic
 
+REPEATED = 0.3  # distinct stamps of all: messages that were recorded twice or thrice have more
 FEW_PAIRS = 0.9  # of the left pictures; fewer are worth a warning
 SYNCHRONISED_MS = 5.0  # between the eyes of a pair: as live pictures are paired
 LATE_STEPS = 1.5  # from one picture to the next: one eye's way to the recorder is not so much longer
@@ -31,7 +32,7 @@ def pair_messages(
     Raises:
         UsageError: nothing pairs.
     """
-    stamps, others = (np.array(keys, np.int64)[:, 1] for keys in (left, right))
+    stamps, others = map(taken, (left, right))
     ahead = came_later(right) - came_later(left)  # the left eye's clock, of the right one's
     if config.clocks == "two":
         others = others + ahead
@@ -49,16 +50,36 @@ def pair_messages(
     return keys, np.stack([stamps[pairs[:, 0]], others[pairs[:, 1]]], axis=1)
 
 
+def taken(keys: Sequence[Key]) -> I64:
+    """When pictures were taken, ns: their stamps, or when they were recorded where most stamps are repeated:
+    then nobody stamped them one by one."""
+    both: I64 = np.array(keys, np.int64)
+    came, stamps = both[:, 0], both[:, 1]
+    distinct = len(np.unique(stamps))
+    return stamps if distinct > REPEATED * len(stamps) or distinct == len(np.unique(came)) else came
+
+
 def came_later(keys: Sequence[Key]) -> int:
     """How much later than their stamps say messages were recorded, ns, the median."""
-    return int(np.median([log_ns - stamp for log_ns, stamp in keys]))
+    return int(np.median([log_ns for log_ns, _ in keys] - taken(keys)))
 
 
 def judge_stamps(
-    keys: Sequence[tuple[Key, Key]], stamps: I64, rate: float | None, counts: tuple[int, int]
+    keys: Sequence[tuple[Key, Key]],
+    stamps: I64,
+    rate: float | None,
+    eyes: tuple[Sequence[Key], Sequence[Key]],
 ) -> tuple[Finding, ...]:
-    """What is odd about pairs of `counts` pictures: few, of clocks that differ, or not of one moment."""
+    """What is odd about pairs of both `eyes`' pictures: few, of clocks that differ, or not of one moment."""
     found = []
+    for eye, pictures in zip(("left", "right"), eyes, strict=True):
+        stamped = [stamp for _, stamp in pictures]
+        if not np.array_equal(taken(pictures), stamped):
+            count = len(set(stamped))
+            what = (
+                f"{len(pictures)} {eye} pictures have {count} stamps: when they were recorded counts instead"
+            )
+            found.append(Finding("warning", what, "let the driver stamp each picture when it is taken"))
     came = np.array([[each[0] for each in pair] for pair in keys], np.int64)
     later = float(np.median((came - stamps) @ [-1, 1])) * 1e-6
     skew = float(np.median(stamps @ [-1, 1])) * 1e-6
@@ -76,6 +97,7 @@ def judge_stamps(
         )
         fix = "depth is wrong where tissue moves: trigger both cameras together, or use genlock"
         found.append(Finding("warning", what, fix, {"skew_ms": round(skew, 2)}))
+    counts = [len(set(pictures)) for pictures in eyes]
     if len(keys) < FEW_PAIRS * counts[0]:
         what = f"{len(keys)} pairs of {counts[0]} left and {counts[1]} right pictures"
         found.append(Finding("warning", what, "what has no partner in time is left out"))

@@ -112,7 +112,7 @@ class BagPairs(Pairs):
         self.count = len(self._keys)
         steps = np.diff(self.stamps[:, 0])
         self.rate = float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else None
-        self.judged = judge_stamps(self._keys, self.stamps, self.rate, (len(left), len(right)))
+        self.judged = judge_stamps(self._keys, self.stamps, self.rate, (left, right))
         self._layout = Layout(config.geometry)
         self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
         self._size: tuple[int, int] | None = None
@@ -152,7 +152,7 @@ class BagPairs(Pairs):
         if size != self._size:
             raise SagsError(
                 f"{where}: {size_text(*size)} px, but the pictures before are {size_text(*self._size)}; "
-                "all pictures must have one size"
+                f"all pictures must have one size: play what is before with source.frames:={self._next}"
             )
         return picture
 

@@ -24,6 +24,7 @@ from sags_node.sources.truth import load_npy
 from sags_node.types import F32, F64, StereoRig
 
 # Of a frame's known depths: what lies outside is drawn to them, as EndoGaussian's loader does.
+UNKNOWN = 65535  # counts, as many programs write it
 DEPTH_PERCENTILES = (3.0, 99.8)
 PLAUSIBLE_DEPTH = (0.01, 1.0)  # m, the median of a frame: in an endoscope's view
 PUBLISHED = (640, 512, 569.4682)  # px: width, height and focal length of the clips of EndoNeRF
@@ -97,7 +98,7 @@ class EndoNerfPairs(FolderPairs):
         return pair._replace(depth=depth, T_world_cam=self._T_world_cam[index])
 
     def _read_depth(self, file: Path) -> F32:
-        """Depth [H, W] m; a count of 0 is unknown."""
+        """Depth [H, W] m; a count of 0 is unknown, as is the last one of 16 bit."""
         counts = read_picture(file, cv2.IMREAD_UNCHANGED)
         if counts.ndim != 2:
             raise SagsError(
@@ -108,7 +109,7 @@ class EndoNerfPairs(FolderPairs):
                 f"{file} is {size_text(*counts.shape[1::-1])} px but the pictures are "
                 f"{size_text(*self.size)}; all pictures of a clip must have one size"
             )
-        known = counts > 0
+        known = (counts > 0) & (counts != UNKNOWN)
         if not known.any():
             return np.zeros(counts.shape, np.float32)
         near, far = np.percentile(counts[known], DEPTH_PERCENTILES)

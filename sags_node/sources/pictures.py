@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sags_node.checks import Finding
 from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
-from sags_node.files import read_file
+from sags_node.files import SHOWN, read_file
 from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
@@ -170,7 +170,7 @@ def list_pictures(folder: Path) -> list[Path]:
     if not folder.is_dir():
         reason = "is not a folder" if folder.exists() else "does not exist"
         raise UsageError(f"picture folder {folder} {reason}; check the path, or SAGS_DATA if it is used")
-    pictures = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
+    pictures = [file for file in folder.glob(SHOWN) if file.suffix.lower() in SUFFIXES]
     for file in pictures:
         if file.exists() and not file.is_file():
             raise UsageError(f"{file} has a picture's name but is no file; remove it from the folder")

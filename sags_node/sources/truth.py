@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
+from sags_node.geometry import is_rotation
 from sags_node.sources.pictures import list_pictures, read_picture
 from sags_node.types import F32, F64, Reference
 
 _LARGEST = 2**31  # bytes
+FARTHEST = 1.0  # m that a scope moves: a millimetre that is taken for a metre
 
 
 class Poses:
@@ -33,6 +35,18 @@ class Poses:
         self._poses = load_array(file, "T_world_cam", (None, 4, 4)).astype(np.float64)
         if not np.isfinite(self._poses).all():
             raise UsageError(f"{file}: T_world_cam holds values that are not finite")
+        rigid = is_rotation(self._poses[:, :3, :3]) & (self._poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
+        if not rigid.all():
+            raise UsageError(
+                f"{file}: T_world_cam of frame {int(np.argmin(rigid))} is no rotation and translation; "
+                "is it transposed, or scaled?"
+            )
+        moved = np.ptp(self._poses[:, :3, 3], axis=0).max(initial=0)
+        if moved > FARTHEST:
+            raise UsageError(
+                f"{file}: T_world_cam moves the camera by {moved:.3g} m, more than within a patient; "
+                "translations are in metres: of millimetres divide them by 1000"
+            )
 
     def at(self, index: int) -> F64:
         """`T_world_cam` [4, 4] of one frame of the recording, metres."""

@@ -141,6 +141,7 @@ def in_pictures(folder: Path) -> None:
     edit(folder, "left", {"camera_matrix": {"data": [float(k) for k in K.ravel()]}})
 
 
+TRANSPOSED = {"camera_matrix": {"data": make_rig().left.K.T.ravel().tolist()}}  # as MATLAB writes it
 MIRROR = {"rectification_matrix": {"data": [1.0, 0, 0, 0, 1.0, 0, 0, 0, -1.0]}}
 
 
@@ -158,6 +159,11 @@ MIRROR = {"rectification_matrix": {"data": [1.0, 0, 0, 0, 1.0, 0, 0, 0, -1.0]}}
         (lambda folder: edit(folder, "right", {"image_width": 720}), "same picture size"),
         (lambda folder: edit(folder, "left", MIRROR), "not a rotation"),
         (in_pictures, "not plausible"),
+        (
+            lambda folder: edit(folder, "left", {"projection_matrix": {"data": [0.0] * 12}}),
+            "all zeros.*one by",
+        ),
+        (lambda folder: edit(folder, "left", TRANSPOSED), "camera_matrix is transposed"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

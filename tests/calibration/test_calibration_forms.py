@@ -330,6 +330,7 @@ def test_zeros_after_the_coefficients_do_not_count(tmp_path: Path) -> None:
     [
         ({"M2": None}, "looked for a matrix named M2, K2"),
         ({"R": np.eye(2)}, "R is not a matrix of 9 numbers"),
+        ({"R": np.array([0.1, 0, 0])}, "of a rotation vector save cv2.Rodrigues(R)[0]"),
         ({"R": np.diag([1.0, 1, -1])}, "is not a rotation"),
         ({"T": np.zeros(3)}, "no baseline"),
         ({"T": np.array([np.nan, 0, 0])}, "NaN"),

@@ -211,6 +211,39 @@ def test_one_broken_file_is_said_once(tmp_path: Path) -> None:
     assert overrides_of(folder)[-1] == f"rig:={folder / 'calib'}"
 
 
+def test_what_macos_writes_beside_files_is_passed_over(tmp_path: Path) -> None:
+    (tmp_path / "videos").mkdir()
+    for name in ("left", "right"):
+        write(tmp_path / f"videos/{name}.mp4", moving(5, -DISPARITY * (name == "right")))
+    for folder in (made(tmp_path / "pictures"), tmp_path / "videos"):
+        for file in [each for each in folder.rglob("*") if each.is_file()]:
+            file.with_name(f"._{file.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X")
+        assert not odd(folder) and not is_refused(folder)
+
+
+def test_a_calibration_of_any_name_in_its_folder_is_used(tmp_path: Path) -> None:
+    folder = made(tmp_path / "case")
+    for name, is_used in (("calib/endoscope.yml", True), ("other.yml", False), ("my_calib.yml", True)):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("%YAML:1.0\n---\n")
+        found = check_folder(folder)
+        assert any(name in each.what for each in found if each.level == "error") == is_used
+        (folder / name).unlink()
+
+
+@pytest.mark.parametrize(("left", "right"), [("image_02", "image_03"), ("image_0", "image_1")])
+def test_folders_of_kitti_are_known_and_others_are_asked_for(left: str, right: str, tmp_path: Path) -> None:
+    folder = made(tmp_path / "case")
+    (folder / "left").rename(folder / left)
+    (folder / "right").rename(folder / right)
+    assert f"source.right:={folder / right}" in overrides_of(folder)
+    (folder / right).rename(folder / "cam7")
+    (error,) = check_folder(folder)
+    assert (
+        error.fix.startswith("name those of both eyes, the left one first: sags new") and "cam7" in error.fix
+    )
+
+
 def test_eyes_are_told_by_names(tmp_path: Path) -> None:
     folder = made(tmp_path / "folders")
     (folder / "left").rename(folder / "cam_left")

@@ -315,6 +315,25 @@ def test_headers_without_stamps_use_the_time_of_recording(tmp_path: Path) -> Non
 # ---- calibration -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("unit", [10**9, 10**18], ids=["whole seconds", "one for all"])
+def test_stamps_that_repeat_give_way_to_the_time_of_recording(unit: int, tmp_path: Path) -> None:
+    rows = files.stereo_rows(ROS2, 30)
+    for _, message, stamp in rows:
+        message.header.stamp.sec, message.header.stamp.nanosec = stamp // unit * unit // 10**9, 0
+    bag = files.write_rosbag2(tmp_path / "bag", rows)
+    frames = play(bag)
+    assert [frame.t_capture_ns for frame in frames] == [START + (40 * n + 5) * MS for n in range(30)]
+    said = [each.what for each in Replay(BagSource(path=bag)).pairs.judged]
+    assert len(said) == 2 and all("when they were recorded counts instead" in each for each in said)
+
+
+def test_messages_that_were_recorded_twice_count_once(tmp_path: Path) -> None:
+    rows = [row for row in files.stereo_rows(ROS2) for _ in (0, 1)]
+    bag = files.write_rosbag2(tmp_path / "bag", rows)
+    assert_frames(play(bag), list(range(COUNT)))
+    assert Replay(BagSource(path=bag)).pairs.judged == ()
+
+
 def test_a_rig_that_is_given_wins_and_one_is_needed(tmp_path: Path) -> None:
     bare = files.write_rosbag2(tmp_path / "bare", files.stereo_rows(ROS2, 2, infos=False))
     with pytest.raises(UsageError, match="no calibration: set rig"):

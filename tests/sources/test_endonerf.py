@@ -199,10 +199,14 @@ def test_zero_is_unknown_and_outliers_are_drawn_to_the_percentiles(clip: Path) -
     counts[2, :5] = 0
     write(clip / "depth/frame-0.png", counts)
     write(clip / "depth/frame-3.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    depth, _, _, without = (frame.depth for frame in play(clip, frames=4))
+    deep = depth_counts(1).astype(np.uint16)
+    deep[:3] = 65535
+    write(clip / "depth/frame-1.png", deep)
+    depth, full, _, without = (frame.depth for frame in play(clip, frames=4))
     assert depth is not None and without is not None and not without.any()
     assert np.allclose(depth[0, :5], 0.080) and np.allclose(depth[1, :5], 0.060)
     assert (depth[2, :5] == 0).all() and np.count_nonzero(depth == 0) == 5
+    assert full is not None and (full[:3] == 0).all() and 0 < full[3:].min() and full.max() < 0.1
 
 
 def test_right_pictures_are_used_when_the_baseline_is_known(clip: Path) -> None:

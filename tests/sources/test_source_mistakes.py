@@ -173,6 +173,36 @@ def test_too_few_poses_say_for_which_frame(folders: cfg.FoldersSource, tmp_path:
     assert "poses.npz holds 4 poses, none for frame 4" in message
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda pose: pose.swapaxes(1, 2), "of frame 1 is no rotation and translation; is it transposed"),
+        (lambda pose: pose * np.array([2.0, 2, 2, 1]), "of frame 0 is no rotation and translation"),
+        (lambda pose: in_unit(pose, 1e3), "moves the camera by 11 m.*of millimetres divide them by 1000"),
+    ],
+)
+def test_poses_that_no_scope_can_have_are_refused(
+    folders: cfg.FoldersSource, tmp_path: Path, change: Callable[[np.ndarray], np.ndarray], said: str
+) -> None:
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 0, 3] = 1e-3 * np.arange(12)  # m
+    config = folders.model_copy(update={"poses": tmp_path / "poses.npz"})
+    for given in (poses, in_unit(poses, 90)):  # 0.99 m: as far as from one end of a patient to the other
+        np.savez(tmp_path / "poses.npz", T_world_cam=given)
+        with open_source(config) as source:
+            np.testing.assert_array_equal([frame.T_world_cam for frame in source], given)
+    np.savez(tmp_path / "poses.npz", T_world_cam=change(poses))
+    with pytest.raises(UsageError, match=said):
+        open_source(config)
+
+
+def in_unit(poses: np.ndarray, per_metre: float) -> np.ndarray:
+    """With translations in a unit of which a metre has so many."""
+    factors = np.ones((4, 4))
+    factors[:3, 3] = per_metre
+    return poses * factors
+
+
 # ---- files that are deleted, cut off, replaced or still being written while they are played ------------
 
 

@@ -50,7 +50,8 @@ def pictures(numbers: range | list[int], eye: int = 0) -> list[U8]:
 def test_pictures_are_counted_and_found_in_every_container(tmp_path: Path, name: str) -> None:
     video = Video(write(tmp_path / name, pictures(range(COUNT)), **CONTAINERS[name]))
     assert video.count == COUNT and video.is_even and video.gaps == [] and not video.cut_off
-    assert video.oddities == [] and video.rate == (25 if name in ("a.mxf", "h.h264") else RATE)
+    assert ["holds no times" in each for each in video.oddities] == [True] * (name == "h.h264")
+    assert video.rate == (25 if name in ("a.mxf", "h.h264") else RATE)
     shown = [video.read(number) for number in range(COUNT)]
     assert [number_in(picture) for picture in shown if picture is not None] == list(range(COUNT))
     assert video.read(COUNT) is None
@@ -358,6 +359,32 @@ def test_bits_that_a_deep_video_does_not_use_are_told(tmp_path: Path, bits: int,
     picture = video.read(0)
     assert picture is not None and is_told == ("uses 12: it may be played too dark" in str(video.oddities))
     assert np.abs(picture[..., 1] - samples / 257).max() < 2
+
+
+def test_what_a_picture_a_second_shows_is_no_file_that_is_cut_off(tmp_path: Path) -> None:
+    """Pictures that are decoded before others are shown: the last is decoded two seconds before its turn."""
+    file = write(tmp_path / "a.mp4", pictures(range(20)), [10.0 * n for n in range(20)], ticks=1000)
+    assert (Video(file).count, Video(file).cut_off, Video(file).rate) == (20, "", 0.1)
+
+
+@pytest.mark.parametrize(("transfer", "name"), [(16, "PQ"), (18, "HLG"), (1, "")])
+def test_tones_of_hdr_are_told(tmp_path: Path, transfer: int, name: str) -> None:
+    options = {"x264-params": f"transfer={ {16: 'smpte2084', 18: 'arib-std-b67', 1: 'bt709'}[transfer] }"}
+    said = Video(write(tmp_path / "a.mp4", pictures(range(3)), options=options)).oddities
+    assert [f"tones of HDR ({name})" in each for each in said] == [True] * bool(name)
+
+
+def test_a_second_track_is_told_with_how_to_take_eyes_apart(tmp_path: Path) -> None:
+    with av.open(str(tmp_path / "scope.mkv"), "w") as container:
+        streams = [container.add_stream("ffv1", RATE) for _ in range(2)]
+        for stream in streams:
+            stream.height, stream.width, stream.pix_fmt = 96, 128, "bgr0"
+        for eye, stream in enumerate(streams):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(1, eye=eye), "rgb24")))
+        for stream in streams:
+            container.mux(stream.encode())
+    (error,) = [each for each in check_folder(tmp_path) if each.level == "error"][:1]
+    assert "2 video tracks" in error.fix and "-map 0:v:1" in error.fix
 
 
 def test_a_name_that_looks_like_an_address_or_a_pattern_is_a_name(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from sags_node.checks import Finding
 from sags_node.config.units import fitting_units, in_metres
 from sags_node.rig import already_rectified, rectifies, rectify_eyes
-from sags_node.rig.check import ENDOSCOPE_BASELINE, RECALIBRATE, size_made_for
+from sags_node.rig.check import ENDOSCOPE_BASELINE, EXCHANGE_FILES, RECALIBRATE, size_made_for
 from sags_node.types import F64, Bool, Eye, StereoRig
 
 FEWEST_MATCHES = 30
@@ -132,7 +132,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
     exchanged_files = Reading(
         exchanged,
         "the eyes are exchanged in the calibration: left.yaml is of the camera that took the right pictures",
-        "exchange left.yaml and right.yaml; the pictures are in order",
+        f"{EXCHANGE_FILES}; the pictures are in order",
     )
     wrong_sign = Reading(
         rows._replace(in_front=1 - rows.in_front),

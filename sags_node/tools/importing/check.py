@@ -37,6 +37,7 @@ from sags_node.tools.importing.folder import Contents, both_eyes, calibration_of
 from sags_node.tools.importing.timing import LOOKED_AT, Timing
 from sags_node.types import U8
 from sags_node.vision.rectify import Rectifier
+from sags_node.vision.watch.color_watch import EXCHANGED, is_blue
 
 MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
 MOST_SAID = 1 << 16  # lines in the log
@@ -186,14 +187,17 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
     found += [*said, *ends]
     if is_wrong(found):
         return found
-    timing, shares = Timing(), []
+    timing, shares, blue = Timing(), [], []
     middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate
     with open_source(source.model_copy(update={"start": middle}), references=False) as opened:
         for frame in islice(opened, LOOKED_AT):
+            blue.append(is_blue(frame.left))
             if frame.right is not None:
                 timing.add(frame.left, frame.right)
             if frame.tissue is not None:
                 shares.append(1 - float(frame.tissue.mean()))
+    if sum(blue) > len(blue) / 2:
+        found.append(parted("warning", EXCHANGED.text))
     return [*found, *pictures.check_shares(shares), *(stamped or timing.findings())]
 
 

@@ -13,13 +13,19 @@ from sags_node.config.launch_file import VIDEO_SUFFIXES, is_launch, known_record
 from sags_node.config.schema import LaunchConfig
 from sags_node.config.yaml_reader import parse_yaml
 from sags_node.errors import UsageError
-from sags_node.files import check_name
+from sags_node.files import SHOWN, check_name
 from sags_node.media.picture_file import SUFFIXES
-from sags_node.rig import find_form
+from sags_node.rig import find_form, is_opencv
 from sags_node.sources.names import EYE
 
 EYES = (("left", "right"), ("l", "r"), ("image_left", "image_right"), ("left_rectified", "right_rectified"))
-HAMLYN_EYES = (("image01", "image02"), ("image_0", "image_1"), ("images", "images_right"))
+HAMLYN_EYES = (("image01", "image02"), ("images", "images_right"))
+KITTI_EYES = (
+    ("image_0", "image_1"),
+    ("image_2", "image_3"),
+    ("image_00", "image_01"),
+    ("image_02", "image_03"),
+)
 MASKS = ("masks", "mask", "tools", "toolmask", "tool_mask")
 LAUNCH_SUFFIXES = (".yaml", ".yml")
 CALIBRATIONS = (".", "calib", "calibration", "camera", "rig")
@@ -94,7 +100,7 @@ def _plain(folder: Path) -> Contents:
         return Contents(
             "two folders of pictures", "", "ok", left, right, masks, depth, launch=(*launch, *tools)
         )
-    videos = sorted(file for file in folder.iterdir() if is_video(file))
+    videos = sorted(file for file in folder.glob(SHOWN) if is_video(file))
     if videos:
         what = "one video" if len(videos) == 1 else f"{len(videos)} videos"
         of_eyes = _eye_videos(videos)
@@ -114,12 +120,16 @@ def _plain(folder: Path) -> Contents:
         )
         return Contents(what, "give the folder that holds the recording", "error")
     instead = f"check one of the folders in it: {', '.join(below[:8])}"
+    if len(likely := [name for name in below if has_pictures(folder / name)]) > 1:
+        instead = (
+            f"name those of both eyes, the left one first: sags new LEFT RIGHT, of {', '.join(likely[:8])}"
+        )
     return Contents("nothing that is known", instead, "error")
 
 
 def _eye_folders(folder: Path) -> tuple[Path, Path] | None:
     """By the usual names, else by names that differ in the eye only, as `cam_left` and `cam_right`."""
-    for left_name, right_name in (*EYES, *HAMLYN_EYES):
+    for left_name, right_name in (*EYES, *HAMLYN_EYES, *KITTI_EYES):
         left, right = _first(folder, (left_name,)), _first(folder, (right_name,))
         if left is not None and right is not None:
             return left, right
@@ -139,7 +149,7 @@ def both_eyes(folder: Path) -> list[tuple[Path, Path]]:
     """Pictures of left and right eye in one folder, as `left_001.png` and `right_001.png`; no masks."""
     by_name = {
         file.name: file
-        for file in sorted(folder.iterdir())
+        for file in sorted(folder.glob(SHOWN))
         if file.suffix.lower() in SUFFIXES and file.is_file() and "mask" not in file.name.lower()
     }
     return [(by_name[left], by_name[right]) for left, right in _pairs(by_name)]
@@ -157,8 +167,11 @@ def _pairs(names: Iterable[str]) -> list[tuple[str, str]]:
 
 def calibration_of(folder: Path) -> Path | None:
     """What lies beside the pictures, in a folder of a usual name or with them."""
-    places = (folder / name for name in CALIBRATIONS)
-    return next((place for place in places if place.is_dir() and find_form(place) is not None), None)
+    places = [place for name in CALIBRATIONS if (place := folder / name).is_dir()]
+    known = next((place for place in places if find_form(place) is not None), None)
+    files = [file for place in places for file in place.glob(SHOWN) if is_opencv(file)]
+    named = [file for file in files if file.parent != folder or "calib" in file.stem.lower()]
+    return named[0] if known is None and len(named) == 1 else known
 
 
 def is_video(file: Path) -> bool:
@@ -204,7 +217,7 @@ _KNOWN: tuple[tuple[tuple[tuple[str, ...], ...], str, str], ...] = (
 
 
 def has_pictures(folder: Path) -> bool:
-    return any(file.suffix.lower() in SUFFIXES for file in folder.iterdir() if file.is_file())
+    return any(file.suffix.lower() in SUFFIXES for file in folder.glob(SHOWN) if file.is_file())
 
 
 def _folder_of(value: object) -> Path | None:

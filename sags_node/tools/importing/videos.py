@@ -13,7 +13,7 @@ import numpy as np
 from sags_node.checks import Finding, parted
 from sags_node.config.schema import GeometryConfig
 from sags_node.errors import UsageError
-from sags_node.media.video import LostPictureError, Video
+from sags_node.media.video import SPLIT, LostPictureError, Video
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import size_text
 from sags_node.sources.videos import VideoPairs
@@ -204,6 +204,9 @@ def _one(file: Path, shown: list[U8]) -> list[Finding]:
 
 
 def _both_needed(file: Path) -> str:
+    with closing(Video(file)) as video:
+        if video.tracks > 1:
+            return f"it holds {video.tracks} video tracks; {SPLIT}"
     return (
         "two videos or one of both eyes are needed; sags calib live "
         f"{shlex.quote(override('source.left', file))} source.kind:=videos {LAYOUT}side_by_side shows what "

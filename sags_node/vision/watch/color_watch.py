@@ -1,0 +1,47 @@
+"""Whether red and blue are exchanged: pictures that were written as BGR and read as RGB, or the reverse.
+
+Tissue in white light is red. In five recordings of three scopes the red of the median pixel exceeds its blue
+by 0.11 to 0.34 of R + G + B; with channels exchanged blue exceeds red by as much. Nothing is held back:
+shapes and depth are right, and in blue light (fluorescence) tissue is blue.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sags_node.types import U8, Finding
+from sags_node.vision.watch.judgement import Evidence, Judgement
+from sags_node.vision.watch.picture_fit import BRIGHT
+from sags_node.vision.watch.standing import Debounced
+
+ACROSS = 64  # pixels across the picture that are looked at
+DARK = 0.15  # of full light, mean of R, G and B: below, the black of the camera counts
+LEAST_SEEN = 0.1  # of them are neither dark nor clipped: fewer tell nothing
+BLUE = 0.08  # of R + G + B: blue over red of the median pixel
+
+EXCHANGED = Finding(
+    "red_blue_exchanged",
+    "tissue is blue over the whole picture: it looks as if red and blue are exchanged; unless the light is "
+    "blue, correct what wrote or sends the pictures (BGR was taken for RGB), or exchange both in the files",
+)
+
+
+class ColorWatch(Debounced):
+    """Looks at the left picture of every frame."""
+
+    def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
+        """What was judged before: colours hold nothing back."""
+        self.note(evidence.pair.t_capture_ns, [EXCHANGED] if is_blue(evidence.pair.left) else [])
+        return judged
+
+
+def is_blue(picture: U8) -> bool:
+    """Whether most of a picture [H, W, 3] is far bluer than red."""
+    step = max(1, picture.shape[1] // ACROSS)
+    pixels = picture[::step, ::step].reshape(-1, 3).astype(np.int32)
+    light = pixels.sum(axis=1)
+    seen = (light > 3 * 255 * DARK) & (pixels.max(axis=1) < 255 * BRIGHT)
+    if np.count_nonzero(seen) < LEAST_SEEN * len(pixels):
+        return False
+    red, _, blue = pixels[seen].T
+    return bool(np.median((blue - red) / light[seen]) > BLUE)

@@ -1,0 +1,93 @@
+"""Red and blue that are exchanged are told by check and run alike; sound pictures are not called so."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from recorded_session import both, frames_of, opened
+
+from sags_node.findings import by_code
+from sags_node.mapping.budget import StepBudget
+from sags_node.media.video import Video
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import open_session
+from sags_node.tools.importing.check import check_folder, overrides_of
+from sags_node.types import U8
+from sags_node.vision.watch.color_watch import is_blue
+
+CODE = "red_blue_exchanged"
+
+
+def exchanged(picture: U8) -> U8:
+    return np.ascontiguousarray(picture[..., ::-1])
+
+
+def recorded(folder: Path, eyes: str) -> Path:
+    """Pictures of the phantom whose right and left `eyes` are exchanged."""
+    for frame in frames_of(opened("source.frames:=6")):
+        shown = both(frame, exchanged) if eyes == "exchanged" else frame
+        for side, eye in (("left", shown.left), ("right", shown.right)):
+            (folder / side).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / side / f"{frame.frame_id}.png"), eye[..., ::-1])  # OpenCV writes BGR
+    return folder
+
+
+@pytest.mark.fault("picture: red and blue are exchanged")
+@pytest.mark.parametrize("eyes", ["exchanged", "as they are"])
+def test_a_folder_is_told_by_check_and_run_alike(eyes: str, tmp_path: Path) -> None:
+    folder = recorded(tmp_path, eyes)
+    said = [each for each in check_folder(folder) if "red and blue" in each.what]
+    assert [each.level for each in said] == ["warning"] * (eyes == "exchanged")
+    session = open_session(folder, [*overrides_of(folder), "source.pace:=step"], guess=True)
+    pipeline = Pipeline(session.config, session.rig)
+    codes = []
+    for frame in frames_of(session):
+        pipeline.process(frame, StepBudget(1))
+        codes.append(CODE in by_code(pipeline.warnings))
+    assert codes == [False] + [eyes == "exchanged"] * 5  # one frame tells nothing
+    if eyes == "exchanged":
+        text = by_code(pipeline.warnings)[CODE]
+        assert text == f"{said[0].what}; {said[0].fix}"
+
+
+def real_pictures(data: Path) -> dict[str, list[U8]]:
+    """Of each recording that is handed over, a few, the left eye's."""
+    found = {}
+    for name, file in (
+        ("d4d", next((data / "d4d_pull").glob("*.mp4"))),
+        ("pulling", data / "endonerf_pulling/pulling.mp4"),
+    ):
+        with closing(Video(file)) as video:
+            read = [video.read(number) for number in range(0, video.count, 20)]
+        panes = [each[: each.shape[0] // 2, : each.shape[1] // 2] for each in read if each is not None]
+        found[name] = panes
+    for pattern in ("hamlyn_invivo*/left/*", "hamlyn_f7*/*_L_*", "tmi*/[lr]*t.png"):
+        files = sorted(data.glob(pattern))
+        found[pattern] = [cv2.imread(str(file))[..., ::-1] for file in files[:: max(1, len(files) // 5)]]
+    return found
+
+
+def test_no_real_recording_is_called_so_unless_it_is(data_folder: Path) -> None:
+    for name, pictures in real_pictures(data_folder).items():
+        assert len(pictures) >= 1, name
+        assert not any(map(is_blue, pictures)), name
+        assert all(is_blue(exchanged(each)) for each in pictures), name
+
+
+@pytest.mark.parametrize(
+    ("color", "is_so"),
+    [
+        ((120, 120, 120), False),  # grey
+        ((100, 110, 118), False),  # a cold white balance: 0.055 of R + G + B
+        ((90, 100, 120), True),  # 0.097
+        ((2, 2, 9), False),  # too dark to have a colour
+        ((20, 60, 255), False),  # clipped
+        ((40, 150, 60), False),  # ICG, or narrow bands
+    ],
+)
+def test_how_blue_is_arithmetic(color: tuple[int, int, int], is_so: bool) -> None:
+    assert is_blue(np.full((48, 64, 3), color, np.uint8)) == is_so
