@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from sags_node.confidence import SURE, SURE_OF_ANCHOR
+from sags_node.confidence import SURE_OF_ANCHOR
 from sags_node.messaging.received import (
     Frame,
     ReceivedCameraInfo,
@@ -17,6 +17,7 @@ from sags_node.messaging.received import (
     TopicName,
 )
 from sags_node.messaging.wire import WireError
+from sags_node.registration.surfaces import Surface
 from sags_node.types import F32, F64, Bool, Camera
 
 DEPTH = TopicName("left/render/depth", ReceivedImage)
@@ -71,8 +72,13 @@ class TissueFrame:
     depth: F32  # [H, W] m, NaN unknown
     tissue: Bool  # [H, W], False: instrument
     anchors: dict[int, Anchor]
-    sure: Bool | None = None  # [H, W] where the depth may decide what hides what; None: everywhere
+    confidence: F32 | None = None  # [H, W] 0..1 of the depth; None: the node does not tell
     recorded_s: float | None = None  # its place in the recording that the node plays; None: not said
+
+    def surface(self, where: Bool) -> Surface:
+        """Some points of the surface that is measured where a picture [H, W] is true."""
+        assert self.confidence is not None
+        return Surface.of_depth(self.depth, self.confidence, where, self.camera)
 
 
 def tissue_frame(
@@ -120,6 +126,6 @@ def tissue_frame(
             )
             for row, place in zip(rows, places, strict=True)
         },
-        sure=None if confidence is None else confidence.array >= SURE,
+        confidence=None if confidence is None else confidence.array,
         recorded_s=None if depth.meta.recorded_s is msgspec.UNSET else depth.meta.recorded_s,
     )

@@ -11,6 +11,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,8 +33,9 @@ from sags_node.overlay import draw as overlay_draw
 from sags_node.overlay.draw import Body, Placed
 from sags_node.overlay.durations import REMEMBERED, Durations
 from sags_node.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
-from sags_node.overlay.held import HeldObject, Pinner
+from sags_node.overlay.held import HeldObject
 from sags_node.overlay.mesh import mesh_of
+from sags_node.overlay.pinner import Pinner
 from sags_node.overlay.save import Layers, Output
 from sags_node.overlay.scene import SceneSpec, built_in, read_scene
 from sags_node.overlay.stream import OverlayStream
@@ -117,9 +119,7 @@ class _Overlay:
         layers: Layers | None,
         tell: Callable[[str], object],
     ) -> None:
-        connect = partial(ControlClient.at, options.node)
         self._options = options
-        self._bodies = bodies
         self._subscriber: Subscriber | None = None  # before there is a node
         self._clock: NodeClock | None = None  # of a node that may be on another machine
         self._tell = tell
@@ -127,7 +127,8 @@ class _Overlay:
         self._stream = stream
         self._output = output
         self._layers = layers
-        self._pinner = Pinner(connect)
+        self._pinner = Pinner(partial(ControlClient.at, options.node))
+        self._worker = ThreadPoolExecutor(1, "sags-measure")
         self._objects = [
             HeldObject(
                 spec,
@@ -135,7 +136,8 @@ class _Overlay:
                 self._pinner,
                 options.repin,
                 options.ahead,
-                body.corners,
+                body,
+                self._worker,
             )
             for spec, body in zip(scene.objects, bodies, strict=True)
         ]
@@ -211,6 +213,7 @@ class _Overlay:
         self._stream.blank("the overlay was stopped")
         self._stream.tell(self._facts())
         self._pinner.close()
+        self._worker.shutdown(cancel_futures=True)
         if self._layers is not None:
             self._layers.close()
         self._output.close()
@@ -260,12 +263,7 @@ class _Overlay:
             frame = tissue_frame(messages, self._right_info(), sure)
         if frame is None:  # the next one may be whole; if not, the clock takes the overlay away
             return None, "incomplete frame"
-        poses = [held.place(frame) for held in self._objects]
-        placed = [
-            Placed(body, T, held.is_sure)
-            for body, held, T in zip(self._bodies, self._objects, poses, strict=True)
-            if T is not None
-        ]
+        placed = [put for held in self._objects if (put := held.placed(frame)) is not None]
         if not placed:
             reason = self._objects[0].reason or "nothing to draw"
             self._stream.blank(reason, (frame.camera.height, frame.camera.width))

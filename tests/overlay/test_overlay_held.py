@@ -17,7 +17,10 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, quat_to_matrix, transform
 from sags_node.mapping.anchors import Anchors
 from sags_node.overlay.frame import Anchor, TissueFrame
-from sags_node.overlay.held import HeldObject, Pinner, Request
+from sags_node.overlay.draw import Body
+from sags_node.overlay.held import HeldObject
+from sags_node.overlay.mesh import Mesh
+from sags_node.overlay.pinner import Pinner, Request
 from sags_node.overlay.pose import on_surface, surface_normal
 from sags_node.overlay.scene import ObjectSpec
 from sags_node.registration.rigid import on_a_line, rigid_fit
@@ -266,7 +269,9 @@ def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any
         anchor["at"] = said
     spec = ObjectSpec.model_validate({"file": "tube.stl", "scale": scale, "anchors": anchors, **more})
     corners = np.array([[-0.015, -0.002, -0.002], [0.015, 0.002, 0.002]]) + (0 if around is None else around)
-    return HeldObject(spec, "pin", FakePinner(), False, 0, corners), with_anchors(frame, places)
+    ends = Mesh(corners.astype(np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+    body = Body(ends, 1.0, None)
+    return HeldObject(spec, "pin", FakePinner(), False, 0, body), with_anchors(frame, places)
 
 
 def local_places() -> np.ndarray:
