@@ -128,15 +128,19 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
     return measured
 
 
+def shown_to_node(phantom: Phantom, number: int, count: int, rate: float) -> StereoFrame:
+    """Frame `number` of `count`, with its true masks and pose."""
+    truth, stamp = phantom.frame(number, count), round((1 + number / rate) * 1e9)
+    return StereoFrame(
+        number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool, T_world_cam=truth.T_world_cam
+    )
+
+
 def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tuple[Camera, Surface]:
     """What `sags register` gets of a second of the node."""
     pipeline, parts = Pipeline(config, phantom.rig, rate=RATE), []
     for number in range(FRAMES):
-        truth = phantom.frame(number, FRAMES)
-        stamp = round((1 + number / RATE) * 1e9)
-        frame = StereoFrame(
-            number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool, T_world_cam=truth.T_world_cam
-        )
+        frame = shown_to_node(phantom, number, FRAMES, RATE)
         result = pipeline.process(frame, StepBudget(STEPS))
         view, tissue = result.views["left"], result.observation.tissue
         receipt.add(frame, tissue)

@@ -86,8 +86,8 @@ class Residual:
         if found.off <= self._stated + found.error:
             return None
         return (
-            f"the surface is {1e3 * found.off:.1f} mm off, {1e3 * self._stated:.1f} were stated: the organ is "
-            "bent or covered, or it has slipped"
+            f"the surface is {1e3 * found.off:.1f} mm off, {1e3 * self._stated:.1f} were stated: the organ "
+            "is bent or covered, or the object has slipped"
         )
 
 
