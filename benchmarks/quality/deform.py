@@ -102,7 +102,7 @@ def _pulled(
             worker.submit(int).result()  # what was begun is done, so a run repeats
             if phantom.tissue.lift(number / count) * float(np.linalg.norm(LIFT)) >= PULLED:
                 gone = _half_space(now - start)[:, used]
-                worlds = [put.seen(put.T_world_body, np.eye(3))[1] for put in placed if put is not None]
+                worlds = [put.shape(put.T_world_body) for put in placed if put is not None]
                 off = np.stack([world.reshape(gone.shape) - layers - gone for world in worlds])
                 said = dict(zip(MODES, (each.status() for each in objects), strict=True))
                 said = {name: {key: each[key] for key in CHECKED} for name, each in said.items()}

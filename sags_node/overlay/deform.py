@@ -6,12 +6,13 @@ mean is that no tissue is bent; C. E. Rasmussen and C. K. I. Williams, "Gaussian
 Learning", 2006, 2.2) carries that over the surface, by how sure each anchor's depth is. A vertex takes it
 from the surface before it on its ray, fading with the depth below. All that is by the frame of the pinning.
 
-Anchors are the node's material points: the picture corrects them, each says how sure it is, and they come
-back when they were lost. Control nodes and Gaussians are none of that, and are renewed under way.
+Anchors are the node's points of the tissue: the picture corrects them, they say how sure they are, and come
+back when they were lost. Control nodes and Gaussians do none of that, and are renewed under way.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
@@ -50,10 +51,11 @@ class _Field:
 
 
 class Deformation:
-    """Bends one object.
+    """Bends one object that is pinned.
 
     Attributes:
         doubt: why the object is rigid; None: it is bent.
+        ids: of the followers; empty: nothing was bent yet.
 
     Args:
         vertices: [V, 3] m, of the object.
@@ -68,31 +70,28 @@ class Deformation:
         self._vertices, self._depth = vertices, depth
         self._pinner, self._worker, self._asked = pinner, worker, asked
         self._beginning: Future[tuple[_Field, list[int]]] | None = None
-        self._begun_ns: int | None = None
+        self._begun_ns = -math.inf
         self._field: _Field | None = None
-        self._ids: list[int] = []
+        self.ids: list[int] = []
         self._rest = np.zeros((0, 3))  # [k, 3] m, of the object: where each was seen first; NaN: not yet
         self._pulling = 0
 
-    def lose(self, release: Callable[[list[int]], object]) -> None:
-        """Begin anew, and `release` the followers."""
+    def release(self, give_back: Callable[[list[int]], object]) -> None:
+        """Give the followers back, those that are being pinned, too."""
+        give_back(self.ids)
         if self._beginning is not None:
-            self._beginning.add_done_callback(
-                lambda done: None if done.exception() else release(done.result()[1])
-            )
-        release(self._ids)
-        self.doubt, self._beginning, self._begun_ns, self._field, self._ids = PINNING, None, None, None, []
+            self._beginning.add_done_callback(lambda it: it.exception() or give_back(it.result()[1]))
 
     def status(self) -> dict[str, dict[str, int]]:
         """For people and programs: how many followers there are, and how many are sure."""
-        return {"deform": {"anchors": len(self._ids), "pulling": self._pulling}}
+        return {"deform": {"anchors": len(self.ids), "pulling": self._pulling}}
 
     def move(self, frame: TissueFrame, T: F64) -> F64 | None:
         """The bent vertices [V, 3] (m, of the object) at its rigid pose T [4, 4]; None: it is rigid."""
         if self._field is None:
             self._begin(frame, T)
             return None
-        states = [frame.anchors.get(each, UNKNOWN) for each in self._ids]
+        states = [frame.anchors.get(each, UNKNOWN) for each in self.ids]
         now = np.asarray(transform(invert(T), np.stack([state.place for state in states])))
         self._rest = np.where(np.isnan(self._rest), now, self._rest)
         ways = now - self._rest
@@ -110,17 +109,16 @@ class Deformation:
 
     def _begin(self, frame: TissueFrame, T: F64) -> None:
         """Choose and pin the followers in the background; again after a while where that is refused."""
-        if self._beginning is None:
-            if self._begun_ns is None or abs(frame.stamp_ns - self._begun_ns) >= AGAIN * 1e9:
-                self._begun_ns = frame.stamp_ns
-                self._beginning = self._worker.submit(self._pinned, frame, T)
-        elif self._beginning.done():
-            done, self._beginning = self._beginning, None
-            if isinstance(done.exception(), SagsError):
-                self.doubt = str(done.exception())
-                return
-            self._field, self._ids = done.result()
-            self._rest = np.full((len(self._ids), 3), np.nan)
+        if self._beginning is None and abs(frame.stamp_ns - self._begun_ns) >= AGAIN * 1e9:
+            self._begun_ns = frame.stamp_ns
+            self._beginning = self._worker.submit(self._pinned, frame, T)
+        elif self._beginning is not None and self._beginning.done():
+            try:
+                self._field, self.ids = self._beginning.result()
+                self._rest = np.full((len(self.ids), 3), np.nan)
+            except SagsError as error:
+                self.doubt = str(error)
+            self._beginning = None
 
     def _pinned(self, frame: TissueFrame, T: F64) -> tuple[_Field, list[int]]:
         field = _field(self._vertices, self._depth, frame, T)
@@ -151,11 +149,8 @@ def _field(vertices: F64, depth: float, frame: TissueFrame, T: F64) -> _Field:
     near = np.flatnonzero((z > 0) & (z - surface < depth))
     z, surface = z[near], surface[near]
     eye = transform(invert(T), frame.camera.T_world_cam[:3, 3])
-    above = (
-        eye + (vertices[near] - eye) * np.minimum(1, surface / z)[:, None]
-    )  # on the surface, along the ray
-    faded = np.maximum(0, z - surface) / depth
-    reach = float(np.median(apart))
+    above = eye + (vertices[near] - eye) * np.minimum(1, surface / z)[:, None]  # of each, on the surface
+    faded, reach = np.maximum(0, z - surface) / depth, float(np.median(apart))
     carried = _kernel(above, points, reach) * (1 - faded**2 * (3 - 2 * faded))[:, None]
     return _Field(points, reach, near, carried.astype(np.float32))
 

@@ -60,16 +60,7 @@ class Body:
         self.corners = np.stack([self.vertices.min(0), self.vertices.max(0)])
         self.middle = self.corners.mean(0)
 
-    def draw(self, camera: Camera, placed: Placed, z: F32, rgba: U8) -> None:
-        """Add what one eye sees of it to a picture [H, W, 4] with depths [H, W] (m), in place."""
-        if not len(self.triangles):
-            return
-        T_cam_body = invert(camera.T_world_cam) @ placed.T_world_body
-        pixels, local = placed.seen(T_cam_body, camera.K)
-        colors = self._lit(invert(T_cam_body)[:3, 3])
-        fill(pixels, np.ascontiguousarray(local[:, 2]), read_only(self.triangles), colors, z, rgba)
-
-    def _lit(self, eye: F64) -> U8:
+    def lit(self, eye: F64) -> U8:
         """Colours [T, 4] lit from the eye (at [3], m), as an endoscope lights; bent or not."""
         rays = self._centres - eye
         facing = np.abs(np.einsum("tc,tc->t", self._normals, rays)) / np.linalg.norm(rays, axis=1)
@@ -86,12 +77,21 @@ class Placed:
     is_sure: bool = True
     vertices: F64 | None = None  # [V, 3] m, of the body, bent with the tissue; None: it is rigid
 
-    def seen(self, T_cam_body: F64, K: F64) -> tuple[F64, F64]:
-        """Its vertices in a picture [V, 2] (px) and in the camera's coordinates [V, 3] (m)."""
-        vertices = self.body.vertices if self.vertices is None else self.vertices
-        local = np.asarray(transform(T_cam_body, vertices), np.float64)
-        flat = local / np.where(local[:, 2] != 0, local[:, 2], 1)[:, None]
-        return np.ascontiguousarray((flat @ K.T)[:, :2]), local
+    def shape(self, T: F64) -> F64:
+        """Its vertices [V, 3] (m) as T [4, 4] transforms its body's coordinates."""
+        return np.asarray(transform(T, self.body.vertices if self.vertices is None else self.vertices))
+
+    def draw(self, camera: Camera, z: F32, rgba: U8, colors: U8 | None = None) -> F64:
+        """Add what one eye sees of it to a picture [H, W, 4] with depths [H, W] (m), in place; its vertices
+        [V, 3] (m) in the camera's coordinates. `colors` are [T, 4]; default: as it is lit."""
+        T_cam_body = invert(camera.T_world_cam) @ self.T_world_body
+        local = self.shape(T_cam_body)
+        if len(local):
+            depths = np.ascontiguousarray(local[:, 2])
+            pixels = (local / np.where(depths != 0, depths, 1)[:, None] @ camera.K.T)[:, :2]
+            colors = self.body.lit(invert(T_cam_body)[:3, 3]) if colors is None else colors
+            fill(np.ascontiguousarray(pixels), depths, read_only(self.body.triangles), colors, z, rgba)
+        return local
 
 
 def draw(
@@ -108,11 +108,11 @@ def draw(
     z, rgba = np.full((height, width), np.inf, np.float32), np.zeros((height, width, 4), np.uint8)
     for placed in objects:
         if placed.is_sure:
-            placed.body.draw(camera, placed, z, rgba)
+            placed.draw(camera, z, rgba)
     sure_z = z.copy()
     for placed in objects:
         if not placed.is_sure:
-            placed.body.draw(camera, placed, z, rgba)
+            placed.draw(camera, z, rgba)
     rows, columns = np.nonzero(z < sure_z)
     faint = np.rint(UNDER * rgba[rows, columns, 3]).astype(np.uint8)
     _hide(z, rgba, frame, slice(None), camera, baseline, UNDER)

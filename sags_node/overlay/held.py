@@ -25,9 +25,7 @@ from sags_node.types import F64
 
 LEAST_ANCHORS = 3  # for a rigid fit
 FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
-MISFIT = (
-    0.003  # m, of an anchor from where its object's shape has it: nine of ten are found within half of it
-)
+MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of ten are within half of it
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
 
 log = logging.getLogger(__name__)
@@ -78,27 +76,29 @@ class HeldObject:
         self._normal: F64 | None = None
         self._lost: str | None = None
         self._body = body
+        self._worker = worker
         self._off: dict[int, float] = {}  # m, of each anchor from where the unbent shape has it
         self._bend: Deformation | None = None
         self._residual: Residual | None = None
-        if body is not None and worker is not None and spec.deform:
-            depth = 1e-3 * spec.deform_depth_mm
-            self._bend = Deformation(body.vertices, depth, pinner, worker, self._asked)
-        stated = spec.registration
-        if worker is not None and stated is not None and stated.residual_p90_mm is not None:
-            self._residual = Residual(1e-3 * stated.residual_p90_mm, stated.share, worker)
+        self._follow()
         self._refused: str | None = None  # for good
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
 
-    def placed(self, frame: TissueFrame) -> Placed | None:
-        """The object as it is to be drawn, or None and a `reason`: placed, bent if it is to be, and checked
-        against the surface if it was registered.
+    def _follow(self) -> None:
+        """Begin to bend and to check it, anew where it was lost."""
+        stated = self.spec.registration
+        if self._body is None or self._worker is None:
+            return
+        if self.spec.deform:
+            depth = 1e-3 * self.spec.deform_depth_mm
+            self._bend = Deformation(self._body.vertices, depth, self._pinner, self._worker, self._asked)
+        if stated is not None and stated.residual_p90_mm is not None:
+            self._residual = Residual(1e-3 * stated.residual_p90_mm, stated.share, self._worker)
 
-        Raises:
-            UsageError: as `place`.
-        """
+    def placed(self, frame: TissueFrame) -> Placed | None:
+        """It as it is to be drawn: placed, bent and checked as its scene file says; see `place`."""
         T = self.place(frame)
         if T is None:
             return None
@@ -187,9 +187,8 @@ class HeldObject:
     def _lose(self, why: str, release: Callable[[list[int]], object]) -> str:
         release(self._ids)
         if self._bend is not None:
-            self._bend.lose(release)
-        if self._residual is not None:
-            self._residual.lose()
+            self._bend.release(release)
+        self._follow()
         self._ids, self._states, self._model, self._normal = [], [], None, None
         self._lost, self._began_anew = f"lost: {why}", False
         return self._lost
@@ -311,10 +310,10 @@ class HeldObject:
         places = np.stack([state.place for state in chosen.values()])
         T, self.error = rigid_fit(model, places, weights)
         off = np.linalg.norm(transform(T, model) - places, axis=1)
-        if self._bend is not None:  # what bends afterwards is no misfit
-            if self._bend.doubt is not None:
-                self._off |= dict(zip(chosen, off.tolist(), strict=True))
-            off = np.array([self._off.get(i, 0.0) for i in chosen])
+        if self._bend is not None and not self._bend.ids:
+            self._off = dict(zip(chosen, off.tolist(), strict=True))
+        elif self._bend is not None:  # what bends afterwards is no misfit
+            off = np.array([self._off.get(i, each) for i, each in zip(chosen, off, strict=True)])
         sure = model[[state.is_sure for state in chosen.values()] & (off <= MISFIT)]
         self.is_sure = len(sure) >= LEAST_ANCHORS and not on_a_line(sure)
         self.unsure = None

@@ -129,17 +129,10 @@ class _Overlay:
         self._layers = layers
         self._pinner = Pinner(partial(ControlClient.at, options.node))
         self._worker = ThreadPoolExecutor(1, "sags-measure")
+        called = ["pin" if options.scene is None else f"{spec.name}: pixel" for spec in scene.objects]
         self._objects = [
-            HeldObject(
-                spec,
-                "pin" if options.scene is None else f"{spec.name}: pixel",
-                self._pinner,
-                options.repin,
-                options.ahead,
-                body,
-                self._worker,
-            )
-            for spec, body in zip(scene.objects, bodies, strict=True)
+            HeldObject(spec, name, self._pinner, options.repin, options.ahead, body, self._worker)
+            for spec, name, body in zip(scene.objects, called, bodies, strict=True)
         ]
         self._source: tuple[str, int] | None = None  # session and epoch of the node
         self._epoch = -1  # of what is published: grows with every new `_source`

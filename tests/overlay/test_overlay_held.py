@@ -16,8 +16,8 @@ from synthetic import BASELINE, NORMAL, plane_depth, plane_result
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, quat_to_matrix, transform
 from sags_node.mapping.anchors import Anchors
-from sags_node.overlay.frame import Anchor, TissueFrame
 from sags_node.overlay.draw import Body
+from sags_node.overlay.frame import Anchor, TissueFrame
 from sags_node.overlay.held import HeldObject
 from sags_node.overlay.mesh import Mesh
 from sags_node.overlay.pinner import Pinner, Request
