@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
 
-GOODBYE = 0.5  # s for the node to take anchors back at the end
+ANSWER = 2.0  # s for the node to pin one
+GOODBYE = 0.5  # s for it to take one back at the end
+AT_ONCE = 16  # connections, of the 64 that a node takes
 
 Request = dict[str, Any]
 
@@ -44,28 +45,32 @@ class Pinner:
         self._worker.shutdown()
 
     def _pin(self, requests: Sequence[Request]) -> list[int]:
-        added: list[int] = []
-        with self._connect() as client:
-            try:
-                for request in requests:
-                    added.append(int(client.request("add_anchor", request)["id"]))
-            except SagsError:
-                for anchor in added:
-                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
-                raise
+        answers, error = self._ask("add_anchor", requests, ANSWER)
+        added = [int(answers[number]["id"]) for number in sorted(answers)]
+        if error is not None:
+            self._remove(added)
+            raise error
         self._held += added
         return added
 
     def _remove(self, ids: list[int]) -> None:
         self._disown(ids)
-        if not ids:
-            return
-        try:
+        self._ask("remove_anchor", [{"id": anchor} for anchor in ids], GOODBYE)  # or the node is gone
+
+    def _ask(
+        self, op: str, requests: Sequence[Request], timeout: float
+    ) -> tuple[dict[int, Any], BaseException | None]:
+        """The answers by number, and what went wrong. Many at once: the node answers between two frames."""
+        answers: dict[int, Any] = {}
+
+        def ask(first: int) -> None:
             with self._connect() as client:
-                for anchor in ids:
-                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
-        except SagsError:
-            return  # the node is gone, and its anchors with it
+                for number in range(first, len(requests), AT_ONCE):
+                    answers[number] = client.request(op, requests[number], timeout)
+
+        with ThreadPoolExecutor(AT_ONCE, "sags-pinner") as pool:
+            asked = [pool.submit(ask, first) for first in range(min(AT_ONCE, len(requests)))]
+        return answers, next(filter(None, (each.exception() for each in asked)), None)
 
     def _disown(self, ids: list[int]) -> None:
         self._held = [anchor for anchor in self._held if anchor not in ids]

@@ -243,7 +243,7 @@ def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, 
     written = yaml.safe_load(scene.read_text())
     written["objects"] += [written["objects"][0] | {"deform": True}]
     scene.write_text(yaml.safe_dump(written))
-    played = run_overlay(OverlayOptions(NodeAddress(run_dir=node.run_dir), scene=scene, seconds=15))
+    played = run_overlay(OverlayOptions(NodeAddress(run_dir=node.run_dir), scene=scene, seconds=20))
     assert played["overlay"] > 0, played
     for held in played["objects"]:
         assert held["sure"] and held["residual_mm"] <= held["residual_limit_mm"], held
