@@ -37,7 +37,7 @@ def bench_registration(ct: Path | None, seeds: int, out: Path | None, json_out: 
 
 
 @click.command("deform")
-@shown("--seeds", type=click.IntRange(1), default=3, help="Phantoms.")
+@shown("--seeds", type=click.IntRange(1), default=5, help="Phantoms.")
 @figures_option
 @as_json
 def bench_deform(seeds: int, out: Path | None, json_out: bool) -> None:

@@ -46,7 +46,7 @@ class Body:
 
     def __init__(self, mesh: Mesh | None, opacity: float, label: str | None) -> None:
         self.label = label
-        self.middle, self.corners = np.zeros(3), np.zeros((2, 3))
+        self.corners = np.zeros((2, 3))
         self.vertices, self.triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
         if mesh is None:
             return
@@ -58,7 +58,6 @@ class Body:
         self._centres = corners.mean(1)
         self._colors, self._alpha = mesh.colors, np.uint8(round(255 * opacity))
         self.corners = np.stack([self.vertices.min(0), self.vertices.max(0)])
-        self.middle = self.corners.mean(0)
 
     def lit(self, eye: F64) -> U8:
         """Colours [T, 4] lit from the eye (at [3], m), as an endoscope lights; bent or not."""
@@ -182,7 +181,7 @@ def _hide(
 
 def _label(rgba: U8, frame: TissueFrame, camera: Camera, placed: Placed, baseline: float) -> None:
     assert placed.body.label is not None
-    middle = np.asarray(transform(placed.T_world_body, placed.body.middle))
+    middle = np.asarray(transform(placed.T_world_body, placed.body.corners.mean(0)))
     point = np.asarray(transform(camera.viewmat, middle))
     if point[2] > 0:
         u, v = (camera.K @ point)[:2] / point[2]
