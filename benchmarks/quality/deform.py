@@ -36,7 +36,7 @@ from sags_node.pipeline.warm_up import warm_up
 from sags_node.types import F64, I32, FrameResult
 
 RATE, SECONDS, STEPS = 15, 4.0, 2  # Hz; s, one pull; steps of the mapper, each frame
-PINNED, LAST = 4, 37  # frames: before the pull, and when it lets go
+PINNED, LAST = 4, 39  # frames: before the pull, and when it lets go
 PULLED, MOVED = 0.010, 0.005  # m, of the grip; of the surface: what lies under it is counted apart
 BELOW = (0.0, 0.005, 0.010, 0.020)  # m
 STATED = 0.45  # mm: what `register` finds of the phantom, nine of ten

@@ -122,11 +122,8 @@ class _Overlay:
         self._options = options
         self._subscriber: Subscriber | None = None  # before there is a node
         self._clock: NodeClock | None = None  # of a node that may be on another machine
-        self._tell = tell
+        self._stream, self._output, self._layers, self._tell = stream, output, layers, tell
         self._waiting_because = ""
-        self._stream = stream
-        self._output = output
-        self._layers = layers
         self._pinner = Pinner(partial(ControlClient.at, options.node))
         self._worker = ThreadPoolExecutor(1, "sags-measure")
         called = ["pin" if options.scene is None else f"{spec.name}: pixel" for spec in scene.objects]

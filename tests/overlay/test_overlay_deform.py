@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor, Future
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from fake_pinner import FakePinner
 from flat_scene import camera_in_front
 
 from sags_node.confidence import confidence_of
@@ -18,7 +19,6 @@ from sags_node.overlay.draw import Body, Placed, draw
 from sags_node.overlay.frame import Anchor, TissueFrame
 from sags_node.overlay.held import HeldObject
 from sags_node.overlay.mesh import Mesh
-from sags_node.overlay.pinner import Pinner
 from sags_node.overlay.scene import ObjectSpec
 from sags_node.types import F64
 
@@ -28,38 +28,19 @@ HOLD = np.array([[x, y, WALL] for x in (-0.038, 0.038) for y in (-0.03, 0.03)]) 
 STATED = {"registration": {"residual_p90_mm": 0.5}}
 
 
-class AtOnce(Executor):
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        done: Future[Any] = Future()
-        try:
-            done.set_result(fn(*args, **kwargs))
-        except SagsError as error:
-            done.set_exception(error)
-        return done
+WORKER = ThreadPoolExecutor(1)
 
 
-class Node(Pinner):
+class Node(FakePinner):
     """A wall of tissue, and anchors in it that go where they are sent."""
 
-    def __init__(self) -> None:
-        self.places: dict[int, F64] = {}
-        self.refusal: SagsError | None = None
-        self.frames = 0
-
-    def pin(self, requests: Any) -> Future[list[int]]:
-        return AtOnce().submit(self._pinned, requests)
-
-    def _pinned(self, requests: Any) -> list[int]:
-        if self.refusal is not None:
-            raise self.refusal
-        for request in requests:
-            self.places[len(self.places) + 1] = np.array([request[axis] for axis in "xyz"])
-        return list(self.places)[-len(requests) :]
+    frames = 0
 
     def frame(self, way: Any = np.zeros_like, depth: Any = WALL, **changed: Any) -> TissueFrame:
         """The next one, a second later."""
         self.frames += 1
-        anchors = {number: Anchor(at + way(at), 1.0, 1.0, SURE) for number, at in self.places.items()}
+        places = {number: np.array(place) for number, place in self.places.items()}
+        anchors = {number: Anchor(at + way(at), 1.0, 1.0, SURE) for number, at in places.items()}
         depth, sure = (np.broadcast_to(np.float32(each), SHAPE).copy() for each in (depth, SURE))
         tissue, stamp = np.ones(SHAPE, bool), self.frames * 10**9
         return replace(TissueFrame(1, stamp, "s", 0, CAMERA, None, depth, tissue, anchors, sure), **changed)
@@ -77,15 +58,22 @@ def held(node: Node, depths: tuple[float, ...] = (0.0,), **more: Any) -> tuple[H
     body = Body(Mesh(vertices, triangles, np.full((len(triangles), 3), 200, np.float32)), 1.0, None)
     anchors = [{"place": place, "at": place} for place in HOLD.tolist()]
     spec = ObjectSpec.model_validate({"file": "organ.ply", "anchors": anchors, **more})
-    thing = HeldObject(spec, "pin", node, False, 0.0, body, AtOnce())
+    thing = HeldObject(spec, "pin", node, False, 0.0, body, WORKER)
     for _ in range(6):
-        thing.placed(node.frame())
+        placed(thing, node.frame())
     assert thing.is_sure or node.refusal, thing.unsure
     return thing, body
 
 
-def bent(thing: HeldObject, frame: TissueFrame) -> tuple[Placed, F64]:
+def placed(thing: HeldObject, frame: TissueFrame) -> Placed | None:
+    """And all that is to be done in the background is done."""
     put = thing.placed(frame)
+    WORKER.submit(int).result()
+    return put
+
+
+def bent(thing: HeldObject, frame: TissueFrame) -> tuple[Placed, F64]:
+    put = placed(thing, frame)
     assert put is not None and put.vertices is not None and put.is_sure
     return put, put.vertices
 
@@ -147,22 +135,20 @@ def test_what_is_not_sure_does_not_pull(how: dict[str, Any]) -> None:
 def test_while_nothing_bends_it_it_is_drawn_as_unsure() -> None:
     """The node has no room for more anchors until it is asked again; later none of them is sure."""
     node = Node()
-    node.refusal, own = SagsError("there are 256 anchors already"), len(HOLD)
-    node.places = {number: place for number, place in enumerate(HOLD, 1)}
-    thing, _ = held(node, deform=True)
-    assert thing.reason == "there are 256 anchors already"  # its own are refused, too
-    node.places, node.refusal = {}, None
-    while thing.times_pinned == 0:
-        thing.placed(node.frame())
     node.refusal = SagsError("no room")
-    put = [thing.placed(node.frame()) for _ in range(3)][-1]
+    thing, _ = held(node, deform=True)
+    node.refusal = None
+    while thing.times_pinned == 0:  # its own anchors
+        placed(thing, node.frame())
+    node.refusal = SagsError("no room")
+    put = [placed(thing, node.frame()) for _ in range(3)][-1]
     assert put is not None and not put.is_sure and put.vertices is None
     assert thing.status()["unsure"] == "it is drawn rigid: no room"
     node.refusal = None
-    assert [thing.placed(node.frame()) for _ in range(4)] and thing.is_sure
-    anchors = node.frame().anchors
+    assert [placed(thing, node.frame()) for _ in range(4)] and thing.is_sure
+    anchors, own = node.frame().anchors, len(HOLD)
     lost = {n: each if n <= own else replace(each, confidence=0.1) for n, each in anchors.items()}
-    put = thing.placed(node.frame(anchors=lost))
+    put = placed(thing, node.frame(anchors=lost))
     assert put is not None and not put.is_sure and put.vertices is None
     assert thing.status()["unsure"].endswith("0 of its 64 anchors on the tissue over it are sure")
 
@@ -173,7 +159,7 @@ def test_while_nothing_bends_it_it_is_drawn_as_unsure() -> None:
 def checked(node: Node, thing: HeldObject, depth: Any, **changed: Any) -> dict[str, Any]:
     """What is said when the wall has been at a depth (m) for two seconds."""
     for _ in range(2):
-        thing.placed(node.frame(depth=depth, **changed))
+        placed(thing, node.frame(depth=depth, **changed))
     return thing.status()
 
 
@@ -216,6 +202,6 @@ def test_it_is_looked_at_once_a_second_as_it_is_bent() -> None:
         pulls = tenth == 5 or tenth >= 9
         for node, thing in ((one, bending), (two, rigid)):
             frame = node.frame(pulled if pulls else np.zeros_like, bulge if pulls else WALL)
-            thing.placed(replace(frame, stamp_ns=10**10 + tenth * 10**8))
+            placed(thing, replace(frame, stamp_ns=10**10 + tenth * 10**8))
         seen.append((bending.status()["sure"], rigid.status()["sure"]))
     assert seen == [(True, True)] * 11 + [(True, False)] * 20
