@@ -21,7 +21,7 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9559,
+    "benchmarks": 9758,
     "sags_lab": 5032,
     "sags_node": 1680,
     "sags_node/bridge": 2597,
@@ -41,18 +41,18 @@ LINES = {
     "sags_node/messaging": 5084,
     "sags_node/model": 960,
     "sags_node/node": 1425,
-    "sags_node/overlay": 2361,
+    "sags_node/overlay": 2707,
     "sags_node/phantom": 1604,
     "sags_node/pipeline": 842,
     "sags_node/recording": 2600,
-    "sags_node/registration": 466,
+    "sags_node/registration": 471,
     "sags_node/rig": 1169,
     "sags_node/ros": 332,
     "sags_node/sources": 5666,
     "sags_node/terminal": 345,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5462,
-    "tests": 45342,
+    "tests": 45577,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -102,9 +102,10 @@ class Deformation:
             self.doubt = f"{len(pulls)} of its {len(states)} anchors on the tissue over it are sure"
             return None
         self.doubt = None
-        weights = _weights(self._field, pulls, ways[pulls], [states[i] for i in pulls])
+        weights = np.zeros(ways.shape, np.float32)
+        weights[pulls] = _weights(self._field, pulls, ways[pulls], [states[i] for i in pulls])
         vertices = self._vertices.copy()
-        vertices[self._field.rows] += self._field.carried[:, pulls] @ weights.astype(np.float32)
+        vertices[self._field.rows] += self._field.carried @ weights
         return vertices
 
     def _begin(self, frame: TissueFrame, T: F64) -> None:
