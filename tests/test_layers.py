@@ -29,16 +29,16 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9559,
+    "benchmarks": 9758,
     "sags_lab": 5032,
     "sags_node": 1204,
     "sags_node/bags": 863,
     "sags_node/cli": 3169,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2599,
-    "sags_node/clients/overlay": 2361,
+    "sags_node/clients/overlay": 2707,
     "sags_node/clients/recording": 1383,
-    "sags_node/clients/registration": 466,
+    "sags_node/clients/registration": 471,
     "sags_node/clients/viewer": 1007,
     "sags_node/config": 1352,
     "sags_node/detail": 932,
@@ -64,7 +64,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1092,
     "sags_node/vision": 5510,
-    "tests": 45612,
+    "tests": 45847,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -1,4 +1,4 @@
-"""`benchmarks registration`: how exactly a model is placed on tissue."""
+"""`benchmarks registration` and `deform`: how exactly a model is placed on tissue, and follows it."""
 
 from __future__ import annotations
 
@@ -32,5 +32,30 @@ def bench_registration(ct: Path | None, seeds: int, out: Path | None, json_out: 
     with progress("registering") as advance:
         measured = registration.measure_registration(ct, seeds, advance)
     for table in [measured] if json_out else registration.tables(measured):
+        show(table)
+    write_json(out, measured)
+
+
+@click.command("deform")
+@shown("--seeds", type=click.IntRange(1), default=5, help="Phantoms.")
+@figures_option
+@as_json
+def bench_deform(seeds: int, out: Path | None, json_out: bool) -> None:
+    """How well a registered model follows tissue that is pulled.
+
+    A part of the phantom's surface, and the same 5, 10 and 20 mm below it, is held by anchors while the
+    surface is pulled by 10 mm and more: rigid, and bent with it (`deform: true`). Errors of its vertices to
+    the truth; below the surface that is an elastic half space, by definition. What the check of the residual
+    says of both.
+
+    \b
+    python -m benchmarks deform --out benchmarks/results/deform.json
+    """
+    from benchmarks.quality import deform
+
+    check_files(out)
+    with progress("pulling") as advance:
+        measured = deform.measure_deform(seeds, advance)
+    for table in [measured] if json_out else deform.tables(measured):
         show(table)
     write_json(out, measured)

@@ -27,7 +27,7 @@ from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.tools.evaluation.receipt import Receipt
-from sags_node.types import F32, F64, I32, Camera, StereoFrame
+from sags_node.types import F32, F64, I32, I64, Camera, StereoFrame
 
 SEEDS = 20
 PAIRS, TARGETS = 5, 5
@@ -104,7 +104,8 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
         receipt = receipt or Receipt(phantom.rig, SIZE, None)
         camera, surface = _node_sees(config, phantom, receipt)
         rng = np.random.default_rng(seed)
-        case = Case(rng, *_part(rng, phantom, camera))
+        used, triangles = part(rng, phantom, camera)
+        case = Case(rng, phantom.tissue.vertices(0.0).reshape(-1, 3)[used].astype(np.float64), triangles)
         placings.append(_registered(case, surface))
         refusals += _spoilt(case, surface)
     refusals += _even(np.random.default_rng(0))
@@ -127,15 +128,19 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
     return measured
 
 
+def shown_to_node(phantom: Phantom, number: int, count: int, rate: float) -> StereoFrame:
+    """Frame `number` of `count`, with its true masks and pose."""
+    truth, stamp = phantom.frame(number, count), round((1 + number / rate) * 1e9)
+    return StereoFrame(
+        number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool, T_world_cam=truth.T_world_cam
+    )
+
+
 def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tuple[Camera, Surface]:
     """What `sags register` gets of a second of the node."""
     pipeline, parts = Pipeline(config, phantom.rig, rate=RATE), []
     for number in range(FRAMES):
-        truth = phantom.frame(number, FRAMES)
-        stamp = round((1 + number / RATE) * 1e9)
-        frame = StereoFrame(
-            number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool, T_world_cam=truth.T_world_cam
-        )
+        frame = shown_to_node(phantom, number, FRAMES, RATE)
         result = pipeline.process(frame, StepBudget(STEPS))
         view, tissue = result.views["left"], result.observation.tissue
         receipt.add(frame, tissue)
@@ -144,16 +149,16 @@ def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tupl
     return view.camera, Surface.joined(parts)
 
 
-def _part(rng: np.random.Generator, phantom: Phantom, camera: Camera) -> tuple[F64, I32]:
-    """Vertices and triangles of the tissue within an ellipse of the picture."""
-    vertices = phantom.tissue.vertices(0.0).reshape(-1, 3).astype(np.float64)
+def part(rng: np.random.Generator, phantom: Phantom, camera: Camera, phase: float = 0.0) -> tuple[I64, I32]:
+    """Numbers of the vertices of the tissue within an ellipse of the picture, and triangles of these."""
+    vertices = phantom.tissue.vertices(phase).reshape(-1, 3).astype(np.float64)
     triangles = phantom.tissue.faces.astype(np.int32)
     size = np.array([camera.width, camera.height])
     middle = size * rng.uniform(0.4, 0.6, 2)
     pixels, _ = project(camera, vertices[triangles].mean(1))
     kept = triangles[np.linalg.norm((pixels - middle) / (PART * size), axis=1) < 1]
     used, numbers = np.unique(kept, return_inverse=True)
-    return vertices[used], numbers.reshape(-1, 3).astype(np.int32)
+    return used.astype(np.int64), numbers.reshape(-1, 3).astype(np.int32)
 
 
 def _far_apart(rng: np.random.Generator, vertices: F64) -> F64:

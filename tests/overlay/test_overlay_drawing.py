@@ -51,9 +51,9 @@ def centre(rgba: np.ndarray) -> np.ndarray:
 
 def test_where_the_depth_is_not_sure_all_is_as_faint_as_what_lies_under_the_tissue() -> None:
     """Neither before it nor behind it: nobody knows."""
-    sure = np.ones(SIZE, bool)
-    sure[:, 80:] = False
-    drawn = draw(replace(wall(), sure=sure), [ball(0.04, radius=0.004)])[..., 3]
+    confidence = np.full(SIZE, 0.5, np.float32)
+    confidence[:, 80:] = 0.49
+    drawn = draw(replace(wall(), confidence=confidence), [ball(0.04, radius=0.004)])[..., 3]
     left, right = drawn[:, :80], drawn[:, 80:]
     assert left.any() and right.any()
     assert set(np.unique(left)) == {0, 255} and set(np.unique(right)) == {0, round(UNDER * 255)}

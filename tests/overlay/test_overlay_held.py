@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
-from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from fake_pinner import FakePinner
 from flat_scene import Scene, camera_in_front, flat_means, flat_scene
 from synthetic import BASELINE, NORMAL, plane_depth, plane_result
 
+from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
-from sags_node.clients.overlay.held import HeldObject, Pinner, Request
+from sags_node.clients.overlay.held import HeldObject
+from sags_node.clients.overlay.mesh import Mesh
+from sags_node.clients.overlay.pinner import Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
 from sags_node.clients.overlay.scene import ObjectSpec
 from sags_node.clients.registration.rigid import on_a_line, rigid_fit
@@ -87,33 +90,6 @@ def test_one_anchor_gives_the_place_and_the_normal_of_the_surface() -> None:
 
 
 # ---- objects held by anchors -----------------------------------------------------------------------------
-
-
-class FakePinner(Pinner):
-    """Gives ids at once, or refuses; remembers what was asked."""
-
-    def __init__(self) -> None:
-        self.asked: list[Any] = []
-        self.removed: list[int] = []
-        self.forgotten: list[int] = []
-        self.refusal: SagsError | None = None
-        self._next = 1
-
-    def pin(self, requests: Any) -> Future[list[int]]:
-        self.asked.append(requests)
-        future: Future[list[int]] = Future()
-        if self.refusal is not None:
-            future.set_exception(self.refusal)
-            return future
-        future.set_result(list(range(self._next, self._next + len(requests))))
-        self._next += len(requests)
-        return future
-
-    def remove(self, ids: Any) -> None:
-        self.removed += ids
-
-    def forget(self, ids: Any) -> None:
-        self.forgotten += ids
 
 
 PIXELS = [[20, 20], [70, 30], [30, 55], [85, 50]]
@@ -266,7 +242,9 @@ def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any
         anchor["at"] = said
     spec = ObjectSpec.model_validate({"file": "tube.stl", "scale": scale, "anchors": anchors, **more})
     corners = np.array([[-0.015, -0.002, -0.002], [0.015, 0.002, 0.002]]) + (0 if around is None else around)
-    return HeldObject(spec, "pin", FakePinner(), False, 0, corners), with_anchors(frame, places)
+    ends = Mesh(corners.astype(np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+    body = Body(ends, 1.0, None)
+    return HeldObject(spec, "pin", FakePinner(), False, 0, body), with_anchors(frame, places)
 
 
 def local_places() -> np.ndarray:

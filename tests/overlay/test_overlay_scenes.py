@@ -161,6 +161,12 @@ def test_a_bad_mesh_is_one_clear_message(name: str, tmp_path: Path) -> None:
         ("objects: [{shape: target, anchors: [{pixel: [.nan, 2]}]}]", "finite number"),
         ("objects: [{shape: target, color: [0, 0, 240]}]", "too near the key colour"),
         ("objects: [{shape: target, opacity: 0}]", "greater than 0"),
+        ("objects: [{shape: target, deforms: true}]", "'objects.0.deforms'; did you mean 'deform'?"),
+        ("objects: [{shape: target, deform: true}]", "deform: true needs a file, and three anchors"),
+        ("objects: [{shape: target, deform_depth_mm: 9}]", "deform_depth_mm says how deep `deform: true`"),
+        ("objects: [{shape: target, deform: deep}]", "objects.0.deform: "),
+        ("objects: [{shape: target, registration: {share: 2}}]", "objects.0.registration.share: "),
+        ("objects: [{shape: target, registration: {residual_p90_mm: -1}}]", "registration.residual_p90_mm: "),
         ("objects: [{shape: target, color: red}]", "this should be a list, e.g. [40, 220, 255]"),
     ],
 )  # fmt: skip

@@ -232,15 +232,22 @@ def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, 
     given = (files / "organ.ply", "--points", files / "pairs.yaml", "-o", scene, "--run-dir", node.run_dir)
     said = figures_of("register", *given, "--json")
     thing = read_scene(scene).objects[0]
-    assert thing.registration == {key: said[key] for key in said if key != "scene"}
+    kept = thing.registration and thing.registration.model_dump()
+    assert kept == {key: said[key] for key in said if key != "scene"}
     assert said["verdict"] == "good" and said["share"] > 0.8
     places, at = (np.array([getattr(anchor, key) for anchor in thing.anchors]) for key in ("place", "at"))
     T, misfit = rigid_fit(thing.scale * at, places, np.ones(len(at)))
     off = np.linalg.norm(transform(T, organ.targets) - DEEP * organ.picks, axis=1)
     assert misfit < 1e-6 and (1e3 * off <= [target["expected_mm"] for target in said["targets"]]).all()
     assert np.allclose(T @ AWAY, np.eye(4), atol=0.05)
-    played = run_overlay(OverlayOptions(NodeAddress(run_dir=node.run_dir), scene=scene, seconds=6))
+    written = yaml.safe_load(scene.read_text())
+    written["objects"] += [written["objects"][0] | {"deform": True}]
+    scene.write_text(yaml.safe_dump(written))
+    played = run_overlay(OverlayOptions(NodeAddress(run_dir=node.run_dir), scene=scene, seconds=20))
     assert played["overlay"] > 0, played
+    for held in played["objects"]:
+        assert held["sure"] and held["residual_mm"] <= held["residual_limit_mm"], held
+    assert played["objects"][1]["deform"]["pulling"] > 20, played
     refused(2, "register", *given, said=(str(scene), "exists already", "--force"))
 
 

@@ -21,6 +21,7 @@ from sags_node.clients.overlay.frame import TissueFrame
 from sags_node.clients.overlay.mark import draw_mark
 from sags_node.clients.overlay.mesh import Mesh
 from sags_node.clients.overlay.raster import fill, hide, key_out
+from sags_node.confidence import SURE
 from sags_node.geometry import invert, transform
 from sags_node.kernels.jit import read_only
 from sags_node.types import F32, F64, U8, Camera
@@ -38,45 +39,33 @@ class Body:
     """A mesh made ready to be drawn again and again; None: only a label.
 
     Attributes:
-        corners: [2, 3] m, between which it lies in its own coordinates.
+        vertices: [V, 3] m, in its own coordinates; [0, 3] of a label.
+        triangles: [T, 3].
+        corners: [2, 3] m, between which it lies.
     """
 
     def __init__(self, mesh: Mesh | None, opacity: float, label: str | None) -> None:
         self.label = label
-        self.middle, self.corners = np.zeros(3), np.zeros((2, 3))
-        self._mesh = mesh
-        self._vertices = np.zeros((0, 3)) if mesh is None else mesh.vertices.astype(np.float64)
+        self.corners = np.zeros((2, 3))
+        self.vertices, self.triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int32)
         if mesh is None:
             return
-        corners = self._vertices[mesh.triangles]  # [T, 3, 3]
+        self.vertices, self.triangles = mesh.vertices.astype(np.float64), mesh.triangles
+        corners = self.vertices[self.triangles]  # [T, 3, 3]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         self._normals = normals / np.where(lengths > 0, lengths, 1)
         self._centres = corners.mean(1)
-        self._alpha = np.uint8(round(255 * opacity))
-        self.corners = np.stack([self._vertices.min(0), self._vertices.max(0)])
-        self.middle = self.corners.mean(0)
+        self._colors, self._alpha = mesh.colors, np.uint8(round(255 * opacity))
+        self.corners = np.stack([self.vertices.min(0), self.vertices.max(0)])
 
-    def draw(self, camera: Camera, T_world_body: F64, z: F32, rgba: U8) -> None:
-        """Add what one eye sees of it to a picture [H, W, 4] with depths [H, W] (m), in place."""
-        if self._mesh is None:
-            return
-        T_cam_body = invert(camera.T_world_cam) @ T_world_body
-        local = np.asarray(transform(T_cam_body, self._vertices), np.float64)
-        depths = np.ascontiguousarray(local[:, 2])
-        flat = local / np.where(depths != 0, depths, 1)[:, None]
-        pixels = np.ascontiguousarray((flat @ camera.K.T)[:, :2])
-        colors = self._lit(invert(T_cam_body)[:3, 3])
-        fill(pixels, depths, read_only(self._mesh.triangles), colors, z, rgba)
-
-    def _lit(self, eye: F64) -> U8:
-        """Colours [T, 4] lit from the eye (at [3], m), as an endoscope lights."""
-        assert self._mesh is not None
+    def lit(self, eye: F64) -> U8:
+        """Colours [T, 4] lit from the eye (at [3], m), as an endoscope lights; bent or not."""
         rays = self._centres - eye
         facing = np.abs(np.einsum("tc,tc->t", self._normals, rays)) / np.linalg.norm(rays, axis=1)
         light = DARKEST + (1 - DARKEST) * facing
         colors = np.full((len(light), 4), self._alpha, np.uint8)
-        colors[:, :3] = np.rint(light[:, None] * self._mesh.colors)
+        colors[:, :3] = np.rint(light[:, None] * self._colors)
         return colors
 
 
@@ -85,6 +74,23 @@ class Placed:
     body: Body
     T_world_body: F64  # [4, 4]
     is_sure: bool = True
+    vertices: F64 | None = None  # [V, 3] m, of the body, bent with the tissue; None: it is rigid
+
+    def shape(self, T: F64) -> F64:
+        """Its vertices [V, 3] (m) as T [4, 4] transforms its body's coordinates."""
+        return np.asarray(transform(T, self.body.vertices if self.vertices is None else self.vertices))
+
+    def draw(self, camera: Camera, z: F32, rgba: U8, colors: U8 | None = None) -> F64:
+        """Add what one eye sees of it to a picture [H, W, 4] with depths [H, W] (m), in place; its vertices
+        [V, 3] (m) in the camera's coordinates. `colors` are [T, 4]; default: as it is lit."""
+        T_cam_body = invert(camera.T_world_cam) @ self.T_world_body
+        local = self.shape(T_cam_body)
+        if len(local):
+            depths = np.ascontiguousarray(local[:, 2])
+            pixels = (local / np.where(depths != 0, depths, 1)[:, None] @ camera.K.T)[:, :2]
+            colors = self.body.lit(invert(T_cam_body)[:3, 3]) if colors is None else colors
+            fill(np.ascontiguousarray(pixels), depths, read_only(self.body.triangles), colors, z, rgba)
+        return local
 
 
 def draw(
@@ -101,11 +107,11 @@ def draw(
     z, rgba = np.full((height, width), np.inf, np.float32), np.zeros((height, width, 4), np.uint8)
     for placed in objects:
         if placed.is_sure:
-            placed.body.draw(camera, placed.T_world_body, z, rgba)
+            placed.draw(camera, z, rgba)
     sure_z = z.copy()
     for placed in objects:
         if not placed.is_sure:
-            placed.body.draw(camera, placed.T_world_body, z, rgba)
+            placed.draw(camera, z, rgba)
     rows, columns = np.nonzero(z < sure_z)
     faint = np.rint(UNDER * rgba[rows, columns, 3]).astype(np.uint8)
     _hide(z, rgba, frame, slice(None), camera, baseline, UNDER)
@@ -168,14 +174,14 @@ def _hide(
     z: F32, rgba: U8, frame: TissueFrame, lines: slice, camera: Camera, baseline: float, under: float
 ) -> None:
     shift = float(camera.K[0, 0] * baseline)
-    sure = np.ones_like(frame.tissue) if frame.sure is None else frame.sure
-    depth, tissue = read_only(frame.depth[lines]), read_only(frame.tissue[lines])
-    hide(z, rgba, depth, tissue, read_only(sure[lines]), shift, NEAREST, ON_SURFACE, under)
+    depth, tissue = frame.depth[lines], frame.tissue[lines]
+    sure = np.ones_like(tissue) if frame.confidence is None else frame.confidence[lines] >= SURE
+    hide(z, rgba, read_only(depth), read_only(tissue), read_only(sure), shift, NEAREST, ON_SURFACE, under)
 
 
 def _label(rgba: U8, frame: TissueFrame, camera: Camera, placed: Placed, baseline: float) -> None:
     assert placed.body.label is not None
-    middle = np.asarray(transform(placed.T_world_body, placed.body.middle))
+    middle = np.asarray(transform(placed.T_world_body, placed.body.corners.mean(0)))
     point = np.asarray(transform(camera.viewmat, middle))
     if point[2] > 0:
         u, v = (camera.K @ point)[:2] / point[2]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from sags_node.confidence import SURE, SURE_OF_ANCHOR
+from sags_node.clients.registration.surfaces import Surface
+from sags_node.confidence import SURE_OF_ANCHOR
 from sags_node.messaging.received import (
     Frame,
     ReceivedCameraInfo,
@@ -33,6 +34,7 @@ CONFIDENCE = TopicName("left/render/depth_confidence", ReceivedImage)  # recordi
 # `SURE_OF_ANCHOR` is 2 s.
 LEAST_IN_SIGHT = 0.02  # 11 s: above it at least two of three are right, below it none to four of five
 LEAST_HIDDEN = 0.1  # 6 s
+TOLD = ("visibility", "confidence", "depth_confidence", "ahead")  # of an `Anchor`, older nodes not all
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +73,13 @@ class TissueFrame:
     depth: F32  # [H, W] m, NaN unknown
     tissue: Bool  # [H, W], False: instrument
     anchors: dict[int, Anchor]
-    sure: Bool | None = None  # [H, W] where the depth may decide what hides what; None: everywhere
+    confidence: F32 | None = None  # [H, W] 0..1 of the depth; None: the node does not tell
     recorded_s: float | None = None  # its place in the recording that the node plays; None: not said
+
+    def surface(self, where: Bool) -> Surface:
+        """Some points of the surface that is measured where a picture [H, W] is true."""
+        assert self.confidence is not None
+        return Surface.of_depth(self.depth, self.confidence, where, self.camera)
 
 
 def tissue_frame(
@@ -87,11 +94,8 @@ def tissue_frame(
     size = (info.height, info.width)
     fields = anchors.points.dtype.names or ()
     said = {(message.meta.session, message.meta.epoch) for message in messages.values()}
-    if not depth.array.shape == tissue.array.shape == size or len(said) != 1:
-        return None
-    if not {"id", "visibility", "confidence"} <= set(fields):
-        return None
-    if confidence is not None and confidence.array.shape != size:
+    shapes = {each.array.shape for each in (depth, tissue, confidence) if each is not None}
+    if shapes != {size} or len(said) != 1 or not {"id", "visibility", "confidence"} <= set(fields):
         return None
     try:
         T_world_cam = messages[POSE].pose()
@@ -111,15 +115,9 @@ def tissue_frame(
         depth=depth.array,
         tissue=tissue.array > 0,
         anchors={
-            int(row["id"]): Anchor(
-                place,
-                float(row["visibility"]),
-                float(row["confidence"]),
-                float(row["depth_confidence"]) if "depth_confidence" in fields else 1.0,
-                float(row["ahead"]) if "ahead" in fields else 0.0,
-            )
+            int(row["id"]): Anchor(place, **{name: float(row[name]) for name in TOLD if name in fields})
             for row, place in zip(rows, places, strict=True)
         },
-        sure=None if confidence is None else confidence.array >= SURE,
+        confidence=None if confidence is None else confidence.array,
         recorded_s=None if depth.meta.recorded_s is msgspec.UNSET else depth.meta.recorded_s,
     )

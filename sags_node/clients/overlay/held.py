@@ -4,89 +4,31 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from sags_node.clients.overlay.deform import Deformation
+from sags_node.clients.overlay.draw import Body, Placed
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
+from sags_node.clients.overlay.pinner import Pinner, Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
+from sags_node.clients.overlay.residual import Residual
 from sags_node.clients.overlay.scene import ObjectSpec
 from sags_node.clients.registration.rigid import on_a_line, rigid_fit
 from sags_node.confidence import LEAST
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
-from sags_node.messaging.control import ControlClient
 from sags_node.types import F64
 
 LEAST_ANCHORS = 3  # for a rigid fit
 FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
-MISFIT = (
-    0.003  # m, of an anchor from where its object's shape has it: nine of ten are found within half of it
-)
+MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of ten are within half of it
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
-GOODBYE = 0.5  # s for the node to take anchors back at the end
-
-Request = dict[str, Any]
 
 log = logging.getLogger(__name__)
-
-
-class Pinner:
-    """Asks the node for anchors in the background: an answer takes a frame or longer.
-
-    Args:
-        connect: a new connection to the node's control socket; raises `SagsError`.
-    """
-
-    def __init__(self, connect: Callable[[], ControlClient]) -> None:
-        self._connect = connect
-        self._worker = ThreadPoolExecutor(1, "sags-pinner")
-        self._held: list[int] = []  # ids of anchors that are ours; only the worker uses it
-
-    def pin(self, requests: Sequence[Request]) -> Future[list[int]]:
-        """Ids of new anchors, all or none; or the node's `SagsError`."""
-        return self._worker.submit(self._pin, requests)
-
-    def remove(self, ids: Sequence[int]) -> None:
-        """Give anchors back, as far as the node is still there."""
-        self._worker.submit(self._remove, list(ids))
-
-    def forget(self, ids: Sequence[int]) -> None:
-        """The node that had these anchors is gone; in another one they may be somebody else's."""
-        self._worker.submit(self._disown, list(ids))
-
-    def close(self) -> None:
-        """Give all anchors back, and wait for that."""
-        self._worker.submit(lambda: self._remove(self._held.copy()))
-        self._worker.shutdown()
-
-    def _pin(self, requests: Sequence[Request]) -> list[int]:
-        added: list[int] = []
-        with self._connect() as client:
-            try:
-                for request in requests:
-                    added.append(int(client.request("add_anchor", request)["id"]))
-            except SagsError:
-                for anchor in added:
-                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
-                raise
-        self._held += added
-        return added
-
-    def _remove(self, ids: list[int]) -> None:
-        self._disown(ids)
-        if not ids:
-            return
-        try:
-            with self._connect() as client:
-                for anchor in ids:
-                    client.request("remove_anchor", {"id": anchor}, GOODBYE)
-        except SagsError:
-            return  # the node is gone, and its anchors with it
-
-    def _disown(self, ids: list[int]) -> None:
-        self._held = [anchor for anchor in self._held if anchor not in ids]
 
 
 class HeldObject:
@@ -101,8 +43,8 @@ class HeldObject:
     Args:
         repin: after the model or the node was started anew, pin it once more at the same pixels and places.
         ahead: how far ahead of its frames it is placed, ms or `auto`, see `add_anchor`.
-        corners: [2, 3] m, between which all of it lies, in its own coordinates; None: nobody looks whether it
-            lies at its anchors.
+        body: what is placed; None: nobody looks whether it lies at its anchors, `placed` is not called.
+        worker: for what takes longer than a frame.
     """
 
     def __init__(
@@ -112,7 +54,8 @@ class HeldObject:
         pinner: Pinner,
         repin: bool,
         ahead: float | str = 0.0,
-        corners: F64 | None = None,
+        body: Body | None = None,
+        worker: Executor | None = None,
     ) -> None:
         self.spec = spec
         self.reason: str | None = None
@@ -132,11 +75,44 @@ class HeldObject:
         self._right = np.zeros(3)  # where the picture's x axis pointed when it was pinned
         self._normal: F64 | None = None
         self._lost: str | None = None
-        self._corners = corners
+        self._body = body
+        self._worker = worker
+        self._off: dict[int, float] = {}  # m, of each anchor from where the unbent shape has it
+        self._bend: Deformation | None = None
+        self._residual: Residual | None = None
+        self._follow()
         self._refused: str | None = None  # for good
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
+
+    def _follow(self) -> None:
+        """Begin to bend and to check it, anew where it was lost."""
+        stated = self.spec.registration
+        if self._body is None or self._worker is None:
+            return
+        if self.spec.deform:
+            depth = 1e-3 * self.spec.deform_depth_mm
+            self._bend = Deformation(self._body.vertices, depth, self._pinner, self._worker, self._asked)
+        if stated is not None and stated.residual_p90_mm is not None:
+            self._residual = Residual(1e-3 * stated.residual_p90_mm, stated.share, self._worker)
+
+    def placed(self, frame: TissueFrame) -> Placed | None:
+        """It as it is to be drawn: placed, bent and checked as its scene file says; see `place`."""
+        T = self.place(frame)
+        if T is None:
+            return None
+        assert self._body is not None
+        put, doubts = Placed(self._body, T), []
+        if self._bend is not None:
+            put = replace(put, vertices=self._bend.move(frame, T))
+            doubts.append(self._bend.doubt and f"it is drawn rigid: {self._bend.doubt}")
+        if self._residual is not None:
+            # The surface is known for now only, not for the time for which it is placed ahead.
+            doubts.append(self._residual.look(frame, put, again=self.ahead_s == 0))
+        for doubt in filter(None, doubts):
+            self.is_sure, self.unsure = False, self.unsure or doubt
+        return replace(put, is_sure=self.is_sure)
 
     def place(self, frame: TissueFrame) -> F64 | None:
         """The pose [4, 4] of the object in the world, or None and a `reason`. Pins it when it is not yet.
@@ -160,8 +136,7 @@ class HeldObject:
         if self._lost is not None and not self._may_pin_again(frame):
             return self._lost
         if self._ids and frame.session != self._session:
-            self._pinner.forget(self._ids)
-            return self._lose("the node was started anew")
+            return self._lose("the node was started anew", self._pinner.forget)
         if not self._ids:
             return self._pin(frame)
         states = [frame.anchors.get(anchor) for anchor in self._ids]
@@ -170,8 +145,8 @@ class HeldObject:
             return "being pinned"  # the anchors come with one of the next frames
         self._states = known
         if not any(np.isfinite(state.place).all() for state in known):
-            self._pinner.remove(self._ids)
-            return self._lose("the model was started anew" if known else "its anchors were removed")
+            why = "the model was started anew" if known else "its anchors were removed"
+            return self._lose(why, self._pinner.remove)
         self._held_s = frame.recorded_s
         if self._model is None:
             self._begin(frame, known)
@@ -194,6 +169,8 @@ class HeldObject:
             "unsure": self.unsure,
             "pinned": self.times_pinned,
             "error_mm": round(1e3 * self.error, 3),
+            **({} if self._residual is None else self._residual.status()),
+            **({} if self._bend is None else self._bend.status()),
             "anchors": [
                 {
                     "id": anchor,
@@ -207,7 +184,11 @@ class HeldObject:
 
     # ---- pinning -------------------------------------------------------------------------------------------
 
-    def _lose(self, why: str) -> str:
+    def _lose(self, why: str, release: Callable[[list[int]], object]) -> str:
+        release(self._ids)
+        if self._bend is not None:
+            self._bend.release(release)
+        self._follow()
         self._ids, self._states, self._model, self._normal = [], [], None, None
         self._lost, self._began_anew = f"lost: {why}", False
         return self._lost
@@ -305,9 +286,9 @@ class HeldObject:
 
     def _distance(self, points: F64) -> float:
         """From the object to the nearest of its points [k, 3], m; 0: it is as near as an object may be."""
-        if self._corners is None:
+        if self._body is None:
             return 0.0
-        low, high = self._corners
+        low, high = self._body.corners
         aside = np.maximum(np.maximum(low - points, points - high), 0)
         distance = float(np.linalg.norm(aside, axis=1).min())
         return distance if distance > np.linalg.norm(high - low) + FAR else 0.0
@@ -329,6 +310,10 @@ class HeldObject:
         places = np.stack([state.place for state in chosen.values()])
         T, self.error = rigid_fit(model, places, weights)
         off = np.linalg.norm(transform(T, model) - places, axis=1)
+        if self._bend is not None and not self._bend.ids:
+            self._off = dict(zip(chosen, off.tolist(), strict=True))
+        elif self._bend is not None:  # what bends afterwards is no misfit
+            off = np.array([self._off.get(i, each) for i, each in zip(chosen, off, strict=True)])
         sure = model[[state.is_sure for state in chosen.values()] & (off <= MISFIT)]
         self.is_sure = len(sure) >= LEAST_ANCHORS and not on_a_line(sure)
         self.unsure = None

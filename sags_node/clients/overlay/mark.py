@@ -61,13 +61,8 @@ def draw_lines(rgba: U8, lines: Sequence[str], shift: int = 0) -> None:
 
 def _fitted(text: str, width: int, scale: float, thickness: int) -> str:
     """As much of it as fits into so many px."""
-    if _width(text, scale, thickness) <= width:
-        return text
-    while text and _width(text + ENDS, scale, thickness) > width:
+    shown = text
+    while text and cv2.getTextSize(shown, FONT, scale, thickness)[0][0] > width:
         text = text[:-1]
-    return text + ENDS
-
-
-def _width(text: str, scale: float, thickness: int) -> int:
-    (across, _), _ = cv2.getTextSize(text, FONT, scale, thickness)
-    return int(across)
+        shown = text + ENDS
+    return shown

@@ -20,7 +20,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform, unproject
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.types import F32, F64
+from sags_node.types import F64
 
 FRAMES = 10  # of the time that is looked at
 PATIENCE = 10.0  # s for the first frame, and beyond that time for the last
@@ -28,8 +28,6 @@ WAIT_FOR_REST = 0.2  # s for what belongs to a frame
 LEAST_SHARE = 0.5  # of the frames, in which a picked point must be known
 HOLDING = 8  # anchors of the scene
 INNER = 0.8  # of the matched points, those nearest to their middle: anchors at a rim are lost first
-
-Seen = tuple[TissueFrame, F32]  # and the confidence of its depth [H, W]
 
 
 def register_live(
@@ -56,16 +54,14 @@ def register_live(
         targets = 0.5 * (vertices.min(0) + vertices.max(0))[None]
     seen = _look(node, seconds)
     places = np.array([_place(pair, number, seen) for number, pair in enumerate(pairs.pairs, 1)])
-    surface = Surface.joined(
-        [Surface.of_depth(frame.depth, sure, frame.tissue, frame.camera) for frame, sure in seen]
-    )
+    surface = Surface.joined([frame.surface(frame.tissue) for frame in seen])
     at = scale * np.array([pair.at for pair in pairs.pairs], np.float64)
     found = register(Shape(vertices, mesh.triangles), at, places.reshape(-1, 3), surface, targets)
     said = found.figures(targets / scale)
     if found.verdict == "refused":
         return said, None
     assert found.T_world_model is not None and found.matched is not None
-    held = _holding(surface.points[found.matched])
+    held = holding(surface.points[found.matched])
     local = transform(invert(found.T_world_model), held) / scale
     anchors = [
         {"place": _short(place), "at": _short(point)} for place, point in zip(held, local, strict=True)
@@ -75,34 +71,34 @@ def register_live(
     return said, {"objects": [thing | {"anchors": anchors, "registration": said}]}
 
 
-def _look(node: NodeAddress, seconds: float) -> list[Seen]:
+def _look(node: NodeAddress, seconds: float) -> list[TissueFrame]:
     """At most `FRAMES` that are spread over some seconds of one session of a node."""
-    seen: list[Seen] = []
+    seen: list[TissueFrame] = []
     apart_ns, deadline, last = 1e9 * seconds / FRAMES, time.monotonic() + PATIENCE + seconds, None
     with Subscriber.at(node, [*NEEDED, CONFIDENCE]) as subscriber:
-        while not seen or seen[-1][0].stamp_ns - seen[0][0].stamp_ns < (FRAMES - 1) * apart_ns:
+        while not seen or seen[-1].stamp_ns - seen[0].stamp_ns < (FRAMES - 1) * apart_ns:
             last = subscriber.wait(NEEDED[0], max(0.0, deadline - time.monotonic()), after=last)
             if last is None:
                 break
             messages = subscriber.aligned([*NEEDED, CONFIDENCE], last.stamp_ns, WAIT_FOR_REST)
-            frame = None if messages is None else tissue_frame(messages, None)
-            if messages is None or frame is None or subscriber.problem(NEEDED[0]) is not None:
+            frame = None if messages is None else tissue_frame(messages, None, messages[CONFIDENCE])
+            if frame is None or subscriber.problem(NEEDED[0]) is not None:
                 continue
             if not last.metric:
                 raise SagsError("the node has no calibration, so nothing has a length: see sags calib")
-            if seen and (frame.session, frame.epoch) != (seen[0][0].session, seen[0][0].epoch):
+            if seen and (frame.session, frame.epoch) != (seen[0].session, seen[0].epoch):
                 seen.clear()  # places of before are of another world
-            if not seen or frame.stamp_ns - seen[-1][0].stamp_ns >= apart_ns:
-                seen.append((frame, messages[CONFIDENCE].array))
+            if not seen or frame.stamp_ns - seen[-1].stamp_ns >= apart_ns:
+                seen.append(frame)
         if not seen:
             why = subscriber.refusal or subscriber.problem(NEEDED[0]) or "no frame was whole"
             raise SagsError(f"no depth came from {subscriber.endpoint}: {why}; does the node run and map?")
     return seen
 
 
-def _place(pair: PairSpec, number: int, seen: Sequence[Seen]) -> F64:
+def _place(pair: PairSpec, number: int, seen: Sequence[TissueFrame]) -> F64:
     """Where the tissue of a pair is: [3] m, world; the middle of what the frames say."""
-    found = [place for frame, sure in seen if (place := _place_in(pair, number, frame, sure)) is not None]
+    found = [place for frame in seen if (place := _place_in(pair, number, frame)) is not None]
     if len(found) < LEAST_SHARE * len(seen):
         what = f"pixel {pair.pixel[0]:g} {pair.pixel[1]:g}" if pair.pixel else f"anchor {pair.anchor}"
         raise SagsError(
@@ -111,7 +107,8 @@ def _place(pair: PairSpec, number: int, seen: Sequence[Seen]) -> F64:
     return np.asarray(np.median(found, axis=0), np.float64)
 
 
-def _place_in(pair: PairSpec, number: int, frame: TissueFrame, sure: F32) -> F64 | None:
+def _place_in(pair: PairSpec, number: int, frame: TissueFrame) -> F64 | None:
+    assert frame.confidence is not None
     if pair.pixel is None:
         anchor = frame.anchors.get(pair.anchor or 0)
         if anchor is None:
@@ -123,12 +120,12 @@ def _place_in(pair: PairSpec, number: int, frame: TissueFrame, sure: F32) -> F64
     if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
         raise UsageError(f"pair {number}: pixel {u:g} {v:g} lies outside the picture of {width}x{height} px")
     at = round(v), round(u)
-    if not (frame.tissue[at] and frame.depth[at] > 0 and sure[at] >= SURE):
+    if not (frame.tissue[at] and frame.depth[at] > 0 and frame.confidence[at] >= SURE):
         return None
     return np.asarray(unproject(frame.camera, np.array([u, v]), np.array(frame.depth[at], np.float64)))
 
 
-def _holding(points: F64) -> F64:
+def holding(points: F64) -> F64:
     """Some of the matched points [N, 3], far apart from each other: [k, 3]."""
     import open3d as o3d
 

@@ -11,6 +11,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,8 +24,9 @@ from sags_node.clients.overlay import draw as overlay_draw
 from sags_node.clients.overlay.draw import Body, Placed
 from sags_node.clients.overlay.durations import REMEMBERED, Durations
 from sags_node.clients.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
-from sags_node.clients.overlay.held import HeldObject, Pinner
+from sags_node.clients.overlay.held import HeldObject
 from sags_node.clients.overlay.mesh import mesh_of
+from sags_node.clients.overlay.pinner import Pinner
 from sags_node.clients.overlay.save import Layers, Output
 from sags_node.clients.overlay.scene import SceneSpec, built_in, read_scene
 from sags_node.clients.overlay.stream import OverlayStream
@@ -117,27 +119,17 @@ class _Overlay:
         layers: Layers | None,
         tell: Callable[[str], object],
     ) -> None:
-        connect = partial(ControlClient.at, options.node)
         self._options = options
-        self._bodies = bodies
         self._subscriber: Subscriber | None = None  # before there is a node
         self._clock: NodeClock | None = None  # of a node that may be on another machine
-        self._tell = tell
+        self._stream, self._output, self._layers, self._tell = stream, output, layers, tell
         self._waiting_because = ""
-        self._stream = stream
-        self._output = output
-        self._layers = layers
-        self._pinner = Pinner(connect)
+        self._pinner = Pinner(partial(ControlClient.at, options.node))
+        self._worker = ThreadPoolExecutor(1, "sags-measure")
+        called = ["pin" if options.scene is None else f"{spec.name}: pixel" for spec in scene.objects]
         self._objects = [
-            HeldObject(
-                spec,
-                "pin" if options.scene is None else f"{spec.name}: pixel",
-                self._pinner,
-                options.repin,
-                options.ahead,
-                body.corners,
-            )
-            for spec, body in zip(scene.objects, bodies, strict=True)
+            HeldObject(spec, name, self._pinner, options.repin, options.ahead, body, self._worker)
+            for spec, name, body in zip(scene.objects, called, bodies, strict=True)
         ]
         self._source: tuple[str, int] | None = None  # session and epoch of the node
         self._epoch = -1  # of what is published: grows with every new `_source`
@@ -211,6 +203,7 @@ class _Overlay:
         self._stream.blank("the overlay was stopped")
         self._stream.tell(self._facts())
         self._pinner.close()
+        self._worker.shutdown(cancel_futures=True)
         if self._layers is not None:
             self._layers.close()
         self._output.close()
@@ -260,12 +253,7 @@ class _Overlay:
             frame = tissue_frame(messages, self._right_info(), sure)
         if frame is None:  # the next one may be whole; if not, the clock takes the overlay away
             return None, "incomplete frame"
-        poses = [held.place(frame) for held in self._objects]
-        placed = [
-            Placed(body, T, held.is_sure)
-            for body, held, T in zip(self._bodies, self._objects, poses, strict=True)
-            if T is not None
-        ]
+        placed = [put for held in self._objects if (put := held.placed(frame)) is not None]
         if not placed:
             reason = self._objects[0].reason or "nothing to draw"
             self._stream.blank(reason, (frame.camera.height, frame.camera.width))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sags_node.config.schema import Section
 from sags_node.config.yaml_reader import read_yaml
@@ -37,6 +37,14 @@ class AnchorSpec(Section):
         return self
 
 
+class Registered(BaseModel):
+    """What the overlay uses of what sags register found; the rest is for people."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+    residual_p90_mm: float | None = Field(None, ge=0)
+    share: float = Field(1.0, gt=0, le=1)
+
+
 class ObjectSpec(Section):
     """A mesh, a point cloud, a built-in shape or a mere label, fixed to the tissue."""
 
@@ -59,7 +67,9 @@ class ObjectSpec(Section):
     )
     anchors: tuple[AnchorSpec, ...] = Field((), max_length=32, description="one, or three and more; default: "
                                             "one in the middle of the tissue")  # fmt: skip
-    registration: dict[str, Any] | None = Field(None, description="what sags register found, for people")
+    deform: bool = Field(False, description="bend it with the tissue over it")
+    deform_depth_mm: float = Field(15.0, gt=0, le=100, description="below the surface it stays rigid")
+    registration: Registered | None = Field(None, description="what sags register found")
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -69,6 +79,10 @@ class ObjectSpec(Section):
             raise ValueError("an object has a file or a shape, not both")
         if len(self.anchors) == 2:
             raise ValueError("two anchors leave it free to turn: give one, or three and more")
+        if self.deform and (len(self.anchors) < 3 or (self.file is None and self.shape is None)):
+            raise ValueError("deform: true needs a file, and three anchors or more that hold it")
+        if "deform_depth_mm" in self.model_fields_set and not self.deform:
+            raise ValueError("deform_depth_mm says how deep `deform: true` reaches: add it")
         said = [anchor.at is not None for anchor in self.anchors]
         if len(said) > 1 and any(said) and not all(said):
             raise ValueError("either every anchor says `at`, or none does")

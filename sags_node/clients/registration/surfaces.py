@@ -60,6 +60,12 @@ class Shape:
         return found
 
 
+def evenly(shape: tuple[int, ...]) -> tuple[int, tuple[slice, slice]]:
+    """How many pixels apart about `POINTS` of a picture [H, W] lie, and which these are."""
+    every = max(1, int(np.sqrt(shape[0] * shape[1] / POINTS)))
+    return every, np.s_[every // 2 :: every, every // 2 :: every]
+
+
 @dataclass(frozen=True, slots=True)
 class Surface:
     """Measured points that say how exact they are."""
@@ -71,8 +77,7 @@ class Surface:
     @classmethod
     def of_depth(cls, depth: F32, confidence: F32, tissue: Bool, camera: Camera) -> Surface:
         """About `POINTS` of a depth picture [H, W] (m; 0 or NaN: unknown), evenly, where there is tissue."""
-        every = max(1, int(np.sqrt(depth.size / POINTS)))
-        at = np.s_[every // 2 :: every, every // 2 :: every]
+        every, at = evenly(depth.shape)
         rows, columns = np.nonzero((depth[at] > 0) & tissue[at] & (confidence[at] >= LEAST))
         pixels = np.stack([columns, rows], -1) * every + every // 2
         z, sure = depth[at][rows, columns], confidence[at][rows, columns]

@@ -1,0 +1,76 @@
+"""Asks the node for anchors, and gives them back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from sags_node.messaging.control import ControlClient
+
+ANSWER = 2.0  # s for the node to pin one
+GOODBYE = 0.5  # s for it to take one back at the end
+AT_ONCE = 16  # connections, of the 64 that a node takes
+
+Request = dict[str, Any]
+
+
+class Pinner:
+    """Asks the node for anchors in the background: an answer takes a frame or longer.
+
+    Args:
+        connect: a new connection to the node's control socket; raises `SagsError`.
+    """
+
+    def __init__(self, connect: Callable[[], ControlClient]) -> None:
+        self._connect = connect
+        self._worker = ThreadPoolExecutor(1, "sags-pinner")
+        self._held: list[int] = []  # ids of anchors that are ours; only the worker uses it
+
+    def pin(self, requests: Sequence[Request]) -> Future[list[int]]:
+        """Ids of new anchors, all or none; or the node's `SagsError`."""
+        return self._worker.submit(self._pin, requests)
+
+    def remove(self, ids: Sequence[int]) -> None:
+        """Give anchors back, as far as the node is still there."""
+        self._worker.submit(self._remove, list(ids))
+
+    def forget(self, ids: Sequence[int]) -> None:
+        """The node that had these anchors is gone; in another one they may be somebody else's."""
+        self._worker.submit(self._disown, list(ids))
+
+    def close(self) -> None:
+        """Give all anchors back, and wait for that."""
+        self._worker.submit(lambda: self._remove(self._held.copy()))
+        self._worker.shutdown()
+
+    def _pin(self, requests: Sequence[Request]) -> list[int]:
+        answers, error = self._ask("add_anchor", requests, ANSWER)
+        added = [int(answers[number]["id"]) for number in sorted(answers)]
+        if error is not None:
+            self._remove(added)
+            raise error
+        self._held += added
+        return added
+
+    def _remove(self, ids: list[int]) -> None:
+        self._disown(ids)
+        self._ask("remove_anchor", [{"id": anchor} for anchor in ids], GOODBYE)  # or the node is gone
+
+    def _ask(
+        self, op: str, requests: Sequence[Request], timeout: float
+    ) -> tuple[dict[int, Any], BaseException | None]:
+        """The answers by number, and what went wrong. Many at once: the node answers between two frames."""
+        answers: dict[int, Any] = {}
+
+        def ask(first: int) -> None:
+            with self._connect() as client:
+                for number in range(first, len(requests), AT_ONCE):
+                    answers[number] = client.request(op, requests[number], timeout)
+
+        with ThreadPoolExecutor(AT_ONCE, "sags-pinner") as pool:
+            asked = [pool.submit(ask, first) for first in range(min(AT_ONCE, len(requests)))]
+        return answers, next(filter(None, (each.exception() for each in asked)), None)
+
+    def _disown(self, ids: list[int]) -> None:
+        self._held = [anchor for anchor in self._held if anchor not in ids]
