@@ -35,7 +35,12 @@ def unsure(result: FrameResult) -> FrameResult:
         gaussians = replace(snapshot.gaussians, depth_errors=np.maximum(errors, LEAST_ERROR))
         snapshot = replace(snapshot, gaussians=gaussians)
     anchors = replace(anchors, depth_confidence=_at_most(anchors.depth_confidence))
-    return replace(result, views=views, snapshot=snapshot, anchors=anchors)
+    instruments = result.instruments
+    if instruments is not None:
+        names = ("confidence", "distance_confidence", "clearance_confidence")
+        low = {name: _at_most(getattr(instruments, name)) for name in names}
+        instruments = replace(instruments, **low)
+    return replace(result, views=views, snapshot=snapshot, anchors=anchors, instruments=instruments)
 
 
 def _at_most(confidence: F32) -> F32:
