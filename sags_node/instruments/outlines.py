@@ -79,7 +79,7 @@ def _disc(side: int) -> U8:
 def _of_component(mask: U8, edge: U8) -> list[Outline]:
     """Of one connected region [h, w]."""
     count, entries = cv2.connectedComponents(cv2.dilate(mask & edge, _disc(APART)))
-    entries *= mask
+    entries *= mask & edge
     found: dict[int, tuple[Outline, U8]] = {}  # by entry, and what of the region it was sought in
     for entry in range(1, count):
         start = (entries == entry).view(np.uint8)
