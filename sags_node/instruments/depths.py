@@ -15,9 +15,10 @@ import numpy as np
 from sags_node.instruments.outlines import Outline
 from sags_node.types import F32, F64, I64, U8, Bool
 
-PATCHES = 16
+PATCHES = 12
 FEWEST = 4  # that agree
 RADIUS = (7, 24)  # px, of a patch: half of the instrument's width, and what is beside it
+SAMPLES = 7  # to each side of the middle, at least as many
 BESIDE = 0.3  # of its width
 MARGIN = 3  # px of what lies around it, whose edge tells where it is
 COARSE = 2.0  # px, of the disparities that are tried
@@ -72,14 +73,15 @@ def disparities(seen: Eyes, outline: Outline, limits: tuple[float, float]) -> Di
     if len(places) < FEWEST:
         return None
     tried = np.arange(limits[0], limits[1] + COARSE, COARSE)
-    scores = np.stack([_scores(seen, c, r, tried, every=2) for c, r in zip(centres, radii, strict=True)])
+    patches = zip(centres, radii, strict=True)
+    scores = np.stack([_scores(seen, c, r, tried, every=1 + r // SAMPLES) for c, r in patches])
     line = tried[_best_line(scores, places)]
     covariance = np.zeros((2, 2))
     for _ in range(REFINED):
         fine = np.arange(-FINE, FINE + 1.0)
         at = (1 - places) * line[0] + places * line[1]
-        patches = zip(centres, radii, at, strict=True)
-        scores = np.stack([_scores(seen, c, radius, d + fine) for c, radius, d in patches])
+        around = zip(centres, radii, at, strict=True)
+        scores = np.stack([_scores(seen, c, r, d + fine, every=1 + r // (2 * SAMPLES)) for c, r, d in around])
         best = scores.argmax(1)
         good = (best > 0) & (best < 2 * FINE) & (scores.max(1) >= AGREES)
         if np.count_nonzero(good) < FEWEST:
@@ -93,12 +95,12 @@ def _is_solid(tools: U8, centre: F64, width: float) -> bool:
     """Whether there is instrument around a place of the midline: not between open jaws."""
     side = 2 * round(CORE * width) + 1
     core = cv2.getRectSubPix(tools, (side, side), (float(centre[0]), float(centre[1])))
-    return float(core.mean()) >= 127  # noqa: PLR2004, half of it
+    return float(core.mean()) > 127
 
 
-def _scores(seen: Eyes, centre: F64, radius: int, tried: F64, every: int = 1) -> F32:
+def _scores(seen: Eyes, centre: F64, radius: int, tried: F64, every: int) -> F32:
     """ZNCC [D] of the patch around a place [2] (u v) with those at the disparities [D] that are tried; -1:
-    beyond the right picture."""
+    beyond the right picture. Every so many rows and columns are compared."""
     around = np.arange(-radius, radius + 1, every, dtype=np.float64)
     patch = _taken(seen.left, centre[0] + around[None], centre[1] + around)[0]
     counts = _taken(seen.counts, centre[0] + around[None], centre[1] + around)[0] > 127

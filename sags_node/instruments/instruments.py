@@ -74,6 +74,7 @@ class Instruments:
     def _numbers(self, ends: list[F64], now_ns: int) -> list[int]:
         """Each keeps the number of the one that was the nearest before."""
         gate = SAME * self._usable.shape[1]
+        self._known = {k: v for k, v in self._known.items() if 0 <= now_ns - v[1] < 1e9 * KEPT}
         pairs = sorted(
             (float(np.hypot(*(end - at))), row, number)
             for row, end in enumerate(ends)
@@ -86,9 +87,7 @@ class Instruments:
         for row in range(len(ends)):
             if row not in numbers:
                 numbers[row], self._next = self._next, self._next + 1
-        now = {numbers[row]: (end, now_ns) for row, end in enumerate(ends)}
-        late = {k: v for k, v in self._known.items() if 0 <= now_ns - v[1] < 1e9 * KEPT}
-        self._known = late | now
+        self._known |= {numbers[row]: (end, now_ns) for row, end in enumerate(ends)}
         return [numbers[row] for row in range(len(ends))]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from sags_node.types import F64, I32, U8, Bool
 
 WIDTH = 320  # px, of the mask in which midlines are sought
-MOST = 8  # instruments of a frame
+MOST = 8  # instruments of a frame, and entries of a region
 SMALLEST = 0.002  # of the picture
 GAP = 7  # px: what is cut by no more (a highlight, the window of a jaw) hangs together
 APART = 21  # px: entries nearer than this are one
@@ -44,8 +44,8 @@ class Outline:
 
 
 def outlines(tools: Bool, usable: Bool) -> list[Outline]:
-    """The instruments [H, W] that enter where the picture, or what is `usable` [H, W] of it, ends; the largest
-    first. What does not reach there is none."""
+    """The instruments [H, W] that enter where the picture, or what is `usable` [H, W] of it, ends; those of
+    the largest regions first. What does not reach there is none."""
     scale = max(1.0, tools.shape[1] / WIDTH)
     size = round(tools.shape[1] / scale), round(tools.shape[0] / scale)
     small, inside = (_smaller(mask, size) for mask in (tools & usable, usable))
@@ -55,7 +55,7 @@ def outlines(tools: Bool, usable: Bool) -> list[Outline]:
     areas = stats[:, cv2.CC_STAT_AREA]
     found = []
     for label in sorted(range(1, count), key=lambda i: -areas[i])[:MOST]:
-        if areas[label] >= SMALLEST * small.size:
+        if areas[label] >= SMALLEST * small.size and len(found) < MOST:
             found += _of_component((labels == label).view(np.uint8), edge)
     middle = 0.5 * scale - 0.5
     return [
@@ -81,7 +81,8 @@ def _of_component(mask: U8, edge: U8) -> list[Outline]:
     count, entries = cv2.connectedComponents(cv2.dilate(mask & edge, _disc(APART)))
     entries *= mask & edge
     found: dict[int, tuple[Outline, U8]] = {}  # by entry, and what of the region it was sought in
-    for entry in range(1, count):
+    sizes = np.bincount(entries.ravel(), minlength=count)
+    for entry in sorted(range(1, count), key=lambda i: -sizes[i])[:MOST]:
         start = (entries == entry).view(np.uint8)
         band = mask if count == 2 else _band(mask, start)
         outline = None if band is None else _of_band(band, start, edge, alone=count == 2)

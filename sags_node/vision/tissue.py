@@ -82,7 +82,7 @@ class TissueMask:
 
     @property
     def instruments(self) -> Bool | None:
-        """What shows an instrument in the newest frame [H, W], before it grows; None: nobody looks for any."""
+        """What shows an instrument in the newest frame [H, W], before it grows; None: nobody looks."""
         return None if self._found is None else ~self._found & self.usable
 
     def _given(self, frame: StereoFrame, pair: RectifiedPair) -> Bool | None:
