@@ -73,9 +73,10 @@ class Scene:
         low, high = WHERE.get(f"{setting} {side}") or WHERE[setting]
         while True:
             pixel = self._rng.uniform([low, 0.25], [high, 0.65]) * SIZE
-            tip = np.asarray(unproject(self.camera, pixel, np.array(self._rng.uniform(*DEPTHS))))
+            depth = np.array(self._rng.uniform(*DEPTHS))
+            tip = np.asarray(unproject(self.camera, pixel, depth), np.float64)
             trocar = TROCARS[side] + self._rng.normal(0, SPREAD, 3)
-            tool = self._made(tip, trocar, np.asarray((tip - trocar) / np.linalg.norm(tip - trocar)))
+            tool = self._made(tip, trocar, (tip - trocar) / np.linalg.norm(tip - trocar))
             near = abs(tool.distance - distance) <= NEAR * distance
             inside = bool(np.all((pixel >= 0) & (pixel < SIZE)))
             if (near or not inside) and self._is_free(tool):
@@ -106,7 +107,7 @@ def _jaws(mesh: Mesh, axis: F64) -> F64:
     end = mesh.vertices[along > along.max() - JAW_END]
     aside = end - (end @ axis)[:, None] * axis
     apart = (aside - aside.mean(0)) @ np.linalg.svd(aside - aside.mean(0), full_matrices=False)[2][0]
-    return end[[apart.argmin(), apart.argmax()]]
+    return np.asarray(end[[apart.argmin(), apart.argmax()]], np.float64)
 
 
 def _off(tool: Tool, place: F64) -> float:
@@ -163,9 +164,9 @@ def _compared(tools: list[Tool], result: FrameResult, shown: Bool) -> list[dict[
     apart = np.linalg.norm(truth[:, None] - states.pixels[known][None], axis=2)
     found: dict[int, int] = {}
     for at in np.argsort(apart, axis=None):
-        number, row = (int(i) for i in np.unravel_index(at, apart.shape))
-        if number not in found and row not in found.values():
-            found[number] = row
+        number, told = (int(i) for i in np.unravel_index(at, apart.shape))
+        if number not in found and told not in found.values():
+            found[number] = told
     ends = _far_ends(shown, result)
     rows = []
     for number, tool in enumerate(tools):

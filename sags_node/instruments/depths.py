@@ -106,7 +106,7 @@ def _scores(seen: Eyes, centre: F64, radius: int, tried: F64, every: int) -> F32
     counts = _taken(seen.counts, centre[0] + around[None], centre[1] + around)[0] > 127
     columns = centre[0] - tried[:, None] + around
     there = _taken(seen.right, columns, centre[1] + seen.row_error + around)
-    share = counts / np.float32(max(1, np.count_nonzero(counts)))
+    share = counts / np.float32(max(1, int(np.count_nonzero(counts))))
     patch = patch - (patch * share).sum()
     there = there - (there * share).sum((1, 2), keepdims=True)
     spread = (patch * patch * share).sum() * (there * there * share).sum((1, 2))

@@ -17,6 +17,7 @@ NINE_OF_TEN = 1.645  # standard deviations
 HALF = 0.75  # of the spread of its end, by which the tip of open jaws or of a hook is uncertain
 ENTANGLED = 1.5  # times the error, where another one lies over it
 AXIS_ERROR = np.radians(25.0)  # nine of ten are smaller, or there is no axis
+AXIS_BIAS = np.radians(8.0)  # nine of ten of the phantom's graspers are below: jaws are not in line
 AHEAD, STEP = 0.15, 5e-4  # m, along the axis: how far tissue is looked for, and how finely
 EVERY = 4  # px, of the surface of which the nearest point is sought
 KEPT = 0.5  # s, that a number is kept for an instrument that is not found
@@ -153,11 +154,18 @@ def _beside_tissue(one: _One, tissue: RenderedView) -> _One:
         return one
     distance, place = met
     apart_by_axis = 0.0
-    for other in one.others:
+    for other in (*one.others, *_tilted(one.axis)):
         met = _met(one.tip, other, camera, tissue.depth)
         apart_by_axis = max(apart_by_axis, np.inf if met is None else abs(met[0] - distance))
     error = float(np.linalg.norm([one.error, errors[place], apart_by_axis]))
     return replace(one, distance=distance, distance_error=error)
+
+
+def _tilted(axis: F64) -> list[F64]:
+    """An axis turned by `AXIS_BIAS` to four sides."""
+    sides = np.linalg.svd(axis[None])[2][1:]
+    turned = [axis + sign * np.tan(AXIS_BIAS) * side for side in sides for sign in (-1, 1)]
+    return [each / np.linalg.norm(each) for each in turned]
 
 
 def _met(tip: F64, axis: F64, camera: Camera, depth: F32) -> tuple[float, tuple[int, int]] | None:

@@ -7,7 +7,7 @@ edge in several places, several instruments lie over each other: each is followe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -53,18 +53,17 @@ def outlines(tools: Bool, usable: Bool) -> list[Outline]:
     edge = inside & ~cv2.erode(inside, np.ones((3, 3), np.uint8), borderValue=0)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(small)
     areas = stats[:, cv2.CC_STAT_AREA]
-    found = []
+    found: list[Outline] = []
     for label in sorted(range(1, count), key=lambda i: -areas[i])[:MOST]:
         if areas[label] >= SMALLEST * small.size and len(found) < MOST:
             found += _of_component((labels == label).view(np.uint8), edge)
-    middle = 0.5 * scale - 0.5
-    return [
-        Outline(
-            *(scale * places + middle for places in (each.far, each.back, each.middles)),
-            scale * each.widths, scale * each.spread, each.is_outside, each.is_alone,
-        )
-        for each in found[:MOST]
-    ]  # fmt: skip
+    return [_enlarged(each, scale) for each in found[:MOST]]
+
+
+def _enlarged(small: Outline, scale: float) -> Outline:
+    far, back, middles = ((at + 0.5) * scale - 0.5 for at in (small.far, small.back, small.middles))
+    widths, spread = scale * small.widths, scale * small.spread
+    return replace(small, far=far, back=back, middles=middles, widths=widths, spread=spread)
 
 
 def _smaller(mask: Bool, size: tuple[int, int]) -> U8:
@@ -138,9 +137,9 @@ def _of_band(mask: U8, start: U8, edge: U8, alone: bool) -> Outline | None:
     far = middle + reach * direction
     back = middle + direction * float((middles[first] - middle) @ direction)
     last = distance[rows, columns] > distance.max() - 2
-    at_edge = bool((edge[rows[last], columns[last]] > 0).any())
-    at_edge = at_edge or np.linalg.norm(far - back) < SHORTEST * width
-    return Outline(far, back, part[~off][::-1], weights[~off][::-1], spread, at_edge, alone)
+    at_edge = (edge[rows[last], columns[last]] > 0).any()
+    is_outside = bool(at_edge or np.linalg.norm(far - back) < SHORTEST * width)
+    return Outline(far, back, part[~off][::-1], weights[~off][::-1], spread, is_outside, alone)
 
 
 def _midline(mask: U8, start: U8) -> tuple[F64, F64, I32]:

@@ -37,9 +37,12 @@ def unsure(result: FrameResult) -> FrameResult:
     anchors = replace(anchors, depth_confidence=_at_most(anchors.depth_confidence))
     instruments = result.instruments
     if instruments is not None:
-        names = ("confidence", "distance_confidence", "clearance_confidence")
-        low = {name: _at_most(getattr(instruments, name)) for name in names}
-        instruments = replace(instruments, **low)
+        instruments = replace(
+            instruments,
+            confidence=_at_most(instruments.confidence),
+            distance_confidence=_at_most(instruments.distance_confidence),
+            clearance_confidence=_at_most(instruments.clearance_confidence),
+        )
     return replace(result, views=views, snapshot=snapshot, anchors=anchors, instruments=instruments)
 
 
