@@ -21,9 +21,9 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9559,
+    "benchmarks": 9846,
     "sags_lab": 5032,
-    "sags_node": 1680,
+    "sags_node": 1699,
     "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
     "sags_node/cli": 3168,
@@ -35,15 +35,16 @@ LINES = {
     "sags_node/field": 1720,
     "sags_node/fitting": 1523,
     "sags_node/importing": 1071,
+    "sags_node/instruments": 541,
     "sags_node/kernels": 1222,
     "sags_node/mapping": 5588,
     "sags_node/media": 833,
-    "sags_node/messaging": 5084,
+    "sags_node/messaging": 5114,
     "sags_node/model": 960,
-    "sags_node/node": 1425,
+    "sags_node/node": 1433,
     "sags_node/overlay": 2361,
-    "sags_node/phantom": 1604,
-    "sags_node/pipeline": 842,
+    "sags_node/phantom": 1616,
+    "sags_node/pipeline": 880,
     "sags_node/recording": 2600,
     "sags_node/registration": 466,
     "sags_node/rig": 1169,
@@ -51,8 +52,8 @@ LINES = {
     "sags_node/sources": 5666,
     "sags_node/terminal": 345,
     "sags_node/viewer": 1007,
-    "sags_node/vision": 5462,
-    "tests": 45342,
+    "sags_node/vision": 5469,
+    "tests": 45626,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
