@@ -35,7 +35,7 @@ LINES = {
     "sags_node/field": 1720,
     "sags_node/fitting": 1523,
     "sags_node/importing": 1071,
-    "sags_node/instruments": 541,
+    "sags_node/instruments": 548,
     "sags_node/kernels": 1222,
     "sags_node/mapping": 5588,
     "sags_node/media": 833,
@@ -53,7 +53,7 @@ LINES = {
     "sags_node/terminal": 345,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5469,
-    "tests": 45626,
+    "tests": 45635,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

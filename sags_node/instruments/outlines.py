@@ -17,6 +17,7 @@ from sags_node.types import F64, I32, U8, Bool
 WIDTH = 320  # px, of the mask in which midlines are sought
 MOST = 8  # instruments of a frame, and entries of a region
 SMALLEST = 0.002  # of the picture
+FRAME = 0.9  # of a row or column at the picture's edge: masked as a whole, it is no instrument
 GAP = 7  # px: what is cut by no more (a highlight, the window of a jaw) hangs together
 APART = 21  # px: entries nearer than this are one
 BIN = 3  # px, of the distance from the entry
@@ -49,6 +50,12 @@ def outlines(tools: Bool, usable: Bool) -> list[Outline]:
     scale = max(1.0, tools.shape[1] / WIDTH)
     size = round(tools.shape[1] / scale), round(tools.shape[0] / scale)
     small, inside = (_smaller(mask, size) for mask in (tools & usable, usable))
+    rows, columns = (np.flatnonzero(small.mean(axis) < FRAME) for axis in (1, 0))
+    if len(rows) == 0 or len(columns) == 0:
+        return []
+    bare = np.zeros_like(inside)
+    bare[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = 1
+    inside &= bare
     small = cv2.morphologyEx(small, cv2.MORPH_CLOSE, _disc(GAP)) & inside
     edge = inside & ~cv2.erode(inside, np.ones((3, 3), np.uint8), borderValue=0)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(small)

@@ -82,6 +82,15 @@ def test_what_does_not_come_from_the_edge_is_no_instrument() -> None:
     assert len(outlines(mask, usable)) == 1
 
 
+def test_a_masked_frame_around_the_picture_joins_no_instruments() -> None:
+    mask = bars(((40, 300), (40, 130)), ((280, 300), (280, 130)))
+    mask[:8], mask[-8:], mask[:, :8], mask[:, -8:] = True, True, True, True
+    found = outlines(mask, EVERYWHERE)
+    assert len(found) == 2 and all(each.is_alone for each in found)
+    for tip in ((40, 130), (280, 130)):
+        assert min(np.linalg.norm(each.far - tip) for each in found) <= COARSE
+
+
 @pytest.mark.parametrize("seed", range(24))
 def test_any_mask_gives_places_or_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
