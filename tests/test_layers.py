@@ -21,7 +21,7 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9846,
+    "benchmarks": 9847,
     "sags_lab": 5032,
     "sags_node": 1699,
     "sags_node/bridge": 2597,

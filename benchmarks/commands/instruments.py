@@ -11,7 +11,7 @@ from sags_node.terminal.console import progress, show
 
 
 @click.command("instruments")
-@shown("--seeds", type=click.IntRange(1), default=6, help="Phantoms, each with other instruments before it.")
+@shown("--seeds", type=click.IntRange(1), default=4, help="Phantoms, each with other instruments before it.")
 @figures_option
 @as_json
 def bench_instruments(seeds: int, out: Path | None, json_out: bool) -> None:

@@ -25,6 +25,7 @@ from sags_node.types import F32, F64, Bool, Camera, FrameResult, StereoFrame
 from sags_node.vision.stereo import StereoDepth
 
 SIZE = (640, 512)
+FIRST = 8  # seed: constants were chosen on those before it
 BEFORE, RATE, STEPS = 3, 5.0, 2  # frames without instruments; a second; steps of the mapper, each frame
 DISTANCES = (0.005, 0.010, 0.020, 0.040)  # m, along the axis
 SIDES = {"one": ("left",), "two": ("left", "right"), "crossing": ("left", "right"), "leaving": ("right",)}
@@ -124,8 +125,8 @@ def measure_instruments(seeds: int, advance: Advance) -> dict[str, Any]:
     configure_threads(config.engine.threads)
     rows: list[dict[str, Any]] = []
     receipt: Receipt | None = None
-    for seed in range(seeds):
-        advance(seed, seeds, "phantom")
+    for seed in range(FIRST, FIRST + seeds):
+        advance(seed - FIRST, seeds, "phantom")
         scene = Scene(seed)
         receipt = receipt or Receipt(scene.phantom.rig, SIZE, None)
         pipeline = Pipeline(config, scene.phantom.rig, rate=RATE)
