@@ -372,6 +372,24 @@ class AnchorStates:
         return AnchorStates(np.empty(0, np.int64), empty(3), empty(2), empty(), empty(), empty(), empty())
 
 
+@dataclass(frozen=True, slots=True)
+class InstrumentStates:
+    """The instruments in one frame. What is not known is NaN, and its confidence 0."""
+
+    ids: I64  # [I] never used again
+    tips: F32  # [I, 3] m, world
+    axes: F32  # [I, 3] unit, world, from the shaft to the tip
+    pixels: F32  # [I, 2] of the tip in the left picture
+    confidence: F32  # [I] 0..1, of the tip, see `sags_node.confidence`
+    distance: F32  # [I] m, from the tip along the axis to the tissue; 0: it touches it, or is in it
+    distance_confidence: F32  # [I] 0..1
+    clearance: F32  # [I] m, from the tip to the nearest tissue
+    clearance_confidence: F32  # [I] 0..1
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
 class Finding(NamedTuple):
     """Something a person should know of: a warning."""
 
@@ -407,6 +425,7 @@ class FrameResult:
     held: str = ""  # why the frame was not taken in, so that the model is that of an older one; empty: it was
     hurried: bool = False  # there was no time to measure its depth
     recorded_s: float | None = None  # as `StereoFrame.recorded_s`
+    instruments: InstrumentStates | None = None  # None: nobody asked
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,9 +29,9 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9758,
+    "benchmarks": 10046,
     "sags_lab": 5032,
-    "sags_node": 1204,
+    "sags_node": 1223,
     "sags_node/bags": 863,
     "sags_node/cli": 3169,
     "sags_node/clients": 1,
@@ -43,15 +43,16 @@ LINES = {
     "sags_node/config": 1352,
     "sags_node/detail": 932,
     "sags_node/engine": 4085,
+    "sags_node/instruments": 548,
     "sags_node/field": 1720,
     "sags_node/kernels": 1222,
     "sags_node/mapping": 5679,
     "sags_node/media": 856,
-    "sags_node/messaging": 5084,
+    "sags_node/messaging": 5114,
     "sags_node/model": 960,
-    "sags_node/node": 1783,
-    "sags_node/phantom": 1604,
-    "sags_node/pipeline": 837,
+    "sags_node/node": 1791,
+    "sags_node/phantom": 1616,
+    "sags_node/pipeline": 872,
     "sags_node/quality": 266,
     "sags_node/rig": 1182,
     "sags_node/ros": 332,
@@ -63,8 +64,8 @@ LINES = {
     "sags_node/tools/export": 891,
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1092,
-    "sags_node/vision": 5510,
-    "tests": 45847,
+    "sags_node/vision": 5517,
+    "tests": 46140,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -45,6 +45,11 @@ ANCHOR_FIELDS = (
     *("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence", "depth_confidence"),
     *("ahead", "x_ahead", "y_ahead", "z_ahead", "u_ahead", "v_ahead"),
 )
+INSTRUMENT_FIELDS = (
+    *("x", "y", "z", "id", "axis_x", "axis_y", "axis_z", "u", "v", "confidence"),
+    *("distance", "distance_confidence", "clearance", "clearance_confidence", "source"),
+)
+BY_MASK = 1  # in the column source: by the tissue mask and both eyes
 POINT_MIN_OPACITY = 0.1
 POINT_BEHIND_SURFACE = 0.003  # m; a Gaussian deeper than this under the drawn surface is not visible
 
@@ -111,6 +116,21 @@ def anchors(result: FrameResult) -> Content:
     rows[:, 14:16] = states.pixels if ahead is None else ahead.pixels
     dense = bool(np.isfinite(states.points).all())
     return cdr.point_cloud(rows, ANCHOR_FIELDS, result.pair.t_capture_ns, dense)
+
+
+def instruments(result: FrameResult) -> Content:
+    """The instruments, as rows of `INSTRUMENT_FIELDS`; what is not known is NaN."""
+    states = result.instruments
+    assert states is not None  # else it is not published
+    rows = np.empty((len(states), len(INSTRUMENT_FIELDS)), np.float32)
+    rows[:, 0:3], rows[:, 4:7], rows[:, 9] = states.tips, states.axes, states.confidence
+    rows.view(np.uint32)[:, 3] = states.ids.astype(np.uint32)
+    rows[:, 7:9] = published.pixels(result.pair, states.pixels)
+    rows[:, 10], rows[:, 11] = states.distance, states.distance_confidence
+    rows[:, 12], rows[:, 13] = states.clearance, states.clearance_confidence
+    rows[:, 14] = BY_MASK
+    dense = bool(np.isfinite(states.tips).all())
+    return cdr.point_cloud(rows, INSTRUMENT_FIELDS, result.pair.t_capture_ns, dense)
 
 
 def view_topics(name: str, stereo: bool, depth: bool) -> list[str]:
@@ -227,13 +247,14 @@ FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
     "points": points,
     "splats": splats,
     "anchors": anchors,
+    "instruments": instruments,
     "tf": lambda r: cdr.transform(r.pair.camera.T_world_cam, r.pair.t_capture_ns),
 }
 
 
 OF_THE_MODEL = (
     *("left/render/image", "right/render/image", "left/render/depth", "left/render/depth_confidence"),
-    *("points", "splats", "anchors", "tf"),
+    *("points", "splats", "anchors", "instruments", "tf"),
 )
 
 
@@ -243,6 +264,8 @@ def tells_of(result: FrameResult, topic: str) -> bool:
     if result.held and topic in OF_THE_MODEL:
         return False
     if topic == "right/render/image" and "right" not in result.views:
+        return False
+    if topic == "instruments" and result.instruments is None:
         return False
     if topic.startswith("right/") and result.pair.right is None:
         return False

@@ -98,8 +98,14 @@ def anchors(pair: RectifiedPair, states: AnchorStates) -> AnchorStates:
     """Anchors with the pixels in which they are published."""
     if pair.published is None:
         return states
-    sizes = (pair.camera.width, pair.camera.height), size_of(pair)
     ahead = states.ahead
     if ahead is not None:
-        ahead = replace(ahead, pixels=scale_pixels(ahead.pixels, *sizes).astype(np.float32))
-    return replace(states, pixels=scale_pixels(states.pixels, *sizes).astype(np.float32), ahead=ahead)
+        ahead = replace(ahead, pixels=pixels(pair, ahead.pixels))
+    return replace(states, pixels=pixels(pair, states.pixels), ahead=ahead)
+
+
+def pixels(pair: RectifiedPair, places: F32) -> F32:
+    """Places [N, 2] of the working size, in the published one."""
+    if pair.published is None:
+        return places
+    return scale_pixels(places, (pair.camera.width, pair.camera.height), size_of(pair)).astype(np.float32)

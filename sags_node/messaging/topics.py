@@ -1,7 +1,7 @@
 """The contents page of the wire: every topic this node publishes, under its namespace.
 
-Coordinates: images and depth belong to the left or right optical frame, `points`, `splats` and `anchors` to
-`world`.
+Coordinates: images and depth belong to the left or right optical frame, `points`, `splats`, `anchors` and
+`instruments` to `world`.
 `splats` holds linear, activated values: scales in metres, opacity 0..1, and colour as the degree-0 spherical
 harmonic f_dc = (rgb - 0.5) / 0.28209479. (A 3DGS PLY file holds the logarithm and the logit instead.)
 """
@@ -52,6 +52,7 @@ TOPICS = (
     Topic("points", POINT_CLOUD, "x y z (m, world) rgb confidence: the visible Gaussians"),
     Topic("splats", POINT_CLOUD, "every Gaussian: linear scales (m), opacity 0..1, world", cached=True),
     Topic("anchors", POINT_CLOUD, "points pinned to the tissue: x y z (m, world), pixel, visibility, age"),
+    Topic("instruments", POINT_CLOUD, "tips and axes of instruments (m, world), how far the tissue is"),
     Topic("tf", TF, "world -> left optical frame"),
     Topic("diagnostics", DIAGNOSTICS, "1 Hz, one status per stage"),
     Topic("status", STRING, "JSON: rates, latencies, drops, memory, what was skipped", cached=True),

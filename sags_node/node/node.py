@@ -111,6 +111,7 @@ class Node:
         self._watched: frozenset[str] = frozenset()  # views that somebody subscribes to
         self._left_is_watched = False  # somebody looks at the left view
         self._right_is_watched = False  # somebody looks at the right eye
+        self._instruments_asked = False
         self._error: BaseException | None = None
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
@@ -271,7 +272,13 @@ class Node:
                     self._operations.reconfigure()
                 waited = time.monotonic() - at if self._live else 0.0
                 latency = self._state.statistics.latency_s
-                request = FrameRequest(waited, self._left_is_watched, self._right_is_watched, latency)
+                request = FrameRequest(
+                    waited,
+                    self._left_is_watched,
+                    self._right_is_watched,
+                    latency,
+                    self._instruments_asked,
+                )
                 self._working_since = time.monotonic()
                 result = self._state.pipeline.process(frame, self._state.budget, request)
                 self._working_since = None
@@ -383,6 +390,7 @@ class Node:
         views = self._state.views
         self._watched = frozenset(name for name in views.status if self._publisher.watches_view(name))
         self._left_is_watched = self._publisher.looked_at("left/render/image")
+        self._instruments_asked = self._publisher.wanted("instruments")
         if self._state.config.publish.right == "auto":
             pictures = ["right/render/image", *(f"view/{name}/right/image" for name in views.pairs)]
             self._right_is_watched = any(map(self._publisher.looked_at, pictures))

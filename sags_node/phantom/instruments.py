@@ -71,15 +71,22 @@ class Instruments:
         """
         axis = _unit(GRASPER_TROCAR - grip)
         tip = grip + axis * (RETREAT * keyed(action, GRASPER_AWAY) - BITE)
-        grasper_pose = _pose(tip, GRASPER_TROCAR, roll=np.radians(55.0))
-        grasper = _posed(self._grasper, grasper_pose, OPENING * keyed(action, GRASPER_OPEN))
+        grasper = self.grasper(tip, GRASPER_TROCAR, OPENING * keyed(action, GRASPER_OPEN))
 
         reach = keyed(action, HOOK_IN)
         sway = 0.12 * np.sin(4 * np.pi * action)
         outside, inside = np.array([1.55, 0.95]), np.array([0.28, 0.30 + sway])
         tip = np.array([*(outside + (inside - outside) * reach) * view_at, 0.058 - 0.004 * reach])
-        hook = _posed(self._hook, _pose(tip, HOOK_TROCAR, roll=np.radians(20.0)), 0.0)
-        return _joined([grasper, hook])
+        return joined([grasper, self.hook(tip, HOOK_TROCAR)])
+
+    def grasper(self, tip: F64, trocar: F64, opening: float = 0.0) -> Mesh:
+        """The grasper whose tip, when it is closed, is at `tip` [3] and that comes through `trocar` [3] (m,
+        world); `opening` of each jaw, radians."""
+        return _posed(self._grasper, _pose(tip, trocar, roll=np.radians(55.0)), opening)
+
+    def hook(self, tip: F64, trocar: F64) -> Mesh:
+        """The hook, as `grasper`. Its end is 3 mm beside its axis, on which the tip is."""
+        return _posed(self._hook, _pose(tip, trocar, roll=np.radians(20.0)), 0.0)
 
 
 def _pose(tip: F64, trocar: F64, roll: float) -> F64:
@@ -99,10 +106,11 @@ def _posed(parts: list[_Part], pose: F64, opening: float) -> Mesh:
         R = pose[:3, :3] @ turn
         vertices = (part.mesh.vertices - hinge) @ R.T + pose[:3, :3] @ hinge + pose[:3, 3]
         meshes.append(Mesh(vertices, part.mesh.normals @ R.T, part.mesh.faces, part.mesh.materials))
-    return _joined(meshes)
+    return joined(meshes)
 
 
-def _joined(meshes: list[Mesh]) -> Mesh:
+def joined(meshes: list[Mesh]) -> Mesh:
+    """One mesh of several."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),

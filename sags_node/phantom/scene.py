@@ -12,7 +12,7 @@ from sags_node.config.schema import PhantomSource
 from sags_node.geometry import invert, transform
 from sags_node.phantom.camera import add_smoke, expose, look, world_rays
 from sags_node.phantom.casting import Bodies
-from sags_node.phantom.instruments import NOTHING, Instruments
+from sags_node.phantom.instruments import NOTHING, Instruments, Mesh
 from sags_node.phantom.motion import Clock, scope_pose
 from sags_node.phantom.noise import fractal_noise
 from sags_node.phantom.relief import BED_DEPTH, Relief, make_relief
@@ -95,15 +95,19 @@ class Phantom:
         self._tracks = self.tissue.track_indices(tracks, self._half_view, TRACKS)
         self._cloud = fractal_noise(smoke, (512, 512), 70, 4)
 
-    def frame(self, index: int, count: int, T_world_cam: F64 | None = None) -> PhantomFrame:
+    def frame(
+        self, index: int, count: int, T_world_cam: F64 | None = None, tools: Mesh | None = None
+    ) -> PhantomFrame:
         """Frame `index` of a session of `count` frames; `T_world_cam` [4, 4]: where the scope is then, if not
-        on its path."""
+        on its path; `tools`: other instruments than those at work."""
         phase = index / count
         if T_world_cam is None:
             T_world_cam = self._scope(phase)
         vertices = self.tissue.vertices(0.0 if self._scene.still_tissue else phase)
-        hook_view = HOOK_DEPTH * np.array(self._half_view)
-        tools = self._instruments.mesh(self._clock.action(phase), self.tissue.grip(vertices), hook_view)
+        if tools is None:
+            hook_view = HOOK_DEPTH * np.array(self._half_view)
+            grip = self.tissue.grip(vertices)
+            tools = self._instruments.mesh(self._clock.action(phase), grip, hook_view)
         bodies = Bodies(self.tissue, vertices, tools)
         lamp = Lamp.at_tip(T_world_cam, self.rig.baseline)
 

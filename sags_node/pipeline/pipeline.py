@@ -21,6 +21,7 @@ from sags_node.detail.seen import SeenFrame
 from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
+from sags_node.instruments.instruments import Instruments
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.budget import Budget, FramePlan
 from sags_node.mapping.camera_tracker import CameraTracker
@@ -41,6 +42,7 @@ from sags_node.types import (
     Camera,
     Finding,
     FrameResult,
+    InstrumentStates,
     Observation,
     RectifiedPair,
     RenderedView,
@@ -50,6 +52,7 @@ from sags_node.types import (
 from sags_node.vision.change import StillScene, is_repeat
 from sags_node.vision.depth import DepthChoice, Measured
 from sags_node.vision.observe import observe
+from sags_node.vision.pyramid import pyramids
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
@@ -77,6 +80,7 @@ class FrameRequest:
     left: bool = False  # somebody looks at the left view: it gets the picture's detail
     right: bool = False  # somebody looks at the right eye: it is drawn, where there is one
     latency: float = 0.0  # s from capture to what shows it, as it was lately
+    instruments: bool = False  # somebody wants to know where they are
 
 
 NOTHING_ASKED = FrameRequest()
@@ -138,6 +142,7 @@ class Pipeline:
         elif vision.pose == "refine":
             self._camera = PoseRefiner(self.map)
         self.anchors = Anchors(self.tissue.usable)
+        self._instruments = Instruments(self.tissue.usable)
         self._pose = PoseWatch(needed=vision.pose in ("session", "refine"))
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._freeze = FreezeWatch(vision.tissue.exclude)
@@ -230,7 +235,7 @@ class Pipeline:
         # 1. Watch: may this frame be trusted? One that may not is held, an equal one is the last again.
         right = pair.right is not None and (request.right or self._config.publish.right is True)
         with clock("watch"):
-            judged = self._watch(frame, pair, right)
+            judged = self._watch(frame, pair, right, request.instruments)
         if self.newest is not None and (judged.hold or judged.repeats):
             return self._carried_on(frame, pair, judged, unseen(pair), clock)
         if judged.is_new_scene:
@@ -268,9 +273,12 @@ class Pipeline:
             self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
             self.anchors.age(pair.t_capture_ns)
             anchors = self.anchors.ahead(self.anchors.states(), mapped.snapshot, request.latency)
+        with clock("instruments"):
+            instruments = self._located_instruments(seen, observation, mapped, judged, request)
         self.newest = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
             self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
+            instruments=instruments,
         )  # fmt: skip
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
@@ -278,13 +286,15 @@ class Pipeline:
         """Until its pose is found, its camera is where it was last, or as it is given."""
         return self.rectifier(replace(frame, T_world_cam=self._camera.guess(frame.T_world_cam)))
 
-    def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool) -> Judgement:
+    def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool, instruments: bool) -> Judgement:
         """What all watchers together say of a frame."""
         if self._reset_due and frame.pose_problem is None:
             self._forget()
         last = self.newest
-        lacks_right = right and last is not None and "right" not in last.views  # somebody has just come
-        equal = last is not None and self._skips.duplicates and not lacks_right and is_repeat(pair, last.pair)
+        lacks = last is not None and (  # somebody has just come
+            (right and "right" not in last.views) or (instruments and last.instruments is None)
+        )
+        equal = last is not None and self._skips.duplicates and not lacks and is_repeat(pair, last.pair)
         evidence = Evidence(frame, pair, last, equal, self.depth.eyes_are_late)
         judged = Judgement(repeats=equal)
         for watcher in self._watchers:
@@ -429,6 +439,23 @@ class Pipeline:
         sure = by_both if judged.learn and not judged.no_stereo else np.zeros_like(by_both)
         self._right.learn(view, rgb, mapped, self.map.model, seen.right, sure, baseline)
         return view
+
+    def _located_instruments(
+        self, pair: RectifiedPair, observation: Observation, mapped: Mapped, judged: Judgement,
+        request: FrameRequest,
+    ) -> InstrumentStates | None:  # fmt: skip
+        if not request.instruments:
+            return None
+        right, rows = pyramids(pair)[1], self.depth.stereo.rows.newest
+        return self._instruments.update(
+            self.tissue.instruments,
+            observation.gray,
+            None if right is None or judged.no_stereo else right.full,
+            observation.camera,
+            pair.baseline,
+            mapped.view,
+            0.0 if rows is None else rows.median,
+        )
 
     def _skipped(self, measured: Measured) -> dict[str, str]:
         """What was left out of a frame that was mapped, and why."""

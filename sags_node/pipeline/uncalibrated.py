@@ -35,7 +35,15 @@ def unsure(result: FrameResult) -> FrameResult:
         gaussians = replace(snapshot.gaussians, depth_errors=np.maximum(errors, LEAST_ERROR))
         snapshot = replace(snapshot, gaussians=gaussians)
     anchors = replace(anchors, depth_confidence=_at_most(anchors.depth_confidence))
-    return replace(result, views=views, snapshot=snapshot, anchors=anchors)
+    instruments = result.instruments
+    if instruments is not None:
+        instruments = replace(
+            instruments,
+            confidence=_at_most(instruments.confidence),
+            distance_confidence=_at_most(instruments.distance_confidence),
+            clearance_confidence=_at_most(instruments.clearance_confidence),
+        )
+    return replace(result, views=views, snapshot=snapshot, anchors=anchors, instruments=instruments)
 
 
 def _at_most(confidence: F32) -> F32:

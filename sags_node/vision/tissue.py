@@ -56,6 +56,7 @@ class TissueMask:
         side = 2 * config.dilate + 1
         self._neighbourhood = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         self.problem = ""
+        self._found: Bool | None = None
 
     def __call__(self, frame: StereoFrame, pair: RectifiedPair, expected: RenderedView | None = None) -> Bool:
         """Mask [H, W], True = tissue; highlights on tissue are tissue.
@@ -74,9 +75,15 @@ class TissueMask:
             tissue = ~self._find_instruments(pair.left, expected, pair.t_capture_ns)
         elif self._topic is None or self._topic.is_new:
             self._check_polarity(tissue)
+        self._found = tissue
         # The picture's border counts as tissue here: only instruments grow.
         eroded: U8 = cv2.erode(tissue.view(np.uint8), self._neighbourhood)
         return eroded.view(np.bool_) & self.usable
+
+    @property
+    def instruments(self) -> Bool | None:
+        """What shows an instrument in the newest frame [H, W], before it grows; None: nobody looks."""
+        return None if self._found is None else ~self._found & self.usable
 
     def _given(self, frame: StereoFrame, pair: RectifiedPair) -> Bool | None:
         if self._segment is not None:

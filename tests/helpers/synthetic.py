@@ -17,10 +17,12 @@ from sags_node.geometry import quat_to_matrix, unproject
 from sags_node.messaging.control import Handler
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import (
+    F32,
     Camera,
     Colours,
     FrameResult,
     Gaussians,
+    InstrumentStates,
     NodeHealth,
     Observation,
     RectifiedPair,
@@ -30,6 +32,21 @@ from sags_node.types import (
 
 WIDTH, HEIGHT, BASELINE = 96, 64, 0.0042
 NORMAL, DISTANCE = np.array([-0.2, 0.1, 1.0]), 0.06  # the plane: NORMAL . p = DISTANCE, camera coordinates, m
+
+
+def plane_instruments() -> InstrumentStates:
+    """One whose tip is known, and one whose tip is beyond the picture."""
+
+    def column(*first: float) -> F32:
+        return np.array([first, np.full(len(first), np.nan)], np.float32)
+
+    def sure(first: float) -> F32:
+        return np.array([first, 0], np.float32)
+
+    return InstrumentStates(
+        np.array([2, 5]), column(0.01, -0.02, 0.06), column(0, 0.6, 0.8), column(30, 20), sure(0.7),
+        column(0.012)[:, 0], sure(0.5), column(0.009)[:, 0], sure(0.6),
+    )  # fmt: skip
 
 
 def plane_camera() -> Camera:
@@ -91,6 +108,7 @@ def plane_result(
         epoch=epoch,
         timings_ms={"map": 12.0},
         skipped={"keyframe": "budget spent"},
+        instruments=plane_instruments(),
     )
 
 

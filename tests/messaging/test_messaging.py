@@ -16,7 +16,18 @@ import numpy as np
 import pytest
 import zmq
 from rosbags.typesys import Stores, get_typestore
-from synthetic import BASELINE, HEIGHT, WIDTH, at_frame, health, plane_depth, plane_result, publisher, stream
+from synthetic import (
+    BASELINE,
+    HEIGHT,
+    WIDTH,
+    at_frame,
+    health,
+    plane_depth,
+    plane_instruments,
+    plane_result,
+    publisher,
+    stream,
+)
 from waiting import repeating, until
 
 from sags_node.geometry import project
@@ -120,6 +131,21 @@ def test_splats_hold_activated_values(received: dict[str, list[client.Received]]
     assert np.allclose([splats["scale_0"][0], splats["scale_1"][0], splats["scale_2"][0]], [1e-3, 2e-3, 5e-4])
     assert np.allclose(splats["rot_z"], 1.5 / np.sqrt(3))
     assert np.array_equal(splats["id"], gaussians.ids)
+
+
+def test_instruments_are_rows_and_what_is_not_known_of_them_is_nan(
+    received: dict[str, list[client.Received]],
+) -> None:
+    message = received["instruments"][0]
+    rows = message.array()
+    found = dict(zip(message.meta["encoding"].split(","), rows.T, strict=True))
+    truth = plane_instruments()
+    assert found["id"].view(np.uint32).tolist() == [2, 5] and set(found["source"].tolist()) == {1.0}
+    told = np.stack([found[name] for name in ("x", "y", "z", "axis_x", "axis_y", "axis_z", "u", "v")], 1)
+    expected = np.hstack([truth.tips, truth.axes, truth.pixels])
+    assert np.array_equal(told, expected, equal_nan=True)
+    for name in ("confidence", "distance", "distance_confidence", "clearance", "clearance_confidence"):
+        assert np.array_equal(found[name], getattr(truth, name), equal_nan=True), name
 
 
 def test_what_is_told_of_depth_says_how_sure_it_is(received: dict[str, list[client.Received]]) -> None:

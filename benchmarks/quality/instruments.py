@@ -1,0 +1,254 @@
+"""How exactly instruments are placed: before the phantom, where their tips are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from benchmarks.quality.depth import Advance, rounded
+from sags_node.confidence import SURE, error_of
+from sags_node.config.schema import LaunchConfig
+from sags_node.geometry import project, unproject
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.budget import StepBudget
+from sags_node.phantom.casting import Bodies
+from sags_node.phantom.instruments import NOTHING, OPENING, Instruments, Mesh, joined
+from sags_node.phantom.scene import Phantom, PhantomScene
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
+from sags_node.pipeline.warm_up import warm_up
+from sags_node.tools.evaluation.receipt import Receipt
+from sags_node.types import F32, F64, Bool, Camera, FrameResult, StereoFrame
+from sags_node.vision.stereo import StereoDepth
+
+SIZE = (640, 512)
+FIRST = 8  # seed: constants were chosen on those before it
+BEFORE, RATE, STEPS = 3, 5.0, 2  # frames without instruments; a second; steps of the mapper, each frame
+DISTANCES = (0.005, 0.010, 0.020, 0.040)  # m, along the axis
+SIDES = {"one": ("left",), "two": ("left", "right"), "crossing": ("left", "right"), "leaving": ("right",)}
+TROCARS = {"left": np.array([-0.105, 0.125, -0.010]), "right": np.array([0.125, 0.105, 0.0])}  # m
+WHERE = {  # of the tip, in parts of the picture's size: from, to
+    "one": (0.25, 0.70), "two left": (0.20, 0.45), "two right": (0.55, 0.80), "crossing left": (0.55, 0.75),
+    "crossing right": (0.25, 0.45), "leaving": (-0.30, -0.05),
+}  # fmt: skip
+DEPTHS = (0.035, 0.085)  # m, of a tip
+NEAR = 0.15  # of the distance
+SPREAD = 0.015  # m, of a trocar along each axis
+FREE = np.arange(0.0, 0.15, 0.0015)  # m from the tip: no tissue hides the instrument
+JAW_END = 0.001  # m, of a jaw
+AROUND = 8  # px around a far end, whose depth is its depth
+SAID = ("tip_mm", "distance_mm", "clearance_mm", "axis_deg")
+BESIDE = ("far_end_on_tissue_mm", "far_end_by_stereo_mm")  # the baselines' tips
+KINDS = ("grasper", "open grasper", "hook")
+
+
+@dataclass(frozen=True, slots=True)
+class Tool:
+    mesh: Mesh
+    kind: str
+    tip: F64  # [3] m, world: on the axis, where its metal ends
+    ends: F64  # [2, 3] m: of open jaws, else twice the tip; what lies between is the tip, too
+    axis: F64  # [3]
+    distance: float  # m
+    clearance: float  # m
+
+
+class Scene:
+    """A phantom at rest, and instruments put before it."""
+
+    def __init__(self, seed: int) -> None:
+        self.phantom = Phantom(
+            PhantomScene(seconds=1.0, width=SIZE[0], height=SIZE[1], seed=seed, still_tissue=True)
+        )
+        self.camera = Camera(*SIZE, self.phantom.rig.left.P[:, :3].astype(np.float64), np.eye(4))
+        self.bare = self.phantom.frame(0, 1, tools=NOTHING)
+        self._rng, self._instruments = np.random.default_rng(seed), Instruments()
+        self._vertices = self.phantom.tissue.vertices(0.0)
+        self._bodies = Bodies(self.phantom.tissue, self._vertices, NOTHING)
+
+    def tool(self, setting: str, side: str, distance: float) -> Tool:
+        """Its tip so far from the tissue along its axis, seen by the left eye but where it is leaving."""
+        low, high = WHERE.get(f"{setting} {side}") or WHERE[setting]
+        while True:
+            pixel = self._rng.uniform([low, 0.25], [high, 0.65]) * SIZE
+            depth = np.array(self._rng.uniform(*DEPTHS))
+            tip = np.asarray(unproject(self.camera, pixel, depth), np.float64)
+            trocar = TROCARS[side] + self._rng.normal(0, SPREAD, 3)
+            tool = self._made(tip, trocar, (tip - trocar) / np.linalg.norm(tip - trocar))
+            near = abs(tool.distance - distance) <= NEAR * distance
+            inside = bool(np.all((pixel >= 0) & (pixel < SIZE)))
+            if (near or not inside) and self._is_free(tool):
+                return tool
+
+    def _made(self, tip: F64, trocar: F64, axis: F64) -> Tool:
+        kind = str(self._rng.choice(KINDS))
+        opening = OPENING if kind == "open grasper" else 0.0
+        made = self._instruments
+        mesh = made.hook(tip, trocar) if kind == "hook" else made.grasper(tip, trocar, opening)
+        tip = tip + axis * float(((mesh.vertices - tip) @ axis).max())
+        ray = np.concatenate([tip, axis]).astype(np.float32)[None]
+        clearance = np.linalg.norm(self._vertices.reshape(-1, 3) - tip, axis=1).min()
+        ends = _jaws(mesh, axis) if opening else np.stack([tip, tip])
+        return Tool(mesh, kind, tip, ends, axis, float(self._bodies.cast(ray).distance[0]), float(clearance))
+
+    def _is_free(self, tool: Tool) -> bool:
+        pixels, depths = project(self.camera, tool.tip - FREE[:, None] * tool.axis)
+        u, v = np.rint(np.nan_to_num(pixels, nan=-1)).astype(int).T
+        inside = (u >= 0) & (v >= 0) & (u < SIZE[0]) & (v < SIZE[1])
+        there = self.bare.depth[np.clip(v, 0, SIZE[1] - 1), np.clip(u, 0, SIZE[0] - 1)]
+        return bool(np.all((depths < there) | ~inside | (depths <= 0)))
+
+
+def _jaws(mesh: Mesh, axis: F64) -> F64:
+    """Where [2, 3] both jaws end."""
+    along = mesh.vertices @ axis
+    end = mesh.vertices[along > along.max() - JAW_END]
+    aside = end - (end @ axis)[:, None] * axis
+    apart = (aside - aside.mean(0)) @ np.linalg.svd(aside - aside.mean(0), full_matrices=False)[2][0]
+    return np.asarray(end[[apart.argmin(), apart.argmax()]], np.float64)
+
+
+def _off(tool: Tool, place: F64) -> float:
+    """From a place [3] to the tip, mm."""
+    way = tool.ends[1] - tool.ends[0]
+    share = np.clip((place - tool.ends[0]) @ way / max(way @ way, 1e-12), 0, 1)
+    return 1e3 * float(np.linalg.norm(tool.ends[0] + share * way - place))
+
+
+def measure_instruments(seeds: int, advance: Advance) -> dict[str, Any]:
+    """Of every setting and distance, `seeds` times."""
+    config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    rows: list[dict[str, Any]] = []
+    receipt: Receipt | None = None
+    for seed in range(FIRST, FIRST + seeds):
+        advance(seed - FIRST, seeds, "phantom")
+        scene = Scene(seed)
+        receipt = receipt or Receipt(scene.phantom.rig, SIZE, None)
+        pipeline = Pipeline(config, scene.phantom.rig, rate=RATE)
+        cases: list[tuple[str, float]] = [("", 0.0)] * BEFORE
+        cases += [(setting, distance) for setting in SIDES for distance in DISTANCES]
+        for number, (setting, distance) in enumerate(cases):
+            tools = [scene.tool(setting, side, distance) for side in SIDES.get(setting, ())]
+            seen = scene.phantom.frame(number, len(cases), tools=joined([NOTHING, *(t.mesh for t in tools)]))
+            stamp = round((1 + number / RATE) * 1e9)
+            frame = StereoFrame(number, stamp, stamp, seen.left, seen.right, tissue=~seen.tool)
+            result = pipeline.process(frame, StepBudget(STEPS), FrameRequest(instruments=True))
+            receipt.add(frame, result.observation.tissue)
+            shown = ~pipeline.rectifier.mask(~seen.tool)
+            rows += [{"seed": seed, "setting": setting, **row} for row in _compared(tools, result, shown)]
+    assert receipt is not None
+    summaries = {setting: _summary([row for row in rows if row["setting"] == setting]) for setting in SIDES}
+    apart = [row for row in rows if row["setting"] in ("one", "two")]
+    return {
+        "settings": summaries,
+        "kinds": {kind: _summary([row for row in apart if row["kind"] == kind]) for kind in KINDS},
+        "distances_mm": {
+            f"{1e3 * near:g} to {1e3 * far:g}": _summary([r for r in apart if near <= r["distance"] < far])
+            for near, far in ((0.0, 0.0075), (0.0075, 0.015), (0.015, 0.03), (0.03, 0.05))
+        },
+        "rows": rows,
+        "receipts": {"phantom": receipt.as_json()},
+    }
+
+
+def _compared(tools: list[Tool], result: FrameResult, shown: Bool) -> list[dict[str, Any]]:
+    """A row for each instrument: what is true, what is said, and what the far end of the mask says."""
+    states = result.instruments
+    assert states is not None  # they are asked for
+    known = np.nonzero(np.isfinite(states.tips[:, 0]))[0]
+    truth = np.array([project(result.observation.camera, tool.tip)[0] for tool in tools]).reshape(-1, 2)
+    apart = np.linalg.norm(truth[:, None] - states.pixels[known][None], axis=2)
+    found: dict[int, int] = {}
+    for at in np.argsort(apart, axis=None):
+        number, told = (int(i) for i in np.unravel_index(at, apart.shape))
+        if number not in found and told not in found.values():
+            found[number] = told
+    ends = _far_ends(shown, result)
+    rows = []
+    for number, tool in enumerate(tools):
+        row: dict[str, Any] = {"kind": tool.kind, "distance": tool.distance, "clearance": tool.clearance}
+        if number in found:
+            at = known[found[number]]
+            said = {"distance": states.distance[at], "clearance": states.clearance[at]}
+            row |= {f"{name}_mm": 1e3 * abs(float(value) - row[name]) for name, value in said.items()}
+            row["tip_mm"] = _off(tool, states.tips[at].astype(np.float64))
+            row["axis_deg"] = float(np.degrees(np.arccos(np.clip(states.axes[at] @ tool.axis, -1, 1))))
+            row["told_mm"] = 1e3 * float(error_of(states.confidence[at]))
+            row["sure"] = bool(states.confidence[at] >= SURE)
+            row["distance_told_mm"] = 1e3 * float(error_of(states.distance_confidence[at]))
+        for name, places in ends.items():
+            if len(places):
+                row[f"{name}_mm"] = min(_off(tool, place) for place in places)
+        rows.append({k: v for k, v in row.items() if isinstance(v, str | bool) or np.isfinite(v)})
+    return rows
+
+
+def _far_ends(shown: Bool, result: FrameResult) -> dict[str, F64]:
+    """Where [K, 3] the far end of each region of the mask is: at the tissue's depth there, and at that which
+    the node's stereo finds on the instruments."""
+    pair, view = result.pair, result.views["left"]
+    camera = result.observation.camera
+    matched, _ = StereoDepth(LaunchConfig().vision.stereo, camera, pair.baseline)(pair, np.ones_like(shown))
+    edge = np.ones_like(shown)
+    edge[1:-1, 1:-1] = False
+    count, labels = cv2.connectedComponents(shown.view(np.uint8))
+    found: dict[str, list[F64]] = {"far_end_on_tissue": [], "far_end_by_stereo": []}
+    for label in range(1, count):
+        rows, columns = np.nonzero(labels == label)
+        entry = np.argwhere((labels == label) & edge)
+        if len(entry) == 0:
+            continue
+        middle = entry.mean(0)
+        far = int(np.hypot(rows - middle[0], columns - middle[1]).argmax())
+        pixel = np.array([columns[far], rows[far]], np.float64)
+        for name, depth in (("far_end_on_tissue", view.depth), ("far_end_by_stereo", matched)):
+            z = _around(np.where(shown, depth, 0) if depth is matched else depth, pixel)
+            if z > 0:
+                found[name].append(np.asarray(unproject(camera, pixel, np.array(z)), np.float64))
+    return {name: np.array(places).reshape(-1, 3) for name, places in found.items()}
+
+
+def _around(depth: F32, pixel: F64) -> float:
+    x, y = pixel.astype(int)
+    near = depth[max(0, y - AROUND) : y + AROUND + 1, max(0, x - AROUND) : x + AROUND + 1]
+    return float(np.median(near[near > 0])) if (near > 0).any() else 0.0
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Medians and nine of ten, of those of which there is something."""
+    placed = [row for row in rows if "tip_mm" in row]
+    said: dict[str, Any] = {"instruments": len(rows), "placed": len(placed)}
+    said["sure"] = sum(row["sure"] for row in placed)
+    if placed:
+        said["within_told"] = rounded(np.mean([row["tip_mm"] <= row["told_mm"] for row in placed]))
+    met = [row for row in placed if "distance_mm" in row]
+    if met:
+        within = [row["distance_mm"] <= row["distance_told_mm"] for row in met]
+        said["distance_within_told"] = rounded(np.mean(within))
+    parts = [("", (*SAID, *BESIDE), rows), ("sure_", SAID, [row for row in placed if row["sure"]])]
+    for prefix, columns, among in parts:
+        for name in columns:
+            values = [row[name] for row in among if name in row]
+            if values:
+                said[f"{prefix}{name}"] = {
+                    "count": len(values), "median": rounded(np.median(values)),
+                    "p90": rounded(np.quantile(values, 0.9)),
+                }  # fmt: skip
+    return said
+
+
+def tables(measured: dict[str, Any]) -> list[Table]:
+    """For people."""
+    names = ("sure_tip_mm", *SAID, *BESIDE)
+    table = Table("", "placed", "sure", "within told", *names, title="errors: median, nine of ten")
+    for part in ("settings", "distances_mm", "kinds"):
+        for name, row in measured[part].items():
+            figures = [f"{row[n]['median']}, {row[n]['p90']}" if n in row else "" for n in names]
+            placed = f"{row['placed']} of {row['instruments']}"
+            table.add_row(name, placed, str(row["sure"]), str(row.get("within_told", "")), *figures)
+    return [table]

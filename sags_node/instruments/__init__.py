@@ -1,0 +1,4 @@
+"""Instruments as objects: where their tips are, how they point, how far the tissue is.
+
+Imports no other folder.
+"""

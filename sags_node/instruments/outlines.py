@@ -1,0 +1,187 @@
+"""The instruments of a mask, each with its midline in the picture.
+
+An instrument enters from the picture's edge. Its midline joins the middles of what is equally far from there,
+measured inside the mask (level sets of the geodesic distance), so that jaws may be open. Where it touches the
+edge in several places, several instruments lie over each other: each is followed straight from its entry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sags_node.types import F64, I32, U8, Bool
+
+WIDTH = 320  # px, of the mask in which midlines are sought
+MOST = 8  # instruments of a frame, and entries of a region
+SMALLEST = 0.002  # of the picture
+FRAME = 0.9  # of a row or column at the picture's edge: masked as a whole, it is no instrument
+GAP = 7  # px: what is cut by no more (a highlight, the window of a jaw) hangs together
+APART = 21  # px: entries nearer than this are one
+BIN = 3  # px, of the distance from the entry
+FEWEST = 4  # points of a midline
+WIDER = 1.4  # times as wide as at its entry: another instrument begins
+BAND = 0.75  # of its width, to each side of the line that an instrument is followed along
+STRAIGHT = 0.15  # of its width, that a straight midline may leave its line; and 1 px
+SIDEWAYS = 0.1  # of its area may: one jaw reaches farther than the other
+SHORTEST = 1.0  # times as long as wide: a corner of a shaft has no end
+MOSTLY = 0.5  # of an entry
+FITS = 4  # of a line, each without what was off
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """An instrument in the picture; px of the mask."""
+
+    far: F64  # [2] u v, its end that is the farthest from the entry
+    back: F64  # [2] u v, where the straight part that ends there begins
+    middles: F64  # [K, 2] u v, of what of that part lies on its line, from the far end
+    widths: F64  # [K] there
+    spread: float  # of its far end to each side of the line: of open jaws, of a hook
+    is_outside: bool  # its end is at the picture's edge, so the tip is beyond; or it is too short to tell
+    is_alone: bool  # nothing else lies over it
+
+
+def outlines(tools: Bool, usable: Bool) -> list[Outline]:
+    """The instruments [H, W] that enter where the picture, or what is `usable` [H, W] of it, ends; those of
+    the largest regions first. What does not reach there is none."""
+    scale = max(1.0, tools.shape[1] / WIDTH)
+    size = round(tools.shape[1] / scale), round(tools.shape[0] / scale)
+    small, inside = (_smaller(mask, size) for mask in (tools & usable, usable))
+    rows, columns = (np.flatnonzero(small.mean(axis) < FRAME) for axis in (1, 0))
+    if len(rows) == 0 or len(columns) == 0:
+        return []
+    bare = np.zeros_like(inside)
+    bare[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = 1
+    inside &= bare
+    small = cv2.morphologyEx(small, cv2.MORPH_CLOSE, _disc(GAP)) & inside
+    edge = inside & ~cv2.erode(inside, np.ones((3, 3), np.uint8), borderValue=0)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(small)
+    areas = stats[:, cv2.CC_STAT_AREA]
+    found: list[Outline] = []
+    for label in sorted(range(1, count), key=lambda i: -areas[i])[:MOST]:
+        if areas[label] >= SMALLEST * small.size and len(found) < MOST:
+            found += _of_component((labels == label).view(np.uint8), edge)
+    return [_enlarged(each, scale) for each in found[:MOST]]
+
+
+def _enlarged(small: Outline, scale: float) -> Outline:
+    far, back, middles = ((at + 0.5) * scale - 0.5 for at in (small.far, small.back, small.middles))
+    widths, spread = scale * small.widths, scale * small.spread
+    return replace(small, far=far, back=back, middles=middles, widths=widths, spread=spread)
+
+
+def _smaller(mask: Bool, size: tuple[int, int]) -> U8:
+    shrunk = cv2.resize(mask.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(shrunk > 127).view(np.uint8)
+
+
+def _disc(side: int) -> U8:
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
+
+
+def _of_component(mask: U8, edge: U8) -> list[Outline]:
+    """Of one connected region [h, w]."""
+    count, entries = cv2.connectedComponents(cv2.dilate(mask & edge, _disc(APART)))
+    entries *= mask & edge
+    found: dict[int, tuple[Outline, U8]] = {}  # by entry, and what of the region it was sought in
+    sizes = np.bincount(entries.ravel(), minlength=count)
+    for entry in sorted(range(1, count), key=lambda i: -sizes[i])[:MOST]:
+        start = (entries == entry).view(np.uint8)
+        band = mask if count == 2 else _band(mask, start)
+        outline = None if band is None else _of_band(band, start, edge, alone=count == 2)
+        if outline is not None and band is not None:
+            found[entry] = outline, band
+    for entry in sorted(found, key=lambda i: -_length(found[i][0])):
+        if entry in found and found[entry][0].is_outside:  # where it leaves, nothing enters
+            band = found[entry][1]
+            left_at = {other for other in found if other != entry and band[entries == other].mean() > MOSTLY}
+            found = {other: kept for other, kept in found.items() if other not in left_at}
+    return [outline for outline, _ in found.values()]
+
+
+def _length(outline: Outline) -> float:
+    return float(np.linalg.norm(outline.far - outline.back))
+
+
+def _band(mask: U8, start: U8) -> U8 | None:
+    """What lies straight before an entry; None: too little tells which way that is."""
+    middles, widths, _ = _midline(mask, start)
+    if len(middles) < FEWEST:
+        return None
+    usual = float(np.median(widths[1:FEWEST]))
+    wider = np.nonzero(widths[FEWEST:] > WIDER * usual)[0]
+    clean = middles[1 : FEWEST + int(wider[0]) if len(wider) else None]
+    direction, middle, _ = _line(clean, np.ones(len(clean)), usual)
+    rows, columns = np.nonzero(mask)
+    aside = (columns - middle[0]) * direction[1] - (rows - middle[1]) * direction[0]
+    band = np.zeros_like(mask)
+    near = np.abs(aside) <= BAND * usual + 1
+    band[rows[near], columns[near]] = 1
+    _, labels = cv2.connectedComponents(band)
+    at_start = labels[(start & band) > 0]
+    return np.asarray(labels == np.bincount(at_start).argmax()).view(np.uint8) if len(at_start) else None
+
+
+def _of_band(mask: U8, start: U8, edge: U8, alone: bool) -> Outline | None:
+    middles, widths, distance = _midline(mask, start)
+    if len(middles) < FEWEST:
+        return None
+    # The longest part that ends at the far end and is straight.
+    for first in range(len(middles) - FEWEST + 1):
+        part, weights = middles[first:], widths[first:]
+        width = float(weights.max())
+        direction, middle, off = _line(part, weights, STRAIGHT * width + 1)
+        if weights[off].sum() <= SIDEWAYS * weights.sum():
+            break
+    rows, columns = np.nonzero(distance > max(0.0, distance.max() - max(3 * BIN, width)))
+    away = np.stack([columns, rows], -1) - middle
+    reach = float((away @ direction).max()) + 0.5
+    end = distance[rows, columns] > distance.max() - 3 * BIN
+    spread = float(np.abs(away[end] @ np.array([direction[1], -direction[0]])).max())
+    far = middle + reach * direction
+    back = middle + direction * float((middles[first] - middle) @ direction)
+    last = distance[rows, columns] > distance.max() - 2
+    at_edge = (edge[rows[last], columns[last]] > 0).any()
+    is_outside = bool(at_edge or np.linalg.norm(far - back) < SHORTEST * width)
+    return Outline(far, back, part[~off][::-1], weights[~off][::-1], spread, is_outside, alone)
+
+
+def _midline(mask: U8, start: U8) -> tuple[F64, F64, I32]:
+    """Middles [K, 2] (u v) and widths [K] (px) of what is ever farther from the start within a mask, and that
+    distance [h, w]; 0: not reached."""
+    rows, columns = np.nonzero(mask)
+    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    inside, reached = np.ascontiguousarray(mask[box]), np.ascontiguousarray((start & mask)[box])
+    distance = reached.astype(np.int32)
+    shapes = [cv2.getStructuringElement(shape, (3, 3)) for shape in (cv2.MORPH_RECT, cv2.MORPH_CROSS)]
+    steps, before, count = 1, 0, cv2.countNonZero(reached)
+    while count > before:
+        reached = cv2.bitwise_and(cv2.dilate(reached, shapes[steps % 2]), inside)
+        distance += reached
+        steps, before, count = steps + 1, count, cv2.countNonZero(reached)
+    distance = np.where(distance > 0, steps + 1 - distance, 0)
+    whole = np.zeros(mask.shape, np.int32)
+    whole[box] = distance
+    rows, columns = np.nonzero(whole)
+    if len(rows) == 0:
+        return np.zeros((0, 2)), np.zeros(0), whole
+    bins = (whole[rows, columns] - 1) // BIN
+    counts = np.maximum(np.bincount(bins), 1)
+    middles = np.stack([np.bincount(bins, places) / counts for places in (columns, rows)], -1)
+    return middles, counts / BIN, whole
+
+
+def _line(points: F64, weights: F64, tolerance: float) -> tuple[F64, F64, Bool]:
+    """Direction [2], the way that the points [K, 2] go, the middle [2] of their line, and which points are
+    farther from it than the tolerance: these do not count (iterated least squares)."""
+    off = np.zeros(len(points), np.bool_)
+    for _ in range(FITS):
+        share = np.where(off, 1e-3, 1.0) * weights
+        middle = share @ points / share.sum()
+        direction = np.linalg.svd((points - middle) * np.sqrt(share)[:, None])[2][0]
+        off = np.abs((points - middle) @ np.array([direction[1], -direction[0]])) > tolerance
+    forward = 1.0 if direction @ (points[-1] - points[0]) >= 0 else -1.0
+    return forward * direction, middle, off

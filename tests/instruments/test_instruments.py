@@ -1,0 +1,191 @@
+"""Instruments as objects: drawn masks whose tips are known, and the phantom's grasper."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import independent_client as client
+import numpy as np
+import pytest
+from instrument_scenes import HEIGHT, WIDTH, bars, filmed
+from running_node import RunningNode
+
+from sags_node.confidence import confidence_of, error_of
+from sags_node.config.schema import LaunchConfig
+from sags_node.instruments.depths import disparities, eyes
+from sags_node.instruments.instruments import Instruments
+from sags_node.instruments.outlines import outlines
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
+from sags_node.types import Bool, InstrumentStates
+
+EVERYWHERE = np.ones((HEIGHT, WIDTH), np.bool_)
+COARSE = 3  # px: distances from the entry are counted in these
+ASKED = FrameRequest(instruments=True)
+OUTSIDE = [((-40, 120), (360, 150)), ((300, 300), (360, 220))]  # from edge to edge; the corner of a shaft
+
+
+def instruments_in(tools: Bool | None, right: bool = True, plane: float = 0.08) -> InstrumentStates:
+    """Of the filmed pictures, before tissue that is a plane at a depth, m."""
+    scene = filmed()
+    left, there = (
+        cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (scene.pair.left, scene.pair.right)
+    )
+    surface = replace(scene.surface, depth=np.full_like(scene.surface.depth, plane))
+    found = Instruments(EVERYWHERE)
+    return found.update(
+        tools, left, there if right else None, scene.pair.camera, scene.pair.baseline, surface
+    )
+
+
+# ---- in the picture --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", range(0, 360, 30))
+def test_the_end_of_a_straight_instrument_is_found_and_the_way_it_points(angle: int) -> None:
+    way = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    tip = np.array([WIDTH, HEIGHT]) / 2 - 0.5
+    (found,) = outlines(bars((tuple(tip - 400 * way), tuple(tip))), EVERYWHERE)
+    assert not found.is_outside and found.is_alone
+    assert np.linalg.norm(found.far - tip) <= COARSE
+    assert (found.far - found.back) @ way / np.linalg.norm(found.far - found.back) > np.cos(np.radians(3))
+
+
+def test_instruments_that_cross_are_two() -> None:
+    tips = np.array([[230, 60], [90, 70]])
+    found = outlines(bars(((20, 300), (230, 60)), ((300, 300), (90, 70))), EVERYWHERE)
+    assert len(found) == 2 and not any(each.is_alone for each in found)
+    for tip in tips:
+        assert min(np.linalg.norm(each.far - tip) for each in found) <= 2 * COARSE
+
+
+def test_the_tip_of_open_jaws_lies_between_them() -> None:
+    mask = bars(((160, 300), (160, 150))) | bars(((160, 155), (120, 90)), ((160, 155), (200, 85)), thick=8)
+    (found,) = outlines(mask, EVERYWHERE)
+    assert abs(found.far[0] - 160) <= 2 * COARSE and abs(found.far[1] - 85) <= 2 * COARSE
+    assert found.spread >= 30  # and says how far each of them is
+
+
+@pytest.mark.parametrize("ends", OUTSIDE)
+def test_an_instrument_whose_tip_is_not_in_the_picture_has_none(ends: tuple[tuple[int, int], ...]) -> None:
+    (found,) = outlines(bars(ends, thick=60), EVERYWHERE)
+    assert found.is_outside
+
+
+def test_what_does_not_come_from_the_edge_is_no_instrument() -> None:
+    mask = bars(((100, 100), (200, 150)))
+    assert outlines(mask, EVERYWHERE) == []
+    usable = EVERYWHERE.copy()
+    usable[:, :110] = False  # e.g. a caption: there the picture ends
+    assert len(outlines(mask, usable)) == 1
+
+
+def test_a_masked_frame_around_the_picture_joins_no_instruments() -> None:
+    mask = bars(((40, 300), (40, 130)), ((280, 300), (280, 130)))
+    mask[:8], mask[-8:], mask[:, :8], mask[:, -8:] = True, True, True, True
+    found = outlines(mask, EVERYWHERE)
+    assert len(found) == 2 and all(each.is_alone for each in found)
+    for tip in ((40, 130), (280, 130)):
+        assert min(np.linalg.norm(each.far - tip) for each in found) <= COARSE
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_any_mask_gives_places_or_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    height, width = [(256, 320), (128, 160), (33, 40)][seed % 3]
+    noise = cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), rng.uniform(0.5, width / 8))
+    mask = noise > np.quantile(noise, rng.uniform(0, 1))
+    gray = rng.integers(0, 255, (height, width), np.uint8)
+    seen = eyes(gray, np.roll(gray, -5, 1), mask, 0.3)
+    for found in outlines(mask, np.ones_like(mask)):
+        assert np.isfinite([*found.far, *found.back, found.spread]).all()
+        line = None if found.is_outside else disparities(seen, found, (2.0, 30.0))
+        assert line is None or np.isfinite(line.covariance).all()
+
+
+# ---- in the world ----------------------------------------------------------------------------------------
+
+
+def test_a_tip_is_where_it_is_told_and_so_is_the_tissue() -> None:
+    scene, found = filmed(), instruments_in(filmed().tools, plane=0.065)
+    assert len(found) == 1
+    told = float(error_of(found.confidence)[0])
+    px = scene.tip[2] ** 2 / (scene.pair.camera.K[0, 0] * scene.pair.baseline)  # m, of one px of disparity
+    assert np.linalg.norm(found.tips[0] - scene.tip) < min(told, 1.5 * px)
+    assert found.axes[0] @ scene.axis > np.cos(np.radians(25))
+    ahead, step = 0.065 - found.tips[0, 2], 0.0005
+    assert ahead / found.axes[0, 2] <= found.distance[0] < ahead / found.axes[0, 2] + step
+    aside = 4 * 0.065 / scene.pair.camera.K[0, 0]  # of every fourth pixel, the nearest
+    assert ahead - 1e-6 <= found.clearance[0] < np.hypot(ahead, aside)
+    assert found.distance_confidence[0] <= found.clearance_confidence[0] <= found.confidence[0]
+
+
+@pytest.mark.fault("instruments: the right eye must not be used")
+def test_a_depth_that_cannot_be_measured_is_not_guessed() -> None:
+    found = instruments_in(filmed().tools, right=False)
+    assert len(found) == 1
+    for unknown in (found.tips, found.axes, found.pixels, found.distance, found.clearance):
+        assert np.isnan(unknown).all()
+    assert not any([found.confidence[0], found.distance_confidence[0], found.clearance_confidence[0]])
+
+
+def test_what_lies_behind_the_tissue_is_not_sure() -> None:
+    found = instruments_in(filmed().tools, plane=0.04)
+    behind = found.tips[0, 2] - 0.04
+    assert behind > 0.01 and found.confidence[0] < confidence_of(np.float32(behind))
+    assert found.distance[0] == 0
+
+
+def test_without_masks_there_are_none() -> None:
+    assert len(instruments_in(None)) == 0 == len(instruments_in(np.zeros_like(EVERYWHERE)))
+
+
+def test_an_instrument_keeps_its_number() -> None:
+    scene, found = filmed(), Instruments(EVERYWHERE)
+    gray = scene.pair.left[..., 0]
+
+    def numbers(at_s: float, *tips: int) -> list[int]:
+        mask = bars(*(((tip, 300), (tip, 128)) for tip in tips)) if tips else ~EVERYWHERE
+        view = replace(scene.surface, t_capture_ns=round(at_s * 1e9))
+        ids = found.update(mask, gray, None, scene.pair.camera, scene.pair.baseline, view).ids
+        return sorted(ids.tolist())
+
+    assert numbers(0.0, 80) == [1]
+    assert numbers(0.1, 90, 240) == [1, 2]
+    assert numbers(0.2, 230) == [2]
+    assert numbers(0.3, 100, 220) == [1, 2]  # away for less than half a second
+    assert numbers(0.4) == []
+    assert numbers(1.0, 100) == [3]  # away for longer: it may be another one
+    assert numbers(1.1, 300) == [4]  # too far to be the same
+
+
+# ---- in the node -----------------------------------------------------------------------------------------
+
+
+def test_nothing_is_made_until_somebody_asks() -> None:
+    scene = filmed()
+    size = {"width": WIDTH, "height": HEIGHT}
+    pipeline = Pipeline(LaunchConfig.model_validate({"vision": size}), scene.phantom.rig)
+    assert pipeline.process(scene.frame, StepBudget(1)).instruments is None
+    later = replace(scene.frame, frame_id=1, t_capture_ns=2 * 10**9)  # it equals the one before
+    found = pipeline.process(later, StepBudget(1), ASKED).instruments
+    assert found is not None and len(found) == 1 and found.confidence[0] > 0
+    config = LaunchConfig.model_validate({"vision": {**size, "tissue": {"method": "none"}}})
+    without = Pipeline(config, scene.phantom.rig).process(scene.frame, StepBudget(1), ASKED).instruments
+    assert without is not None and len(without) == 0
+
+
+@pytest.mark.live
+def test_a_subscriber_gets_them_with_every_frame(phantom_session: Path, tmp_path: Path) -> None:
+    node = RunningNode(phantom_session, tmp_path, "source.pace:=fast")
+    messages = client.collect(node.data, ["sags/instruments"], 5, 60)["sags/instruments"]
+    assert node.stop() == 0
+    for message in messages:
+        client.check_meta(message, "sensor_msgs/msg/PointCloud2")
+        names = message.meta["encoding"].split(",")
+        rows = dict(zip(names, message.array().reshape(-1, len(names)).T, strict=True))
+        assert len(rows["x"]) >= 1 and set(rows["source"].tolist()) == {1.0}
+        known = np.isfinite(rows["x"])
+        assert (rows["confidence"][~known] == 0).all() and (rows["confidence"][known] > 0).all()
