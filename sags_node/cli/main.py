@@ -36,6 +36,7 @@ from sags_node.cli.launching import (
     split,
     split_recording,
 )
+from sags_node.cli.measure import measure
 from sags_node.cli.new import new
 from sags_node.cli.node_options import node_options, ns_option, own_control_option
 from sags_node.cli.offline import evaluate, fit
@@ -347,7 +348,7 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
 
 for command in (
     *(new, evaluate, fit, export, bag, bridge, calib, overlay, register, view, topic),
-    *(anchor, param, pause, resume, reset),
+    *(anchor, measure, param, pause, resume, reset),
 ):
     main.add_command(command)
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
