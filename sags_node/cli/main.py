@@ -23,6 +23,7 @@ from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
 from sags_node.cli.control import anchor, param, pause, reset, resume
 from sags_node.cli.export import export
+from sags_node.cli.latency import latency
 from sags_node.cli.launching import (
     all_figures,
     as_json,
@@ -348,7 +349,7 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
 
 for command in (
     *(new, evaluate, fit, export, bag, bridge, calib, overlay, register, view, topic),
-    *(anchor, measure, param, pause, resume, reset),
+    *(anchor, latency, measure, param, pause, resume, reset),
 ):
     main.add_command(command)
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
