@@ -5,6 +5,7 @@ from __future__ import annotations
 import http
 import json
 import math
+import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -95,8 +96,10 @@ class _Said(msgspec.Struct):
 class _Server(ThreadingHTTPServer):
     daemon_threads = False  # closing waits for what is being answered, at most `SILENT`
 
-    def handle_error(self, *_: Any) -> None:
+    def handle_error(self, *whose: Any) -> None:
         """A browser that has gone is no error."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(*whose)
 
 
 class Page(Codes):
@@ -150,7 +153,9 @@ class Page(Codes):
         """The page."""
         if host not in self._hosts or path != "/":
             return http.HTTPStatus.NOT_FOUND, f"there is {self.address} alone"
-        bits = [["".join("01"[bit > 0] for bit in row) for row in cells(number)] for number in range(NUMBERS)]
+        bits = [
+            ["".join(str(bit // 255) for bit in row) for row in cells(number)] for number in range(NUMBERS)
+        ]
         text = resources.files("sags_node.latency").joinpath("page.html").read_text(encoding="utf-8")
         text = text.replace("/*CODES*/[]", json.dumps(bits)).replace("/*EVERY*/100", str(EVERY_MS))
         return http.HTTPStatus.OK, text

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import threading
 import time
-from collections.abc import Callable
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +18,13 @@ import cv2
 import numpy as np
 import pytest
 from synthetic import plane_result, publisher
+from waiting import until
 
 from sags_node.config.schema import PushSource
 from sags_node.latency.code import NUMBERS, Reader, paint
 from sags_node.latency.ledger import Ledger, Moment
 from sags_node.latency.run import measure_latency
-from sags_node.latency.shown import Codes, Pushed
+from sags_node.latency.shown import Codes, Page, Pushed
 from sags_node.messaging.address import NodeAddress
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8, Camera, FrameResult
@@ -128,23 +133,26 @@ def shows(left: U8, stamp_ns: int, frame_id: int) -> FrameResult:
     return replace(result, pair=replace(result.pair, camera=camera, left=left, right=None))
 
 
-def measured(
-    codes: Codes, run_dir: Path, ended: Callable[[], object]
-) -> tuple[threading.Thread, dict[str, Any]]:
-    """Begun in a thread, and what it finds."""
+@contextmanager
+def measuring(codes: Codes, run_dir: Path, ended: Callable[[], object]) -> Iterator[dict[str, Any]]:
+    """In a thread that is joined; gives what it finds."""
     found: dict[str, Any] = {}
-    node = NodeAddress(run_dir=run_dir)
+    node, stop = NodeAddress(run_dir=run_dir), threading.Event()
 
     def measure() -> None:
         try:
             with codes:
-                found.update(measure_latency(node, None, codes, 2.0, print, threading.Event()))
+                found.update(measure_latency(node, None, codes, 2.0, print, stop))
         finally:
             ended()
 
     thread = threading.Thread(target=measure)
     thread.start()
-    return thread, found
+    try:
+        yield found
+    finally:
+        stop.set()
+        thread.join()
 
 
 @pytest.mark.live
@@ -155,13 +163,12 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
     source = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), (320, 256))
     with publisher(tmp_path / "run") as node, source:
         codes = Pushed(source.endpoint, phantom_session, rate=20.0)
-        thread, found = measured(codes, tmp_path / "run", source.stop)
-        for frame in source:
-            while time.time_ns() < frame.t_capture_ns + HELD * 1e9:
-                time.sleep(0.001)
-            node.publish_result(shows(frame.left, frame.t_capture_ns, frame.frame_id), dropped=0)
-            node.poll(0)
-        thread.join()
+        with measuring(codes, tmp_path / "run", source.stop) as found:
+            for frame in source:
+                while time.time_ns() < frame.t_capture_ns + HELD * 1e9:
+                    time.sleep(0.001)
+                node.publish_result(shows(frame.left, frame.t_capture_ns, frame.frame_id), dropped=0)
+                node.poll(0)
     assert found["read"] > 0 and found["read"] + found["lost"] == found["codes"]
     assert found["unknown"] == found["unreadable"] == found["clock_set"] == 0
     assert found["parts_ms"]["captured"]["max"] == pytest.approx(
@@ -170,3 +177,74 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
     assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
     assert found["total_ms"]["p50"] >= 1e3 * HELD
     assert found["total_ms"]["max"] >= found["parts_ms"]["published"]["max"]
+
+
+@pytest.fixture
+def display() -> Iterator[Any]:
+    """A browser with a page of 400x400 px."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium on this machine (Debian: chromium)")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        try:
+            yield browser.new_page(viewport={"width": 400, "height": 400})
+        finally:
+            browser.close()
+
+
+@pytest.mark.live
+@pytest.mark.alone
+def test_a_camera_that_films_the_page_closes_the_circle(display: Any, tmp_path: Path) -> None:
+    """Screenshots are what the camera sees; they are published `HELD` later."""
+    codes, ended = Page(0), threading.Event()
+    with publisher(tmp_path / "run") as node, measuring(codes, tmp_path / "run", ended.set) as found:
+        display.goto(codes.address)
+        for number in itertools.count():
+            if ended.is_set():
+                break
+            shot = cv2.imdecode(np.frombuffer(display.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+            stamp_ns = time.time_ns()
+            while time.time_ns() < stamp_ns + HELD * 1e9:
+                time.sleep(0.001)
+            node.publish_result(shows(shot[..., ::-1].copy(), stamp_ns, number), dropped=0)
+            node.poll(0)
+        until(lambda: "ended" in display.inner_text("#said"))
+    assert found["from"] == "displayed" and found["read"] > 0 and found["unknown"] == 0
+    assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
+    assert found["total_ms"]["p50"] >= 1e3 * HELD
+    assert found["parts_ms"]["captured"]["p50"] > 0  # it is drawn before it is filmed
+
+
+@pytest.mark.live
+def test_only_the_page_itself_says_what_is_shown() -> None:
+    """Else any page that is open in the browser could; and the newest page is the one that counts."""
+    with Page(0) as page:
+
+        def post(said: str, origin: str, host: str | None = None) -> int:
+            request = urllib.request.Request(f"{page.address}shown", said.encode(), {"Origin": origin})
+            if host is not None:
+                request.add_header("Host", host)
+            try:
+                with urllib.request.urlopen(request, timeout=60) as answer:
+                    return int(answer.status)
+            except urllib.error.HTTPError as error:
+                return error.code
+
+        own = page.address.rstrip("/")
+        good = '{"page": 1e12, "number": 5, "shown_ms": 100.0, "now_ms": 104.5}'
+        assert post(good, own) == 200
+        assert post(good, "http://elsewhere.example") == 409
+        assert post(good, "http://elsewhere.example", host="elsewhere.example") == 409
+        for wrong in (
+            "",
+            "[]",
+            good.replace("5,", "1000,"),
+            good.replace("100.0", "1e300"),
+            good + " " * 2000,
+        ):
+            assert post(wrong, own) == 400
+        assert post(good.replace("1e12", "2e12"), own) == 200
+        assert post(good, own) == 409
+        figures = page.ledger.figures(Moment(0, 0), Moment.now())
+        assert (figures["codes"], figures["read"]) == (2, 0)
