@@ -21,12 +21,12 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9559,
+    "benchmarks": 9774,
     "sags_lab": 5032,
-    "sags_node": 1680,
+    "sags_node": 1684,
     "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
-    "sags_node/cli": 3168,
+    "sags_node/cli": 3410,
     "sags_node/config": 1352,
     "sags_node/detail": 929,
     "sags_node/engine": 4071,
@@ -36,9 +36,10 @@ LINES = {
     "sags_node/fitting": 1523,
     "sags_node/importing": 1071,
     "sags_node/kernels": 1222,
+    "sags_node/latency": 431,
     "sags_node/mapping": 5588,
     "sags_node/media": 833,
-    "sags_node/messaging": 5084,
+    "sags_node/messaging": 5270,
     "sags_node/model": 960,
     "sags_node/node": 1425,
     "sags_node/overlay": 2361,
@@ -52,7 +53,7 @@ LINES = {
     "sags_node/terminal": 345,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5462,
-    "tests": 45342,
+    "tests": 45788,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -76,8 +76,9 @@ def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[s
                 found = _values(result, shapes)
                 exact = [_exact(kind, truth[rows], corners) for kind, corners in shapes]
                 first, firsts = first or exact, firsts or found
-                for (kind, _), *values in zip(shapes, found, exact, firsts, first, strict=True):
-                    _add(tallies[kind], 1e6 if kind == "area" else 1e3, *values)
+                rest = zip(shapes, found, exact, firsts, first, strict=True)
+                for (kind, _), now, true, before, truly in rest:
+                    _add(tallies[kind], 1e6 if kind == "area" else 1e3, now, true, before, truly)
             advance(number + 1, source.frame_count, "measuring")
     anchors = 0 if rows is None else len(rows)
     figures = {kind: _figures(tally) for kind, tally in tallies.items()}

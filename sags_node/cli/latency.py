@@ -57,13 +57,13 @@ def latency(
     sags latency --push tcp://127.0.0.1:5558 --overlay overlay
     """
     from sags_node.latency.run import measure_latency
-    from sags_node.latency.shown import Page, Pushed
+    from sags_node.latency.shown import Codes, Page, Pushed
 
     drawn = None if overlay is None else replace(node, ns=overlay, endpoint=None)
     with stop_signals() as stop:
         if push is None:
-            codes: Page | Pushed = Page(port)
-            console.print(f"open {codes.address} on the display that is filmed", markup=False, soft_wrap=True)
+            codes: Codes = (page := Page(port))
+            console.print(f"open {page.address} on the display that is filmed", markup=False, soft_wrap=True)
         else:
             from sags_node.config.schema import PhantomSource
             from sags_node.phantom import cached_session

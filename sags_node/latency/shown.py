@@ -193,4 +193,7 @@ def _answer(request: BaseHTTPRequestHandler, status: http.HTTPStatus, text: str)
 
 
 def _picture(file: Path) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    return np.asarray(cv2.imread(str(file))[..., ::-1], np.uint8)
+    picture = cv2.imread(str(file))
+    if picture is None:
+        raise SagsError(f"{file} is no picture that can be read")
+    return np.asarray(picture[..., ::-1], np.uint8)

@@ -102,8 +102,8 @@ def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measure
         return Measured(None, None, f"there is no anchor {listed}", anchors.metric)
     try:
         T_world_cam = frame[POSE].pose()
-    except WireError as error:
-        return Measured(None, None, str(error), anchors.metric)
+    except WireError as problem:
+        return Measured(None, None, str(problem), anchors.metric)
     distinct = list(dict.fromkeys(numbers))  # a way may come back to an anchor, which errs once
     order = [distinct.index(number) for number in numbers]
     points = np.array([[rows[number][axis] for axis in "xyz"] for number in distinct], np.float64)
@@ -112,8 +112,10 @@ def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measure
         for column in ("visibility", "confidence", "depth_confidence")
     )
 
-    def named(which: Bool, what: str) -> list[str]:
-        listed = ", ".join(str(number) for number, one in zip(distinct, which, strict=True) if one)
+    def named(which: Bool | np.bool_, what: str) -> list[str]:
+        listed = ", ".join(
+            str(number) for number, one in zip(distinct, np.atleast_1d(which), strict=True) if one
+        )
         return [f"anchor {listed} {what}"] if listed else []
 
     if lost := named(~np.isfinite(points).all(1), "is lost"):
