@@ -26,7 +26,7 @@ LINES = {
     "sags_node": 1684,
     "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
-    "sags_node/cli": 3410,
+    "sags_node/cli": 3411,
     "sags_node/config": 1352,
     "sags_node/detail": 929,
     "sags_node/engine": 4071,
