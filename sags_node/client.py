@@ -10,6 +10,7 @@ from sags_node.messaging.address import ClientKeys
 from sags_node.messaging.async_subscriber import AsyncSubscriber
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.freshness import StaleError
+from sags_node.messaging.measure import MEASURING, Measured, measure
 from sags_node.messaging.node_clock import NodeClock, Offset
 from sags_node.messaging.received import (
     Frame,
@@ -26,11 +27,13 @@ from sags_node.messaging.sender import FrameSender, PoseSender
 from sags_node.messaging.subscriber import Subscriber
 
 __all__ = [
+    "MEASURING",
     "AsyncSubscriber",
     "ClientKeys",
     "ControlClient",
     "Frame",
     "FrameSender",
+    "Measured",
     "NodeClock",
     "Offset",
     "PoseSender",
@@ -45,4 +48,5 @@ __all__ = [
     "StaleError",
     "Subscriber",
     "TopicName",
+    "measure",
 ]

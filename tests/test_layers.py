@@ -29,13 +29,14 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10046,
+    "benchmarks": 10261,
     "sags_lab": 5032,
-    "sags_node": 1223,
+    "sags_node": 1227,
     "sags_node/bags": 863,
-    "sags_node/cli": 3169,
+    "sags_node/cli": 3412,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2599,
+    "sags_node/clients/latency": 431,
     "sags_node/clients/overlay": 2707,
     "sags_node/clients/recording": 1383,
     "sags_node/clients/registration": 471,
@@ -48,7 +49,7 @@ LINES = {
     "sags_node/kernels": 1222,
     "sags_node/mapping": 5679,
     "sags_node/media": 856,
-    "sags_node/messaging": 5114,
+    "sags_node/messaging": 5300,
     "sags_node/model": 960,
     "sags_node/node": 1791,
     "sags_node/phantom": 1616,
@@ -65,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1092,
     "sags_node/vision": 5517,
-    "tests": 46140,
+    "tests": 46586,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -127,8 +127,8 @@ class _Run:
             wanted = np.ones(len(places), np.bool_)
         else:
             places = np.asarray(project(result.pair.camera, points)[0], np.float64)
-            wanted = _visible(frame) & _middle(places, result)
-        pinned = _pin(pipeline, result, places, wanted)
+            wanted = _visible(frame) & middle(places, result)
+        pinned = pin(pipeline, result, places, wanted)
         self._rows, self._places, self.count = pinned, places[pinned], len(pinned)
         self._shared = np.unique(np.linspace(0, self.count - 1, BESIDE).round().astype(np.int64))
         picture, places = result.pair.left, self._places[self._shared]
@@ -265,14 +265,14 @@ def _grid(result: FrameResult) -> F64:
     return np.stack(np.meshgrid(columns, rows), 2).reshape(-1, 2).astype(np.float64)
 
 
-def _middle(places: F64, result: FrameResult) -> Bool:
+def middle(places: F64, result: FrameResult) -> Bool:
     """Which of some pixels [P, 2] are not near the picture's edge."""
     height, width = result.observation.tissue.shape
     inside = (places >= BORDER) & (places < [width - BORDER, height - BORDER])
     return np.asarray(inside.all(1))
 
 
-def _pin(pipeline: Pipeline, result: FrameResult, places: F64, wanted: Bool) -> I64:
+def pin(pipeline: Pipeline, result: FrameResult, places: F64, wanted: Bool) -> I64:
     """Anchors at the wanted ones of some pixels [P, 2]; returns the rows of those that could be pinned."""
     pinned = []
     for row in np.flatnonzero(wanted):

@@ -23,6 +23,7 @@ from sags_node.cli.bridge import bridge
 from sags_node.cli.calib import calib
 from sags_node.cli.control import anchor, param, pause, reset, resume
 from sags_node.cli.export import export
+from sags_node.cli.latency import latency
 from sags_node.cli.launching import (
     all_figures,
     as_json,
@@ -36,6 +37,7 @@ from sags_node.cli.launching import (
     split,
     split_recording,
 )
+from sags_node.cli.measure import measure
 from sags_node.cli.new import new
 from sags_node.cli.node_options import node_options, ns_option, own_control_option
 from sags_node.cli.offline import evaluate, fit
@@ -348,7 +350,7 @@ def moved_bench(arguments: tuple[str, ...]) -> None:
 
 for command in (
     *(new, evaluate, fit, export, bag, bridge, calib, overlay, register, view, topic),
-    *(anchor, param, pause, resume, reset),
+    *(anchor, latency, measure, param, pause, resume, reset),
 ):
     main.add_command(command)
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):

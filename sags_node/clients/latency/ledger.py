@@ -1,0 +1,106 @@
+"""When codes were shown, and when they were seen again, on the monotonic clock.
+
+Stamps of messages are of the wall clock. They are brought to the other by the difference of both.
+"""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+CLOCK_SET = 2_000_000  # ns by which the difference of both clocks may change while a code is on its way
+MOST_READS = 10  # of both clocks, for one moment
+PERCENTILES = (50, 95, 99, 99.9)
+
+
+class Moment(NamedTuple):
+    """The same moment on both clocks, ns."""
+
+    monotonic: int
+    wall: int
+
+    @classmethod
+    def now(cls) -> Moment:
+        for _ in range(MOST_READS):
+            before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+            if after - before < CLOCK_SET // 20:  # else another thread ran between the two
+                break
+        return cls(after, wall)
+
+    def later(self, seconds: float) -> Moment:
+        return Moment(*(clock + round(1e9 * seconds) for clock in self))
+
+
+class Ledger:
+    """Codes that were shown, and pictures in which they were looked for.
+
+    Args:
+        first: name of the moment at which a code is shown.
+    """
+
+    def __init__(self, first: str) -> None:
+        self._first = first
+        self._shown: dict[int, list[Moment]] = defaultdict(list)
+        self._seen: list[tuple[int | None, dict[str, int], Moment]] = []
+
+    def shown(self, number: int, at: Moment) -> None:
+        """A code was shown from this moment on, which is later than those before."""
+        self._shown[number].append(at)
+
+    def seen(self, number: int | None, stamps: Mapping[str, int], at: Moment) -> None:
+        """A picture was shown.
+
+        Args:
+            number: of the code that was read in it; None: none could be.
+            stamps: of its way, wall clock ns by name, in order.
+        """
+        self._seen.append((number, dict(stamps), at))
+
+    def figures(self, since: Moment, until: Moment) -> dict[str, Any]:
+        """Of each code that was shown between two moments the first picture that shows it.
+
+        Returns:
+            codes, read, lost (in no picture), unreadable (pictures without a code), unknown (pictures with a
+            code that was not shown before), clock_set (codes that count in the whole alone: the wall clock
+            was set meanwhile), total_ms and parts_ms, by the name of what ends each.
+        """
+        total: dict[Moment, float] = {}
+        parts: dict[str, list[float]] = defaultdict(list)
+        counts = dict.fromkeys(("unreadable", "unknown", "clock_set"), 0)
+        for number, stamps, at in self._seen:
+            before = [] if number is None else self._shown.get(number, [])
+            place = bisect_right(before, at)
+            if not place:
+                counts["unreadable" if number is None else "unknown"] += since <= at <= until
+                continue
+            begun = before[place - 1]
+            if begun in total or not since <= begun <= until:
+                continue
+            total[begun] = 1e-6 * (at.monotonic - begun.monotonic)
+            ahead, last = at.wall - at.monotonic, begun.monotonic
+            if abs(ahead - (begun.wall - begun.monotonic)) > CLOCK_SET:
+                counts["clock_set"] += 1
+                continue
+            for name, stamp in {**stamps, "shown": at.wall}.items():
+                parts[name].append(1e-6 * (stamp - ahead - last))
+                last = stamp - ahead
+        codes = sum(since <= at <= until for moments in self._shown.values() for at in moments)
+        return {
+            "from": self._first,
+            "codes": codes,
+            "read": len(total),
+            "lost": codes - len(total),
+            **counts,
+            "total_ms": _spread(list(total.values())),
+            "parts_ms": {name: _spread(values) for name, values in parts.items()},
+        }
+
+
+def _spread(ms: list[float]) -> dict[str, float]:
+    said = zip(PERCENTILES, np.percentile(ms, PERCENTILES), strict=True) if ms else ()
+    return {f"p{q:g}": round(float(v), 2) + 0.0 for q, v in said} | ({"max": round(max(ms), 2)} if ms else {})

@@ -1,0 +1,79 @@
+"""What a screen shows of a node, and the codes in it."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+
+from sags_node.clients.latency.code import Reader
+from sags_node.clients.latency.ledger import Moment
+from sags_node.clients.latency.shown import Codes
+from sags_node.clients.overlay.draw import over
+from sags_node.errors import SagsError
+from sags_node.messaging.address import NodeAddress
+from sags_node.messaging.received import Received, ReceivedImage, TopicName
+from sags_node.messaging.subscriber import Subscriber
+
+PICTURE = TopicName("left/image_rect_color", ReceivedImage)
+OVERLAY = TopicName("left/overlay/image", ReceivedImage)
+SETTLED = 2.0  # s after the first code, from which on codes count: a model has begun by then
+LAST = 1.0  # s that the last code has to be seen
+LOOK = 0.1  # s
+REMIND = 5.0  # s without a code, after which it is said
+
+
+def measure_latency(
+    node: NodeAddress,
+    overlay: NodeAddress | None,
+    codes: Codes,
+    seconds: float,
+    tell: Callable[[str], object],
+    stop: threading.Event,
+) -> dict[str, object]:
+    """See when codes come back in what a screen shows: the node's left picture, and what is drawn over it.
+
+    Args:
+        overlay: each picture waits for its overlay from there; None: there is none.
+        seconds: how long codes count, from `SETTLED` after the first that is seen.
+        tell: what it waits for.
+        stop: ends it early.
+
+    Returns:
+        As `Ledger.figures`.
+
+    Raises:
+        SagsError: no node or overlay runs, or no code was seen before it was stopped.
+    """
+    ledger, reader = codes.ledger, Reader()
+    newest: Received | None = None
+    since, ends_at, remind_at = None, math.inf, time.monotonic() + REMIND
+    leading = (node, PICTURE) if overlay is None else (overlay, OVERLAY)
+    with Subscriber.at(node, [PICTURE]) as pictures, Subscriber.at(leading[0], [leading[1]]) as subscriber:
+        while not stop.is_set() and (now := time.monotonic()) < ends_at + LAST:
+            due = codes.step(now < ends_at)
+            came = subscriber.wait(leading[1], min(LOOK, due), after=newest)
+            if since is None and now > remind_at:
+                remind_at = now + REMIND
+                silent = codes.problem or pictures.problem(PICTURE) or subscriber.problem(leading[1])
+                tell(f"waiting: {silent or 'there is no code in the pictures'}")
+            if came is None:
+                continue
+            newest = came
+            frame = pictures.aligned([PICTURE], came.stamp_ns, LOOK)
+            if frame is None:
+                continue
+            picture = frame[PICTURE]
+            stamps = {"captured": picture.stamp_ns, "published": picture.meta.publish_ns}
+            if overlay is not None:
+                stamps["drawn"] = came.meta.publish_ns
+            pixels = picture.array.copy() if overlay is None else over(picture.array, came.array)
+            at = Moment.now()
+            number = reader.read(pixels)
+            ledger.seen(number, {**stamps, "received": max(came.received_ns, picture.received_ns)}, at)
+            if number is not None and since is None:
+                since, ends_at = at.later(SETTLED), now + SETTLED + seconds
+    if since is None:
+        raise SagsError(f"no code was seen: {codes.hint}")
+    return ledger.figures(since, Moment.now().later(-LAST))

@@ -1,0 +1,186 @@
+"""What anchors measure on tissue: a distance, a path, an area, with the error that follows from the anchors'.
+
+with Subscriber(MEASURING) as subscriber:
+    newest = subscriber.wait(ANCHORS, timeout=3.0)
+    frame = newest and subscriber.aligned(MEASURING, newest.stamp_ns, timeout=0.2)
+    if frame and subscriber.ok(ANCHORS):
+        print(measure(frame, [1, 2]))
+
+Lines between anchors are straight. They do not follow the surface: pin more anchors along a curve.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sags_node.confidence import SURE, SURE_OF_ANCHOR, error_of
+from sags_node.errors import UsageError
+from sags_node.geometry import invert, transform
+from sags_node.messaging.received import Frame, ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
+from sags_node.messaging.wire import WireError
+from sags_node.types import F64, Bool
+
+ANCHORS = TopicName("anchors", ReceivedCloud)
+POSE = TopicName("tf", ReceivedRos)
+INFO = TopicName("left/camera_info", ReceivedCameraInfo)
+MEASURING = (ANCHORS, POSE, INFO)
+
+# Of the picture's width. Nine of ten anchors that are seen lie nearer to their point in the picture: 0.7 to
+# 1.4 px of 640 (`off_by_px` in benchmarks/results/tracking_*.json).
+SIDEWAYS = 1.5 / 640
+NORMAL = 1.645  # standard deviations of a normal distribution, within which nine of ten lie
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One value of one frame.
+
+    Attributes:
+        value: m, or m2 of an area; None: an anchor is lost, or there is none of that number.
+        error: nine of ten are smaller, as of a depth's confidence; a standard deviation is `error / NORMAL`.
+            None: not known.
+        unsure: why it must not be shown as sure; None: nothing speaks against it.
+        metric: False: the node has no calibration, and the value no unit.
+    """
+
+    value: float | None
+    error: float | None
+    unsure: str | None
+    metric: bool = True
+
+    def stretch(self, reference: Measured) -> tuple[float, float] | None:
+        """The ratio to an earlier value, and its error; None where one of both has none.
+
+        The errors of both are taken to be independent. What is wrong in both in the same way makes it better.
+        """
+        if not self.value or not reference.value or self.error is None or reference.error is None:
+            return None
+        ratio = self.value / reference.value
+        return ratio, ratio * math.hypot(self.error / self.value, reference.error / reference.value)
+
+
+def check_numbers(numbers: Sequence[int], area: bool) -> None:
+    """Whether something can be measured between anchors of these numbers.
+
+    Raises:
+        UsageError: too few, or the same one where it makes no sense.
+    """
+    least = 3 if area else 2
+    if len(numbers) < least:
+        raise UsageError(f"{'an area needs' if area else 'give'} {least} anchors or more (sags anchor list)")
+    twice = len(set(numbers)) < len(numbers) if area else any(np.diff(numbers) == 0)
+    if twice:
+        raise UsageError(
+            "the same anchor twice" + ("" if area else " in a row") + ": each is a corner of its own"
+        )
+
+
+def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measured:
+    """The length of the way along anchors, of two their distance; or the area of the polygon of anchors.
+
+    Each anchor is moved by its errors, in depth along its ray and sideways, and what that changes is added
+    in squares. Errors in depth are alike where the calibration is wrong, and independent where matches are:
+    the larger of both sums counts.
+
+    Args:
+        frame: the messages `MEASURING` of one frame.
+        numbers: of the anchors, in order.
+        area: of a polygon that is not flat, that of its shadow on its mean plane (Newell's).
+
+    Raises:
+        UsageError: see `check_numbers`.
+    """
+    check_numbers(numbers, area)
+    anchors, info = frame[ANCHORS], frame[INFO]
+    rows = {int(row["id"]): row for row in anchors.points}
+    if missing := [number for number in numbers if number not in rows]:
+        listed = ", ".join(map(str, missing))
+        return Measured(None, None, f"there is no anchor {listed}", anchors.metric)
+    try:
+        T_world_cam = frame[POSE].pose()
+    except WireError as problem:
+        return Measured(None, None, str(problem), anchors.metric)
+    distinct = list(dict.fromkeys(numbers))  # a way may come back to an anchor, which errs once
+    order = [distinct.index(number) for number in numbers]
+    points = np.array([[rows[number][axis] for axis in "xyz"] for number in distinct], np.float64)
+    visibility, confidence, depth_confidence = (
+        np.array([rows[number][column] for number in distinct], np.float32)
+        for column in ("visibility", "confidence", "depth_confidence")
+    )
+
+    def named(which: Bool | np.bool_, what: str) -> list[str]:
+        listed = ", ".join(
+            str(number) for number, one in zip(distinct, np.atleast_1d(which), strict=True) if one
+        )
+        return [f"anchor {listed} {what}"] if listed else []
+
+    if lost := named(~np.isfinite(points).all(1), "is lost"):
+        return Measured(None, None, lost[0], anchors.metric)
+    if area and _crosses(points):
+        why = "the polygon crosses itself: name its anchors in the order in which they lie around it"
+        return Measured(None, None, why, anchors.metric)
+    slipped = named(confidence < SURE_OF_ANCHOR, "may be on other tissue")
+    unsure = [
+        *slipped,
+        *named(visibility < 1, "is not wholly in sight"),
+        *named(~(depth_confidence >= SURE), "has a depth that is a guess"),
+    ]
+
+    def value_of(places: F64) -> float:
+        return (area_of if area else length_of)(places[order])
+
+    error = _error(value_of, points, error_of(depth_confidence).astype(np.float64), T_world_cam, info)
+    known = not slipped and math.isfinite(error)
+    return Measured(value_of(points), error if known else None, "; ".join(unsure) or None, anchors.metric)
+
+
+def length_of(points: F64) -> float:
+    """The length of the way along points [N, 3]."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def area_of(points: F64) -> float:
+    """The area of the polygon with the corners [N, 3]; see `measure`."""
+    arms = points - points[0]
+    return 0.5 * float(np.linalg.norm(np.cross(arms[:-1], arms[1:]).sum(0)))
+
+
+def _error(
+    of: Callable[[F64], float], points: F64, depth_errors: F64, T_world_cam: F64, info: ReceivedCameraInfo
+) -> float:
+    """Of what `of` says of the points [N, 3], whose depths have these errors [N] (m)."""
+    depths = transform(invert(T_world_cam), points)[:, 2]
+    along = (points - T_world_cam[:3, 3]) * (depth_errors / depths)[:, None]
+    beside = SIDEWAYS * info.width / info.K[0, 0] * depths
+    value = of(points)
+
+    def change(moves: F64) -> float:
+        return max(abs(of(points + moves) - value), abs(of(points - moves) - value))
+
+    def each(moves: F64) -> float:
+        """One anchor at a time, added in squares."""
+        return math.hypot(*(change(one) for one in np.eye(len(points))[:, :, None] * moves))
+
+    sideways = math.hypot(*(each(beside[:, None] * T_world_cam[:3, axis]) for axis in (0, 1)))
+    return math.hypot(max(each(along), change(along)), sideways)
+
+
+def _crosses(points: F64) -> bool:
+    """Whether two sides of a polygon [N, 3] cross, seen along the normal of its mean plane."""
+    normal = np.linalg.svd(points - points.mean(0))[2][-1]
+    count = len(points)
+
+    def side(a: int, b: int, c: int) -> float:
+        arms = points[[b, c]] - points[a]
+        return float(np.sign(normal @ np.cross(arms[0], arms[1])))
+
+    sides = [(i, (i + 1) % count) for i in range(count)]
+    return any(
+        side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
+        for number, (a, b) in enumerate(sides)
+        for c, d in sides[number + 1 :]
+    )

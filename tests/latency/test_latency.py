@@ -1,0 +1,250 @@
+"""`sags latency`: codes, the figures on a virtual clock, and chains whose delay their own stamps tell."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from synthetic import plane_result, publisher
+from waiting import until
+
+from sags_node.clients.latency.code import NUMBERS, Reader, paint
+from sags_node.clients.latency.ledger import Ledger, Moment
+from sags_node.clients.latency.run import measure_latency
+from sags_node.clients.latency.shown import Codes, Page, Pushed
+from sags_node.config.schema import PushSource
+from sags_node.messaging.address import NodeAddress
+from sags_node.sources.push import PushedPictures
+from sags_node.types import U8, Camera, FrameResult
+
+MS = 1_000_000
+HELD = 0.2  # s, by which a chain is known to hold pictures
+CHROMIUM = shutil.which("chromium")
+
+
+def numbered(number: int) -> U8:
+    """On tissue's colours."""
+    picture = np.random.default_rng(0).integers(90, 150, (256, 320, 3)).astype(np.uint8)
+    paint(picture, number)
+    return picture
+
+
+@pytest.mark.parametrize("number", [0, 7, 500, NUMBERS - 1])
+def test_a_code_is_read_from_a_picture_that_was_filmed(number: int) -> None:
+    picture, reader = numbered(number), Reader()
+    seen = np.float32([[12, 9], [300, 30], [310, 250], [30, 235]])
+    corners = np.float32([[0, 0], [319, 0], [319, 255], [0, 255]])
+    filmed = cv2.warpPerspective(picture, cv2.getPerspectiveTransform(corners, seen), (320, 256))
+    filmed = cv2.GaussianBlur(filmed, (0, 0), 1.0) // 2
+    assert reader.read(picture) == reader.read(filmed) == number
+    assert reader.read(np.full_like(picture, 90)) is None
+
+
+def test_two_codes_in_one_exposure_are_not_taken_for_a_third() -> None:
+    reader = Reader()
+    for number in range(0, NUMBERS, 41):
+        for share in (0.3, 0.5, 0.7):
+            both = cv2.addWeighted(numbered(number), share, numbered(number + 1), 1 - share, 0)
+            assert reader.read(both) in (None, number, (number + 1) % NUMBERS)
+
+
+class Chain:
+    """A camera of 30 Hz before a node and a screen, on a clock that only the test moves. Every eighth picture
+    is lost, and every eleventh unreadable; numbers begin anew on the way."""
+
+    def __init__(self, mapped_ms: float, wall_ms: float = 0.0) -> None:
+        self.ledger, jitter = Ledger("sent"), np.random.default_rng(1)
+        self.delays = []
+        for i in range(200):
+            begun = Moment(i * 33 * MS, (i * 33 + 10**6) * MS)
+            self.ledger.shown((i + NUMBERS - 50) % NUMBERS, begun)
+            if i % 8 == 0:
+                continue
+            delay = int((20 + mapped_ms + jitter.uniform(0, 30)) * MS)
+            is_set = round(wall_ms * MS) if i >= 190 else 0
+            at = Moment(begun.monotonic + delay, begun.wall + delay + is_set)
+            stamps = {
+                "captured": begun.wall,
+                "published": at.wall - 15 * MS - is_set,
+                "received": at.wall - 5 * MS,
+            }
+            number = None if i % 11 == 0 else (i + NUMBERS - 50) % NUMBERS
+            self.ledger.seen(number, stamps, at)
+            if number is not None:
+                self.delays.append(delay / MS)
+                again = Moment(*(clock + MS for clock in at))
+                self.ledger.seen(number, stamps, again)  # it stays until the next one
+        self.figures = self.ledger.figures(Moment(0, 0), Moment(10**18, 10**18))
+
+
+def test_200_ms_more_on_the_way_are_found_as_200_ms_more_and_where_they_are() -> None:
+    fast, slow = Chain(10), Chain(210)
+    for chain in (fast, slow):
+        exact = {f"p{q:g}": np.percentile(chain.delays, q) for q in (50, 95, 99, 99.9)}
+        assert chain.figures["total_ms"] == pytest.approx(exact | {"max": max(chain.delays)}, abs=0.01)
+    more = {key: slow.figures["total_ms"][key] - fast.figures["total_ms"][key] for key in exact}
+    assert more == pytest.approx(dict.fromkeys(exact, 200.0), abs=0.02)
+    for name, added in (("captured", 0), ("published", 200), ("received", 0), ("shown", 0)):
+        parts = [chain.figures["parts_ms"][name]["p99"] for chain in (fast, slow)]
+        assert parts[1] - parts[0] == pytest.approx(added, abs=0.02)
+    assert fast.figures["parts_ms"]["shown"]["max"] == 5 and fast.figures["parts_ms"]["received"]["p50"] == 10
+
+
+def test_losses_and_what_cannot_be_read_are_counted() -> None:
+    figures = Chain(10).figures
+    lost = [i for i in range(200) if i % 8 == 0]
+    unread = [i for i in range(200) if i % 11 == 0 and i % 8]
+    assert (figures["codes"], figures["read"]) == (200, 200 - len(lost) - len(unread))
+    assert (figures["lost"], figures["unreadable"]) == (len(lost) + len(unread), len(unread))
+    assert figures["unknown"] == figures["clock_set"] == 0
+    ledger = Ledger("sent")
+    ledger.shown(3, Moment(5, 5))
+    ledger.seen(3, {}, Moment(4, 4))  # before it was shown
+    ledger.seen(9, {}, Moment(6, 6))
+    figures = ledger.figures(Moment(0, 0), Moment(10, 10))
+    assert (figures["unknown"], figures["read"], figures["total_ms"]) == (2, 0, {})
+
+
+def test_a_clock_that_is_set_meanwhile_changes_no_delay() -> None:
+    calm, jumped = Chain(10), Chain(10, wall_ms=-500.0)
+    assert jumped.figures["total_ms"] == calm.figures["total_ms"]
+    assert jumped.figures["clock_set"] == sum(i % 8 != 0 and i % 11 != 0 for i in range(190, 200))
+    for name, spread in calm.figures["parts_ms"].items():
+        assert jumped.figures["parts_ms"][name] == pytest.approx(spread, abs=0.7)  # ten of 160 fewer
+
+
+def shows(left: U8, stamp_ns: int, frame_id: int) -> FrameResult:
+    """A node's result with this left picture."""
+    result = plane_result(frame_id, stamp_ns)
+    height, width = left.shape[:2]
+    camera = Camera(width, height, result.pair.camera.K, np.eye(4))
+    return replace(result, pair=replace(result.pair, camera=camera, left=left, right=None))
+
+
+@contextmanager
+def measuring(codes: Codes, run_dir: Path, ended: Callable[[], object]) -> Iterator[dict[str, Any]]:
+    """In a thread that is joined; gives what it finds."""
+    found: dict[str, Any] = {}
+    node, stop = NodeAddress(run_dir=run_dir), threading.Event()
+
+    def measure() -> None:
+        try:
+            with codes:
+                found.update(measure_latency(node, None, codes, 2.0, print, stop))
+        finally:
+            ended()
+
+    thread = threading.Thread(target=measure)
+    thread.start()
+    try:
+        yield found
+    finally:
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.live
+def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
+    phantom_session: Path, tmp_path: Path
+) -> None:
+    """By its own stamps: no picture leaves before `HELD` after its capture."""
+    source = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), (320, 256))
+    with publisher(tmp_path / "run") as node, source:
+        codes = Pushed(source.endpoint, phantom_session, rate=20.0)
+        with measuring(codes, tmp_path / "run", source.stop) as found:
+            for frame in source:
+                while time.time_ns() < frame.t_capture_ns + HELD * 1e9:
+                    time.sleep(0.001)
+                node.publish_result(shows(frame.left, frame.t_capture_ns, frame.frame_id), dropped=0)
+                node.poll(0)
+    assert found["read"] > 0 and found["read"] + found["lost"] == found["codes"]
+    assert found["unknown"] == found["unreadable"] == found["clock_set"] == 0
+    assert found["parts_ms"]["captured"]["max"] == pytest.approx(
+        0, abs=0.1
+    )  # its stamp is that of the sending
+    assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
+    assert found["total_ms"]["p50"] >= 1e3 * HELD
+    assert found["total_ms"]["max"] >= found["parts_ms"]["published"]["max"]
+
+
+@pytest.fixture
+def display() -> Iterator[Any]:
+    """A browser with a page of 400x400 px."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium on this machine (Debian: chromium)")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        try:
+            yield browser.new_page(viewport={"width": 400, "height": 400})
+        finally:
+            browser.close()
+
+
+@pytest.mark.live
+@pytest.mark.alone
+def test_a_camera_that_films_the_page_closes_the_circle(display: Any, tmp_path: Path) -> None:
+    """Screenshots are what the camera sees; they are published `HELD` later."""
+    codes, ended = Page(0), threading.Event()
+    with publisher(tmp_path / "run") as node, measuring(codes, tmp_path / "run", ended.set) as found:
+        display.goto(codes.address)
+        for number in itertools.count():
+            if ended.is_set():
+                break
+            shot = cv2.imdecode(np.frombuffer(display.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+            stamp_ns = time.time_ns()
+            while time.time_ns() < stamp_ns + HELD * 1e9:
+                time.sleep(0.001)
+            node.publish_result(shows(shot[..., ::-1].copy(), stamp_ns, number), dropped=0)
+            node.poll(0)
+        until(lambda: "ended" in display.inner_text("#said"))
+    assert found["from"] == "displayed" and found["read"] > 0 and found["unknown"] == 0
+    assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
+    assert found["total_ms"]["p50"] >= 1e3 * HELD
+    assert found["parts_ms"]["captured"]["p50"] > 0  # it is drawn before it is filmed
+
+
+@pytest.mark.live
+def test_only_the_page_itself_says_what_is_shown() -> None:
+    """Else any page that is open in the browser could; and the newest page is the one that counts."""
+    with Page(0) as page:
+
+        def post(said: str, origin: str, host: str | None = None) -> int:
+            request = urllib.request.Request(f"{page.address}shown", said.encode(), {"Origin": origin})
+            if host is not None:
+                request.add_header("Host", host)
+            try:
+                with urllib.request.urlopen(request, timeout=60) as answer:
+                    return int(answer.status)
+            except urllib.error.HTTPError as error:
+                return error.code
+
+        own = page.address.rstrip("/")
+        good = '{"page": 1e12, "number": 5, "shown_ms": 100.0, "now_ms": 104.5}'
+        assert post(good, own) == 200
+        assert post(good, "http://elsewhere.example") == 409
+        assert post(good, "http://elsewhere.example", host="elsewhere.example") == 409
+        for wrong in (
+            "",
+            "[]",
+            good.replace("5,", "1000,"),
+            good.replace("100.0", "1e300"),
+            good + " " * 2000,
+        ):
+            assert post(wrong, own) == 400
+        assert post(good.replace("1e12", "2e12"), own) == 200
+        assert post(good, own) == 409
+        figures = page.ledger.figures(Moment(0, 0), Moment.now())
+        assert (figures["codes"], figures["read"]) == (2, 0)
