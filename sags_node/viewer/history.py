@@ -8,15 +8,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sags_node.evaluation.gallery import Picture
-from sags_node.evaluation.metrics import as_float, psnr
 from sags_node.types import F64
 from sags_node.viewer.feed import Moment
 
 PERIOD = 1.0  # s between two points
 GAP = 10.0  # s without a point
 LENGTH = 120  # points
-FIGURES = ("rate", "p50", "p99", "psnr")
+FIGURES = ("rate", "p50", "p99", "overlay", "rung")
 
 
 class History:
@@ -33,11 +31,13 @@ class History:
         if since > GAP:
             self._points.clear()
             return True
-        if moment.model is None or (self._points and since < PERIOD):
+        if moment.problem is not None or (self._points and since < PERIOD):
             return False
-        status = moment.status
+        status, overlay = moment.status, moment.overlay
         p50, p99 = (status.latency_ms.get(name, np.nan) for name in ("p50", "p99"))
-        self._points.append((now, status.rate_hz, p50, p99, _psnr(moment.model)))
+        overlaid = (None if overlay is None else overlay.latency_ms.get("p50")) or np.nan
+        rung = np.nan if status.rung is None else float(status.rung.number)
+        self._points.append((now, status.rate_hz, p50, p99, overlaid, rung))
         return True
 
     def series(self, *figures: str) -> tuple[F64, ...]:
@@ -45,7 +45,3 @@ class History:
         points = np.array(self._points, np.float64).reshape(-1, 1 + len(FIGURES))
         times = points[:, 0] - (points[-1, 0] if len(points) else 0.0)
         return (times, *(points[:, 1 + FIGURES.index(figure)] for figure in figures))
-
-
-def _psnr(model: Picture) -> float:
-    return psnr(as_float(model.render), as_float(model.truth), model.tissue)

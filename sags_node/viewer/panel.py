@@ -12,21 +12,27 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
+from sags_node.confidence import SURE, SURE_OF_ANCHOR
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
+from sags_node.types import F64
+from sags_node.viewer.cursor import depth_line
 from sags_node.viewer.feed import Moment, Status
 from sags_node.viewer.history import LENGTH, PERIOD, History
-from sags_node.viewer.pictures import Sheet
+from sags_node.viewer.overlay import Overlay
+from sags_node.viewer.pictures import VIEWS, Sheet
+from sags_node.viewer.saving import KINDS, exported, name_of, screenshot
 from sags_node.viewer.scene import UNIT, Scene
 
 ANSWER_TIME = 20.0  # s; recordings take seconds
 PICTURES_WIDTH = 480  # px
+NARROW = 500  # px of the scene beside both panels: a narrower one gets the place of the controls
 PLOT_HEIGHT = 80  # px
 NOTICE_TIME = 6.0  # s
 JPEG_QUALITY = 80
 NONE = "-"  # no anchor chosen
-BRIGHT, BLUE, ORANGE = "#c9d1d9", "#4dabf7", "#ffa94d"
+BRIGHT, BLUE, ORANGE, GREEN = "#c9d1d9", "#4dabf7", "#ffa94d", "#51cf66"
 
 
 class Asker:
@@ -35,15 +41,16 @@ class Asker:
     def __init__(self, node: NodeAddress) -> None:
         self._node = node
 
-    def ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> None:
-        """One request of its own: callbacks come from several threads."""
+    def ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> Any:
+        """One request of its own: callbacks come from several threads. None: it was refused."""
         try:
             with ControlClient.at(self._node) as control:
                 answer = control.request(op, args, ANSWER_TIME)
         except SagsError as error:
             tell(client, f"{title}: refused", str(error), "red")
-        else:
-            tell(client, title, _in_words(answer), "green")
+            return None
+        tell(client, title, _in_words(answer), "green")
+        return answer
 
 
 def tell(client: viser.ClientHandle | None, title: str, text: str, color: Any) -> None:
@@ -62,33 +69,113 @@ class Panel:
     def __init__(self, server: viser.ViserServer, scene: Scene, asker: Asker, ns: str, rate: float) -> None:
         self._gui, self._scene, self._asker = server.gui, scene, asker
         self._sheet, self._history = Sheet(), History()
+        self._moment, self._unit = Moment("connecting"), "mm"
+        self._frozen_since: float | None = None
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"sags view · {ns}")
         server.gui.main_panel.dock_right()
-        self._status = server.gui.add_html(status_line(Moment("connecting")))
+        self._status = server.gui.add_html(status_line(self._moment))
+        self._build_keeping()
         self._build_view(rate)
         self._build_anchors()
+        with server.gui.add_folder("Overlay"):
+            self._overlay = server.gui.add_html("")
         self._build_node()
         self._build_pictures()
-        server.scene.on_click()(self._pin)
+        server.scene.on_click()(self._clicked)
 
     @property
     def rate(self) -> float:
         """How often the browser should be brought up to date, Hz."""
         return float(self._rate.value)
 
+    @property
+    def view(self) -> str:
+        """Which of the `VIEWS` is looked at."""
+        return str(self._view.value)
+
+    @property
+    def frozen(self) -> bool:
+        """Whether somebody wants to look at one moment."""
+        return self._frozen_since is not None
+
+    def fit(self, client: viser.ClientHandle) -> None:
+        """Leave room for the scene in a narrow browser: its controls begin as a bar."""
+        if client.camera.image_width < NARROW:
+            client.gui.main_panel.minimize()
+
     def show(self, moment: Moment) -> None:
         """Bring status, pictures, plots and the list of anchors up to date."""
+        if self.frozen:  # since the moment was asked for
+            return
+        self._moment = moment
+        self._unit = "no unit" if "uncalibrated" in moment.status.warning_codes else "mm"
         self._status.content = status_line(moment)
-        self._pictures.image = self._sheet.draw(moment)
+        self._draw()
         if self._history.add(moment):
             for plot, figures in self._plots:
                 plot.data = self._history.series(*figures)
-        status = moment.status
-        self._unit = "no unit" if status is not None and "uncalibrated" in status.warning_codes else "mm"
+        self._overlay.content = _overlay_table(moment.overlay)
         self._list_anchors(moment.anchors)
 
+    def stay(self) -> None:
+        """Say how old the frozen moment is by now; what is looked at of it may change."""
+        assert self._frozen_since is not None
+        age = time.monotonic() - self._frozen_since
+        self._status.content = status_line(
+            Moment(f"FROZEN {age:.0f} s ago: what you see is old; Go on shows the node again")
+        )
+        self._draw(f"  FROZEN {age:.0f} s ago")
+        self._list_anchors(self._moment.anchors)
+
+    def go_on(self) -> None:
+        """Show the node again."""
+        self._frozen_since, self._freeze.label = None, "Freeze"
+
+    def _draw(self, remark: str = "") -> None:
+        self._sheet.fixed = None if self._auto.value else (self._near.value * UNIT, self._far.value * UNIT)
+        sheet = self._sheet.draw(self._moment, self.view, remark)
+        self._pictures.image = sheet
+        self._depth.content = depth_line(self._moment, self.view, sheet.shape[0], self._unit)
+
     # ---- building ------------------------------------------------------------------------------------
+
+    def _build_keeping(self) -> None:
+        self._freeze = self._gui.add_button("Freeze", icon=viser.Icon.SNOWFLAKE)
+
+        @self._freeze.on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            if self.frozen:
+                self.go_on()
+            else:
+                self._frozen_since, self._freeze.label = time.monotonic(), "Go on"
+
+        @self._gui.add_button("Screenshot", icon=viser.Icon.CAMERA).on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            client = event.client
+            if client is not None:
+                sheet = self._pictures.image
+                self._send(client, "Screenshot", ".png", lambda: screenshot(client, sheet))
+
+        with self._gui.add_folder("Export", expand_by_default=False):
+            kind = self._gui.add_dropdown("What", tuple(KINDS))
+
+            @self._gui.add_button("Download", icon=viser.Icon.DOWNLOAD).on_click
+            def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+                if event.client is not None:
+                    what, moment = kind.value, self._moment
+                    ending = f"_{what}{KINDS[what]}"
+                    self._send(event.client, f"Export {what}", ending, lambda: exported(moment, what))
+
+    def _send(self, client: viser.ClientHandle, title: str, suffix: str, make: Callable[[], bytes]) -> None:
+        """A file of this moment, to the browser that asked."""
+        name = name_of(self._moment, suffix)
+        try:
+            client.send_file_download(name, make(), save_immediately=True)
+        except SagsError as error:
+            tell(client, f"{title}: refused", str(error), "red")
+        else:
+            tell(client, title, name, "green")
 
     def _build_view(self, rate: float) -> None:
         buttons = self._gui.add_button_group("Look from", ("aside", "left camera"))
@@ -98,13 +185,15 @@ class Panel:
             if event.client is not None:
                 self._scene.look(event.client, through=event.target.value == "left camera")
 
-        self._rate = self._gui.add_slider("Updates per s", 1.0, 10.0, 1.0, rate)
+        self._rate = self._gui.add_slider("Updates per s", 1.0, 30.0, 1.0, rate)
 
     def _build_anchors(self) -> None:
         with self._gui.add_folder("Anchors"):
             self._pinning = self._gui.add_checkbox("Click on tissue pins one", True)
             self._anchor_rows = self._gui.add_html("")
-            self._chosen = self._gui.add_dropdown("Anchor", (NONE,))
+            self._chosen = self._gui.add_dropdown("Anchor", (NONE,), hint="or click on it in the scene")
+            self._other = self._gui.add_dropdown("Distance to", (NONE,), hint="the one clicked before")
+            self._distance = self._gui.add_html("")
             remove = self._gui.add_button("Remove", icon=viser.Icon.TRASH)
 
         @remove.on_click
@@ -145,14 +234,30 @@ class Panel:
     def _build_pictures(self) -> None:
         panel = self._gui.add_panel()
         with panel.add_tab("Pictures and figures"):
+            views = tuple(VIEWS)
+            self._view = self._gui.add_dropdown("Show", views, initial_value=views[0])
             self._pictures = self._gui.add_image(
-                self._sheet.draw(Moment()), format="jpeg", jpeg_quality=JPEG_QUALITY
+                self._sheet.draw(self._moment, views[0]), format="jpeg", jpeg_quality=JPEG_QUALITY
             )
+            self._depth = self._gui.add_html("")
+            with self._gui.add_folder("Depth colours", expand_by_default=False):
+                self._auto = self._gui.add_checkbox("Follow the tissue", True)
+                self._near = self._gui.add_number("Near (mm)", 50.0, min=1.0, max=1000.0)
+                self._far = self._gui.add_number("Far (mm)", 150.0, min=1.0, max=1000.0)
+            latencies = {"p50": BLUE, "p99": ORANGE, "overlay": GREEN}
             self._plots = [
                 self._plot("Rate (Hz)", {"rate": BRIGHT}),
-                self._plot("Latency (ms): p50 blue, p99 orange", {"p50": BLUE, "p99": ORANGE}),
-                self._plot("PSNR on tissue (dB)", {"psnr": BRIGHT}),
+                self._plot("Latency (ms): p50 blue, p99 orange, overlay green", latencies),
+                self._plot("Rung of the ladder of quality", {"rung": BRIGHT}),
             ]
+
+        @self._auto.on_update
+        def _(event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
+            """Fixed colours begin as they are."""
+            if not event.target.value:
+                near, far = self._sheet.shown
+                self._near.value, self._far.value = round(near / UNIT), round(far / UNIT)
+
         panel.dock_left()
         panel.set_width(PICTURES_WIDTH)
 
@@ -175,29 +280,63 @@ class Panel:
 
     # ---- anchors -------------------------------------------------------------------------------------
 
-    def _pin(self, event: viser.SceneClickEvent) -> None:
-        if not self._pinning.value:
-            return
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """A click on an anchor chooses it; one on the tissue pins a new one."""
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        hit = self._scene.anchor_at(origin, direction)
+        if hit is not None:
+            self._choose(hit)
+        elif self._pinning.value:
+            self._pin(event.client, origin * UNIT, direction)
+
+    def _pin(self, client: viser.ClientHandle | None, origin: F64, direction: F64) -> None:
         splats = self._scene.splats
-        if splats is None:
-            tell(event.client, "Pin", "there is nothing to pin to now", "orange")
+        if splats is None or self.frozen:
+            why = "what you see is old: Go on first" if self.frozen else "there is nothing to pin to now"
+            tell(client, "Pin", why, "orange")
             return
-        origin, direction = np.array(event.ray_origin) * UNIT, np.array(event.ray_direction)
         point = splats.hit(origin, direction)
         if point is None:
-            tell(event.client, "Pin", "no tissue there", "orange")
+            tell(client, "Pin", "no tissue there", "orange")
             return
         place = {axis: float(x) for axis, x in zip("xyz", point, strict=True)}
-        self._asker.ask(event.client, "Pin", "add_anchor", place)
+        answer = self._asker.ask(client, "Pin", "add_anchor", place)
+        if answer is not None:
+            self._choose(int(answer["id"]))
+
+    def _choose(self, anchor: int) -> None:
+        """The one chosen before is what the distance is measured to."""
+        before = self._chosen.value
+        for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
+            if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
+                choice.options = (*choice.options, chosen)
+            choice.value = chosen
 
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
         rows = [] if anchors is None else list(anchors)
         self._anchor_rows.content = _anchor_table(rows, self._unit)
         if anchors is None:  # nothing fresh came: what somebody has chosen stays
+            self._distance.content = ""
             return
         numbers = (NONE, *(str(int(row["id"])) for row in rows))
-        if self._chosen.options != numbers:
-            self._chosen.options = numbers  # viser keeps the choice while it is there
+        for choice in (self._chosen, self._other):
+            if choice.options != numbers:
+                choice.options = numbers  # viser keeps the choice while it is there
+        by_number = {str(int(row["id"])): row for row in rows}
+        first, second = (by_number.get(choice.value) for choice in (self._chosen, self._other))
+        apart = None if first is None or second is None else distance(first, second, self._unit)
+        self._distance.content = "" if apart is None else _line(apart)
+
+
+def distance(first: Any, second: Any, unit: str) -> str:
+    """How far two anchors, rows of `anchors`, are apart in a straight line; a guess is said to be one."""
+    apart = float(np.linalg.norm([first[axis] - second[axis] for axis in "xyz"])) / UNIT
+    if not np.isfinite(apart):
+        return "Distance: one of them is lost"
+    sure = all(
+        row["confidence"] >= SURE_OF_ANCHOR and row["depth_confidence"] >= SURE for row in (first, second)
+    )
+    return f"Distance: {apart:.1f} {unit}" + ("" if sure else ", a guess: one is not sure")
 
 
 def _recording(folder: viser.GuiTextHandle, keep: viser.GuiNumberHandle[float]) -> dict[str, Any]:
@@ -239,10 +378,25 @@ def _warnings(status: Status) -> str:
     )
 
 
+def _line(text: str) -> str:
+    return f'<div style="padding:0 1em;font-size:0.9em">{html.escape(text)}</div>'
+
+
+def _overlay_table(overlay: Overlay | None) -> str:
+    """Each object of the overlay, and how it does."""
+    if overlay is None:
+        return _line("none runs here: sags overlay")
+    said = [f"blank: {overlay.reason}"] if overlay.reason else []
+    for thing in overlay.objects:
+        unsure = f"not sure: {thing.unsure}" if thing.unsure else "sure"
+        said.append(f"{thing.name}: {f'not drawn: {thing.reason}' if thing.reason else unsure}")
+    return "".join(map(_line, said))
+
+
 def _anchor_table(rows: list[Any], unit: str) -> str:
     """Where each anchor is, and how sure it is."""
     if not rows:
-        return '<div style="padding:0 1em;opacity:0.7">none yet</div>'
+        return _line("none yet")
     cells = []
     for row in rows:
         place = " ".join(f"{row[axis] / UNIT:.1f}" for axis in "xyz") if np.isfinite(row["x"]) else "lost"

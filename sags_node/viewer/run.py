@@ -14,10 +14,13 @@ from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.viewer.feed import Feed, Moment
 from sags_node.viewer.panel import Asker, Panel
+from sags_node.viewer.pictures import needs_of, overlaid_in
 from sags_node.viewer.scene import Scene
 from sags_node.viewer.server import serving
 
-RATE = 4.0  # Hz, at first
+RATE = 20.0  # Hz, at first
+PULLED = 5.0  # Hz; for fewer updates each frame is asked for, for more the node sends all
+FROZEN_PERIOD = 0.5  # s between two looks at whether it goes on
 IDLE_WAIT = 0.25  # s between looks for a browser
 BROWSER_TIME = 2.0  # s that a browser may take to show an update
 
@@ -48,6 +51,7 @@ def run_viewer(
             scene = Scene(server)
             panel = Panel(server, scene, Asker(node), node.ns, RATE)
             server.on_client_connect(scene.look)
+            server.on_client_connect(panel.fit)
             ready(url, server.get_port())
             with redirect_stdout(sys.stderr):  # what viser has to say; stdout is for machines
                 _follow(server, feed, scene, panel, stop)
@@ -56,22 +60,42 @@ def run_viewer(
 
 
 def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:
-    """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows."""
+    """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows.
+
+    The scene costs a browser without a graphics card much. There it is brought up to date more seldom than
+    the pictures: in half of the browser's time at most.
+    """
+    period, scene_due = 0.0, 0.0
     while not stop.is_set():
+        began = time.monotonic()
         if not server.get_clients():
+            feed.pause()
+            panel.go_on()
             scene.show(Moment())
             stop.wait(IDLE_WAIT)
             continue
-        began = time.monotonic()
-        moment = feed.now()
-        scene.show(moment)
-        panel.show(moment)
+        if panel.frozen:
+            feed.pause()
+            panel.stay()
+            stop.wait(FROZEN_PERIOD)
+            continue
+        moment = feed.now(needs_of(panel.view), overlaid_in(panel.view), steady=period < 1 / PULLED)
+        whole = moment.problem is not None or time.monotonic() >= scene_due
+        with server.atomic():
+            if whole:
+                scene.show(moment)
+            panel.show(moment)
+        server.flush()
         sent = time.monotonic()
         for client in server.get_clients().values():
             _await(client)
         answered = time.monotonic()
+        took, least = answered - sent, 1 / panel.rate
+        scene_due = answered + took if whole else scene_due
         # Half of the browser's time at most is for taking in updates; the rest is the user's.
-        stop.wait(max(began + 1 / panel.rate - answered, answered - sent))
+        rest = 0.0 if whole and took > least else took
+        stop.wait(max(began + least - answered, rest))
+        period = time.monotonic() - began
 
 
 def _await(client: viser.ClientHandle) -> None:

@@ -1,0 +1,62 @@
+"""The depth under the cursor, looked up by the page itself: what a browser points at does not come here."""
+
+from __future__ import annotations
+
+import base64
+
+import numpy as np
+
+from sags_node.confidence import SURE
+from sags_node.viewer.feed import CONFIDENCE, DEPTH, Moment
+from sags_node.viewer.pictures import BAR, COLUMNS, VIEWS
+
+STEP = 1e-4  # m
+GUESS = 1 << 15  # the bit of a depth that is none to trust; 0: none is known
+# Runs in the page. A picture's depth lies behind it as base64 of little-endian uint16.
+SCRIPT = """<script>
+(() => {
+  let at = null;
+  addEventListener("mousemove", ({ target, offsetX, offsetY }) => {
+    at = target.tagName !== "IMG" ? null
+      : [offsetX / target.clientWidth, offsetY / target.clientHeight, target];
+  });
+  setInterval(() => {
+    const told = document.getElementById("sags-depth");
+    if (told === null) return;
+    const { columns, rows, bar, left, width, height, depths, unit } = told.dataset;
+    const [across, down] = at === null || !at[2].isConnected ? [-1, -1] : [at[0] * columns, at[1] * rows];
+    const tile = Math.floor(down) * columns + Math.floor(across);
+    const v = (down - Math.floor(down) - bar) / (1 - bar);
+    told.textContent = "Depth: point at a picture";
+    if (across < 0 || v < 0 || left[tile] !== "1") return;
+    const place = Math.floor(v * height) * width + Math.floor((across - Math.floor(across)) * width);
+    const bytes = atob(depths), depth = bytes.charCodeAt(2 * place) + 256 * bytes.charCodeAt(2 * place + 1);
+    const said = ((depth & 0x7fff) / 10).toFixed(1) + " " + unit;
+    told.textContent = "Depth: " + (depth ? said + (depth >> 15 ? ", a guess" : "") : "not known there");
+  }, 100);
+})();
+</script>"""
+
+
+def depth_line(moment: Moment, view: str, height: int, unit: str) -> str:
+    """The line below a sheet of that height (px) that tells the depth; empty where none is shown."""
+    names = VIEWS[view]
+    depth, confidence = moment.pictures.get(DEPTH), moment.pictures.get(CONFIDENCE)
+    if "Depth" not in names or depth is None or confidence is None or depth.shape != confidence.shape:
+        return ""
+    steps = np.nan_to_num(depth / STEP, nan=0.0).clip(0, GUESS - 1).round().astype("<u2")
+    steps[(confidence < SURE) & (steps > 0)] += GUESS
+    columns = min(COLUMNS, len(names))
+    rows = -(-len(names) // columns)
+    data = {
+        "columns": columns,
+        "rows": rows,
+        "bar": BAR * rows / height,
+        "left": "".join(str(int(not name.startswith("Right"))) for name in names),
+        "width": depth.shape[1],
+        "height": depth.shape[0],
+        "unit": unit,
+        "depths": base64.b64encode(steps.tobytes()).decode(),
+    }
+    attributes = " ".join(f'data-{name}="{value}"' for name, value in data.items())
+    return f'<div id="sags-depth" style="padding:0 1em;font-size:0.9em" {attributes}>Depth</div>'
