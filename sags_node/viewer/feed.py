@@ -67,7 +67,7 @@ class Status(msgspec.Struct, frozen=True):
 
     state: str = ""  # "" before it has said anything
     rate_hz: float = 0.0
-    latency_ms: dict[str, float] = {}
+    latency_ms: dict[str, float | None] = {}
     gaussians: int = 0
     rung: Rung | None = None
     last_error: str | None = None

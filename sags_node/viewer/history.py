@@ -14,7 +14,7 @@ from sags_node.viewer.feed import Moment
 PERIOD = 1.0  # s between two points
 GAP = 10.0  # s without a point
 LENGTH = 120  # points
-FIGURES = ("rate", "p50", "p99", "overlay", "rung")
+FIGURES = ("rate", "p50", "p99", "rung")
 
 
 class History:
@@ -33,11 +33,10 @@ class History:
             return True
         if moment.problem is not None or (self._points and since < PERIOD):
             return False
-        status, overlay = moment.status, moment.overlay
-        p50, p99 = (status.latency_ms.get(name, np.nan) for name in ("p50", "p99"))
-        overlaid = (None if overlay is None else overlay.latency_ms.get("p50")) or np.nan
+        status = moment.status
+        p50, p99 = (status.latency_ms.get(name) or np.nan for name in ("p50", "p99"))
         rung = np.nan if status.rung is None else float(status.rung.number)
-        self._points.append((now, status.rate_hz, p50, p99, overlaid, rung))
+        self._points.append((now, status.rate_hz, p50, p99, rung))
         return True
 
     def series(self, *figures: str) -> tuple[F64, ...]:

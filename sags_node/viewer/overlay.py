@@ -18,23 +18,17 @@ WAIT = 0.1  # s for the overlay of a frame: it takes some ms to draw
 SILENT_AFTER = 2.5  # s without a `status`, which comes every second
 
 
-class Held(msgspec.Struct, frozen=True):
-    """An anchor of an object."""
-
-    id: int
-
-
 class Thing(msgspec.Struct, frozen=True):
     """An object of the overlay."""
 
     name: str
     reason: str | None = None  # why it is not drawn
     unsure: str | None = None  # why its place is not sure
-    anchors: tuple[Held, ...] = ()
+    anchors: tuple[dict[str, float | None], ...] = ()
 
 
 class Overlay(msgspec.Struct, frozen=True):
-    """What the overlay says of itself."""
+    """What the overlay says of itself, see docs/wire.md."""
 
     state: str = ""
     reason: str | None = None  # why it is blank
@@ -67,12 +61,11 @@ class OverlayFeed:
 
     def pictures(self, eyes: Iterable[str], stamp_ns: int) -> dict[str, U8]:
         """[H, W, 4] of each eye, of exactly the frame captured at `stamp_ns`; empty where there is none."""
-        said = self.says()
-        names = [EYES[eye] for eye in eyes]
+        names, said = {eye: EYES[eye] for eye in eyes}, self.says()
         if not names or said is None or said.state != "running":
             return {}
-        frame = self._subscriber.aligned(names, stamp_ns, WAIT) or {}
-        return {eye: frame[name].array for eye, name in EYES.items() if name in frame}
+        frame = self._subscriber.aligned(names.values(), stamp_ns, WAIT)
+        return {} if frame is None else {eye: frame[name].array for eye, name in names.items()}
 
     def close(self) -> None:
         self._subscriber.close()

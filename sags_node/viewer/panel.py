@@ -22,17 +22,16 @@ from sags_node.viewer.feed import Moment, Status
 from sags_node.viewer.history import LENGTH, PERIOD, History
 from sags_node.viewer.overlay import Overlay
 from sags_node.viewer.pictures import VIEWS, Sheet
-from sags_node.viewer.saving import KINDS, exported, name_of, screenshot
+from sags_node.viewer.saving import KINDS, exported, screenshot
 from sags_node.viewer.scene import UNIT, Scene
 
 ANSWER_TIME = 20.0  # s; recordings take seconds
-PICTURES_WIDTH = 480  # px
-NARROW = 500  # px of the scene beside both panels: a narrower one gets the place of the controls
+WIDTH = 480  # px, of pictures and controls
 PLOT_HEIGHT = 80  # px
 NOTICE_TIME = 6.0  # s
 JPEG_QUALITY = 80
 NONE = "-"  # no anchor chosen
-BRIGHT, BLUE, ORANGE, GREEN = "#c9d1d9", "#4dabf7", "#ffa94d", "#51cf66"
+BRIGHT, BLUE, ORANGE = "#c9d1d9", "#4dabf7", "#ffa94d"
 
 
 class Asker:
@@ -100,14 +99,11 @@ class Panel:
         return self._frozen_since is not None
 
     def fit(self, client: viser.ClientHandle) -> None:
-        """Leave room for the scene in a narrow browser: its controls begin as a bar."""
-        if client.camera.image_width < NARROW:
-            client.gui.main_panel.minimize()
+        """Leave half of a narrow browser to the scene."""
+        client.gui.main_panel.set_width(min(WIDTH, client.camera.image_width // 2))
 
     def show(self, moment: Moment) -> None:
         """Bring status, pictures, plots and the list of anchors up to date."""
-        if self.frozen:  # since the moment was asked for
-            return
         self._moment = moment
         self._unit = "no unit" if "uncalibrated" in moment.status.warning_codes else "mm"
         self._status.content = status_line(moment)
@@ -140,42 +136,24 @@ class Panel:
 
     # ---- building ------------------------------------------------------------------------------------
 
+    def _button(
+        self, label: str, icon: viser.IconName, do: Callable[[viser.ClientHandle], None]
+    ) -> viser.GuiButtonHandle:
+        button = self._gui.add_button(label, icon=icon)
+
+        @button.on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            if event.client is not None:
+                do(event.client)
+
+        return button
+
     def _build_keeping(self) -> None:
-        self._freeze = self._gui.add_button("Freeze", icon=viser.Icon.SNOWFLAKE)
-
-        @self._freeze.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            if self.frozen:
-                self.go_on()
-            else:
-                self._frozen_since, self._freeze.label = time.monotonic(), "Go on"
-
-        @self._gui.add_button("Screenshot", icon=viser.Icon.CAMERA).on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            client = event.client
-            if client is not None:
-                sheet = self._pictures.image
-                self._send(client, "Screenshot", ".png", lambda: screenshot(client, sheet))
-
+        self._freeze = self._button("Freeze", viser.Icon.SNOWFLAKE, lambda _: self._freeze_or_go_on())
+        self._button("Screenshot", viser.Icon.CAMERA, self._screenshot)
         with self._gui.add_folder("Export", expand_by_default=False):
-            kind = self._gui.add_dropdown("What", tuple(KINDS))
-
-            @self._gui.add_button("Download", icon=viser.Icon.DOWNLOAD).on_click
-            def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-                if event.client is not None:
-                    what, moment = kind.value, self._moment
-                    ending = f"_{what}{KINDS[what]}"
-                    self._send(event.client, f"Export {what}", ending, lambda: exported(moment, what))
-
-    def _send(self, client: viser.ClientHandle, title: str, suffix: str, make: Callable[[], bytes]) -> None:
-        """A file of this moment, to the browser that asked."""
-        name = name_of(self._moment, suffix)
-        try:
-            client.send_file_download(name, make(), save_immediately=True)
-        except SagsError as error:
-            tell(client, f"{title}: refused", str(error), "red")
-        else:
-            tell(client, title, name, "green")
+            self._kind = self._gui.add_dropdown("What", KINDS)
+            self._button("Download", viser.Icon.DOWNLOAD, self._export)
 
     def _build_view(self, rate: float) -> None:
         buttons = self._gui.add_button_group("Look from", ("aside", "left camera"))
@@ -194,15 +172,7 @@ class Panel:
             self._chosen = self._gui.add_dropdown("Anchor", (NONE,), hint="or click on it in the scene")
             self._other = self._gui.add_dropdown("Distance to", (NONE,), hint="the one clicked before")
             self._distance = self._gui.add_html("")
-            remove = self._gui.add_button("Remove", icon=viser.Icon.TRASH)
-
-        @remove.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            if self._chosen.value == NONE:
-                tell(event.client, "Remove", "choose an anchor first", "orange")
-                return
-            anchor = int(self._chosen.value)
-            self._asker.ask(event.client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
+            self._button("Remove", viser.Icon.TRASH, self._remove)
 
     def _build_node(self) -> None:
         with self._gui.add_folder("Node"):
@@ -226,28 +196,24 @@ class Panel:
         args: Callable[[], Mapping[str, Any]] = dict,
     ) -> None:
         """A button for one operation of the node."""
-
-        @self._gui.add_button(label, icon=icon).on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            self._asker.ask(event.client, label, op, args())
+        self._button(label, icon, lambda client: self._asker.ask(client, label, op, args()))
 
     def _build_pictures(self) -> None:
         panel = self._gui.add_panel()
         with panel.add_tab("Pictures and figures"):
             views = tuple(VIEWS)
             self._view = self._gui.add_dropdown("Show", views, initial_value=views[0])
+            self._depth = self._gui.add_html("")
             self._pictures = self._gui.add_image(
                 self._sheet.draw(self._moment, views[0]), format="jpeg", jpeg_quality=JPEG_QUALITY
             )
-            self._depth = self._gui.add_html("")
             with self._gui.add_folder("Depth colours", expand_by_default=False):
                 self._auto = self._gui.add_checkbox("Follow the tissue", True)
                 self._near = self._gui.add_number("Near (mm)", 50.0, min=1.0, max=1000.0)
                 self._far = self._gui.add_number("Far (mm)", 150.0, min=1.0, max=1000.0)
-            latencies = {"p50": BLUE, "p99": ORANGE, "overlay": GREEN}
             self._plots = [
                 self._plot("Rate (Hz)", {"rate": BRIGHT}),
-                self._plot("Latency (ms): p50 blue, p99 orange, overlay green", latencies),
+                self._plot("Latency (ms): p50 blue, p99 orange", {"p50": BLUE, "p99": ORANGE}),
                 self._plot("Rung of the ladder of quality", {"rung": BRIGHT}),
             ]
 
@@ -258,8 +224,7 @@ class Panel:
                 near, far = self._sheet.shown
                 self._near.value, self._far.value = round(near / UNIT), round(far / UNIT)
 
-        panel.dock_left()
-        panel.set_width(PICTURES_WIDTH)
+        panel.dock_above(self._gui.main_panel)
 
     def _plot(self, title: str, figures: Mapping[str, str]) -> tuple[viser.GuiUplotHandle, tuple[str, ...]]:
         """A plot of figures (name -> colour) over the last minutes."""
@@ -278,7 +243,37 @@ class Panel:
         )
         return plot, tuple(figures)
 
-    # ---- anchors -------------------------------------------------------------------------------------
+    # ---- what is asked for ---------------------------------------------------------------------------
+
+    def _freeze_or_go_on(self) -> None:
+        if self.frozen:
+            self.go_on()
+        else:
+            self._frozen_since, self._freeze.label = time.monotonic(), "Go on"
+
+    def _screenshot(self, client: viser.ClientHandle) -> None:
+        self._send(client, "Screenshot", ".png", lambda: screenshot(client, self._pictures.image))
+
+    def _export(self, client: viser.ClientHandle) -> None:
+        kind, moment = self._kind.value, self._moment
+        self._send(client, f"Export {kind}", f"_{kind}.ply", lambda: exported(moment, kind))
+
+    def _send(self, client: viser.ClientHandle, title: str, ending: str, make: Callable[[], bytes]) -> None:
+        """A file of this moment, named by its time."""
+        name = time.strftime("sags_%Y%m%d_%H%M%S", time.localtime(self._moment.t_capture_ns * 1e-9)) + ending
+        try:
+            client.send_file_download(name, make(), save_immediately=True)
+        except SagsError as error:
+            tell(client, f"{title}: refused", str(error), "red")
+        else:
+            tell(client, title, name, "green")
+
+    def _remove(self, client: viser.ClientHandle) -> None:
+        if self._chosen.value == NONE:
+            tell(client, "Remove", "choose an anchor first", "orange")
+            return
+        anchor = int(self._chosen.value)
+        self._asker.ask(client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         """A click on an anchor chooses it; one on the tissue pins a new one."""
@@ -357,7 +352,7 @@ def status_line(moment: Moment) -> str:
     if moment.problem is not None:
         color, text = "#ff922b", moment.problem
     else:
-        latency = status.latency_ms.get("p50", np.nan)
+        latency = status.latency_ms.get("p50") or np.nan
         figures = f"{status.rate_hz:.1f} Hz, {latency:.0f} ms, {status.gaussians} Gaussians"
         if status.rung is not None:
             figures += f", rung {status.rung.number} of 0 to {status.rung.of - 1}"
@@ -386,7 +381,8 @@ def _overlay_table(overlay: Overlay | None) -> str:
     """Each object of the overlay, and how it does."""
     if overlay is None:
         return _line("none runs here: sags overlay")
-    said = [f"blank: {overlay.reason}"] if overlay.reason else []
+    latency = overlay.latency_ms.get("p50")
+    said = [f"blank: {overlay.reason}" if overlay.reason else f"{latency or 0:.0f} ms after the camera"]
     for thing in overlay.objects:
         unsure = f"not sure: {thing.unsure}" if thing.unsure else "sure"
         said.append(f"{thing.name}: {f'not drawn: {thing.reason}' if thing.reason else unsure}")

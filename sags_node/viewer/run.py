@@ -20,8 +20,7 @@ from sags_node.viewer.server import serving
 
 RATE = 20.0  # Hz, at first
 PULLED = 5.0  # Hz; for fewer updates each frame is asked for, for more the node sends all
-FROZEN_PERIOD = 0.5  # s between two looks at whether it goes on
-IDLE_WAIT = 0.25  # s between looks for a browser
+IDLE_WAIT = 0.25  # s between looks for a browser, and for whether a frozen page goes on
 BROWSER_TIME = 2.0  # s that a browser may take to show an update
 
 
@@ -60,14 +59,9 @@ def run_viewer(
 
 
 def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:
-    """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows.
-
-    The scene costs a browser without a graphics card much. There it is brought up to date more seldom than
-    the pictures: in half of the browser's time at most.
-    """
-    period, scene_due = 0.0, 0.0
+    """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows."""
+    period = 0.0
     while not stop.is_set():
-        began = time.monotonic()
         if not server.get_clients():
             feed.pause()
             panel.go_on()
@@ -77,24 +71,22 @@ def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, s
         if panel.frozen:
             feed.pause()
             panel.stay()
-            stop.wait(FROZEN_PERIOD)
+            stop.wait(IDLE_WAIT)
             continue
+        began = time.monotonic()
         moment = feed.now(needs_of(panel.view), overlaid_in(panel.view), steady=period < 1 / PULLED)
-        whole = moment.problem is not None or time.monotonic() >= scene_due
+        if panel.frozen:  # meanwhile
+            continue
         with server.atomic():
-            if whole:
-                scene.show(moment)
+            scene.show(moment)
             panel.show(moment)
         server.flush()
         sent = time.monotonic()
         for client in server.get_clients().values():
             _await(client)
         answered = time.monotonic()
-        took, least = answered - sent, 1 / panel.rate
-        scene_due = answered + took if whole else scene_due
         # Half of the browser's time at most is for taking in updates; the rest is the user's.
-        rest = 0.0 if whole and took > least else took
-        stop.wait(max(began + least - answered, rest))
+        stop.wait(max(began + 1 / panel.rate - answered, answered - sent))
         period = time.monotonic() - began
 
 

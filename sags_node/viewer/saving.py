@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,12 +15,7 @@ from sags_node.types import U8
 from sags_node.viewer.feed import Moment
 
 RENDER_TIME = 20.0  # s that a browser may take to draw its scene once more
-KINDS = {"mesh": ".ply", "points": ".ply", "splats": ".ply"}
-
-
-def name_of(moment: Moment, suffix: str) -> str:
-    """A file name that says when the moment was captured."""
-    return time.strftime("sags_%Y%m%d_%H%M%S", time.localtime(moment.t_capture_ns * 1e-9)) + suffix
+KINDS = ("mesh", "points", "splats")
 
 
 def screenshot(client: viser.ClientHandle, sheet: U8) -> bytes:
@@ -53,9 +47,9 @@ def exported(moment: Moment, kind: str) -> bytes:
     if moment.splats is None or moment.camera is None:
         raise SagsError(f"there is no model now: {moment.problem}")
     if "uncalibrated" in moment.status.warning_codes:
-        raise SagsError("the node has no calibration, so its lengths have no unit, and files are in metres")
+        raise SagsError("without a calibration lengths have no unit, and files are in metres")
     scene = Scene(gaussians_of(moment.splats), moment.camera, moment.t_capture_ns)
     with TemporaryDirectory(prefix="sags-view-") as folder:
-        file = Path(folder, f"model{KINDS[kind]}")
+        file = Path(folder, "model.ply")
         export(scene, {kind: file}, Orbit(0.0, 0.0), lambda *progress: None)
         return file.read_bytes()

@@ -159,7 +159,7 @@ class Scene:
 def names_of(overlay: Overlay) -> dict[int, str]:
     """Of each anchor that holds an object of the overlay: what that is, with a `?` where it is not sure."""
     return {
-        anchor.id: thing.name + ("" if thing.unsure is None else " ?")
+        int(anchor["id"] or 0): thing.name + ("" if thing.unsure is None else " ?")
         for thing in overlay.objects
         for anchor in thing.anchors
     }
