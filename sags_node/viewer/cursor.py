@@ -16,24 +16,25 @@ GUESS = 1 << 15  # the bit of a depth that is none to trust; 0: none is known
 SCRIPT = """<script>
 (() => {
   let at = null;
-  addEventListener("mousemove", ({ target, offsetX, offsetY }) => {
-    at = target.tagName !== "IMG" ? null
-      : [offsetX / target.clientWidth, offsetY / target.clientHeight, target];
-  });
-  setInterval(() => {
-    const told = document.getElementById("sags-depth");
-    if (told === null) return;
-    const { columns, rows, bar, left, width, height, depths, unit } = told.dataset;
+  const depth = ({ columns, rows, bar, left, width, height, depths, unit }) => {
     const [across, down] = at === null || !at[2].isConnected ? [-1, -1] : [at[0] * columns, at[1] * rows];
-    const tile = Math.floor(down) * columns + Math.floor(across);
-    const v = (down - Math.floor(down) - bar) / (1 - bar);
-    told.textContent = "Depth: point at a picture";
-    if (across < 0 || v < 0 || left[tile] !== "1") return;
-    const place = Math.floor(v * height) * width + Math.floor((across - Math.floor(across)) * width);
-    const bytes = atob(depths), depth = bytes.charCodeAt(2 * place) + 256 * bytes.charCodeAt(2 * place + 1);
-    const said = ((depth & 0x7fff) / 10).toFixed(1) + " " + unit;
-    told.textContent = "Depth: " + (depth ? said + (depth >> 15 ? ", a guess" : "") : "not known there");
-  }, 100);
+    const column = Math.floor(across), row = Math.floor(down), v = (down - row - bar) / (1 - bar);
+    if (across < 0 || v < 0 || left[row * columns + column] !== "1") return "point at a picture";
+    const place = 2 * (Math.floor(v * height) * width + Math.floor((across - column) * width));
+    const bytes = atob(depths), steps = bytes.charCodeAt(place) + 256 * bytes.charCodeAt(place + 1);
+    const said = ((steps & 0x7fff) / 10).toFixed(1) + " " + unit;
+    return steps ? said + (steps >> 15 ? ", a guess" : "") : "not known there";
+  };
+  const tell = () => {
+    const line = document.getElementById("sags-depth"), text = line && "Depth: " + depth(line.dataset);
+    if (line && line.textContent !== text) line.textContent = text;
+  };
+  addEventListener("mousemove", ({ target, offsetX, offsetY }) => {
+    const { clientWidth, clientHeight } = target;
+    at = target.tagName === "IMG" ? [offsetX / clientWidth, offsetY / clientHeight, target] : null;
+    tell();
+  });
+  new MutationObserver(tell).observe(document, { childList: true, subtree: true });
 })();
 </script>"""
 

@@ -64,10 +64,9 @@ def test_a_node_of_two_frames_a_second_is_shown_too(tmp_path: Path) -> None:
         feed.close()
 
 
-def test_a_frame_without_a_picture_that_is_looked_at_is_not_shown_as_whole(tmp_path: Path) -> None:
-    plane = plane_result()
-    no_model = replace(plane, views={})
-    with node_sockets(tmp_path / "run") as running, making(running, no_model):
+def test_of_a_frame_that_was_not_taken_in_its_picture_alone_is_shown(tmp_path: Path) -> None:
+    held = replace(plane_result(), held="blurred")
+    with node_sockets(tmp_path / "run") as running, making(running, held):
         feed = Feed(NodeAddress(run_dir=tmp_path / "run"))
         until(lambda: LEFT in feed.now(FOUR).pictures)
         moment = feed.now(FOUR)
