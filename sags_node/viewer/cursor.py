@@ -43,7 +43,7 @@ def depth_line(moment: Moment, view: str, height: int, unit: str) -> str:
     """The line below a sheet of that height (px) that tells the depth; empty where none is shown."""
     names = VIEWS[view]
     depth, confidence = moment.pictures.get(DEPTH), moment.pictures.get(CONFIDENCE)
-    if "Depth" not in names or depth is None or confidence is None or depth.shape != confidence.shape:
+    if depth is None or confidence is None or depth.shape != confidence.shape:
         return ""
     steps = np.nan_to_num(depth / STEP, nan=0.0).clip(0, GUESS - 1).round().astype("<u2")
     steps[(confidence < SURE) & (steps > 0)] += GUESS

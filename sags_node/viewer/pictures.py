@@ -17,7 +17,7 @@ from sags_node.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, RIGHT_M
 NEEDS = {
     "Left input": (LEFT,),
     "Model": (MODEL,),
-    "Depth": (DEPTH, CONFIDENCE, TISSUE),
+    "Depth": (DEPTH, TISSUE),
     "Error on tissue": (LEFT, MODEL, TISSUE),
     "Right input": (RIGHT,),
     "Right model": (RIGHT_MODEL,),
@@ -30,7 +30,7 @@ VIEWS = {
     "Input, model, depth, error": ("Left input", "Model", "Depth", "Error on tissue"),
     "Input": ("Left input",),
     "Model": ("Model",),
-    "Depth": ("Depth",),
+    "Depth under the cursor": ("Left input", "Depth"),
     "Right eye": ("Right input", "Right model"),
     "Stereo input": ("Left input", "Right input"),
     "Stereo model": ("Model", "Right model"),
@@ -105,8 +105,9 @@ class Sheet:
 
 
 def needs_of(view: str) -> list[str]:
-    """The topics of its pictures."""
-    return [topic for name in VIEWS[view] for topic in NEEDS[name]]
+    """The topics of its pictures; how sure a depth is costs the node too much where nobody asks for numbers."""
+    sure = [CONFIDENCE] if view == "Depth under the cursor" else []
+    return sure + [topic for name in VIEWS[view] for topic in NEEDS[name]]
 
 
 def overlaid_in(view: str) -> list[str]:

@@ -34,7 +34,7 @@ from sags_node.viewer import splats as viewer_splats
 from sags_node.viewer.cursor import depth_line
 from sags_node.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, TISSUE, Moment, Rung, Status
 from sags_node.viewer.history import GAP, History
-from sags_node.viewer.pictures import BAR, VIEWS, Sheet
+from sags_node.viewer.pictures import BAR, VIEWS, Sheet, needs_of
 from sags_node.viewer.splats import Splats, splats_of
 
 pytestmark = [pytest.mark.live, pytest.mark.alone]
@@ -177,23 +177,25 @@ def test_both_eyes_stand_side_by_side_and_the_overlay_lies_on_them() -> None:
 
 def test_the_range_of_the_depth_colours_is_that_which_is_asked_for() -> None:
     sheet = Sheet()
-    sheet.draw(moment(), "Depth")
+    sheet.draw(moment(), "Depth under the cursor")
     assert sheet.shown == pytest.approx((0.05, 0.08))
-    followed = sheet.draw(moment(), "Depth")[100, 50]
+    followed = sheet.draw(moment(), "Depth under the cursor")[100, -50]
     sheet.fixed = (0.01, 0.3)
-    fixed = sheet.draw(moment(), "Depth")[100, 50]
+    fixed = sheet.draw(moment(), "Depth under the cursor")[100, -50]
     assert sheet.shown == (0.01, 0.3) and (followed != fixed).any()
 
 
 def test_the_depth_under_the_cursor_is_the_drawn_one_and_a_guess_is_said_to_be_one() -> None:
-    line = depth_line(moment(), FOUR, 2 * (BAR + 288), "mm")
+    view = "Depth under the cursor"
+    assert {DEPTH, CONFIDENCE} <= set(needs_of(view)) and CONFIDENCE not in needs_of(FOUR)
+    line = depth_line(moment(), view, BAR + 288, "mm")
     told = dict(re.findall(r'data-(\w+)="([^"]*)"', line))
     steps = np.frombuffer(base64.b64decode(told["depths"]), "<u2").reshape(32, 40)
-    assert (told["columns"], told["rows"], told["left"]) == ("2", "2", "1111")
+    assert (told["columns"], told["rows"], told["left"]) == ("2", "1", "11")
     assert (steps[0] == 0).all(), "not known"
     assert (steps[1:16, 20:] == 500).all() and (steps[16:, 20:] == 800).all(), "tenths of mm"
     assert (steps[16:, :20] == 800 + 2**15).all(), "a guess"
-    assert depth_line(moment(), "Input", 300, "mm") == depth_line(Moment("gone"), FOUR, 300, "mm") == ""
+    assert depth_line(Moment("gone"), view, 300, "mm") == ""
 
 
 def test_figures_grow_by_the_second_and_go_after_a_gap() -> None:
@@ -413,6 +415,8 @@ def test_a_live_node_is_shown_obeys_and_disappears(
         page.get_by_role("option", name=str(number)).click()
         page.get_by_role("button", name="Remove", exact=True).click()
         until(lambda: anchors(subscriber) == {}, page)
+    page.get_by_label("Show", exact=True).click()
+    page.get_by_role("option", name="Depth under the cursor").click()
     picture = page.locator("img").first.bounding_box()
     page.mouse.move(picture["x"] + picture["width"] / 4, picture["y"] + 60)
     until(lambda: " mm" in str(page.locator("#sags-depth").text_content()), page)
