@@ -1,4 +1,4 @@
 """`sags view`: a running node in a web browser on this machine (extra `viewer`: viser).
 
-Imports evaluation, messaging and model.
+Imports evaluation, export, messaging and model.
 """

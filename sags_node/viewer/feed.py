@@ -231,4 +231,4 @@ def _camera(frame: Mapping[str, Received]) -> Camera | None:
 def known_depth(pictures: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
     """The depths (m) that the model knows, [k]."""
     depth = pictures.get(DEPTH, np.zeros(0, np.float32))
-    return depth[np.isfinite(depth)]
+    return np.asarray(depth[np.isfinite(depth)])

@@ -40,7 +40,7 @@ class OverlayFeed:
     """Follows the overlay, which may come and go; used from one thread."""
 
     def __init__(self, run_dir: Path | None) -> None:
-        rates = dict.fromkeys(EYES.values(), LEAST_HZ)
+        rates: dict[str, float] = dict.fromkeys(EYES.values(), LEAST_HZ)
         self._subscriber = Subscriber(
             EYES.values(), ns=NS, run_dir=run_dir, rates=rates, paused=True, may_be_absent=True
         )

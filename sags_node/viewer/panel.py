@@ -222,7 +222,8 @@ class Panel:
             """Fixed colours begin as they are."""
             if not event.target.value:
                 near, far = self._sheet.shown
-                self._near.value, self._far.value = round(near / UNIT), round(far / UNIT)
+                self._near.value = round(near / UNIT)  # type: ignore[misc]  # viser's setter, which mypy misses
+                self._far.value = round(far / UNIT)  # type: ignore[misc]  # as above
 
         panel.dock_above(self._gui.main_panel)
 
@@ -305,7 +306,7 @@ class Panel:
         for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
             if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
                 choice.options = (*choice.options, chosen)
-            choice.value = chosen
+            choice.value = chosen  # type: ignore[misc]  # as above
 
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
         rows = [] if anchors is None else list(anchors)

@@ -97,15 +97,18 @@ class Sheet:
         return None if drawn is None else _blended(picture, drawn)
 
     def _follow(self, model: Picture) -> None:
-        now, last = depth_range([model]), self._followed
-        if last is not None:
-            now = tuple(RANGE_MEMORY * a + (1 - RANGE_MEMORY) * b for a, b in zip(last, now, strict=True))
-        self._followed = now
-        self.shown = self.fixed or now
+        near, far = depth_range([model])
+        if self._followed is not None:
+            near, far = (
+                RANGE_MEMORY * last + (1 - RANGE_MEMORY) * now
+                for last, now in zip(self._followed, (near, far), strict=True)
+            )
+        self._followed = (near, far)
+        self.shown = self.fixed or self._followed
 
 
 def needs_of(view: str) -> list[str]:
-    """The topics of its pictures; how sure a depth is costs the node too much where nobody asks for numbers."""
+    """The topics of its pictures. The confidence of a depth costs the node too much where nobody reads it."""
     sure = [CONFIDENCE] if view == "Depth under the cursor" else []
     return sure + [topic for name in VIEWS[view] for topic in NEEDS[name]]
 
@@ -132,4 +135,4 @@ def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
 def _blended(picture: U8, drawn: U8) -> U8:
     """The overlay [H, W, 4], not premultiplied, over the picture [h, w, 3]."""
     small = cv2.resize(drawn, picture.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
-    return (picture + small[..., 3:] / 255 * (small[..., :3] - picture)).astype(np.uint8)
+    return np.asarray(picture + small[..., 3:] / 255 * (small[..., :3] - picture), np.uint8)
