@@ -133,8 +133,8 @@ class Feed:
                 self._frame = whole or self._frame
             return self._seen(subscriber, set(names), overlaid)
         finally:
-            if not steady:
-                self.pause()
+            if not steady:  # the overlay goes on: one that begins to draw has nothing of this frame
+                subscriber.pause()
 
     def pause(self) -> None:
         """Let nothing but `status` come until the next `now`."""

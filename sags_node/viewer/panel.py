@@ -26,7 +26,7 @@ from sags_node.viewer.saving import KINDS, exported, screenshot
 from sags_node.viewer.scene import UNIT, Scene
 
 ANSWER_TIME = 20.0  # s; recordings take seconds
-WIDTH = 480  # px, of pictures and controls
+WIDTH = 400  # px, of pictures and controls
 PLOT_HEIGHT = 80  # px
 NOTICE_TIME = 6.0  # s
 JPEG_QUALITY = 80

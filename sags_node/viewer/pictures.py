@@ -75,6 +75,9 @@ class Sheet:
             if tile is None:
                 text = f"{name}: nothing new"
             else:
+                text += (
+                    ": nothing is drawn" if name in OVERLAID and OVERLAID[name] not in moment.drawn else ""
+                )
                 sheet[top + BAR : top + high, left_edge : left_edge + TILE_WIDTH] = tile
             color = _MARKED if remark else (220, 220, 220)
             cv2.putText(sheet, text, (left_edge + 6, top + 17), _FONT, 0.5, color, 1, cv2.LINE_AA)
@@ -94,7 +97,7 @@ class Sheet:
         if name not in OVERLAID:
             return picture
         drawn = moment.drawn.get(OVERLAID[name])
-        return None if drawn is None else _blended(picture, drawn)
+        return picture if drawn is None else _blended(picture, drawn)
 
     def _follow(self, model: Picture) -> None:
         near, far = depth_range([model])

@@ -171,8 +171,8 @@ def test_both_eyes_stand_side_by_side_and_the_overlay_lies_on_them() -> None:
     assert (stereo[100, 50] == 90).all() and (stereo[100, half + 50] == 45).all()
     both = Sheet().draw(overlaid, "Stereo overlay")
     assert (both[100, 50] == 90).all() and (both[100, half - 50] == (250, 0, 0)).all()
-    empty = both[BAR:, half:]
-    assert (empty == empty[0, 0]).all(), "no overlay of the right eye came for this frame"
+    assert (both[BAR + 10 :, half:] == 45).all(), "no overlay of the right eye came for this frame"
+    assert (both[:BAR, half:] != stereo[:BAR, half:]).any(), "which is said"
 
 
 def test_the_range_of_the_depth_colours_is_that_which_is_asked_for() -> None:
