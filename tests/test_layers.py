@@ -26,11 +26,11 @@ LINES = {
     "sags_node": 1680,
     "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
-    "sags_node/cli": 3168,
+    "sags_node/cli": 3170,
     "sags_node/config": 1352,
     "sags_node/detail": 929,
     "sags_node/engine": 4071,
-    "sags_node/evaluation": 3085,
+    "sags_node/evaluation": 3086,
     "sags_node/export": 891,
     "sags_node/field": 1720,
     "sags_node/fitting": 1523,
@@ -50,9 +50,9 @@ LINES = {
     "sags_node/ros": 332,
     "sags_node/sources": 5666,
     "sags_node/terminal": 345,
-    "sags_node/viewer": 1007,
+    "sags_node/viewer": 1490,
     "sags_node/vision": 5462,
-    "tests": 45342,
+    "tests": 45591,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
