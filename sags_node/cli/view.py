@@ -32,8 +32,10 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     """Show a running node in a web browser on this machine.
 
     A page with the live model in 3D (drag turns, wheel zooms, right drag moves), the left camera and its
-    picture; beside it input, render, depth and error, rates and latencies; buttons to pause, reset and
-    record. A click on the tissue pins an anchor, which follows it.
+    picture; beside it pictures of your choice (input, model, depth, error, the right eye, stereo, the
+    overlay), rates and latencies; buttons to freeze a moment, to keep a screenshot or the model as a file,
+    and to pause, reset and record. A click on the tissue pins an anchor, which follows it; a click on an
+    anchor chooses it, and the distance to the one before is told.
 
     Nothing old is shown as new: what stops coming disappears within a second, and the line at the top right
     says why. The node may be started later and restarted.
@@ -50,6 +52,7 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     if importlib.util.find_spec("viser") is None:
         raise UsageError("sags view needs viser; install it with: pip install 'sags-node[viewer]'")
     from sags_node.clients.viewer.run import run_viewer
+    from sags_node.tools.export.moment import file_of
 
     os.nice(NICENESS)
 
@@ -61,4 +64,4 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
 
     stop = threading.Event()
     on_stop_signals(stop.set)
-    run_viewer(host, port, insecure, node, ready, stop=stop)
+    run_viewer(host, port, insecure, node, ready, export=file_of, stop=stop)

@@ -68,7 +68,7 @@ def tiles(picture: Picture, near: float, far: float) -> list[U8]:
         shrunk(picture.truth),
         shrunk(picture.render),
         depth_tile(picture, near, far),
-        _error_tile(picture),
+        error_tile(picture),
     ]
 
 
@@ -79,7 +79,8 @@ def depth_tile(picture: Picture, near: float, far: float) -> U8:
     return _with_bar(tile, cv2.COLORMAP_TURBO, f"{far * 1e3:.0f} mm", f"{near * 1e3:.0f} mm")
 
 
-def _error_tile(picture: Picture) -> U8:
+def error_tile(picture: Picture) -> U8:
+    """Difference of render and input on the tissue of one frame."""
     difference = cv2.absdiff(picture.truth, picture.render).astype(np.float32).mean(-1) / 255
     tile = shrunk(_coloured(difference / ERROR_AT_TOP, cv2.COLORMAP_INFERNO, picture.tissue))
     return _with_bar(tile, cv2.COLORMAP_INFERNO, "0", f"{ERROR_AT_TOP:.0%}")

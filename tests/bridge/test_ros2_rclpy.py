@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridging import anchored, bridged, senders, sockets
-from places import SESSION
+from places import ROOT, SESSION
 from ros_peers import DOMAIN, LARGE_BUFFERS, RosNode, listener, rclpy_python, ros_node
 from running_node import RunningNode
 from synthetic import at_frame, stream
@@ -180,3 +180,25 @@ def test_ros_pins_an_anchor_and_outlives_a_killed_bridge_and_a_killed_node(tmp_p
     finally:
         running.process.kill()
         running.process.wait(10)
+
+
+def test_the_example_publishes_where_the_tissue_is(tmp_path: Path) -> None:
+    """examples/ros2/follow_tissue.py, as its first lines say."""
+    where = "geometry_msgs/msg/PointStamped:/tissue_point:reliable"
+    running = RunningNode(SESSION, tmp_path, "source.pace:=realtime")
+    words = ["--ros-args", "-p", "u:=150.0", "-p", "v:=120.0"]
+    try:
+        with ros_node(where) as node, bridge(tmp_path / "run"):
+            example = subprocess.Popen(
+                [rclpy_python(), ROOT / "examples/ros2/follow_tissue.py", *words],
+                env=os.environ | {"ROS_DOMAIN_ID": str(DOMAIN)} | LARGE_BUFFERS,
+            )
+            try:
+                until(lambda: len(node.came["/tissue_point"]) > 3)
+            finally:
+                example.send_signal(signal.SIGINT)
+                assert example.wait(60) == 0
+    finally:
+        running.stop()
+    depths = [np.frombuffer(bytes.fromhex(each.data)[-8:], "<f8")[0] for each in node.came["/tissue_point"]]
+    assert 0.03 < np.median(depths) < 0.2, "metres, of tissue"

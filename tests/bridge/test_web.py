@@ -6,17 +6,21 @@ import json
 import shutil
 import socket
 import struct
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bridging import anchored, anchored_at, bridged, senders, sockets
+from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
 from thin_sender import making, node_sockets
 from waiting import until
@@ -285,3 +289,20 @@ def test_a_browser_draws_what_comes_and_goes_blank(page: Any, tmp_path: Path) ->
     for color, (u, v) in zip(colors, result.anchors.pixels[[0, 1, 3]].astype(int), strict=True):
         ring = raw["marks"][v - 8 : v + 9, u - 8 : u + 8].reshape(-1, 4).astype(int)
         assert np.abs(ring[np.argmax(ring[:, 3])][:3] - color).max() < 20
+
+
+def test_the_example_shows_the_model_in_a_page_of_its_own(page: Any, tmp_path: Path) -> None:
+    """examples/web, as its first lines say."""
+    shutil.copytree(ROOT / "examples/web", tmp_path / "page")
+    shutil.copy(ROOT / "sags_node/clients/bridge/web_page/sags.js", tmp_path / "page")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path / "page"))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        site = f"http://127.0.0.1:{server.server_port}"
+        run_dir, origin = tmp_path / "run", {"origins": (site,)}
+        with node_sockets(run_dir) as running, bridged(run_web, options(run_dir, **origin)) as port:
+            with making(running, anchored()):
+                page.goto(f"{site}/?from=ws://127.0.0.1:{port}/ws")
+                until(lambda: pixels(page, "model").any())
+                until(lambda: " px" in str(page.text_content("#anchors")))
+        server.shutdown()

@@ -1,44 +1,103 @@
-"""What the viewer takes from a node, over real sockets."""
+"""What the viewer takes from a node and from an overlay, over real sockets."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from synthetic import health, publisher, stream
-from waiting import until
+from synthetic import HEIGHT, WIDTH, plane_depth, plane_result
+from thin_sender import making, node_sockets
+from waiting import repeating, until
 
-from sags_node.clients.viewer.feed import TOPICS, Feed
+from sags_node.clients.overlay.stream import OverlayStream
+from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, TISSUE, WHOLE, Feed
+from sags_node.clients.viewer.overlay import OverlayFeed
 from sags_node.messaging.address import NodeAddress
 
 pytestmark = pytest.mark.live
 
+FOUR = (LEFT, MODEL, DEPTH, CONFIDENCE, TISSUE)
+
 
 def test_the_node_makes_one_frame_for_each_update_and_nothing_between(tmp_path: Path) -> None:
-    run_dir = tmp_path / "run"
-    running_well = replace(health(), latency_ms={"p50": 40.0})
-    with publisher(run_dir) as running, stream(running, said=lambda: running_well):
-        feed = Feed(NodeAddress(run_dir=run_dir))
-        until(lambda: feed.now().model is not None)
+    plane = plane_result()
+    with node_sockets(tmp_path / "run") as running, making(running, plane) as made:
+        feed = Feed(NodeAddress(run_dir=tmp_path / "run"))
+        until(lambda: feed.now(FOUR).camera is not None)
         shown = []
         for _ in range(3):
-            until(lambda: not any(running.wanted(name) for name in TOPICS))
-            moment = feed.now()
-            assert moment.problem is None and moment.model is not None, "the whole frame came"
+            until(lambda: not any(running.wanted(name) for name in (*WHOLE, *FOUR)))
+            moment = feed.now(FOUR)
+            assert moment.problem is None and moment.camera is not None, "the whole frame came"
             assert moment.splats is not None and moment.anchors is not None
-            shown.append(moment.model.frame_id)
+            shown.append(moment.t_capture_ns)
         feed.close()
     assert shown == sorted(set(shown)), "a new one each time"
+    assert set().union(*made) == set(FOUR), "no picture that nobody looks at"
+    near = moment.pictures[DEPTH][1:], plane_depth(plane.pair.camera)[::4, ::4][1:]
+    np.testing.assert_allclose(*near, atol=2.6e-5)
+    assert moment.pictures[LEFT].shape == (HEIGHT // 2, WIDTH // 2, 3)
+
+
+def test_for_updates_that_follow_at_once_every_frame_comes(tmp_path: Path) -> None:
+    with node_sockets(tmp_path / "run", right=True) as running, making(running, plane_result()):
+        feed = Feed(NodeAddress(run_dir=tmp_path / "run"))
+        until(lambda: feed.now((RIGHT,), steady=True).camera is not None)
+        for _ in range(5):
+            moment = feed.now((RIGHT,), steady=True)
+            assert set(moment.pictures) == {LEFT, RIGHT} and running.wanted("splats")
+        feed.pause()
+        until(lambda: not running.wanted("splats"))
+        feed.close()
 
 
 def test_a_node_of_two_frames_a_second_is_shown_too(tmp_path: Path) -> None:
-    run_dir = tmp_path / "run"
-    running_well = replace(health(), latency_ms={"p50": 40.0})
-    with publisher(run_dir) as running, stream(running, rate=2.0, said=lambda: running_well):
-        feed = Feed(NodeAddress(run_dir=run_dir))
-        until(lambda: feed.now().model is not None)
+    with node_sockets(tmp_path / "run") as running, making(running, plane_result(), rate=2.0):
+        feed = Feed(NodeAddress(run_dir=tmp_path / "run"))
+        until(lambda: feed.now(FOUR).camera is not None)
         for _ in range(3):
-            moment = feed.now()
-            assert moment.problem is None and moment.model is not None
+            moment = feed.now(FOUR)
+            assert moment.problem is None and moment.camera is not None
         feed.close()
+
+
+def test_of_a_frame_that_was_not_taken_in_its_picture_alone_is_shown(tmp_path: Path) -> None:
+    held = replace(plane_result(), held="blurred")
+    with node_sockets(tmp_path / "run") as running, making(running, held):
+        feed = Feed(NodeAddress(run_dir=tmp_path / "run"))
+        until(lambda: LEFT in feed.now(FOUR).pictures)
+        moment = feed.now(FOUR)
+        feed.close()
+    assert set(moment.pictures) == {LEFT} and moment.camera is None and moment.splats is None
+    assert moment.problem == "waiting for the model of this picture"
+
+
+def test_of_the_overlay_the_picture_of_exactly_that_frame_is_shown(tmp_path: Path) -> None:
+    drawn = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
+    thing = {
+        "name": "vessel",
+        "reason": None,
+        "unsure": "its anchors",
+        "anchors": [{"id": 3, "confidence": None}],
+    }
+    with OverlayStream("overlay", tmp_path / "run", (0, 0, 255)) as stream:
+        stamp = time.time_ns()
+
+        def send(_: int) -> None:
+            stream.serve()
+            stream.show({"left": drawn}, 1, stamp, 0)
+            stream.tell({"latency_ms": {"p50": 41.0, "max": None}, "objects": [thing]})
+            time.sleep(0.01)
+
+        with repeating(send):
+            feed = OverlayFeed(tmp_path / "run")
+            feed.ask(("left",))
+            until(lambda: feed.pictures(("left",), stamp) != {})
+            assert (feed.pictures(("left",), stamp)["left"] == drawn).all()
+            assert feed.pictures(("left",), stamp + 1) == feed.pictures((), stamp) == {}
+            said = feed.says()
+            feed.close()
+    assert said is not None and said.objects[0].name == "vessel" and said.objects[0].unsure == "its anchors"

@@ -9,14 +9,12 @@ from collections.abc import Callable
 import numpy as np
 
 from sags_node.clients.viewer.feed import Moment
-from sags_node.quality.gallery import Picture
-from sags_node.quality.metrics import as_float, psnr
 from sags_node.types import F64
 
 PERIOD = 1.0  # s between two points
 GAP = 10.0  # s without a point
 LENGTH = 120  # points
-FIGURES = ("rate", "p50", "p99", "psnr")
+FIGURES = ("rate", "p50", "p99", "rung")
 
 
 class History:
@@ -33,11 +31,12 @@ class History:
         if since > GAP:
             self._points.clear()
             return True
-        if moment.model is None or (self._points and since < PERIOD):
+        if moment.problem is not None or (self._points and since < PERIOD):
             return False
         status = moment.status
-        p50, p99 = (status.latency_ms.get(name, np.nan) for name in ("p50", "p99"))
-        self._points.append((now, status.rate_hz, p50, p99, _psnr(moment.model)))
+        p50, p99 = (status.latency_ms.get(name) or np.nan for name in ("p50", "p99"))
+        rung = np.nan if status.rung is None else float(status.rung.number)
+        self._points.append((now, status.rate_hz, p50, p99, rung))
         return True
 
     def series(self, *figures: str) -> tuple[F64, ...]:
@@ -45,7 +44,3 @@ class History:
         points = np.array(self._points, np.float64).reshape(-1, 1 + len(FIGURES))
         times = points[:, 0] - (points[-1, 0] if len(points) else 0.0)
         return (times, *(points[:, 1 + FIGURES.index(figure)] for figure in figures))
-
-
-def _psnr(model: Picture) -> float:
-    return psnr(as_float(model.render), as_float(model.truth), model.tissue)

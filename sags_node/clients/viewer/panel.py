@@ -12,16 +12,21 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
+from sags_node.clients.viewer.cursor import depth_line
 from sags_node.clients.viewer.feed import Moment, Status
 from sags_node.clients.viewer.history import LENGTH, PERIOD, History
-from sags_node.clients.viewer.pictures import Sheet
+from sags_node.clients.viewer.overlay import Overlay
+from sags_node.clients.viewer.pictures import VIEWS, Sheet
+from sags_node.clients.viewer.saving import KINDS, Exporter, exported, screenshot
 from sags_node.clients.viewer.scene import UNIT, Scene
+from sags_node.confidence import SURE, SURE_OF_ANCHOR
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
+from sags_node.types import F64
 
 ANSWER_TIME = 20.0  # s; recordings take seconds
-PICTURES_WIDTH = 480  # px
+WIDTH = 400  # px, of pictures and controls
 PLOT_HEIGHT = 80  # px
 NOTICE_TIME = 6.0  # s
 JPEG_QUALITY = 80
@@ -35,15 +40,16 @@ class Asker:
     def __init__(self, node: NodeAddress) -> None:
         self._node = node
 
-    def ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> None:
-        """One request of its own: callbacks come from several threads."""
+    def ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> Any:
+        """One request of its own: callbacks come from several threads. None: it was refused."""
         try:
             with ControlClient.at(self._node) as control:
                 answer = control.request(op, args, ANSWER_TIME)
         except SagsError as error:
             tell(client, f"{title}: refused", str(error), "red")
-        else:
-            tell(client, title, _in_words(answer), "green")
+            return None
+        tell(client, title, _in_words(answer), "green")
+        return answer
 
 
 def tell(client: viser.ClientHandle | None, title: str, text: str, color: Any) -> None:
@@ -59,36 +65,97 @@ class Panel:
         rate: how often the browser is brought up to date at first, Hz.
     """
 
-    def __init__(self, server: viser.ViserServer, scene: Scene, asker: Asker, ns: str, rate: float) -> None:
-        self._gui, self._scene, self._asker = server.gui, scene, asker
+    def __init__(
+        self, server: viser.ViserServer, scene: Scene, asker: Asker, exporter: Exporter, ns: str, rate: float
+    ) -> None:
+        self._gui, self._scene, self._asker, self._exporter = server.gui, scene, asker, exporter
         self._sheet, self._history = Sheet(), History()
+        self._moment, self._unit = Moment("connecting"), "mm"
+        self._frozen_since: float | None = None
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"sags view · {ns}")
         server.gui.main_panel.dock_right()
-        self._status = server.gui.add_html(status_line(Moment("connecting")))
+        self._status = server.gui.add_html(status_line(self._moment))
+        self._build_keeping()
         self._build_view(rate)
         self._build_anchors()
+        with server.gui.add_folder("Overlay"):
+            self._overlay = server.gui.add_html("")
         self._build_node()
         self._build_pictures()
-        server.scene.on_click()(self._pin)
+        server.scene.on_click()(self._clicked)
 
     @property
     def rate(self) -> float:
         """How often the browser should be brought up to date, Hz."""
         return float(self._rate.value)
 
+    @property
+    def view(self) -> str:
+        """Which of the `VIEWS` is looked at."""
+        return str(self._view.value)
+
+    @property
+    def frozen(self) -> bool:
+        """Whether somebody wants to look at one moment."""
+        return self._frozen_since is not None
+
+    def fit(self, client: viser.ClientHandle) -> None:
+        """Leave half of a narrow browser to the scene."""
+        client.gui.main_panel.set_width(min(WIDTH, client.camera.image_width // 2))
+
     def show(self, moment: Moment) -> None:
         """Bring status, pictures, plots and the list of anchors up to date."""
+        self._moment = moment
+        self._unit = "no unit" if "uncalibrated" in moment.status.warning_codes else "mm"
         self._status.content = status_line(moment)
-        self._pictures.image = self._sheet.draw(moment)
+        self._draw()
         if self._history.add(moment):
             for plot, figures in self._plots:
                 plot.data = self._history.series(*figures)
-        status = moment.status
-        self._unit = "no unit" if status is not None and "uncalibrated" in status.warning_codes else "mm"
+        self._overlay.content = _overlay_table(moment.overlay)
         self._list_anchors(moment.anchors)
 
+    def stay(self) -> None:
+        """Say how old the frozen moment is by now; what is looked at of it may change."""
+        assert self._frozen_since is not None
+        age = time.monotonic() - self._frozen_since
+        self._status.content = status_line(
+            Moment(f"FROZEN {age:.0f} s ago: what you see is old; Go on shows the node again")
+        )
+        self._draw(f"  FROZEN {age:.0f} s ago")
+        self._list_anchors(self._moment.anchors)
+
+    def go_on(self) -> None:
+        """Show the node again."""
+        self._frozen_since, self._freeze.label = None, "Freeze"
+
+    def _draw(self, remark: str = "") -> None:
+        self._sheet.fixed = None if self._auto.value else (self._near.value * UNIT, self._far.value * UNIT)
+        sheet = self._sheet.draw(self._moment, self.view, remark)
+        self._pictures.image = sheet
+        self._depth.content = depth_line(self._moment, self.view, sheet.shape[0], self._unit)
+
     # ---- building ------------------------------------------------------------------------------------
+
+    def _button(
+        self, label: str, icon: viser.IconName, do: Callable[[viser.ClientHandle], None]
+    ) -> viser.GuiButtonHandle:
+        button = self._gui.add_button(label, icon=icon)
+
+        @button.on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+            if event.client is not None:
+                do(event.client)
+
+        return button
+
+    def _build_keeping(self) -> None:
+        self._freeze = self._button("Freeze", viser.Icon.SNOWFLAKE, lambda _: self._freeze_or_go_on())
+        self._button("Screenshot", viser.Icon.CAMERA, self._screenshot)
+        with self._gui.add_folder("Export", expand_by_default=False):
+            self._kind = self._gui.add_dropdown("What", KINDS)
+            self._button("Download", viser.Icon.DOWNLOAD, self._export)
 
     def _build_view(self, rate: float) -> None:
         buttons = self._gui.add_button_group("Look from", ("aside", "left camera"))
@@ -98,22 +165,16 @@ class Panel:
             if event.client is not None:
                 self._scene.look(event.client, through=event.target.value == "left camera")
 
-        self._rate = self._gui.add_slider("Updates per s", 1.0, 10.0, 1.0, rate)
+        self._rate = self._gui.add_slider("Updates per s", 1.0, 30.0, 1.0, rate)
 
     def _build_anchors(self) -> None:
         with self._gui.add_folder("Anchors"):
             self._pinning = self._gui.add_checkbox("Click on tissue pins one", True)
             self._anchor_rows = self._gui.add_html("")
-            self._chosen = self._gui.add_dropdown("Anchor", (NONE,))
-            remove = self._gui.add_button("Remove", icon=viser.Icon.TRASH)
-
-        @remove.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            if self._chosen.value == NONE:
-                tell(event.client, "Remove", "choose an anchor first", "orange")
-                return
-            anchor = int(self._chosen.value)
-            self._asker.ask(event.client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
+            self._chosen = self._gui.add_dropdown("Anchor", (NONE,), hint="or click on it in the scene")
+            self._other = self._gui.add_dropdown("Distance to", (NONE,), hint="the one clicked before")
+            self._distance = self._gui.add_html("")
+            self._button("Remove", viser.Icon.TRASH, self._remove)
 
     def _build_node(self) -> None:
         with self._gui.add_folder("Node"):
@@ -137,24 +198,36 @@ class Panel:
         args: Callable[[], Mapping[str, Any]] = dict,
     ) -> None:
         """A button for one operation of the node."""
-
-        @self._gui.add_button(label, icon=icon).on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            self._asker.ask(event.client, label, op, args())
+        self._button(label, icon, lambda client: self._asker.ask(client, label, op, args()))
 
     def _build_pictures(self) -> None:
         panel = self._gui.add_panel()
         with panel.add_tab("Pictures and figures"):
+            views = tuple(VIEWS)
+            self._view = self._gui.add_dropdown("Show", views, initial_value=views[0])
+            self._depth = self._gui.add_html("")
             self._pictures = self._gui.add_image(
-                self._sheet.draw(Moment()), format="jpeg", jpeg_quality=JPEG_QUALITY
+                self._sheet.draw(self._moment, views[0]), format="jpeg", jpeg_quality=JPEG_QUALITY
             )
+            with self._gui.add_folder("Depth colours", expand_by_default=False):
+                self._auto = self._gui.add_checkbox("Follow the tissue", True)
+                self._near = self._gui.add_number("Near (mm)", 50.0, min=1.0, max=1000.0)
+                self._far = self._gui.add_number("Far (mm)", 150.0, min=1.0, max=1000.0)
             self._plots = [
                 self._plot("Rate (Hz)", {"rate": BRIGHT}),
                 self._plot("Latency (ms): p50 blue, p99 orange", {"p50": BLUE, "p99": ORANGE}),
-                self._plot("PSNR on tissue (dB)", {"psnr": BRIGHT}),
+                self._plot("Rung of the ladder of quality", {"rung": BRIGHT}),
             ]
-        panel.dock_left()
-        panel.set_width(PICTURES_WIDTH)
+
+        @self._auto.on_update
+        def _(event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
+            """Fixed colours begin as they are."""
+            if not event.target.value:
+                near, far = self._sheet.shown
+                self._near.value = round(near / UNIT)  # type: ignore[misc]  # viser's setter, which mypy misses
+                self._far.value = round(far / UNIT)  # type: ignore[misc]  # as above
+
+        panel.dock_above(self._gui.main_panel)
 
     def _plot(self, title: str, figures: Mapping[str, str]) -> tuple[viser.GuiUplotHandle, tuple[str, ...]]:
         """A plot of figures (name -> colour) over the last minutes."""
@@ -173,31 +246,95 @@ class Panel:
         )
         return plot, tuple(figures)
 
-    # ---- anchors -------------------------------------------------------------------------------------
+    # ---- what is asked for ---------------------------------------------------------------------------
 
-    def _pin(self, event: viser.SceneClickEvent) -> None:
-        if not self._pinning.value:
+    def _freeze_or_go_on(self) -> None:
+        if self.frozen:
+            self.go_on()
+        else:
+            self._frozen_since, self._freeze.label = time.monotonic(), "Go on"
+
+    def _screenshot(self, client: viser.ClientHandle) -> None:
+        self._send(client, "Screenshot", ".png", lambda: screenshot(client, self._pictures.image))
+
+    def _export(self, client: viser.ClientHandle) -> None:
+        kind, moment = self._kind.value, self._moment
+        self._send(client, f"Export {kind}", f"_{kind}.ply", lambda: exported(moment, kind, self._exporter))
+
+    def _send(self, client: viser.ClientHandle, title: str, ending: str, make: Callable[[], bytes]) -> None:
+        """A file of this moment, named by its time."""
+        name = time.strftime("sags_%Y%m%d_%H%M%S", time.localtime(self._moment.t_capture_ns * 1e-9)) + ending
+        try:
+            client.send_file_download(name, make(), save_immediately=True)
+        except SagsError as error:
+            tell(client, f"{title}: refused", str(error), "red")
+        else:
+            tell(client, title, name, "green")
+
+    def _remove(self, client: viser.ClientHandle) -> None:
+        if self._chosen.value == NONE:
+            tell(client, "Remove", "choose an anchor first", "orange")
             return
+        anchor = int(self._chosen.value)
+        self._asker.ask(client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """A click on an anchor chooses it; one on the tissue pins a new one."""
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        hit = self._scene.anchor_at(origin, direction)
+        if hit is not None:
+            self._choose(hit)
+        elif self._pinning.value:
+            self._pin(event.client, origin * UNIT, direction)
+
+    def _pin(self, client: viser.ClientHandle | None, origin: F64, direction: F64) -> None:
         splats = self._scene.splats
-        if splats is None:
-            tell(event.client, "Pin", "there is nothing to pin to now", "orange")
+        if splats is None or self.frozen:
+            why = "what you see is old: Go on first" if self.frozen else "there is nothing to pin to now"
+            tell(client, "Pin", why, "orange")
             return
-        origin, direction = np.array(event.ray_origin) * UNIT, np.array(event.ray_direction)
         point = splats.hit(origin, direction)
         if point is None:
-            tell(event.client, "Pin", "no tissue there", "orange")
+            tell(client, "Pin", "no tissue there", "orange")
             return
         place = {axis: float(x) for axis, x in zip("xyz", point, strict=True)}
-        self._asker.ask(event.client, "Pin", "add_anchor", place)
+        answer = self._asker.ask(client, "Pin", "add_anchor", place)
+        if answer is not None:
+            self._choose(int(answer["id"]))
+
+    def _choose(self, anchor: int) -> None:
+        """The one chosen before is what the distance is measured to."""
+        before = self._chosen.value
+        for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
+            if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
+                choice.options = (*choice.options, chosen)
+            choice.value = chosen  # type: ignore[misc]  # as above
 
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
         rows = [] if anchors is None else list(anchors)
         self._anchor_rows.content = _anchor_table(rows, self._unit)
         if anchors is None:  # nothing fresh came: what somebody has chosen stays
+            self._distance.content = ""
             return
         numbers = (NONE, *(str(int(row["id"])) for row in rows))
-        if self._chosen.options != numbers:
-            self._chosen.options = numbers  # viser keeps the choice while it is there
+        for choice in (self._chosen, self._other):
+            if choice.options != numbers:
+                choice.options = numbers  # viser keeps the choice while it is there
+        by_number = {str(int(row["id"])): row for row in rows}
+        first, second = (by_number.get(choice.value) for choice in (self._chosen, self._other))
+        apart = None if first is None or second is None else distance(first, second, self._unit)
+        self._distance.content = "" if apart is None else _line(apart)
+
+
+def distance(first: Any, second: Any, unit: str) -> str:
+    """How far two anchors, rows of `anchors`, are apart in a straight line; a guess is said to be one."""
+    apart = float(np.linalg.norm([first[axis] - second[axis] for axis in "xyz"])) / UNIT
+    if not np.isfinite(apart):
+        return "Distance: one of them is lost"
+    sure = all(
+        row["confidence"] >= SURE_OF_ANCHOR and row["depth_confidence"] >= SURE for row in (first, second)
+    )
+    return f"Distance: {apart:.1f} {unit}" + ("" if sure else ", a guess: one is not sure")
 
 
 def _recording(folder: viser.GuiTextHandle, keep: viser.GuiNumberHandle[float]) -> dict[str, Any]:
@@ -218,7 +355,7 @@ def status_line(moment: Moment) -> str:
     if moment.problem is not None:
         color, text = "#ff922b", moment.problem
     else:
-        latency = status.latency_ms.get("p50", np.nan)
+        latency = status.latency_ms.get("p50") or np.nan
         figures = f"{status.rate_hz:.1f} Hz, {latency:.0f} ms, {status.gaussians} Gaussians"
         if status.rung is not None:
             figures += f", rung {status.rung.number} of 0 to {status.rung.of - 1}"
@@ -239,10 +376,26 @@ def _warnings(status: Status) -> str:
     )
 
 
+def _line(text: str) -> str:
+    return f'<div style="padding:0 1em;font-size:0.9em">{html.escape(text)}</div>'
+
+
+def _overlay_table(overlay: Overlay | None) -> str:
+    """Each object of the overlay, and how it does."""
+    if overlay is None:
+        return _line("none runs here: sags overlay")
+    latency = overlay.latency_ms.get("p50")
+    said = [f"blank: {overlay.reason}" if overlay.reason else f"{latency or 0:.0f} ms after the camera"]
+    for thing in overlay.objects:
+        unsure = f"not sure: {thing.unsure}" if thing.unsure else "sure"
+        said.append(f"{thing.name}: {f'not drawn: {thing.reason}' if thing.reason else unsure}")
+    return "".join(map(_line, said))
+
+
 def _anchor_table(rows: list[Any], unit: str) -> str:
     """Where each anchor is, and how sure it is."""
     if not rows:
-        return '<div style="padding:0 1em;opacity:0.7">none yet</div>'
+        return _line("none yet")
     cells = []
     for row in rows:
         place = " ".join(f"{row[axis] / UNIT:.1f}" for axis in "xyz") if np.isfinite(row["x"]) else "lost"

@@ -1,79 +1,141 @@
-"""The four pictures of the newest frame on one sheet: input, render, depth, error."""
+"""Pictures of the newest frame on one sheet: of both eyes, of the model, its depth and error, the overlay."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.clients.viewer.feed import Moment
-from sags_node.quality.gallery import TILE_WIDTH, Picture, depth_range, tiles
+from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, RIGHT_MODEL, TISSUE, Moment
+from sags_node.quality.gallery import TILE_WIDTH, Picture, depth_range, depth_tile, error_tile, shrunk
 from sags_node.types import U8
 
-CAPTIONS = ("Left input", "Model", "Depth", "Error on tissue")
+# What each picture is made of.
+NEEDS = {
+    "Left input": (LEFT,),
+    "Model": (MODEL,),
+    "Depth": (DEPTH, TISSUE),
+    "Error on tissue": (LEFT, MODEL, TISSUE),
+    "Right input": (RIGHT,),
+    "Right model": (RIGHT_MODEL,),
+    "Left overlay": (LEFT,),
+    "Right overlay": (RIGHT,),
+}
+OVERLAID = {"Left overlay": "left", "Right overlay": "right"}
+# What somebody may look at; the first is shown first.
+VIEWS = {
+    "Input, model, depth, error": ("Left input", "Model", "Depth", "Error on tissue"),
+    "Input": ("Left input",),
+    "Model": ("Model",),
+    "Depth under the cursor": ("Left input", "Depth"),
+    "Right eye": ("Right input", "Right model"),
+    "Stereo input": ("Left input", "Right input"),
+    "Stereo model": ("Model", "Right model"),
+    "Overlay": ("Left overlay",),
+    "Stereo overlay": ("Left overlay", "Right overlay"),
+}
+COLUMNS = 2
 BAR = 24  # px above each picture
 RANGE_MEMORY = 0.9  # of the last depth range: the colours must not flicker
-_GROUND = (36, 36, 36)
+_GROUND, _MARKED = 36, (255, 169, 77)
+_NOTHING = np.zeros((0, 0), np.uint8)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Sheet:
-    """Draws the sheet, one after another with steady depth colours."""
+    """Draws the sheet, one after another with steady depth colours.
+
+    Attributes:
+        shown: the range of the depth colours, m.
+        fixed: that they are to have; None: they follow the tissue.
+    """
 
     def __init__(self) -> None:
-        self._range: tuple[float, float] | None = None
+        self.shown = (0.0, 1.0)
+        self.fixed: tuple[float, float] | None = None
+        self._followed: tuple[float, float] | None = None
         self._height = round(TILE_WIDTH * 0.8)  # of a tile; that of the last picture
 
-    def draw(self, moment: Moment) -> U8:
-        """Two by two pictures [h, w, 3], RGB; empty where there is nothing new to show."""
-        shown: list[U8] = []
-        if moment.model is not None:
-            small = _small(moment.model)  # first: all that follows costs by the pixel
-            self._follow(*depth_range([small]))
-            assert self._range is not None
-            shown = tiles(small, *self._range)
-        elif moment.picture is not None:
-            shown = [_fitted(moment.picture, cv2.INTER_AREA)]
-        if shown:
-            self._height = shown[0].shape[0]
-        panes = [
-            self._pane(caption, shown[place] if place < len(shown) else None)
-            for place, caption in enumerate(CAPTIONS)
-        ]
-        return np.vstack([np.hstack(panes[:2]), np.hstack(panes[2:])])
+    def draw(self, moment: Moment, view: str, remark: str = "") -> U8:
+        """The pictures of a view [h, w, 3], RGB; empty where there is nothing new to show."""
+        model = _model(moment.pictures)
+        if DEPTH in moment.pictures and TISSUE in moment.pictures:
+            self._follow(model)
+        if (left := moment.pictures.get(LEFT)) is not None:
+            self._height = shrunk(left).shape[0]
+        names, high = VIEWS[view], BAR + self._height
+        columns = min(COLUMNS, len(names))
+        sheet = np.full((len(names) // columns * high, columns * TILE_WIDTH, 3), _GROUND, np.uint8)
+        for place, name in enumerate(names):
+            top, left_edge = place // columns * high, place % columns * TILE_WIDTH
+            tile, text = self._tile(name, model, moment), f"{name}{remark}"
+            if tile is None:
+                text = f"{name}: nothing new"
+            else:
+                text += (
+                    ": nothing is drawn" if name in OVERLAID and OVERLAID[name] not in moment.drawn else ""
+                )
+                sheet[top + BAR : top + high, left_edge : left_edge + TILE_WIDTH] = tile
+            color = _MARKED if remark else (220, 220, 220)
+            cv2.putText(sheet, text, (left_edge + 6, top + 17), _FONT, 0.5, color, 1, cv2.LINE_AA)
+        if moment.problem is not None:  # also where the controls, which say so, are folded away
+            cv2.putText(sheet, moment.problem, (6, high - 8), _FONT, 0.5, _MARKED, 1, cv2.LINE_AA)
+        return sheet
 
-    def _follow(self, near: float, far: float) -> None:
-        if self._range is not None:
+    def _tile(self, name: str, model: Picture, moment: Moment) -> U8 | None:
+        needed = NEEDS[name]
+        if not all(topic in moment.pictures for topic in needed):
+            return None
+        if name == "Depth":
+            return depth_tile(model, *self.shown)
+        if name == "Error on tissue":
+            return error_tile(model)
+        picture = shrunk(moment.pictures[needed[0]])
+        if name not in OVERLAID:
+            return picture
+        drawn = moment.drawn.get(OVERLAID[name])
+        return picture if drawn is None else _blended(picture, drawn)
+
+    def _follow(self, model: Picture) -> None:
+        near, far = depth_range([model])
+        if self._followed is not None:
             near, far = (
-                RANGE_MEMORY * old + (1 - RANGE_MEMORY) * new
-                for old, new in zip(self._range, (near, far), strict=True)
+                RANGE_MEMORY * last + (1 - RANGE_MEMORY) * now
+                for last, now in zip(self._followed, (near, far), strict=True)
             )
-        self._range = (near, far)
-
-    def _pane(self, caption: str, tile: U8 | None) -> U8:
-        pane = np.full((BAR + self._height, TILE_WIDTH, 3), _GROUND, np.uint8)
-        if tile is not None:
-            pane[BAR:] = tile
-        text = caption if tile is not None else f"{caption}: nothing new"
-        cv2.putText(pane, text, (6, 17), _FONT, 0.5, (220, 220, 220), 1, cv2.LINE_AA)
-        return pane
+        self._followed = (near, far)
+        self.shown = self.fixed or self._followed
 
 
-def _small(model: Picture) -> Picture:
-    """A frame as wide as a tile. Depth is picked, not averaged: 0 means unknown."""
-    return Picture(
-        model.frame_id,
-        model.psnr,
-        truth=_fitted(model.truth, cv2.INTER_AREA),
-        render=_fitted(model.render, cv2.INTER_AREA),
-        depth=_fitted(model.depth, cv2.INTER_NEAREST),
-        tissue=_fitted(model.tissue.view(np.uint8), cv2.INTER_NEAREST) > 0,
+def needs_of(view: str) -> list[str]:
+    """The topics of its pictures. The confidence of a depth costs the node too much where nobody reads it."""
+    sure = [CONFIDENCE] if view == "Depth under the cursor" else []
+    return sure + [topic for name in VIEWS[view] for topic in NEEDS[name]]
+
+
+def overlaid_in(view: str) -> list[str]:
+    """The eyes whose overlay it shows."""
+    return [OVERLAID[name] for name in VIEWS[view] if name in OVERLAID]
+
+
+def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
+    """What came of a frame, as small as its numbers are: all that follows costs by the pixel."""
+    tissue = pictures.get(TISSUE, _NOTHING)
+    size = tissue.shape[::-1]
+    truth, render = (
+        cv2.resize(pictures[name], size, interpolation=cv2.INTER_AREA)
+        if name in pictures and TISSUE in pictures
+        else _NOTHING
+        for name in (LEFT, MODEL)
     )
+    depth = np.nan_to_num(pictures.get(DEPTH, _NOTHING), nan=0.0)
+    return Picture(0, np.nan, truth, render, depth, tissue > 0)
 
 
-def _fitted(picture: NDArray[Any], interpolation: int) -> NDArray[Any]:
-    height = max(1, round(picture.shape[0] * TILE_WIDTH / picture.shape[1]))
-    fitted: NDArray[Any] = cv2.resize(picture, (TILE_WIDTH, height), interpolation=interpolation)
-    return fitted
+def _blended(picture: U8, drawn: U8) -> U8:
+    """The overlay [H, W, 4], not premultiplied, over the picture [h, w, 3]."""
+    small = cv2.resize(drawn, picture.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+    return np.asarray(picture + small[..., 3:] / 255 * (small[..., :3] - picture), np.uint8)

@@ -12,13 +12,16 @@ import viser
 
 from sags_node.clients.viewer.feed import Feed, Moment
 from sags_node.clients.viewer.panel import Asker, Panel
+from sags_node.clients.viewer.pictures import needs_of, overlaid_in
+from sags_node.clients.viewer.saving import Exporter
 from sags_node.clients.viewer.scene import Scene
 from sags_node.clients.viewer.server import serving
 from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.node_clock import NodeClock
 
-RATE = 4.0  # Hz, at first
-IDLE_WAIT = 0.25  # s between looks for a browser
+RATE = 20.0  # Hz, at first
+PULLED = 5.0  # Hz; for fewer updates each frame is asked for, for more the node sends all
+IDLE_WAIT = 0.25  # s between looks for a browser, and for whether a frozen page goes on
 BROWSER_TIME = 2.0  # s that a browser may take to show an update
 
 
@@ -29,12 +32,14 @@ def run_viewer(
     node: NodeAddress = THE_NODE,
     ready: Callable[[str, int], None] = lambda url, port: None,
     *,
+    export: Exporter,
     stop: threading.Event,
 ) -> None:
     """Serve the viewer until `stop` is set.
 
     Args:
         node: it need not run yet. With both `endpoint` and `control` its clock is asked for, too.
+        export: writes the model of a moment as a file.
         ready: called with the address and the port once browsers can connect.
 
     Raises:
@@ -46,8 +51,9 @@ def run_viewer(
     try:
         with serving(host, port, insecure) as (server, url):
             scene = Scene(server)
-            panel = Panel(server, scene, Asker(node), node.ns, RATE)
+            panel = Panel(server, scene, Asker(node), export, node.ns, RATE)
             server.on_client_connect(scene.look)
+            server.on_client_connect(panel.fit)
             ready(url, server.get_port())
             with redirect_stdout(sys.stderr):  # what viser has to say; stdout is for machines
                 _follow(server, feed, scene, panel, stop)
@@ -57,21 +63,34 @@ def run_viewer(
 
 def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:
     """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows."""
+    period = 0.0
     while not stop.is_set():
         if not server.get_clients():
+            feed.pause()
+            panel.go_on()
             scene.show(Moment())
             stop.wait(IDLE_WAIT)
             continue
+        if panel.frozen:
+            feed.pause()
+            panel.stay()
+            stop.wait(IDLE_WAIT)
+            continue
         began = time.monotonic()
-        moment = feed.now()
-        scene.show(moment)
-        panel.show(moment)
+        moment = feed.now(needs_of(panel.view), overlaid_in(panel.view), steady=period < 1 / PULLED)
+        if panel.frozen:  # meanwhile
+            continue
+        with server.atomic():
+            scene.show(moment)
+            panel.show(moment)
+        server.flush()
         sent = time.monotonic()
         for client in server.get_clients().values():
             _await(client)
         answered = time.monotonic()
         # Half of the browser's time at most is for taking in updates; the rest is the user's.
         stop.wait(max(began + 1 / panel.rate - answered, answered - sent))
+        period = time.monotonic() - began
 
 
 def _await(client: viser.ClientHandle) -> None:

@@ -7,6 +7,7 @@ would vanish. Its axes are the node's world: x right, y down, z away from the fi
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import cv2
@@ -14,11 +15,12 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from sags_node.clients.viewer.feed import Moment
+from sags_node.clients.viewer.feed import LEFT, Moment, known_depth
+from sags_node.clients.viewer.overlay import Overlay
 from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.confidence import SURE_OF_ANCHOR
 from sags_node.geometry import matrix_to_quat, transform
-from sags_node.types import U8, Camera
+from sags_node.types import F64, U8, Camera
 
 UNIT = 1e-3  # m
 FRUSTUM = 12.0  # mm deep
@@ -38,6 +40,7 @@ class Scene:
     def __init__(self, server: viser.ViserServer) -> None:
         self.splats: Splats | None = None  # those shown
         self.camera: Camera | None = None
+        self.places: dict[int, F64] = {}  # of the anchors that have one, mm
         self._server = server
         self._drawn_splats: viser.GaussianSplatHandle | None = None
         self._frustum: viser.CameraFrustumHandle | None = None
@@ -51,13 +54,22 @@ class Scene:
         server.initial_camera.look_at = np.array([0.0, 0.0, self._depth])
 
     def show(self, moment: Moment) -> None:
-        """Bring the scene up to date in one step."""
-        if moment.model is not None and (known := moment.model.depth[moment.model.depth > 0]).size:
+        """Bring the scene up to date."""
+        if (known := known_depth(moment.pictures)).size:
             self._depth = float(np.median(known)) / UNIT
-        with self._server.atomic():
-            self._show_splats(None if moment.splats is None else splats_of(moment.splats))
-            self._show_camera(moment.camera, moment.picture)
-            self._show_anchors(moment.anchors)
+        self._show_splats(None if moment.splats is None else splats_of(moment.splats))
+        self._show_camera(moment.camera, moment.pictures.get(LEFT))
+        self._show_anchors(moment.anchors, {} if moment.overlay is None else names_of(moment.overlay))
+
+    def anchor_at(self, origin: F64, direction: F64) -> int | None:
+        """The anchor that a ray from `origin` (mm) along `direction` hits first; None: it hits none."""
+        ray = direction / np.linalg.norm(direction)
+        hit = {
+            anchor: float(offset @ ray)
+            for anchor, offset in ((anchor, place - origin) for anchor, place in self.places.items())
+            if np.linalg.norm(np.cross(offset, ray)) < ANCHOR_SIZE and offset @ ray > 0
+        }
+        return min(hit, key=hit.__getitem__, default=None)
 
     def look(self, client: viser.ClientHandle, through: bool = False) -> None:
         """Turn a browser to the tissue: from aside, or as the left camera sees it."""
@@ -72,9 +84,7 @@ class Scene:
                 client.camera.fov = _fov(self.camera)
 
     def _show_splats(self, splats: Splats | None) -> None:
-        """A browser builds its buffers anew when the number changes, so it is filled up to a round one. Each
-        time viser 1.1.1 reports there `computeBoundingSphere(): Computed radius is NaN`. That is of its own
-        flat quad, not of what is sent: nothing is culled then."""
+        """A browser builds its buffers anew when the number changes, so it is filled up to a round one."""
         self.splats = splats
         if splats is None or len(splats.means) == 0:
             if self._drawn_splats is not None:
@@ -121,28 +131,38 @@ class Scene:
         self._frustum.wxyz = matrix_to_quat(camera.T_world_cam[:3, :3])
         self._frustum.position = camera.T_world_cam[:3, 3] / UNIT
 
-    def _show_anchors(self, anchors: NDArray[Any] | None) -> None:
-        """Anchors that have a place, as numbered points."""
+    def _show_anchors(self, anchors: NDArray[Any] | None, names: Mapping[int, str]) -> None:
+        """Anchors that have a place, as numbered points; `names` are of what the overlay holds by them."""
         rows = () if anchors is None else anchors[np.isfinite(anchors["x"])]
-        places = {int(row["id"]): np.array([row[axis] for axis in "xyz"]) / UNIT for row in rows}
-        for gone in self._labels.keys() - places.keys():
+        self.places = {int(row["id"]): np.array([row[axis] for axis in "xyz"]) / UNIT for row in rows}
+        for gone in self._labels.keys() - self.places.keys():
             self._labels.pop(gone).remove()
-        for anchor, place in places.items():
+        for anchor, place in self.places.items():
+            text = f"{anchor} {names.get(anchor, '')}".rstrip()
             if anchor not in self._labels:
-                self._labels[anchor] = self._server.scene.add_label(f"/anchors/{anchor}", str(anchor))
-            self._labels[anchor].position = place
-        if self._anchors is not None and not places:
+                self._labels[anchor] = self._server.scene.add_label(f"/anchors/{anchor}", text)
+            self._labels[anchor].position, self._labels[anchor].text = place, text
+        if self._anchors is not None and not self.places:
             self._anchors.remove()
             self._anchors = None
-        if places:
+        if self.places:
             self._anchors = self._server.scene.add_point_cloud(
                 "/anchor_points",
-                np.array(list(places.values())),
+                np.array(list(self.places.values())),
                 np.array([anchor_color(row) for row in rows], np.uint8),
                 point_size=ANCHOR_SIZE,
                 point_shape="circle",
                 precision="float32",
             )
+
+
+def names_of(overlay: Overlay) -> dict[int, str]:
+    """Of each anchor that holds an object of the overlay: what that is, with a `?` where it is not sure."""
+    return {
+        int(anchor["id"] or 0): thing.name + ("" if thing.unsure is None else " ?")
+        for thing in overlay.objects
+        for anchor in thing.anchors
+    }
 
 
 def anchor_color(row: Any) -> tuple[int, int, int]:

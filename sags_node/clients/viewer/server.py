@@ -4,16 +4,32 @@ from __future__ import annotations
 
 import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from io import StringIO
+from typing import Any
 
 import viser
 import websockets.asyncio.server
+from websockets.http11 import Request, Response
 
+from sags_node.clients.viewer.cursor import SCRIPT
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import is_loopback
+
+# The quad of a splat has two numbers a corner in viser 1.1.1, of which three.js reads three: it reports a
+# sphere of radius NaN around it, and culls nothing. The third is not drawn; large, it culls nothing.
+MEND = """<script>
+(() => {
+  const { head } = document, append = head.appendChild;
+  head.appendChild = (node) => {
+    if (node.type === "module") node.textContent = node.textContent.replace(
+      "Float32Array([-2,-2,2,-2,2,2,-2,2]),2)", "Float32Array([-2,-2,-1e9,2,-2,1e9,2,2,-1e9,-2,2,1e9]),3)");
+    return append.call(head, node);
+  };
+})();
+</script>"""
 
 
 class _LocalServer(viser.ViserServer):
@@ -69,11 +85,29 @@ def _bindable(host: str, port: int) -> int:
         return int(probe.getsockname()[1])
 
 
+def _answer(
+    answer: Callable[[Any, Request], Response | None], connection: Any, request: Request
+) -> Response | None:
+    """viser's answer; its page gets our scripts."""
+    if "Accept-Encoding" in request.headers:
+        del request.headers["Accept-Encoding"]  # so that the page can be read here
+    response = answer(connection, request)
+    if response is not None and b"</head>" in response.body:
+        response.body = response.body.replace(b"</head>", f"{SCRIPT}{MEND}</head>".encode(), 1)
+        del response.headers["Content-Length"]  # else there are two
+        response.headers["Content-Length"] = str(len(response.body))
+    return response
+
+
 @contextmanager
 def _only_from(origin: re.Pattern[str]) -> Iterator[None]:
-    """viser has no setting for the origins it accepts; websockets has, so it is set on the way there."""
+    """viser has no setting for the origins it accepts, nor for its page; websockets has."""
     serve = websockets.asyncio.server.serve
-    websockets.asyncio.server.serve = partial(serve, origins=[origin])  # type: ignore[assignment, misc]  # as above
+
+    def served(*args: Any, process_request: Any, **options: Any) -> Any:
+        return serve(*args, process_request=partial(_answer, process_request), origins=[origin], **options)
+
+    websockets.asyncio.server.serve = served  # type: ignore[assignment, misc]  # as above
     try:
         yield
     finally:

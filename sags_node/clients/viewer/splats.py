@@ -31,7 +31,7 @@ class Splats:
     def covariances(self, unit: float) -> F32:
         """[N, 3, 3] in squares of a unit of so many metres."""
         sides = self.rotations * (self.scales / unit)[:, None, :]
-        return sides @ np.swapaxes(sides, 1, 2)
+        return np.asarray(np.einsum("nik,njk->nij", sides, sides))
 
     def hit(self, origin: F64, direction: F64) -> F64 | None:
         """Where a ray from `origin` (m) along `direction` meets the tissue: half of its light is taken there.

@@ -1,0 +1,74 @@
+"""A node of rclpy that pins a point of the tissue and publishes where it is: `tissue_point`, PointStamped.
+
+    sags run launch/d4d_pull.yaml &
+    sags bridge ros2 &
+    python3 examples/ros2/follow_tissue.py --ros-args -p u:=320.0 -p v:=256.0     # where ROS 2 is set up
+
+It needs rclpy and ROS' messages, and nothing of this package. Tried with Kilted; see docs/bridges.md.
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import Point, PointStamped
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+
+SURE = 0.5  # of both confidences: docs/wire.md, Anchors
+ASK_AGAIN = 2.0  # s: a request of a publisher that has just begun may be lost
+
+
+class FollowTissue(Node):
+    """Silent while the point is not recognised, or how deep it lies is a guess."""
+
+    def __init__(self) -> None:
+        super().__init__("follow_tissue")
+        self.anchor: int | None = None
+        self.pixel = Point(
+            x=self.declare_parameter("u", 320.0).value, y=self.declare_parameter("v", 256.0).value
+        )
+        self.request = self.create_publisher(Point, "/sags/request/add_anchor_at_pixel", 1)
+        self.place = self.create_publisher(PointStamped, "tissue_point", 1)
+        self.create_subscription(String, "/sags/answer", self.answered, 10)
+        self.create_subscription(PointCloud2, "/sags/anchors", self.came, 1)
+        self.asking = self.create_timer(ASK_AGAIN, lambda: self.request.publish(self.pixel))
+
+    def answered(self, message: String) -> None:
+        answer = json.loads(message.data)
+        if answer.get("request") != "add_anchor_at_pixel" or self.anchor is not None:
+            return
+        if "error" in answer:  # and it is asked again
+            self.get_logger().warning(answer["error"])
+            return
+        self.anchor = answer["result"]["id"]
+        self.asking.cancel()
+        self.get_logger().info(f"follows anchor {self.anchor}")
+
+    def came(self, cloud: PointCloud2) -> None:
+        if self.anchor is None:
+            return
+        columns = {field.name: field.offset // 4 for field in cloud.fields}
+        numbers = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_step // 4)
+        ids = numbers[:, columns["id"]].view("<u4") if len(numbers) else np.zeros(0, "<u4")
+        for row in numbers[ids == self.anchor]:
+            if min(row[columns["confidence"]], row[columns["depth_confidence"]]) >= SURE:
+                place = PointStamped(header=cloud.header)
+                place.point.x, place.point.y, place.point.z = (float(row[columns[axis]]) for axis in "xyz")
+                self.place.publish(place)
+
+
+def main() -> None:
+    rclpy.init()
+    node = FollowTissue()
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+        pass
+
+
+if __name__ == "__main__":
+    main()
