@@ -58,7 +58,7 @@ def main() -> None:
     refused = subprocess.run(
         [sags, "run"], check=False, cwd=home, stderr=subprocess.PIPE, text=True, timeout=60
     )
-    assert refused.returncode == 2 and "sags-node[node]" in refused.stderr, refused.stderr
+    assert refused.returncode == 2 and "'.[node]'" in refused.stderr, refused.stderr
     print(f"a client: {len(brought)} packages", flush=True)
 
     sags = _installed(OUT / "venv", f"{wheel}[node,report]")

@@ -23,7 +23,7 @@ HEAD = """# Licences
 
 Python packages that the product needs, directly or indirectly, with the licence that each states.
 The product is under Apache-2.0 ([LICENSE](../../LICENSE)). "extra" names the extra of an
-optional package: `pip install 'sags-node[EXTRA]'`. `make sbom` writes the contents of an installation
+optional package: `pip install '.[EXTRA]'`. `make sbom` writes the contents of an installation
 as CycloneDX.
 
 | package | version | licence | extra |

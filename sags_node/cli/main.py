@@ -43,7 +43,7 @@ from sags_node.cli.overlay import overlay
 from sags_node.cli.register import register
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError, UsageError, install
 from sags_node.evaluation.plots import check_plots
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
 
@@ -80,8 +80,8 @@ class Sags(click.Group):
         except ModuleNotFoundError as error:
             if str(error.name).partition(".")[0] not in OF_THE_NODE:
                 raise
-            node = "pip install 'sags-node[node]'"
-            said, code = f"{error.name} is not installed: this is for a client; for all of it {node}", 2
+            said = f"{error.name} is not installed: this is for a client; for all of it {install('node')}"
+            code = 2
         except OSError as error:
             if error.errno not in NO_ROOM:
                 raise

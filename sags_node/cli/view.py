@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from sags_node.cli.launching import as_json, shown
 from sags_node.cli.node_options import NICENESS, endpoint_option, node_options, ns_option
-from sags_node.errors import UsageError
+from sags_node.errors import UsageError, install
 from sags_node.terminal.console import console, on_stop_signals, show
 
 if TYPE_CHECKING:
@@ -45,10 +45,10 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     sags view                           # then open the printed address
     ssh -L 8080:127.0.0.1:8080 HOST     # to look from another machine: the same port on both
 
-    Needs: pip install 'sags-node[viewer]'
+    Needs the extra `viewer`: pip install '.[viewer]' in a clone.
     """
     if importlib.util.find_spec("viser") is None:
-        raise UsageError("sags view needs viser; install it with: pip install 'sags-node[viewer]'")
+        raise UsageError(f"sags view needs viser; install it with: {install('viewer')}")
     from sags_node.viewer.run import run_viewer
 
     os.nice(NICENESS)
