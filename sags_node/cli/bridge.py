@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, file_option, path_option, positive, shown
-from sags_node.cli.node_options import NICENESS, endpoint_option, node_options, ns_option
+from sags_node.cli.launching import as_json, file_option, positive, shown
+from sags_node.cli.node_options import NICENESS, both_options, run_dir_option
 from sags_node.errors import SagsError, UsageError, install
 from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, on_stop_signals, show
@@ -59,12 +59,9 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     """Options of every bridge; the command gets them as `node`, `overlay`, `max_age`, `stop`, and
     `say`, which tells where it is once peers can come."""
 
-    @endpoint_option
-    @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; with --endpoint.")
-    @ns_option
-    @node_options
+    @both_options
     @shown("--overlay-ns", default="overlay", help="Namespace of a sags overlay.")
-    @path_option("--run-dir", help="Of the connection files.")
+    @run_dir_option
     @max_age_option(help="Seconds since capture after which a picture is taken back.")
     @as_json
     @wraps(command)
@@ -213,7 +210,7 @@ def web(ready: Ready, stop: threading.Event, **options: Any) -> None:
 @click.option("--right", metavar="LAUNCH", help="What comes behind the right eye's.")
 @shown("--rate", type=positive, default=60.0, help="Hz of the display.")
 @shown("--overlay-ns", default="overlay", help="Namespace of the sags overlay.")
-@path_option("--run-dir", help="Of the connection file.")
+@run_dir_option
 @max_age_option(help="Seconds since capture after which there is only the key colour.")
 def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
     """Write the overlay into GStreamer, on its key colour.

@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +37,7 @@ from sags_node.cli.launching import (
     split_recording,
 )
 from sags_node.cli.new import new
-from sags_node.cli.node_options import node_options, ns_option, own_control_option
+from sags_node.cli.node_options import WHICH_NODE, control_option, node_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.register import register
@@ -55,8 +55,33 @@ OF_THE_NODE = frozenset("torch cv2 open3d onnxruntime numba PIL mcap lz4 zstanda
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
 
 
+SECTIONS = {
+    "Run": "demo run new import doctor phantom health param pause resume reset",
+    "Look": "view topic anchor overlay register",
+    "Record": "bag export archive",
+    "Measure": "eval fit calib",
+    "Connect": "bridge keygen",
+}
+
+
 class Sags(click.Group):
-    """Turns expected errors into one message and an exit code."""
+    """Turns expected errors into one message and an exit code; its help has the commands in sections."""
+
+    sections: Mapping[str, str] = {}
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        names = {title: said.split() for title, said in self.sections.items()}
+        placed = set[str]().union(*names.values())
+        rest = [name for name in self.list_commands(ctx) if name not in placed]
+        for title, those in (names | {"More" if names else "Commands": rest}).items():
+            there = {name: self.commands[name] for name in those if name in self.commands}
+            rows = [(name, each.get_short_help_str(66)) for name, each in there.items() if not each.hidden]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+        if names:
+            with formatter.section("Which node, for commands that look for one"):
+                formatter.write_dl(list(WHICH_NODE.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -127,6 +152,10 @@ def main(verbose: bool, form: str) -> None:
     ZeroMQ on this machine. Start with `sags demo`.
 
     Research software, not a medical device.
+
+    \b
+    For completion of commands, options and topics (also zsh_source, fish_source):
+    eval "$(_SAGS_COMPLETE=bash_source sags)"
     """
     begin(verbose, form)
 
@@ -274,7 +303,7 @@ def keygen(name: str, out: Path) -> None:
 
 
 @main.command()
-@own_control_option
+@control_option
 @ns_option
 @node_options
 @as_json
@@ -350,5 +379,6 @@ for command in (
     *(anchor, param, pause, resume, reset),
 ):
     main.add_command(command)
+main.sections = SECTIONS
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
     more.load()(main)  # of packages that stand beside this one

@@ -11,7 +11,7 @@ import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, shown
-from sags_node.cli.node_options import NICENESS, endpoint_option, node_options, ns_option
+from sags_node.cli.node_options import NICENESS, both_options
 from sags_node.errors import UsageError, install
 from sags_node.terminal.console import console, on_stop_signals, show
 
@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@endpoint_option
-@click.option("--control", help="Control socket of the node; default: its connection file.")
-@ns_option
-@node_options
+@both_options
 @shown("--port", type=click.IntRange(0, 65535), default=8080, help="0: any free one.")
 @shown("--host", default="127.0.0.1", help="Address to serve on.")
 @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")

@@ -1,4 +1,4 @@
-"""`sags topic list | echo | hz | bw | delay`: look at what a node publishes, in the words of `ros2 topic`.
+"""What `sags topic` finds: what a node publishes, in the words of `ros2 topic`.
 
 Each function gives plain dictionaries that JSON can hold.
 """
@@ -19,7 +19,7 @@ from sags_node.errors import SagsError
 from sags_node.messaging import topics, wire
 from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.freezes import freezes_of
-from sags_node.messaging.node_clock import NodeClock
+from sags_node.messaging.node_clock import NodeClock, Offset
 from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
@@ -30,7 +30,7 @@ from sags_node.messaging.received import (
     ReceivedText,
     interpret,
 )
-from sags_node.messaging.stream import listen_to
+from sags_node.messaging.stream import check_topic, listen_to
 
 Record = dict[str, Any]
 
@@ -78,13 +78,13 @@ def _listed(heard: set[str]) -> list[topics.Topic]:
 
 
 def topic_echo(
-    topic: str,
+    names: str | Sequence[str],
     node: NodeAddress = THE_NODE,
     seconds: float | None = None,
     count: int | None = None,
     warned: Callable[[Mapping[str, str]], object] = lambda warnings: None,
 ) -> Iterator[Record]:
-    """Each message of a topic: who, when, and its content (arrays as their range).
+    """Each message of one or some topics: who, when, and its content (arrays as their range).
 
     Args:
         warned: called with all that the sender's `status` warns of, code -> text, whenever one comes.
@@ -93,32 +93,67 @@ def topic_echo(
         UsageError: there is no such topic.
         SagsError: no node is known, or nothing came within `seconds` or `PATIENCE`.
     """
+    asked = [names] if isinstance(names, str) else names
     shown = 0
     began = time.monotonic()
     status = topics.full_name(node.ns, "status")
-    for arrived in listen_to(node, [topic, "status"], seconds):
+    for arrived in listen_to(node, [*asked, "status"], seconds):
         received = None if arrived is None else interpret(*arrived)
         if received is not None and received.topic == status:
             assert isinstance(received, ReceivedText)  # so says its topic
             warned(received.warnings())
-            if topic.lstrip("/").removeprefix(f"{node.ns}/") != "status":
+            if status not in (topics.full_name(node.ns, _plain(name, node)) for name in asked):
                 received = None
         if received is None:
             if not shown and time.monotonic() - began > PATIENCE:
-                raise _silence(topic, node, PATIENCE)
+                raise _silence(asked[0], node, PATIENCE)
             continue
         yield _echo(received)
         shown += 1
         if shown == count:
             return
     if not shown and seconds is not None:
-        raise _silence(topic, node, seconds)
+        raise _silence(asked[0], node, seconds)
+
+
+def topic_info(name: str, node: NodeAddress = THE_NODE, seconds: float = 1.0) -> Record:
+    """What a topic is by the contract, and what was heard of it in `seconds`.
+
+    Raises:
+        UsageError: there is no such topic.
+        SagsError: no node is known.
+    """
+    topic = check_topic(_plain(name, node))
+    senders, messages = set[str](), 0
+    for arrived in listen_to(node, [topic.name], seconds):
+        if arrived is not None:
+            senders.add(arrived[0].meta.session)
+            messages += 1
+    return {
+        "topic": topics.full_name(node.ns, topic.name),
+        "type": topic.type,
+        "content": topic.content,
+        "last_value_kept": topic.cached,
+        "publishers": len(senders),
+        "messages": messages,
+    }
 
 
 def topic_figures(
     kind: Literal["hz", "bw", "delay"], topic: str, node: NodeAddress = THE_NODE, seconds: float = 5.0
 ) -> Record:
-    """Measure what comes on a topic in `seconds`.
+    """`figures_of` a single topic."""
+    (figures,) = figures_of(kind, [topic], node, seconds).values()
+    return figures
+
+
+def figures_of(
+    kind: Literal["hz", "bw", "delay"],
+    names: Sequence[str],
+    node: NodeAddress = THE_NODE,
+    seconds: float = 5.0,
+) -> dict[str, Record]:
+    """Measure what comes on some topics in `seconds`, each by its full name.
 
     Args:
         kind: hz: rate, spread of the intervals, freezes. bw: bytes per second, and the mean, smallest and
@@ -127,17 +162,21 @@ def topic_figures(
 
     Raises:
         UsageError: there is no such topic.
-        SagsError: no node is known, fewer than two messages came, or the node's clock is not known.
+        SagsError: no node is known, fewer than two messages came of one, or the node's clock is not known.
     """
     offset = None
     if kind == "delay" and node.control is not None:
         with NodeClock.at(node) as clock:
-            samples = _listen_to(topic, node, seconds)
+            heard = _listen_to(names, node, seconds)
             offset, problem = clock.offset, clock.problem
         if offset is None:
             raise SagsError(f"{node.control}: {problem}")
     else:
-        samples = _listen_to(topic, node, seconds)
+        heard = _listen_to(names, node, seconds)
+    return {full: _figures(kind, samples, offset) for full, samples in heard.items()}
+
+
+def _figures(kind: str, samples: list[_Sample], offset: Offset | None) -> Record:
     window = {"window": len(samples)}
     if kind == "bw":
         sizes = np.array([sample.size for sample in samples])
@@ -169,18 +208,19 @@ def _spread(values: NDArray[np.float64]) -> Record:
     }
 
 
-def _listen_to(topic: str, node: NodeAddress, seconds: float) -> list[_Sample]:
-    """At least two messages of one topic."""
-    heard = _heard([topic], node, seconds)
-    if not heard:
-        raise _silence(topic, node, seconds)
-    ((full, samples),) = heard.items()
-    fresh = _without_resent(full.removeprefix(f"{node.ns}/"), samples)
-    if len(fresh) < 2:
-        raise SagsError(
-            f"too few messages came on {full} in {seconds:g} s to measure; set --seconds to listen longer"
-        )
-    return fresh
+def _listen_to(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str, list[_Sample]]:
+    """At least two messages of each topic."""
+    heard, found = _heard(names, node, seconds), {}
+    for name in (_plain(each, node) for each in names):
+        full = topics.full_name(node.ns, name)
+        if full not in heard:
+            raise _silence(name, node, seconds)
+        found[full] = _without_resent(name, heard[full])
+        if len(found[full]) < 2:
+            raise SagsError(
+                f"too few messages came on {full} in {seconds:g} s to measure; set --seconds to listen longer"
+            )
+    return found
 
 
 def _heard(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str, list[_Sample]]:
@@ -201,12 +241,17 @@ def _without_resent(name: str, samples: list[_Sample]) -> list[_Sample]:
     return samples[1:] if topic is not None and topic.cached else samples
 
 
+def _plain(name: str, node: NodeAddress) -> str:
+    """A topic without leading slash and namespace."""
+    return name.lstrip("/").removeprefix(f"{node.ns}/")
+
+
 def _size(message: wire.Message) -> int:
     return sum(memoryview(part).nbytes for part in message.parts)
 
 
 def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:
-    full = topics.full_name(node.ns, topic.lstrip("/").removeprefix(f"{node.ns}/"))
+    full = topics.full_name(node.ns, _plain(topic, node))
     hint = "is the node running and not waiting?"
     if "/right/" in full:
         hint += f" ({topics.NO_RIGHT_EYE})"
