@@ -22,15 +22,15 @@ FOLDERS = sorted(init.parent.name for init in PACKAGE.glob("*/__init__.py"))
 # one that needs less lowers it.
 LINES = {
     "benchmarks": 9559,
-    "sags_lab": 5032,
-    "sags_node": 1680,
+    "sags_lab": 5028,
+    "sags_node": 1685,
     "sags_node/bridge": 2597,
     "sags_node/calibration": 1836,
-    "sags_node/cli": 3168,
-    "sags_node/config": 1352,
+    "sags_node/cli": 3285,
+    "sags_node/config": 1343,
     "sags_node/detail": 929,
     "sags_node/engine": 4071,
-    "sags_node/evaluation": 3085,
+    "sags_node/evaluation": 3110,
     "sags_node/export": 891,
     "sags_node/field": 1720,
     "sags_node/fitting": 1523,
@@ -38,7 +38,7 @@ LINES = {
     "sags_node/kernels": 1222,
     "sags_node/mapping": 5588,
     "sags_node/media": 833,
-    "sags_node/messaging": 5084,
+    "sags_node/messaging": 5103,
     "sags_node/model": 960,
     "sags_node/node": 1425,
     "sags_node/overlay": 2361,
@@ -49,10 +49,10 @@ LINES = {
     "sags_node/rig": 1169,
     "sags_node/ros": 332,
     "sags_node/sources": 5666,
-    "sags_node/terminal": 345,
+    "sags_node/terminal": 359,
     "sags_node/viewer": 1007,
     "sags_node/vision": 5462,
-    "tests": 45342,
+    "tests": 45423,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -31,6 +31,7 @@ from sags_node.cli.launching import (
 )
 from sags_node.cli.node_options import data_options
 from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.topics import plain_name
 from sags_node.terminal.console import console, on_stop_signals, progress, show
 
 if TYPE_CHECKING:
@@ -157,7 +158,7 @@ def record(
             console.print(escape(line), soft_wrap=True)
 
     with _failure_reported(tell if from_stdin else None):
-        names = tuple(check_topic(say.plain(name, node.ns)).name for name in topics)
+        names = tuple(check_topic(plain_name(node.ns, name)).name for name in topics)
         options = RecordOptions(
             folder=out or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
             topics=names,
@@ -257,8 +258,8 @@ def play(
     from sags_node.recording.player import Player, PlayOptions
 
     options = PlayOptions(
-        topics=tuple(say.plain(name, ns) for name in topics),
-        exclude=tuple(say.plain(name, ns) for name in exclude),
+        topics=tuple(plain_name(ns, name) for name in topics),
+        exclude=tuple(plain_name(ns, name) for name in exclude),
         remap=say.remappings(remap, ns),
         **how,
     )

@@ -125,7 +125,7 @@ def get(name: str | None, json_out: bool, node: NodeAddress) -> None:
     """Print the configuration in force, or the part of it that KEY names.
 
     \b
-    sags param get                      # all of it, as a launch file says it
+    sags param dump > mine.yaml         # all of it, as a launch file
     sags param get mapping.budget_ms    # null: it follows the rate of the frames
     """
     found: Any = ask(node, "get_parameters")
@@ -134,16 +134,7 @@ def get(name: str | None, json_out: bool, node: NodeAddress) -> None:
     show(({name: found} if name else found) if json_out else text.yaml_text(found))
 
 
-@param.command()
-@asking
-def dump(json_out: bool, node: NodeAddress) -> None:
-    """Print the configuration in force as a launch file.
-
-    \b
-    sags param dump > mine.yaml
-    """
-    found = ask(node, "get_parameters")
-    show(found if json_out else text.yaml_text(found))
+param.add_command(get, "dump")  # its name in ros2
 
 
 @param.command()

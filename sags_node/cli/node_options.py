@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ class NodeOption(click.Option):
         return (names, "Which node: see sags --help.") if self is taken[0] else None
 
 
-def _option(name: str, **how: Any) -> Any:
+def _option(name: str, **how: Any) -> Callable[[Command], Command]:
     return click.option(name, cls=NodeOption, help=WHICH_NODE[name], **how)
 
 

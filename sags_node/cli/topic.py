@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
-from click.shell_completion import CompletionItem
 
 from sags_node.cli.launching import as_json, part_of, positive, shown
 from sags_node.cli.node_options import control_option, data_options
@@ -18,16 +17,12 @@ if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
 
-def _completed(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+def _completed(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     from sags_node.messaging.topics import OVERLAY_TOPICS, TOPICS
 
-    known = (*TOPICS, *OVERLAY_TOPICS)
-    return [
-        CompletionItem(each.name, help=each.content) for each in known if each.name.startswith(incomplete)
-    ]
+    return [each.name for each in (*TOPICS, *OVERLAY_TOPICS) if each.name.startswith(incomplete)]
 
 
-one_topic = click.argument("name", shell_complete=_completed)
 some_topics = click.argument("names", nargs=-1, required=True, metavar="NAME...", shell_complete=_completed)
 
 
@@ -57,15 +52,12 @@ def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
 
 
 @topic.command("info")
-@one_topic
+@click.argument("name", shell_complete=_completed)
 @data_options
 @shown("--seconds", type=positive, default=1.0, help="How long to listen.")
 @as_json
 def topic_info(name: str, seconds: float, json_out: bool, node: NodeAddress) -> None:
-    """What topic NAME is: type, content, and how many send it now.
-
-    sags topic list has the rates of all, sags health what the node says of itself.
-    """
+    """What topic NAME is: type, content, and how many send it now."""
     from sags_node.messaging import introspection as tool
 
     found = tool.topic_info(name, node, seconds)
@@ -100,23 +92,23 @@ def topic_echo(
 
 
 def _measuring(name: Literal["hz", "bw", "delay"], doc: str, *more: Callable[..., Any]) -> None:
-    """The commands that listen to topics for a while; `more` are options of one alone."""
+    """The commands that listen to topics, one after the other; `more` are options of one alone."""
 
     @topic.command(name, help=doc)
     @some_topics
     @data_options
-    @shown("--seconds", type=positive, default=5.0, help="How long to listen.")
+    @shown("--seconds", type=positive, default=5.0, help="How long to listen to each.")
     @as_json
     def command(names: tuple[str, ...], json_out: bool, **asked: Any) -> None:
         from sags_node.messaging import introspection as tool
 
-        found = tool.figures_of(name, names, **asked)
+        found = {each: tool.topic_figures(name, each, **asked) for each in names}
         if json_out:
-            show(found if len(found) > 1 else next(iter(found.values())))
+            show(found if len(found) > 1 else found[names[0]])
             return
-        for full, figures in found.items():
+        for each, figures in found.items():
             said: str = getattr(text, f"{name}_text")(figures)
-            show(f"{full}: {said}" if len(found) > 1 else said)
+            show(f"{each}: {said}" if len(found) > 1 else said)
 
     for option in more:
         option(command)

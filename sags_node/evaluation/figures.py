@@ -229,17 +229,14 @@ def verdict(figures: Flat) -> list[tuple[str, str]]:
             left out.
     """
     followed = _said(figures, *_off("track"), ("track.lost", "; {:.0%} given up (no Gaussian near)"))
-    warped = (
-        ("right.psnr", "{:.1f} dB PSNR"),
-        ("right.warp_psnr", f" ({_WARP} by the same depth: {{:.1f}} dB)"),
-    )
+    right = ("right.psnr", "{:.1f} dB PSNR"), ("right.warp_psnr", f" ({_WARP}: {{:.1f}} dB)")
     hidden = ("hidden.psnr", "{:.1f} dB PSNR"), ("hidden.copy_psnr", " (as it was last seen: {:.1f} dB)")
     warned = below(figures, "warnings").items()
     lines = {
         "overlay": _overlay(figures),
         "points": followed or _said(figures, ("track.lost", "all given up")),
         "depth": _depth(figures),
-        "right eye": _said(figures, *warped),
+        "right eye": _said(figures, *right),
         "hidden": _said(figures, *hidden),
         "speed": _speed(figures),
         "latency": _latency(figures),
@@ -322,11 +319,12 @@ def _depth(figures: Flat) -> str:
     reference = AGAINST.get(str(figures.get("settings.depth_reference")), "the recording's")
     covered = "depth.coverage", ", on {:.0%} of the tissue"
     said = _said(figures, *_off("depth"), covered)
-    alone = (
+    alone = _said(
+        figures,
         ("measured_depth.median_mm", "; stereo alone: {:.2f} mm"),
         ("measured_depth.coverage", " on {:.0%}"),
     )
-    return said and f"{said}, against {reference}{_said(figures, *alone)}"
+    return said and f"{said}, against {reference}{alone}"
 
 
 def _quality(figures: Flat) -> str:

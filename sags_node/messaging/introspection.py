@@ -19,7 +19,7 @@ from sags_node.errors import SagsError
 from sags_node.messaging import topics, wire
 from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.freezes import freezes_of
-from sags_node.messaging.node_clock import NodeClock, Offset
+from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import (
     Received,
     ReceivedCameraInfo,
@@ -102,7 +102,7 @@ def topic_echo(
         if received is not None and received.topic == status:
             assert isinstance(received, ReceivedText)  # so says its topic
             warned(received.warnings())
-            if status not in (topics.full_name(node.ns, _plain(name, node)) for name in asked):
+            if "status" not in (topics.plain_name(node.ns, name) for name in asked):
                 received = None
         if received is None:
             if not shown and time.monotonic() - began > PATIENCE:
@@ -123,37 +123,16 @@ def topic_info(name: str, node: NodeAddress = THE_NODE, seconds: float = 1.0) ->
         UsageError: there is no such topic.
         SagsError: no node is known.
     """
-    topic = check_topic(_plain(name, node))
-    senders, messages = set[str](), 0
-    for arrived in listen_to(node, [topic.name], seconds):
-        if arrived is not None:
-            senders.add(arrived[0].meta.session)
-            messages += 1
-    return {
-        "topic": topics.full_name(node.ns, topic.name),
-        "type": topic.type,
-        "content": topic.content,
-        "last_value_kept": topic.cached,
-        "publishers": len(senders),
-        "messages": messages,
-    }
+    topic = check_topic(topics.plain_name(node.ns, name))
+    heard = [arrived[0].meta.session for arrived in listen_to(node, [topic.name], seconds) if arrived]
+    said = {"topic": topics.full_name(node.ns, topic.name), "type": topic.type, "content": topic.content}
+    return said | {"publishers": len(set(heard)), "messages": len(heard), "kept_for_newcomers": topic.cached}
 
 
 def topic_figures(
     kind: Literal["hz", "bw", "delay"], topic: str, node: NodeAddress = THE_NODE, seconds: float = 5.0
 ) -> Record:
-    """`figures_of` a single topic."""
-    (figures,) = figures_of(kind, [topic], node, seconds).values()
-    return figures
-
-
-def figures_of(
-    kind: Literal["hz", "bw", "delay"],
-    names: Sequence[str],
-    node: NodeAddress = THE_NODE,
-    seconds: float = 5.0,
-) -> dict[str, Record]:
-    """Measure what comes on some topics in `seconds`, each by its full name.
+    """Measure what comes on a topic in `seconds`.
 
     Args:
         kind: hz: rate, spread of the intervals, freezes. bw: bytes per second, and the mean, smallest and
@@ -162,21 +141,17 @@ def figures_of(
 
     Raises:
         UsageError: there is no such topic.
-        SagsError: no node is known, fewer than two messages came of one, or the node's clock is not known.
+        SagsError: no node is known, fewer than two messages came, or the node's clock is not known.
     """
     offset = None
     if kind == "delay" and node.control is not None:
         with NodeClock.at(node) as clock:
-            heard = _listen_to(names, node, seconds)
+            samples = _listen_to(topic, node, seconds)
             offset, problem = clock.offset, clock.problem
         if offset is None:
             raise SagsError(f"{node.control}: {problem}")
     else:
-        heard = _listen_to(names, node, seconds)
-    return {full: _figures(kind, samples, offset) for full, samples in heard.items()}
-
-
-def _figures(kind: str, samples: list[_Sample], offset: Offset | None) -> Record:
+        samples = _listen_to(topic, node, seconds)
     window = {"window": len(samples)}
     if kind == "bw":
         sizes = np.array([sample.size for sample in samples])
@@ -208,19 +183,18 @@ def _spread(values: NDArray[np.float64]) -> Record:
     }
 
 
-def _listen_to(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str, list[_Sample]]:
-    """At least two messages of each topic."""
-    heard, found = _heard(names, node, seconds), {}
-    for name in (_plain(each, node) for each in names):
-        full = topics.full_name(node.ns, name)
-        if full not in heard:
-            raise _silence(name, node, seconds)
-        found[full] = _without_resent(name, heard[full])
-        if len(found[full]) < 2:
-            raise SagsError(
-                f"too few messages came on {full} in {seconds:g} s to measure; set --seconds to listen longer"
-            )
-    return found
+def _listen_to(topic: str, node: NodeAddress, seconds: float) -> list[_Sample]:
+    """At least two messages of one topic."""
+    heard = _heard([topic], node, seconds)
+    if not heard:
+        raise _silence(topic, node, seconds)
+    ((full, samples),) = heard.items()
+    fresh = _without_resent(full.removeprefix(f"{node.ns}/"), samples)
+    if len(fresh) < 2:
+        raise SagsError(
+            f"too few messages came on {full} in {seconds:g} s to measure; set --seconds to listen longer"
+        )
+    return fresh
 
 
 def _heard(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str, list[_Sample]]:
@@ -241,17 +215,12 @@ def _without_resent(name: str, samples: list[_Sample]) -> list[_Sample]:
     return samples[1:] if topic is not None and topic.cached else samples
 
 
-def _plain(name: str, node: NodeAddress) -> str:
-    """A topic without leading slash and namespace."""
-    return name.lstrip("/").removeprefix(f"{node.ns}/")
-
-
 def _size(message: wire.Message) -> int:
     return sum(memoryview(part).nbytes for part in message.parts)
 
 
 def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:
-    full = topics.full_name(node.ns, _plain(topic, node))
+    full = topics.full_name(node.ns, topics.plain_name(node.ns, topic))
     hint = "is the node running and not waiting?"
     if "/right/" in full:
         hint += f" ({topics.NO_RIGHT_EYE})"

@@ -138,9 +138,7 @@ def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
         assert pure_json(sags(*command, "--json").stdout)[key] > 0
         assert unit in sags(*command).stdout
     two = pure_json(sags("topic", "hz", "left/depth", "tf", *listen, "--json").stdout)
-    assert (
-        set(two) == {"sags/left/depth", "sags/tf"} and min(each["average_rate"] for each in two.values()) > 0
-    )
+    assert min(two[name]["average_rate"] for name in ("left/depth", "tf")) > 0
 
 
 def test_echo_in_words_and_in_json(beside_node: dict[str, Any]) -> None:

@@ -61,7 +61,7 @@ def test_a_verdict_has_what_an_overlay_needs_first_with_units_and_baselines() ->
         "points": "0.38 mm off (median), nine of ten within 0.88 mm; 33% given up (no Gaussian near)",
         "overlay": "on 249 of 268 frames (93%), 39 ms (p50), 97 ms (p99) after the camera;"
         " 19 without: being pinned",
-        "right eye": "34.1 dB PSNR (left picture, warped by the same depth: 32.6 dB)",
+        "right eye": "34.1 dB PSNR (left picture, warped: 32.6 dB)",
         "hidden": "26.1 dB PSNR (as it was last seen: 25.3 dB)",
         "quality": "rung 3 of 0 to 15 for most frames (1 to 14), 21,510 Gaussians on average, 640x512 px",
         "warnings": "frames_missed (16 frames)",
