@@ -18,7 +18,7 @@ unexport PYTHONDONTWRITEBYTECODE
 missing = $(shell for p in $(1); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done)
 apt_install = apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null
 
-.PHONY: setup run test test-all bench gpu-check test-targets test-tools simulate stops soak fuzz wheel-test sbom audit licences lint golden docs check-docs clean
+.PHONY: setup run test test-all bench gpu-check test-targets test-tools simulate stops soak fuzz wheel-test sbom release audit licences lint golden docs check-docs clean
 
 setup: $(STAMP)
 
@@ -31,8 +31,10 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 1; }
 	@echo "Installing Python packages into $(VENV): a minute or two, by the network"
 	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) torch uv
-	@# uv takes a fifth of pip's time; it does not know pip's configuration, so where it fails pip goes on.
+	@$(PIP) uv
+	@# torch for the card that is there, or for the CPU. uv takes a fifth of pip's time; it does not know pip's
+	@# configuration, so where it fails pip goes on.
+	@$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt --torch-backend auto torch 2>/dev/null || $(PIP) torch
 	@$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt -e '.[dev]' || \
 	  { echo "uv could not; pip goes on"; $(PIP) -e '.[dev]'; }
 	@touch $@
@@ -111,7 +113,7 @@ check-docs: setup
 	@status=0; $(BIN)/python docs/dev/check_docs.py || status=1; \
 	$(BIN)/python -m pytest tests/test_layers.py --tb=line || status=1; exit $$status
 
-# The wheel in an empty environment, and its demo: some minutes, 2 GB in out/wheel.
+# The wheel in an empty environment, and its demo: some minutes, 3 GB in out/wheel.
 wheel-test: setup
 	$(BIN)/python tests/wheel.py
 
@@ -119,6 +121,17 @@ wheel-test: setup
 sbom: wheel-test
 	$(PYTHON) -m venv out/tools && out/tools/bin/pip install -q --disable-pip-version-check cyclonedx-bom
 	out/tools/bin/cyclonedx-py environment --pyproject pyproject.toml -o out/sbom.json out/wheel/venv
+
+# What is given away, in out/release: the wheel that was tried, the sdist, what it runs with, and their hashes.
+release: sbom
+	rm -rf out/release && mkdir out/release
+	out/tools/bin/pip install -q --disable-pip-version-check build twine packaging
+	cp out/wheel/sags_node-*.whl out/sbom.json out/release
+	out/tools/bin/python -m build -q --sdist --outdir out/release .
+	out/tools/bin/twine check --strict out/release/sags_node-*
+	out/wheel/venv/bin/pip check
+	out/tools/bin/python docs/dev/soup_page.py out/release/sbom.json
+	cd out/release && sha256sum * > SHA256SUMS && cat SHA256SUMS
 
 # Whether osv.dev knows a vulnerability of what that environment holds.
 audit: wheel-test

@@ -17,6 +17,11 @@ class UsageError(SagsError):
     exit_code = 2
 
 
+def install(extra: str) -> str:
+    """How to get an extra of this package, in words."""
+    return f"pip install '.[{extra}]' in a clone, or 'sags-node[{extra}]' from an index that has it"
+
+
 _LONGEST = 100  # characters of a value in a message
 _repr = Repr()
 _repr.maxstring = _repr.maxother = _LONGEST

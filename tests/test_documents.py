@@ -25,7 +25,11 @@ def test_what_is_not_there_is_found(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(
         "# A title\n`sags_node/gone.py` [a](page.md#a-title) [b](page.md#b) [c](gone.md) [d](#d)\n"
+        "[there](tests/test_a.py) [gone](tests/test_a.py)\n"
     )
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests/test_a.py").write_text("\ndef test_there() -> None: ...\n")
+    assert [line.split()[2] for line in check_docs.missing_tests(page)] == ["gone,"]
     assert [line.split()[2] for line in check_docs.missing_files(page)] == ["sags_node/gone.py,"]
     assert [line.split()[3] for line in check_docs.dead_links(page)] == ["page.md#b,", "gone.md,", "#d,"]
 

@@ -34,7 +34,7 @@ def holds_one(node: Subscriber) -> bool:
 def test_all_start_and_end_together_and_the_notebook_plots_what_was_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plt = pytest.importorskip("matplotlib.pyplot", reason="plots need: pip install 'sags-node[report]'")
+    plt = pytest.importorskip("matplotlib.pyplot", reason="plots need the extra report")
     (tmp_path / "run").mkdir(mode=0o700)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")

@@ -73,10 +73,21 @@ def dead_links(page: Path) -> Iterator[str]:
             yield f"{page.name} links to {link}{anchor and '#'}{anchor}, which is not there"
 
 
+def missing_tests(page: Path) -> Iterator[str]:
+    """Tests that a page links to by their names, without `test_`."""
+    for name, link in re.findall(
+        r"\[([a-z0-9_]+)\]\(([^)]*/test_\w+\.py)\)", page.read_text(encoding="utf-8")
+    ):
+        file = page.parent / link
+        if file.exists() and f"\ndef test_{name}(" not in file.read_text(encoding="utf-8"):
+            yield f"{page.name} names {name}, which is not in {link}"
+
+
 def check_pages() -> Iterator[str]:
     for page in pages():
         yield from missing_files(page)
         yield from dead_links(page)
+        yield from missing_tests(page)
 
 
 def check_scripts() -> Iterator[str]:

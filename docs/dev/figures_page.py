@@ -1,6 +1,6 @@
 """Writes the tables of figures in README.md and other pages from benchmarks/results: `make docs`.
 
-A table stands between two comments. `claims.txt` and `headline.txt` are tables whose figures are named.
+A table stands between two comments. `why.txt`, `headline.txt` and `claims.txt` name the figures of theirs.
 A result that is not there ends with its name.
 """
 
@@ -62,7 +62,8 @@ class Figure:
     """A part of results, found by what stands in brackets behind them, as `str.format` does.
 
     Of a list: a place, the row in which one of the values is that word, or `*` for all rows. What is asked of
-    all rows is written as the range of its values, what is asked of several runs as one value each. `test`
+    all rows is written as the range of its values, what is asked of several runs as one value each, or behind
+    `*` as their range. `test`
     is the half of a clip that no constant was chosen on, and all of a clip that has none.
     """
 
@@ -72,8 +73,8 @@ class Figure:
 
     def __getitem__(self, key: str | int) -> Figure:
         if key == "*":
-            (rows,) = self._runs
-            return Figure(rows, rows=True)
+            (first, *others) = self._runs
+            return Figure(self._runs if others else first, rows=True)
         return Figure([_part(run, key) for run in self._runs], self._rows)
 
     def __format__(self, how: str) -> str:
@@ -97,7 +98,7 @@ def claimed(line: str) -> list[str]:
 
 
 def lines(name: str) -> list[str]:
-    """Of `claims.txt` or `headline.txt`, without comments."""
+    """Of one of the `.txt`, without comments."""
     text = (HERE / name).read_text(encoding="utf-8")
     return [line for line in text.splitlines() if line and not line.startswith("#")]
 
@@ -116,7 +117,7 @@ def table(titles: str, rows: list[str]) -> str:
 def pages() -> dict[Path, str]:
     """What each page should be."""
     written = {
-        "README.md": (_headline(),),
+        "README.md": (_plain("why.txt"), _plain("headline.txt")),
         "benchmarks/README.md": (_claims(), _live()),
         "benchmarks/ladder.md": (_ladder(),),
         "docs/how-it-works.md": (_methods(),),
@@ -130,9 +131,9 @@ def _replaced(page: str, *tables: str) -> str:
     return before + "".join(BEGIN + new + rest for new, rest in zip(tables, after, strict=True))
 
 
-def _headline() -> str:
-    """Of README.md: live as it came, then frame by frame, which repeats."""
-    return table(" D4D, second half | model | compared with", list(map(filled, lines("headline.txt"))))
+def _plain(name: str) -> str:
+    """A table of README.md."""
+    return table(" | the model | beside it", list(map(filled, lines(name))))
 
 
 def _claims() -> str:

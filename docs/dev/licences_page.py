@@ -16,14 +16,14 @@ from packaging.requirements import Requirement
 
 PAGE = Path(__file__).with_name("licences.md")
 ROOT = PAGE.parents[2]
-NOT_SHIPPED = {"dev"}  # extras for those who change the product
+NOT_SHIPPED = {"dev", "all"}  # extras for those who change the product, and of others
 HEAD = """# Licences
 
 <!-- Written by `make licences` from what is installed. Change nothing here. -->
 
 Python packages that the product needs, directly or indirectly, with the licence that each states.
 The product is under Apache-2.0 ([LICENSE](../../LICENSE)). "extra" names the extra of an
-optional package: `pip install 'sags-node[EXTRA]'`. `make sbom` writes the contents of an installation
+optional package: `pip install '.[EXTRA]'`. `make sbom` writes the contents of an installation
 as CycloneDX.
 
 | package | version | licence | extra |
@@ -50,7 +50,7 @@ def _closure(requirements: list[str]) -> set[str]:
     while waiting:
         one = waiting.pop()
         for extra in ("", *one.extras):
-            key = (_plain(one.name), extra)
+            key = (plain(one.name), extra)
             if key in seen or (one.marker is not None and not one.marker.evaluate({"extra": ""})):
                 continue
             seen.add(key)
@@ -58,7 +58,7 @@ def _closure(requirements: list[str]) -> set[str]:
                 needs = distribution(one.name).requires or []
             except PackageNotFoundError:
                 continue
-            names.add(_plain(one.name))
+            names.add(plain(one.name))
             waiting += [need for need in map(Requirement, needs) if _applies(need, extra)]
     return names
 
@@ -71,7 +71,7 @@ def _applies(need: Requirement, extra: str) -> bool:
     return applies
 
 
-def _plain(name: str) -> str:
+def plain(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError, UsageError, install
 
 NEEDED = ("ray", "pyarrow", "fsspec")  # the extra `archive`
 OBJECT_STORE = 80 << 20  # bytes: nothing large is passed; Ray wants 75 MiB at least
@@ -33,9 +33,7 @@ def check_installed() -> None:
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        raise UsageError(
-            f"archives need {', '.join(missing)}, which is not installed: pip install 'sags-node[lab]'"
-        )
+        raise UsageError(f"archives need {', '.join(missing)}, which is not installed: {install('lab')}")
 
 
 @contextmanager

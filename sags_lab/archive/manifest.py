@@ -20,7 +20,7 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
-from sags_node.errors import SagsError, UsageError, brief
+from sags_node.errors import SagsError, UsageError, brief, install
 from sags_node.files import check_file, whole
 
 COLUMNS = ("recording", "rig", "overrides", "weight", "segment")
@@ -236,7 +236,5 @@ def parquet() -> Any:
     try:
         import pyarrow.parquet as pq
     except ImportError:
-        raise UsageError(
-            "Parquet files need pyarrow, which is not installed: pip install 'sags-node[lab]'"
-        ) from None
+        raise UsageError(f"Parquet files need pyarrow, which is not installed: {install('lab')}") from None
     return pq

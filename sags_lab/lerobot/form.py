@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from sags_lab.lerobot.stats import Stats, merged
-from sags_node.errors import UsageError
+from sags_node.errors import UsageError, install
 from sags_node.tools.export.played import TRACKS
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def check_lerobot() -> None:
         import pyarrow.parquet  # noqa: F401
     except ImportError:
         raise UsageError(
-            "LeRobot data sets need pyarrow, which is not installed: pip install 'sags-node[lab]'"
+            f"LeRobot data sets need pyarrow, which is not installed: {install('lab')}"
         ) from None
 
 

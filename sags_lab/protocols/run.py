@@ -52,7 +52,7 @@ def measure_endonerf(
     """
     options = MeasureOptions(HOLD_OUT, every=1, lpips_weights=lpips, paper_psnr=True)
     found = evaluate(
-        folder, [AS_GIVEN, *overrides], options, "step", None, lambda what, done: progress(done, what)
+        folder, [AS_GIVEN, *overrides], options, "step", None, lambda what, done, count: progress(done, what)
     )
     heldout = found.summary["heldout"]
     if heldout is None:

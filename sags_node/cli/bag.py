@@ -29,8 +29,9 @@ from sags_node.cli.launching import (
     shown,
     split_recording,
 )
-from sags_node.cli.node_options import data_options, ns_option
+from sags_node.cli.node_options import data_options
 from sags_node.errors import SagsError, UsageError
+from sags_node.messaging.topics import plain_name
 from sags_node.terminal.console import console, on_stop_signals, progress, show
 
 if TYPE_CHECKING:
@@ -51,7 +52,8 @@ def bag() -> None:
 @launch_argument
 @session_option
 @path_option("-o", "--out", "--output", help="New folder; default: sags_<date>_<time>.")
-@click.option("--topics", multiple=True, metavar="NAME", help="Record only this; may be repeated.")
+@click.option("-a", "--all", "everything", is_flag=True, help="Record all topics, as without --topics.")
+@click.option("--topics", multiple=True, metavar="NAME...", help="Record only these.")
 @shown(
     "--compression",
     type=click.Choice(["none", "jpeg", "png"]),
@@ -93,6 +95,7 @@ def record(
     launch: tuple[str, ...],
     session: str | None,
     out: Path | None,
+    everything: bool,
     topics: tuple[str, ...],
     max_bag_size: int,
     max_bag_duration: float,
@@ -113,19 +116,22 @@ def record(
 
     \b
     sags bag record -o out/case1 --compression jpeg
-    sags bag record --topics left/image_rect_color --topics right/image_rect_color
+    sags bag record --topics left/image_rect_color right/image_rect_color
     sags bag record -o out/case2 --max-bag-size 4000000000
     sags bag record -o out/last --snapshot-mode 20 & kill -USR1 $!
     sags bag record launch/d4d_pull.yaml -o out/case3 mapping.budget_ms:=100
     """
     from datetime import datetime
 
-    if stray := [said for said in launch if ":=" not in said and not Path(said).exists()]:
-        named = " ".join(f"--topics {topic}" for topic in (*topics, *stray))
+    stray = tuple(said for said in launch if ":=" not in said and not Path(said).exists())
+    if stray and not topics:
         raise UsageError(
-            f"{' '.join(stray)}: no such recording; topics are named so: {named}; without --topics all are "
-            "recorded"
+            f"{' '.join(stray)}: no such recording; topics are named so: --topics {' '.join(stray)}; without "
+            "--topics all are recorded"
         )
+    launch, topics = tuple(said for said in launch if said not in stray), (*topics, *stray)
+    if everything and topics:
+        raise UsageError("--all or --topics, not both")
     words = played_instead(launch, session)
     if launch and words is None:
         raise UsageError(f"{launch[0]}: key:=value needs a recording: sags bag record RECORDING key:=value")
@@ -152,7 +158,7 @@ def record(
             console.print(escape(line), soft_wrap=True)
 
     with _failure_reported(tell if from_stdin else None):
-        names = tuple(check_topic(say.plain(name, node.ns)).name for name in topics)
+        names = tuple(check_topic(plain_name(node.ns, name)).name for name in topics)
         options = RecordOptions(
             folder=out or Path(f"sags_{datetime.now():%Y%m%d_%H%M%S}"),
             topics=names,
@@ -166,11 +172,12 @@ def record(
             return
         notices = Notices(warn)
 
-        def progress(summary: dict[str, Any]) -> None:
+        def watched(summary: dict[str, Any]) -> None:
             if from_stdin:
                 tell({"progress": {key: said for key, said in summary.items() if key != "topics"}})
             else:
                 notices.update(by_code(by_stage(findings(summary))))
+                advance(summary["messages"])
 
         recorder = Recorder(options)
         on_stop_signals(recorder.stop)
@@ -182,7 +189,8 @@ def record(
             timer.daemon = True
             timer.start()
         try:
-            summary = recorder.run(tell, progress)
+            with progress("recording, messages") as advance:
+                summary = recorder.run(tell, watched)
         except KeyboardInterrupt:
             saved = f"sags bag recover {shlex.quote(str(options.folder))} -o OUT"
             warn(f"broken off: save what is there with: {saved}")
@@ -223,7 +231,7 @@ def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
 @click.option("-x", "--exclude", multiple=True, metavar="NAME", help="Do not play this; may be repeated.")
 @click.option("-m", "--remap", multiple=True, metavar="OLD:=NEW", help="Publish under another name.")
 @shown("--endpoint", default="tcp://127.0.0.1:5556", help="Where to publish.")
-@ns_option
+@shown("--ns", default="sags", help="Namespace of the topics.")
 @as_json
 def play(
     path: Path,
@@ -250,8 +258,8 @@ def play(
     from sags_node.config.schema import PublishConfig
 
     options = PlayOptions(
-        topics=tuple(say.plain(name, ns) for name in topics),
-        exclude=tuple(say.plain(name, ns) for name in exclude),
+        topics=tuple(plain_name(ns, name) for name in topics),
+        exclude=tuple(plain_name(ns, name) for name in exclude),
         remap=say.remappings(remap, ns),
         **how,
     )

@@ -8,6 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from sags_node.errors import UsageError
+from sags_node.messaging.topics import plain_name
 from sags_node.terminal import text
 
 
@@ -21,12 +22,7 @@ def remappings(said: Sequence[str], ns: str) -> dict[str, str]:
     for old, assigned, new in pairs:
         if not (old and assigned and new):
             raise UsageError(f"--remap {old}{assigned}{new}: write old:=new")
-    return {plain(old, ns): plain(new, ns) for old, _, new in pairs}
-
-
-def plain(name: str, ns: str) -> str:
-    """A topic without leading slash and namespace."""
-    return name.lstrip("/").removeprefix(f"{ns}/")
+    return {plain_name(ns, old): plain_name(ns, new) for old, _, new in pairs}
 
 
 def recorded_table(summary: Mapping[str, Any]) -> Table:

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.markup import escape
 
-from sags_node.cli.launching import as_json, file_option, path_option, positive, shown
-from sags_node.cli.node_options import NICENESS, endpoint_option, node_options, ns_option
-from sags_node.errors import SagsError, UsageError
+from sags_node.cli.launching import as_json, file_option, positive, shown
+from sags_node.cli.node_options import NICENESS, both_options, run_dir_option
+from sags_node.errors import SagsError, UsageError, install
 from sags_node.files import check_file, whole
 from sags_node.terminal.console import console, on_stop_signals, show
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
-INSTALL = "install it with: pip install 'sags-node[bridges]'"
+INSTALL = f"install it with: {install('bridges')}"
 
 max_age_option = partial(shown, "--max-age", type=positive, default=0.4)
 Ready = Callable[[str, int], None]  # host and port, once peers can come
@@ -59,12 +59,9 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     """Options of every bridge; the command gets them as `node`, `overlay`, `max_age`, `stop`, and
     `say`, which tells where it is once peers can come."""
 
-    @endpoint_option
-    @click.option("--control", metavar="ENDPOINT", help="Control socket of the node; with --endpoint.")
-    @ns_option
-    @node_options
+    @both_options
     @shown("--overlay-ns", default="overlay", help="Namespace of a sags overlay.")
-    @path_option("--run-dir", help="Of the connection files.")
+    @run_dir_option
     @max_age_option(help="Seconds since capture after which a picture is taken back.")
     @as_json
     @wraps(command)
@@ -165,7 +162,7 @@ def openigtlink(send: str, ready: Ready, stop: threading.Event, **options: Any) 
 
     A list of points sent to the device SagsPin is pinned to the tissue.
 
-    Needs: pip install 'sags-node[bridges]'
+    Needs the extra `bridges`: pip install '.[bridges]' in a clone.
     """
     _check_installed("pyigtl", "pyigtl", "openigtlink")
     from sags_node.clients.bridge.openigtlink import IgtlOptions, run_openigtlink
@@ -200,7 +197,7 @@ def web(ready: Ready, stop: threading.Event, **options: Any) -> None:
 
     Pages of other origins are refused unless --origin names them.
 
-    Needs: pip install 'sags-node[bridges]'
+    Needs the extra `bridges`: pip install '.[bridges]' in a clone.
     """
     _check_installed("websockets", "websockets", "web")
     from sags_node.clients.bridge.web import WebOptions, run_web
@@ -213,7 +210,7 @@ def web(ready: Ready, stop: threading.Event, **options: Any) -> None:
 @click.option("--right", metavar="LAUNCH", help="What comes behind the right eye's.")
 @shown("--rate", type=positive, default=60.0, help="Hz of the display.")
 @shown("--overlay-ns", default="overlay", help="Namespace of the sags overlay.")
-@path_option("--run-dir", help="Of the connection file.")
+@run_dir_option
 @max_age_option(help="Seconds since capture after which there is only the key colour.")
 def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
     """Write the overlay into GStreamer, on its key colour.
@@ -260,7 +257,7 @@ def foxglove(layout: Path | None, ready: Ready, stop: threading.Event, **options
     Any web page that is open in a browser of this machine can connect too. So peers can look, and do nothing
     else unless --pin is given.
 
-    Needs: pip install 'sags-node[bridges]'
+    Needs the extra `bridges`: pip install '.[bridges]' in a clone.
     """
     _check_installed("foxglove", "foxglove-sdk", "foxglove")
     if layout is not None:
@@ -318,7 +315,7 @@ def ros2(
     Requests are topics under /sags/request; answers come on /sags/answer. RViz's tool Publish Point pins an
     anchor when its topic is /sags/request/add_anchor.
 
-    Needs: pip install 'sags-node[ros2]'
+    Needs the extra `ros2`: pip install '.[ros2]' in a clone.
     """
     if interface != "lo":
         _check_open(f"--interface {interface}", insecure)

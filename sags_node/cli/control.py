@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from sags_node.cli.launching import as_json, group_of, path_option
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option, own_control_option
+from sags_node.cli.launching import as_json, group_of, part_of
+from sags_node.cli.node_options import asked_options, endpoint_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.terminal import text
 from sags_node.terminal.console import show
@@ -21,8 +22,7 @@ ANCHORS_WAIT = 3.0  # s for the anchors of a frame
 
 def asking(command: Callable[..., None]) -> Callable[..., None]:
     """Options of a command that asks a node; it gets the node as `node`."""
-    run_dir = path_option("--run-dir", help="Of the connection file.")
-    return group_of(own_control_option, ns_option, run_dir, node_options, as_json)(command)
+    return group_of(asked_options, as_json)(command)
 
 
 def ask(node: NodeAddress, op: str, args: dict[str, Any] | None = None) -> Any:
@@ -125,21 +125,46 @@ def get(name: str | None, json_out: bool, node: NodeAddress) -> None:
     """Print the configuration in force, or the part of it that KEY names.
 
     \b
-    sags param get                      # all of it, as a launch file says it
+    sags param dump > mine.yaml         # all of it, as a launch file
     sags param get mapping.budget_ms    # null: it follows the rate of the frames
     """
-    import yaml
-
     found: Any = ask(node, "get_parameters")
-    for part in name.split(".") if name else ():
-        if not isinstance(found, dict) or part not in found:
-            known = f"; there are {', '.join(found)}" if isinstance(found, dict) else ""
-            raise UsageError(f"unknown key '{name}'{known}")
-        found = found[part]
-    if json_out:
-        show({name: found} if name else found)
-    else:
-        show(yaml.safe_dump(found, sort_keys=False).removesuffix("...\n").rstrip())
+    if name:
+        found = part_of(found, name)
+    show(({name: found} if name else found) if json_out else text.yaml_text(found))
+
+
+param.add_command(get, "dump")  # its name in ros2
+
+
+@param.command()
+@click.argument("file", metavar="FILE.yaml", type=click.Path(path_type=Path))
+@asking
+def load(file: Path, json_out: bool, node: NodeAddress) -> None:
+    """Change what a file of sags param dump says otherwise than the node.
+
+    All of it or, if one of the keys cannot change, nothing: see sags param set.
+    """
+    from sags_node.config.yaml_reader import read_yaml
+
+    wanted = read_yaml(file, "parameters")
+    if not isinstance(wanted, dict):
+        raise UsageError(f"{file} has no parameters: write key: value, as sags param dump does")
+    now = dict(_leaves(ask(node, "get_parameters")))
+    said = {key: value for key, value in _leaves(wanted) if key not in now or now[key] != value}
+    if said:
+        ask(node, "set_parameters", said)
+    changed = ", ".join(f"{key} is {value}" for key, value in said.items())
+    show(said if json_out else changed or "all of it is so already")
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Each value of nested keys, by its whole key."""
+    for key, value in tree.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 @param.command("set")

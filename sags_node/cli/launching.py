@@ -124,6 +124,22 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
     return path, overrides
 
 
+def part_of(found: Any, name: str) -> Any:
+    """The value under a key in words, `a.b.0`.
+
+    Raises:
+        UsageError: there is none.
+    """
+    for word in name.split("."):
+        keys = range(len(found)) if isinstance(found, list) else found if isinstance(found, dict) else ()
+        known = {str(key): key for key in keys}
+        if word not in known:
+            there = f"; there are {', '.join(known)}" if known else ""
+            raise UsageError(f"unknown key '{name}'{there}")
+        found = found[known[word]]
+    return found
+
+
 def open_launched(path: str | None, overrides: Sequence[str], guess: Guess | None = None) -> Session:
     """Open a session and make its kernels ready; says what is played, what takes long and what it runs on.
 

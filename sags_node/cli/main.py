@@ -9,7 +9,7 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,13 +39,13 @@ from sags_node.cli.launching import (
 )
 from sags_node.cli.measure import measure
 from sags_node.cli.new import new
-from sags_node.cli.node_options import node_options, ns_option, own_control_option
+from sags_node.cli.node_options import WHICH_NODE, control_option, node_options, ns_option
 from sags_node.cli.offline import evaluate, fit
 from sags_node.cli.overlay import overlay
 from sags_node.cli.register import register
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError, UsageError, install
 from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
 from sags_node.tools.evaluation.plots import check_plots
 
@@ -57,8 +57,33 @@ OF_THE_NODE = frozenset("torch cv2 open3d onnxruntime numba PIL mcap lz4 zstanda
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
 
 
+SECTIONS = {
+    "Run": "demo run new import doctor phantom health param pause resume reset",
+    "Look": "view topic anchor overlay register",
+    "Record": "bag export archive",
+    "Measure": "eval fit calib",
+    "Connect": "bridge keygen",
+}
+
+
 class Sags(click.Group):
-    """Turns expected errors into one message and an exit code."""
+    """Turns expected errors into one message and an exit code; its help has the commands in sections."""
+
+    sections: Mapping[str, str] = {}
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        names = {title: said.split() for title, said in self.sections.items()}
+        placed = set[str]().union(*names.values())
+        rest = [name for name in self.list_commands(ctx) if name not in placed]
+        for title, those in (names | {"More" if names else "Commands": rest}).items():
+            there = {name: self.commands[name] for name in those if name in self.commands}
+            rows = [(name, each.get_short_help_str(66)) for name, each in there.items() if not each.hidden]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+        if names:
+            with formatter.section("Which node, for commands that look for one"):
+                formatter.write_dl(list(WHICH_NODE.items()))
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -82,8 +107,8 @@ class Sags(click.Group):
         except ModuleNotFoundError as error:
             if str(error.name).partition(".")[0] not in OF_THE_NODE:
                 raise
-            node = "pip install 'sags-node[node]'"
-            said, code = f"{error.name} is not installed: this is for a client; for all of it {node}", 2
+            said = f"{error.name} is not installed: this is for a client; for all of it {install('node')}"
+            code = 2
         except OSError as error:
             if error.errno not in NO_ROOM:
                 raise
@@ -129,6 +154,10 @@ def main(verbose: bool, form: str) -> None:
     ZeroMQ on this machine. Start with `sags demo`.
 
     Research software, not a medical device.
+
+    \b
+    For completion of commands, options and topics (also zsh_source, fish_source):
+    eval "$(_SAGS_COMPLETE=bash_source sags)"
     """
     begin(verbose, form)
 
@@ -277,7 +306,7 @@ def keygen(name: str, out: Path) -> None:
 
 
 @main.command()
-@own_control_option
+@control_option
 @ns_option
 @node_options
 @as_json
@@ -353,5 +382,6 @@ for command in (
     *(anchor, latency, measure, param, pause, resume, reset),
 ):
     main.add_command(command)
+main.sections = SECTIONS
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
     more.load()(main)  # of packages that stand beside this one

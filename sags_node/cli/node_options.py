@@ -2,37 +2,53 @@
 
 from __future__ import annotations
 
-from functools import wraps
+from collections.abc import Callable
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
-from sags_node.cli.launching import Command, group_of, path_option
+from sags_node.cli.launching import Command, group_of
 
 NICENESS = 19  # of a client's process: the node goes first, where both want the same cores
 
-endpoint_option = click.option(
-    "--endpoint", help="Data socket of the node; default: the connection file of the node on this machine."
-)
-own_control_option = click.option(
-    "--control", metavar="ENDPOINT", help="Control socket; default: the node's connection file."
-)
-ns_option = click.option("--ns", default="sags", show_default=True, help="Namespace of the topics.")
+WHICH_NODE = {  # said once, by `sags --help`
+    "--ns": "Its namespace, sags by default. An overlay, a player and others have their own: --ns overlay.",
+    "--endpoint": "Its data socket; default: the connection file of the node on this machine.",
+    "--control": "Its control socket, which a node of another machine needs beside --endpoint.",
+    "--run-dir": "Folder of the connection file; default: that of this user.",
+    "--key": "Your secret key file (sags keygen), for a node that wants one.",
+    "--server-key": "The node's .pub file or the key itself; default: the connection file.",
+}
+
+
+class NodeOption(click.Option):
+    """Where a node is: the help of a command names those that it takes in one line."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        taken = [each for each in ctx.command.params if isinstance(each, NodeOption)]
+        names = ", ".join(each.opts[0] for each in taken)
+        return (names, "Which node: see sags --help.") if self is taken[0] else None
+
+
+def _option(name: str, **how: Any) -> Callable[[Command], Command]:
+    return click.option(name, cls=NodeOption, help=WHICH_NODE[name], **how)
+
+
+_path = partial(_option, type=click.Path(path_type=Path))
+endpoint_option = _option("--endpoint", metavar="ENDPOINT")
+control_option = _option("--control", metavar="ENDPOINT")
+ns_option = _option("--ns", default="sags", metavar="NAME")
+run_dir_option = _path("--run-dir", metavar="FOLDER")
 
 
 def node_options(command: Command) -> Command:
     """Options for a node that wants keys; the command gets them, and what other options say of where the node
     is, as `node`."""
 
-    @path_option(
-        "--key", metavar="FILE.key", help="Your secret key file (sags keygen), for a node that wants one."
-    )
-    @click.option(
-        "--server-key",
-        metavar="KEY",
-        help="The node's .pub file or the key itself; default: the connection file.",
-    )
+    @_path("--key", metavar="FILE.key")
+    @_option("--server-key", metavar="KEY")
     @wraps(command)
     def with_node(*args: Any, key: Path | None, server_key: str | None, **rest: Any) -> None:
         from sags_node.messaging.address import NodeAddress, client_keys
@@ -44,3 +60,5 @@ def node_options(command: Command) -> Command:
 
 
 data_options = group_of(endpoint_option, ns_option, node_options)  # for what the node sends
+asked_options = group_of(control_option, ns_option, run_dir_option, node_options)  # for what it is asked
+both_options = group_of(control_option, data_options)

@@ -126,7 +126,7 @@ def evaluate(
             options,
             cast(Pace, pace),
             iterations,
-            lambda what, frames: advance(frames, None, what),
+            lambda what, done, count: advance(done, count, what),
         )
     page = None
     if report is not None:

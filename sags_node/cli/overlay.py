@@ -8,7 +8,7 @@ import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, force_option, path_option, positive, shown
-from sags_node.cli.node_options import endpoint_option, node_options, ns_option
+from sags_node.cli.node_options import both_options, run_dir_option
 from sags_node.terminal import text
 from sags_node.terminal.console import console, show
 
@@ -33,10 +33,7 @@ class Ahead(click.ParamType["float | str"]):
 
 
 @click.command()
-@endpoint_option
-@click.option("--control", metavar="ENDPOINT", help="Control socket of the node; needed with --endpoint.")
-@ns_option
-@node_options
+@both_options
 @path_option(
     "--scene",
     metavar="FILE.yaml",
@@ -57,10 +54,7 @@ class Ahead(click.ParamType["float | str"]):
     help="Place it where tissue is expected so long after its frame; auto: when that is published.",
 )
 @shown("--own-ns", default="overlay", help="Namespace of what is published here.")
-@path_option(
-    "--run-dir",
-    help="Of the connection files, the node's and this overlay's; default: that of the node.",
-)
+@run_dir_option
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @path_option("-o", "--out", "--save", "save", help="Write what is shown: .mp4, or .png.")
 @path_option(

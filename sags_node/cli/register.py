@@ -12,11 +12,10 @@ from sags_node.cli.launching import (
     check_files,
     file_option,
     force_option,
-    path_option,
     positive,
     shown,
 )
-from sags_node.cli.node_options import data_options
+from sags_node.cli.node_options import data_options, run_dir_option
 from sags_node.errors import SagsError
 from sags_node.files import whole
 from sags_node.terminal.console import show
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 @shown("--scale", type=positive, default=0.001, help="Metres per unit of MODEL; files of scans are in mm.")
 @shown("--seconds", type=positive, default=1.0, help="How long the surface is looked at.")
 @data_options
-@path_option("--run-dir", help="Of the connection file.")
+@run_dir_option
 @force_option
 @as_json
 def register(

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from sags_node.cli.launching import as_json, positive, shown
-from sags_node.cli.node_options import data_options
+from sags_node.cli.launching import as_json, part_of, positive, shown
+from sags_node.cli.node_options import control_option, data_options
 from sags_node.terminal import text
 from sags_node.terminal.console import show, tell
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
+
+
+def _completed(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    from sags_node.messaging.topics import OVERLAY_TOPICS, TOPICS
+
+    return [each.name for each in (*TOPICS, *OVERLAY_TOPICS) if each.name.startswith(incomplete)]
+
+
+some_topics = click.argument("names", nargs=-1, required=True, metavar="NAME...", shell_complete=_completed)
 
 
 @click.group()
@@ -41,47 +51,74 @@ def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
     show(rows if json_out else text.topics_table(rows))
 
 
-@topic.command("echo")
-@click.argument("name")
+@topic.command("info")
+@click.argument("name", shell_complete=_completed)
 @data_options
-@click.option("--count", type=click.IntRange(1), help="Stop after so many messages; default: Ctrl-C.")
+@shown("--seconds", type=positive, default=1.0, help="How long to listen.")
 @as_json
-def topic_echo(name: str, count: int | None, json_out: bool, node: NodeAddress) -> None:
-    """Print the messages of topic NAME, bulk data as shape and range.
+def topic_info(name: str, seconds: float, json_out: bool, node: NodeAddress) -> None:
+    """What topic NAME is: type, content, and how many send it now."""
+    from sags_node.messaging import introspection as tool
 
-    Warnings of its sender go to stderr.
+    found = tool.topic_info(name, node, seconds)
+    show(found if json_out else text.yaml_text(found))
+
+
+@topic.command("echo")
+@some_topics
+@data_options
+@click.option("--count", type=click.IntRange(1), help="Stop after so many messages in all; default: Ctrl-C.")
+@click.option("--once", "count", flag_value=1, type=int, help="Stop after the first message.")
+@click.option("--field", metavar="KEY", help="Print only this of each: content.status, delay_s, content.K.0.")
+@as_json
+def topic_echo(
+    names: tuple[str, ...], count: int | None, field: str | None, json_out: bool, node: NodeAddress
+) -> None:
+    """Print the messages of topics, bulk data as shape and range.
+
+    Warnings of their sender go to stderr.
+
+    \b
+    sags topic echo tf
+    sags topic echo status --once --field content.rate_hz
     """
     from sags_node.messaging import introspection as tool
     from sags_node.terminal.notices import Notices
 
     notices = Notices(tell)
-    for message in tool.topic_echo(name, node, count=count, warned=notices.update):
-        show(message if json_out else text.echo_text(message))
+    for message in tool.topic_echo(names, node, count=count, warned=notices.update):
+        found: Any = part_of(message, field) if field else message
+        show(json.dumps(found) if json_out else text.echo_text(found))
 
 
 def _measuring(name: Literal["hz", "bw", "delay"], doc: str, *more: Callable[..., Any]) -> None:
-    """The commands that listen to one topic for a while; `more` are options of one alone."""
+    """The commands that listen to topics, one after the other; `more` are options of one alone."""
 
     @topic.command(name, help=doc)
-    @click.argument("topic_name", metavar="NAME")
+    @some_topics
     @data_options
-    @shown("--seconds", type=positive, default=5.0, help="How long to listen.")
+    @shown("--seconds", type=positive, default=5.0, help="How long to listen to each.")
     @as_json
-    def command(topic_name: str, json_out: bool, **asked: Any) -> None:
+    def command(names: tuple[str, ...], json_out: bool, **asked: Any) -> None:
         from sags_node.messaging import introspection as tool
 
-        figures = tool.topic_figures(name, topic_name, **asked)
-        show(figures if json_out else getattr(text, f"{name}_text")(figures))
+        found = {each: tool.topic_figures(name, each, **asked) for each in names}
+        if json_out:
+            show(found if len(found) > 1 else found[names[0]])
+            return
+        for each, figures in found.items():
+            said: str = getattr(text, f"{name}_text")(figures)
+            show(f"{each}: {said}" if len(found) > 1 else said)
 
     for option in more:
         option(command)
 
 
-_measuring("hz", "Rate of topic NAME, and min, max and std dev of the intervals.")
-_measuring("bw", "Bytes per second and per message of topic NAME.")
+_measuring("hz", "Rate of topics, and min, max and std dev of the intervals.")
+_measuring("bw", "Bytes per second and per message of topics.")
 _measuring(
     "delay",
-    "Age of the messages of topic NAME: now minus the capture stamp. Of a node on another machine, --control "
+    "Age of the messages of topics: now minus the capture stamp. Of a node on another machine, --control "
     "lets its clock be asked for; else both clocks are taken to be equal.",
-    click.option("--control", metavar="ENDPOINT", help="Control socket of the node."),
+    control_option,
 )

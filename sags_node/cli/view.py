@@ -11,8 +11,8 @@ import click
 from rich.markup import escape
 
 from sags_node.cli.launching import as_json, shown
-from sags_node.cli.node_options import NICENESS, endpoint_option, node_options, ns_option
-from sags_node.errors import UsageError
+from sags_node.cli.node_options import NICENESS, both_options
+from sags_node.errors import UsageError, install
 from sags_node.terminal.console import console, on_stop_signals, show
 
 if TYPE_CHECKING:
@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@endpoint_option
-@click.option("--control", help="Control socket of the node; default: its connection file.")
-@ns_option
-@node_options
+@both_options
 @shown("--port", type=click.IntRange(0, 65535), default=8080, help="0: any free one.")
 @shown("--host", default="127.0.0.1", help="Address to serve on.")
 @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
@@ -47,10 +44,10 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     sags view                           # then open the printed address
     ssh -L 8080:127.0.0.1:8080 HOST     # to look from another machine: the same port on both
 
-    Needs: pip install 'sags-node[viewer]'
+    Needs the extra `viewer`: pip install '.[viewer]' in a clone.
     """
     if importlib.util.find_spec("viser") is None:
-        raise UsageError("sags view needs viser; install it with: pip install 'sags-node[viewer]'")
+        raise UsageError(f"sags view needs viser; install it with: {install('viewer')}")
     from sags_node.clients.viewer.run import run_viewer
     from sags_node.tools.export.moment import file_of
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any, TypeVar, get_args
@@ -13,7 +13,6 @@ from pydantic import ValidationError
 
 from sags_node.config.schema import (
     LaunchConfig,
-    LiveSource,
     PhantomSource,
     Section,
     Source,
@@ -37,25 +36,8 @@ SIDECAR_TYPE = "dvrk_data:video_sidecar@"
 SIDECAR_LOOK = 65536  # bytes at either end; jsoncpp sorts the keys, so the type comes after the frames
 
 
-def _path_keys(section: type[Section]) -> Iterator[str]:
-    """The keys whose values are paths, of a section and of all that are in it."""
-    for name, field in section.model_fields.items():
-        kinds = [field.annotation]
-        for kind in kinds:  # grows
-            kinds += get_args(kind)
-        if Path in kinds:
-            yield name
-        for kind in kinds:
-            if isinstance(kind, type) and issubclass(kind, Section):
-                yield from _path_keys(kind)
-
-
-_PATH_KEYS = frozenset(_path_keys(LaunchConfig))
 _SOURCES: dict[str, type[Section]] = {
     source.model_fields["kind"].default: source for source in get_args(get_args(Source)[0])
-}
-_LIVE_PATHS = {  # of sources whose other keys are devices, topics and launch strings
-    kind: frozenset(_path_keys(source)) for kind, source in _SOURCES.items() if issubclass(source, LiveSource)
 }
 
 
@@ -141,17 +123,26 @@ def written_in(folder: Path, tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with_texts(
-    tree: Mapping[str, Any], change: Callable[[str, str, bool], str], path_keys: frozenset[str] = _PATH_KEYS
+    tree: Mapping[str, Any], change: Callable[[str, str, bool], str], section: Any = LaunchConfig
 ) -> dict[str, Any]:
-    """A tree with every text in it changed: `change` gets its key, the text, and whether it is a path."""
+    """A tree with every text in it changed: `change` gets its key, the text, and whether it is a path.
+
+    Args:
+        section: of the configuration, which has these keys; None: of none.
+    """
 
     def changed(key: str, value: Any) -> Any:
+        field = None if section is None else section.model_fields.get(key)
+        kinds = [None if field is None else field.annotation]
+        for kind in kinds:  # grows
+            kinds += get_args(kind)
         if isinstance(value, dict):
-            live = _LIVE_PATHS.get(str(value.get("kind"))) if key == "source" else None
-            return _with_texts(value, change, path_keys if live is None else live)
+            sections = (kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section))
+            part = _SOURCES.get(str(value.get("kind"))) if key == "source" else next(sections, None)
+            return _with_texts(value, change, part)
         if isinstance(value, list):
             return [changed(key, item) for item in value]
-        return change(key, value, key in path_keys) if isinstance(value, str) else value
+        return change(key, value, Path in kinds) if isinstance(value, str) else value
 
     return {key: changed(key, value) for key, value in tree.items()}
 

@@ -384,7 +384,7 @@ class SentSource(LiveSource):
 
 
 class RosGraph(Section):
-    """Where a ROS 2 graph is; needs `pip install 'sags-node[ros2]'`, and no ROS."""
+    """Where a ROS 2 graph is; needs the extra `ros2`, and no ROS."""
 
     domain: int | None = Field(
         None, ge=0, le=232, description="number of the graph; default: `$ROS_DOMAIN_ID`, else 0"

@@ -1,4 +1,4 @@
-"""`sags topic list | echo | hz | bw | delay`: look at what a node publishes, in the words of `ros2 topic`.
+"""What `sags topic` finds: what a node publishes, in the words of `ros2 topic`.
 
 Each function gives plain dictionaries that JSON can hold.
 """
@@ -30,7 +30,7 @@ from sags_node.messaging.received import (
     ReceivedText,
     interpret,
 )
-from sags_node.messaging.stream import listen_to
+from sags_node.messaging.stream import check_topic, listen_to
 
 Record = dict[str, Any]
 
@@ -78,13 +78,13 @@ def _listed(heard: set[str]) -> list[topics.Topic]:
 
 
 def topic_echo(
-    topic: str,
+    names: str | Sequence[str],
     node: NodeAddress = THE_NODE,
     seconds: float | None = None,
     count: int | None = None,
     warned: Callable[[Mapping[str, str]], object] = lambda warnings: None,
 ) -> Iterator[Record]:
-    """Each message of a topic: who, when, and its content (arrays as their range).
+    """Each message of one or some topics: who, when, and its content (arrays as their range).
 
     Args:
         warned: called with all that the sender's `status` warns of, code -> text, whenever one comes.
@@ -93,26 +93,40 @@ def topic_echo(
         UsageError: there is no such topic.
         SagsError: no node is known, or nothing came within `seconds` or `PATIENCE`.
     """
+    asked = [names] if isinstance(names, str) else names
     shown = 0
     began = time.monotonic()
     status = topics.full_name(node.ns, "status")
-    for arrived in listen_to(node, [topic, "status"], seconds):
+    for arrived in listen_to(node, [*asked, "status"], seconds):
         received = None if arrived is None else interpret(*arrived)
         if received is not None and received.topic == status:
             assert isinstance(received, ReceivedText)  # so says its topic
             warned(received.warnings())
-            if topic.lstrip("/").removeprefix(f"{node.ns}/") != "status":
+            if "status" not in (topics.plain_name(node.ns, name) for name in asked):
                 received = None
         if received is None:
             if not shown and time.monotonic() - began > PATIENCE:
-                raise _silence(topic, node, PATIENCE)
+                raise _silence(asked[0], node, PATIENCE)
             continue
         yield _echo(received)
         shown += 1
         if shown == count:
             return
     if not shown and seconds is not None:
-        raise _silence(topic, node, seconds)
+        raise _silence(asked[0], node, seconds)
+
+
+def topic_info(name: str, node: NodeAddress = THE_NODE, seconds: float = 1.0) -> Record:
+    """What a topic is by the contract, and what was heard of it in `seconds`.
+
+    Raises:
+        UsageError: there is no such topic.
+        SagsError: no node is known.
+    """
+    topic = check_topic(topics.plain_name(node.ns, name))
+    heard = [arrived[0].meta.session for arrived in listen_to(node, [topic.name], seconds) if arrived]
+    said = {"topic": topics.full_name(node.ns, topic.name), "type": topic.type, "content": topic.content}
+    return said | {"publishers": len(set(heard)), "messages": len(heard), "kept_for_newcomers": topic.cached}
 
 
 def topic_figures(
@@ -206,7 +220,7 @@ def _size(message: wire.Message) -> int:
 
 
 def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:
-    full = topics.full_name(node.ns, topic.lstrip("/").removeprefix(f"{node.ns}/"))
+    full = topics.full_name(node.ns, topics.plain_name(node.ns, topic))
     hint = "is the node running and not waiting?"
     if "/right/" in full:
         hint += f" ({topics.NO_RIGHT_EYE})"

@@ -83,7 +83,7 @@ def listen_to(
         SagsError: no endpoint is known, or the node refuses this client.
     """
     ns = node.ns
-    known = [check_topic(name.lstrip("/").removeprefix(f"{ns}/")) for name in names]
+    known = [check_topic(topics.plain_name(ns, name)) for name in names]
     wanted = {topics.full_name(ns, topic.name) for topic in known}
     prefixes = sorted(wanted) or [f"{ns}/"]
     deadline = None if seconds is None else time.monotonic() + seconds

@@ -157,6 +157,11 @@ def find(name: str) -> Topic | None:
     return None if view is None else Topic(name, *_VIEW_KINDS[view[1]], cached=view[1] == "camera_info")
 
 
+def plain_name(ns: str, name: str) -> str:
+    """A topic as people write it, without leading slash and namespace."""
+    return name.lstrip("/").removeprefix(f"{ns}/")
+
+
 def full_name(ns: str, name: str) -> str:
     """The topic as it stands on the wire, e.g. `sags/left/depth`."""
     return f"{ns}/{name}"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sags_node.config.schema import RosGraph
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError, UsageError, install
 from sags_node.messaging import cdr
 from sags_node.ros.endpoints import BEST_EFFORT, Delivery, Reader, Writer, ros_type
 
@@ -45,7 +45,7 @@ class Graph:
             from cyclonedds.core import DDSException, Policy, Qos, WaitSet
             from cyclonedds.domain import DomainParticipant
         except ImportError:
-            raise UsageError("ROS 2 needs one more package: pip install 'sags-node[ros2]'") from None
+            raise UsageError(f"ROS 2 needs one more package: {install('ros2')}") from None
         self.domain = domain_of(config)
         self.interface = config.interface
         self._domain = _domain(self.domain, config.interface)

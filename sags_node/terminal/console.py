@@ -21,6 +21,7 @@ from rich.table import Table
 
 WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
 
+SAY_EVERY = 10.0  # s between two lines of progress, where no terminal shows a bar
 SAME_SIGNAL = 0.5  # s
 LOOK_AGAIN = 0.02  # s until a Ctrl-C that could not come through is tried again
 LONGEST_WAIT = 10.0  # s, after which it is tried whatever becomes of it
@@ -80,14 +81,20 @@ def _print(line: str) -> None:
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[..., None]]:
-    """A progress bar that appears with its first advance(done, total=None, what=None)."""
+def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[Callable[..., None]]:
+    """A progress bar that appears with its first advance(done, total=None, what=None); where there is no
+    terminal, a line now and then."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None, visible=False)
+        said = now()
 
         def advance(done: int, total: int | None = None, description: str | None = None) -> None:
+            nonlocal said
             bar.update(task, completed=done, total=total, description=description or what, visible=True)
+            if not console.is_terminal and now() - said >= SAY_EVERY:
+                said = now()
+                _print(f"{description or what}: {done}" + ("" if total is None else f" of {total}"))
 
         yield advance
 

@@ -67,11 +67,18 @@ def bw_text(figures: Record) -> str:
     )
 
 
-def echo_text(record: Record) -> str:
-    """One message as YAML, ended by a line of dashes."""
+def yaml_text(value: Any, short_lines: bool = True) -> str:
+    """A value as YAML, without a last line that means nothing to people."""
     import yaml  # only here: all commands load this file
 
-    return yaml.safe_dump(_short(record), sort_keys=False, default_flow_style=None, width=100) + "---"
+    flow = False if short_lines else None  # None: what has no parts stands in one line
+    said: str = yaml.safe_dump(value, sort_keys=False, default_flow_style=flow, width=100)
+    return said.removesuffix("...\n").rstrip()
+
+
+def echo_text(record: Any) -> str:
+    """One message, or a part of one, as YAML, ended by a line of dashes."""
+    return f"{yaml_text(_short(record), short_lines=False)}\n---"
 
 
 def overlay_table(summary: Record) -> Table:

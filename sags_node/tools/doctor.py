@@ -33,7 +33,7 @@ from sags_node.config.schema import (
     V4l2Source,
 )
 from sags_node.engine.device import find_gpu, has_gpu
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError, UsageError, install
 from sags_node.kernels.cache import cache_root
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
 from sags_node.pipeline.session import lacks_rig, rig_of
@@ -165,7 +165,7 @@ def _device(path: str) -> Finding:
 
 def _ros(section: str, config: RosGraph) -> Finding:
     if find_spec("cyclonedds") is None:
-        return Finding("error", "cyclonedds is not installed", "pip install 'sags-node[ros2]'")
+        return Finding("error", "cyclonedds is not installed", install("ros2"))
     there = sorted(each.name for each in Path("/sys/class/net").iterdir())
     if config.interface not in there:
         remedy = f"set {section}.interface to one of {', '.join(there)}"

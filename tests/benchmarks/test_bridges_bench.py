@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-pytest.importorskip("pyigtl", reason="no bridges without: pip install 'sags-node[bridges]'")
-pytest.importorskip("foxglove", reason="no bridges without: pip install 'sags-node[bridges]'")
+pytest.importorskip("pyigtl", reason="no bridges without: pip install '.[bridges]'")
+pytest.importorskip("foxglove", reason="no bridges without: pip install '.[bridges]'")
 pytest.importorskip("av", reason="no H.264 without PyAV")
-pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
 
 from benchmarks.node import bridges, crowd
 

@@ -41,7 +41,7 @@ def state(joined: Peer) -> str:
 
 @pytest.mark.fault("process: a bridge is killed; the node is killed under a bridge")
 def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(tmp_path: Path) -> None:
-    pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
+    pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bridges]'")
     program = built(PEER, tmp_path)
     run_dir = tmp_path / "run"
     with bridge(run_dir, "openigtlink", "--port", "0") as (first, port):
@@ -96,7 +96,7 @@ def test_other_machines_are_let_in_only_when_it_is_said(command: str, option: st
 def test_a_place_or_a_view_that_cannot_be_is_refused(
     options: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+    pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
     monkeypatch.setattr(os, "nice", lambda by: 0)  # this process goes on
     refused(2, "bridge", "ros2", *options, said=(said,))
 
@@ -113,13 +113,13 @@ def test_a_missing_extra_is_named_with_the_way_to_get_it(
     command: str, module: str, package: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
-    refused(2, "bridge", command, said=(f"needs {package}", "pip install 'sags-node[bridges]'"))
+    refused(2, "bridge", command, said=(f"needs {package}", "pip install '.[bridges]'"))
 
 
 def test_without_its_extra_the_bridge_to_ros_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cyclonedds.domain", None)
     monkeypatch.setattr(os, "nice", lambda by: 0)
-    refused(2, "bridge", "ros2", said=("pip install 'sags-node[ros2]'",))
+    refused(2, "bridge", "ros2", said=("pip install '.[ros2]'",))
 
 
 def test_the_help_says_when_to_use_which() -> None:

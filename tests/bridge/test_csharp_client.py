@@ -19,7 +19,7 @@ from bridging import SEEN, anchored, anchored_at, bridged, sockets
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, stream
 
-pytest.importorskip("websockets", reason="no gateway without: pip install 'sags-node[bridges]'")
+pytest.importorskip("websockets", reason="no gateway without: pip install '.[bridges]'")
 
 from websockets.sync.server import ServerConnection, serve
 

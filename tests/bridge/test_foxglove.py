@@ -21,7 +21,7 @@ from ports import free_port, is_free
 from synthetic import HEIGHT, WIDTH, plane_result, stream
 from waiting import until
 
-pytest.importorskip("foxglove", reason="no Foxglove without: pip install 'sags-node[bridges]'")
+pytest.importorskip("foxglove", reason="no Foxglove without: pip install '.[bridges]'")
 pytest.importorskip("websockets", reason="no peer without the package websockets")
 
 from websockets.exceptions import ConnectionClosed

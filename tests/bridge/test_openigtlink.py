@@ -17,7 +17,7 @@ from igtl_peer import PEER, built, peer
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
 
-pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install 'sags-node[bridges]'")
+pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bridges]'")
 
 from pyigtl.messages import PointMessage
 

@@ -25,7 +25,7 @@ from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
 from thin_sender import making, node_sockets
 from waiting import until
 
-pytest.importorskip("websockets", reason="no gateway without: pip install 'sags-node[bridges]'")
+pytest.importorskip("websockets", reason="no gateway without: pip install '.[bridges]'")
 
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect

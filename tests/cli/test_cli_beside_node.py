@@ -18,6 +18,7 @@ from command_line import RUN_HERE, figures_of, pure_json, refused, sags, start, 
 from places import ROOT
 
 from sags_node.clients.overlay import run as overlay
+from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LIVE_PARAMETERS
 from sags_node.messaging import introspection as topic
 from sags_node.messaging.received import ReceivedText
@@ -136,13 +137,32 @@ def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
         command = ("topic", tool, "left/depth", *listen)
         assert pure_json(sags(*command, "--json").stdout)[key] > 0
         assert unit in sags(*command).stdout
+    two = pure_json(sags("topic", "hz", "left/depth", "tf", *listen, "--json").stdout)
+    assert min(two[name]["average_rate"] for name in ("left/depth", "tf")) > 0
 
 
 def test_echo_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
     lines = sags("topic", "echo", "left/depth", "--count", "2", "--json").stdout.splitlines()
     assert [pure_json(line)["topic"] for line in lines] == ["sags/left/depth"] * 2
-    transform = sags("topic", "echo", "/sags/tf", "--count", "1").stdout
+    both = sags("topic", "echo", "tf", "left/depth", "--count", "4", "--json").stdout.splitlines()
+    assert {pure_json(line)["topic"] for line in both} == {"sags/tf", "sags/left/depth"}
+    transform = sags("topic", "echo", "/sags/tf", "--once").stdout
     assert "rotation: {x: " in transform and transform.endswith("---\n") and "msgtype" not in transform
+
+
+def test_a_part_of_a_message_is_printed_alone(beside_node: dict[str, Any]) -> None:
+    once = ("topic", "echo", "left/camera_info", "--once", "--field")
+    assert sags(*once, "content.width", "--json").stdout == "320\n"
+    assert sags(*once, "content.K.2").stdout == "[0.0, 0.0, 1.0]\n---\n"
+    refused(2, *once, "content.widht", said=("unknown key 'content.widht'", "width, height"))
+
+
+def test_info_says_what_a_topic_is(beside_node: dict[str, Any]) -> None:
+    said = figures_of("topic", "info", "/sags/left/depth", "--json")
+    assert said["type"] == "sensor_msgs/msg/Image" and "(m)" in said["content"]
+    assert said["publishers"] == 1 and said["messages"] > 0
+    assert "publishers: 0" in sags("topic", "info", "clock").stdout
+    refused(2, "topic", "info", "left/dept", said=("did you mean 'left/depth'",))
 
 
 def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Path) -> None:
@@ -197,6 +217,22 @@ def test_parameters_are_read_and_set(beside_node: dict[str, Any]) -> None:
     refused(2, "param", "get", "mapping.budget", said=("unknown key 'mapping.budget'", "budget_ms"))
     refused(2, "param", "set", "mapping.budget_ms", "20", said=("write mapping.budget_ms:=20",))
     refused(1, "param", "set", "mapping.rung:=2", said=("mapping.rung", "cannot be changed", "budget_ms"))
+
+
+def test_parameters_are_kept_as_a_launch_file_and_loaded(beside_node: dict[str, Any], tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(sags("param", "dump").stdout)
+    assert load_launch(file).model_dump(mode="json") == figures_of("param", "get", "--json")
+    assert sags("param", "load", file).stdout == "all of it is so already\n"
+    file.write_text("mapping: {budget_ms: 20}")
+    assert sags("param", "load", file).stdout == "mapping.budget_ms is 20\n"
+    assert sags("param", "get", "mapping.budget_ms").stdout == "20.0\n"
+    file.write_text("mapping: {budget_ms: null, rung: 2}")
+    refused(1, "param", "load", file, said=("mapping.rung", "cannot be changed"))
+    assert sags("param", "get", "mapping.budget_ms").stdout == "20.0\n"  # all or nothing
+    assert sags("param", "set", "mapping.budget_ms:=null").exit_code == 0
+    file.write_text("[1, 2]")
+    refused(2, "param", "load", file, said=("has no parameters",))
 
 
 def test_a_node_is_paused_resumed_and_reset(beside_node: dict[str, Any]) -> None:

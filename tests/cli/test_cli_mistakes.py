@@ -167,7 +167,8 @@ def test_a_calibration_is_not_converted_onto_itself(user_files: Path, tmp_path: 
     ("arguments", "said"),
     [
         (["left/render/depth"], "--topics left/render/depth; without --topics all are recorded"),
-        (["--topics", "left/depth", "tf"], "--topics left/depth --topics tf"),
+        (["--topics", "left/depth", "no_such"], "unknown topic 'no_such'"),
+        (["--all", "--topics", "left/depth"], "--all or --topics, not both"),
         (["rig:=x"], "rig:=x: key:=value needs a recording"),
     ],
 )

@@ -17,6 +17,7 @@ from sags_node.config.schema import (
     LaunchConfig,
     MappingConfig,
     Section,
+    V4l2Source,
     VideosSource,
     VisionConfig,
 )
@@ -45,6 +46,15 @@ def test_paths_are_relative_to_the_file_and_variables_are_expanded(
     assert config.source.left == tmp_path / "left"
     assert config.source.right == Path("/somewhere/right")
     assert config.rig == tmp_path / "calib"
+
+
+def test_a_word_that_is_a_path_elsewhere_is_none(tmp_path: Path) -> None:
+    """`right` of a source is a path, of publish it is not; `left` of a live source is no path either."""
+    file = tmp_path / "launch.yaml"
+    file.write_text("source: {kind: v4l2, left: a, right: b}\npublish: {right: auto, run_dir: here}")
+    found = load_launch(file)
+    assert (found.publish.right, found.publish.run_dir) == ("auto", tmp_path / "here")
+    assert isinstance(found.source, V4l2Source) and found.source.left == "a"
 
 
 def test_overrides_win_over_the_file() -> None:

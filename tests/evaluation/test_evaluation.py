@@ -418,7 +418,7 @@ def test_without_matplotlib_it_says_at_once_what_to_install(
     monkeypatch.setattr(plots, "find_spec", lambda name: None)
     for command in (["eval", "--report", str(tmp_path / "out")], ["demo", "--out", str(tmp_path / "out")]):
         result = CliRunner().invoke(main, command)
-        assert result.exit_code == 2 and "pip install 'sags-node[report]'" in result.stderr
+        assert result.exit_code == 2 and "pip install '.[report]'" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -21,7 +21,7 @@ from sags_node.config.schema import RosGraph
 from sags_node.ros.endpoints import Delivery
 from sags_node.ros.graph import Graph
 
-pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
 
 CACHE = Path(
     os.environ.get("SAGS_ROS_CACHE")

@@ -1,4 +1,4 @@
-"""A program that uses a node needs nothing of what maps: `pip install sags-node` does not bring it."""
+"""A program that uses a node needs nothing of what maps: `pip install .` does not bring it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from places import ROOT
 
 from sags_node.cli.main import OF_THE_NODE
+from sags_node.errors import install
 
 BLOCKED = """
 import sys
@@ -76,7 +77,7 @@ def test_what_needs_it_says_how_to_install_it(command: str, tmp_path: Path) -> N
     done = without_the_node(COMMAND, *command.split(), folder=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert "is not installed" in line and line.endswith("pip install 'sags-node[node]'")
+    assert "is not installed" in line and "pip install '.[node]'" in line
 
 
 def test_the_package_asks_for_it_in_an_extra_alone() -> None:
@@ -84,3 +85,10 @@ def test_the_package_asks_for_it_in_an_extra_alone() -> None:
     assert {modules.get(name, name) for name in requirements("node")} == OF_THE_NODE
     assert not requirements() & requirements("node")
     assert "sags-node[node]" in requirements("dev")
+
+
+def test_what_is_advised_works_in_a_clone() -> None:
+    """The package's name is on no index yet: whoever takes it there would be installed."""
+    places = (*ROOT.glob("sags_*/**/*.py"), *ROOT.glob("docs/**/*.md"), ROOT / "README.md")
+    assert not [file for file in places if "pip install 'sags-node" in file.read_text("utf-8")]
+    assert install("viewer").startswith("pip install '.[viewer]'")

@@ -132,7 +132,7 @@ def test_no_pair_is_mismatched_or_comes_twice(
         source: Any = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), size)
         where = source.endpoint
     else:
-        pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+        pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
         from sags_node.sources.ros2 import RosCameras
 
         kind = "compressed" if settings else ""
@@ -155,7 +155,7 @@ def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
     if way == "gst":
         need_gstreamer()
     if way == "ros2":
-        pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install 'sags-node[ros2]'")
+        pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
     with running(way, tmp_path, phantom_session, monkeypatch) as (node, shown, sender):
         with sender():
             until(lambda: shown, START_SECONDS)

@@ -236,7 +236,7 @@ def refused(code: int, *arguments: str) -> str:
 
 def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install 'sags-node[viewer]'" in refused(2)
+    assert "pip install '.[viewer]'" in refused(2)
 
 
 @needs_viser

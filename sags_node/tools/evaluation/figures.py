@@ -59,6 +59,7 @@ def _paper(what: str, group: str) -> tuple[Figure, Figure]:
 
 _COPY = "the picture before, shown again"
 _BEFORE = f"{_COPY}: {{:.1f}} dB"
+_WORTH = ", which has no depth, no other view and no hidden tissue"
 _STEREO = "stereo alone"
 _WARP = "left picture, warped"
 _AHEAD = (
@@ -69,6 +70,35 @@ _AHEAD = (
 AWAY = (2, 5, 10, 20)  # mm to the right of the left eye
 
 TABLE: dict[str, list[Figure]] = {
+    "Overlay": [
+        Figure("frames that came", "overlay.frames"),
+        Figure("shown on", "overlay.overlay"),
+        Figure("not shown", "overlay.blanked.*"),
+        *_times("camera's stamp to sending", "overlay.latency_ms"),
+        *_times("drawing", "overlay.draw_ms"),
+        Figure("times it stood still", "overlay.freezes.count"),
+        Figure("seconds it stood still", "overlay.freezes.seconds", "s", 1),
+        Figure("messages lost", "overlay.lost"),
+    ],
+    "Points": [
+        Figure("off, median", "track.median_mm", "mm", 2),
+        Figure("off, nine of ten below", "track.p90_mm", "mm", 2),
+        Figure("off, median", "track.median_px", "px", 1),
+        Figure("lost", "track.lost", "%"),
+    ],
+    "Depth": [
+        Figure("error, median", "depth.median_mm", "mm", 2, _STEREO, "measured_depth.median_mm"),
+        Figure("error, nine of ten below", "depth.p90_mm", "mm", 2, _STEREO, "measured_depth.p90_mm"),
+        Figure("error, root mean square", "depth.rmse_mm", "mm", 2, _STEREO, "measured_depth.rmse_mm"),
+        Figure("share of the tissue", "depth.coverage", "%", 0, _STEREO, "measured_depth.coverage"),
+        Figure("share that calls itself sure", "depth_confidence.sure_share", "%"),
+        Figure("error of that, nine of ten below", "depth_confidence.sure_p90_mm", "mm", 2),
+        Figure("flicker", "flicker.depth_mm", "mm", 2, _STEREO, "flicker.measured_depth_mm"),
+        Figure("camera, error of position", "pose.ate_mm", "mm", 2, "a rigid scene", "pose.rigid_ate_mm"),
+        Figure("camera, largest", "pose.max_mm", "mm", 2, "a rigid scene", "pose.rigid_max_mm"),
+        Figure("camera, frame to frame", "pose.rpe_mm", "mm", 2, "a rigid scene", "pose.rigid_rpe_mm"),
+        Figure("camera, turn", "pose.rpe_deg", "degrees", 3, "a rigid scene", "pose.rigid_rpe_deg"),
+    ],
     "Speed": [
         Figure("frames of the recording", "frames"),
         Figure("shown", "processed"),
@@ -119,35 +149,6 @@ TABLE: dict[str, list[Figure]] = {
         *_paper("left render", "shown"),
         *_paper("kept back", "heldout"),
     ],
-    "Depth": [
-        Figure("error, median", "depth.median_mm", "mm", 2, _STEREO, "measured_depth.median_mm"),
-        Figure("error, nine of ten below", "depth.p90_mm", "mm", 2, _STEREO, "measured_depth.p90_mm"),
-        Figure("error, root mean square", "depth.rmse_mm", "mm", 2, _STEREO, "measured_depth.rmse_mm"),
-        Figure("share of the tissue", "depth.coverage", "%", 0, _STEREO, "measured_depth.coverage"),
-        Figure("share that calls itself sure", "depth_confidence.sure_share", "%"),
-        Figure("error of that, nine of ten below", "depth_confidence.sure_p90_mm", "mm", 2),
-        Figure("flicker", "flicker.depth_mm", "mm", 2, _STEREO, "flicker.measured_depth_mm"),
-        Figure("camera, error of position", "pose.ate_mm", "mm", 2, "a rigid scene", "pose.rigid_ate_mm"),
-        Figure("camera, largest", "pose.max_mm", "mm", 2, "a rigid scene", "pose.rigid_max_mm"),
-        Figure("camera, frame to frame", "pose.rpe_mm", "mm", 2, "a rigid scene", "pose.rigid_rpe_mm"),
-        Figure("camera, turn", "pose.rpe_deg", "degrees", 3, "a rigid scene", "pose.rigid_rpe_deg"),
-    ],
-    "Points": [
-        Figure("off, median", "track.median_mm", "mm", 2),
-        Figure("off, nine of ten below", "track.p90_mm", "mm", 2),
-        Figure("off, median", "track.median_px", "px", 1),
-        Figure("lost", "track.lost", "%"),
-    ],
-    "Overlay": [
-        Figure("frames that came", "overlay.frames"),
-        Figure("shown on", "overlay.overlay"),
-        Figure("not shown", "overlay.blanked.*"),
-        *_times("camera's stamp to sending", "overlay.latency_ms"),
-        *_times("drawing", "overlay.draw_ms"),
-        Figure("times it stood still", "overlay.freezes.count"),
-        Figure("seconds it stood still", "overlay.freezes.seconds", "s", 1),
-        Figure("messages lost", "overlay.lost"),
-    ],
 }
 
 # Over points and frames; the other groups are means over frames.
@@ -189,7 +190,7 @@ def _rows(figures: Flat, asked: Sequence[Figure], segments: Sequence[str]) -> li
     for figure in asked:
         if figure.key.endswith(".*"):
             each = below(figures, figure.key[:-2])
-            found = [(f"{figure.what}: {name}", [value], "") for name, value in each.items()]
+            found = [(f"{figure.what}: {name}", [value], "") for name, value in each.items() if value]
         else:
             group, _, key = figure.key.partition(".")
             values = [figures.get(figure.key), *(figures.get(f"{group}.{name}.{key}") for name in segments)]
@@ -221,24 +222,26 @@ AGAINST = {  # `settings.depth_reference`
 
 
 def verdict(figures: Flat) -> list[tuple[str, str]]:
-    """What, and how good: at most eleven lines.
+    """What, and how good, what an overlay needs first: a line each.
 
     Args:
         figures: of `summarise`, and of an overlay under `overlay`, made `flat`. What is missing or None is
             left out.
     """
-    followed = _said(figures, *_off("track"), ("track.lost", "; {:.0%} lost"))
-    overlay = (("overlay.overlay", "on {}"), ("overlay.frames", " of {} frames"))
-    blanked = (f"; {count} without: {why}" for why, count in below(figures, "overlay.blanked").items())
+    followed = _said(figures, *_off("track"), ("track.lost", "; {:.0%} given up (no Gaussian near)"))
+    right = ("right.psnr", "{:.1f} dB PSNR"), ("right.warp_psnr", f" ({_WARP}: {{:.1f}} dB)")
+    hidden = ("hidden.psnr", "{:.1f} dB PSNR"), ("hidden.copy_psnr", " (as it was last seen: {:.1f} dB)")
     warned = below(figures, "warnings").items()
     lines = {
+        "overlay": _overlay(figures),
+        "points": followed or _said(figures, ("track.lost", "all given up")),
+        "depth": _depth(figures),
+        "right eye": _said(figures, *right),
+        "hidden": _said(figures, *hidden),
         "speed": _speed(figures),
         "latency": _latency(figures),
         "picture": _picture(figures),
         "unseen": _said(figures, ("heldout.psnr", "{:.1f} dB PSNR on frames kept back"), _copied("heldout")),
-        "depth": _depth(figures),
-        "points": followed or _said(figures, ("track.lost", "all lost")),
-        "overlay": "".join((_said(figures, *overlay), *blanked)),
         "quality": _quality(figures),
         "warnings": ", ".join(f"{code} ({count} frames)" for code, count in warned),
         "machine": _machine(figures),
@@ -251,6 +254,16 @@ def _said(figures: Flat, *pieces: tuple[str, str]) -> str:
     if figures.get(pieces[0][0]) is None:
         return ""
     return "".join(text.format(figures[key]) for key, text in pieces if figures.get(key) is not None)
+
+
+def _overlay(figures: Flat) -> str:
+    """The age is that of the camera's frame when the overlay of it is sent."""
+    came = figures.get("overlay.frames")
+    share = f" ({figures['overlay.overlay'] / came:.0%})" if came else ""
+    on = _said(figures, ("overlay.overlay", "on {}"), ("overlay.frames", f" of {{}} frames{share}"))
+    age = _said(figures, *_middle("overlay.latency_ms"))
+    blanked = (f"; {count} without: {why}" for why, count in below(figures, "overlay.blanked").items())
+    return "".join((on, f", {age} after the camera" if on and age else "", *blanked))
 
 
 def _copied(group: str) -> tuple[str, str]:
@@ -294,7 +307,7 @@ def _picture(figures: Flat) -> str:
     }
     for key, name in shown.items():
         if figures.get(key) is not None:
-            beside = [_said(figures, ("predict.copy_psnr", _BEFORE))]
+            beside = [_said(figures, ("predict.copy_psnr", _BEFORE + _WORTH))]
             if key == "predict.psnr" and figures.get("predict.model_psnr") != figures[key]:
                 beside.append(_said(figures, ("predict.model_psnr", "the model alone: {:.1f} dB")))
             said = "; ".join(filter(None, beside))
@@ -306,7 +319,12 @@ def _depth(figures: Flat) -> str:
     reference = AGAINST.get(str(figures.get("settings.depth_reference")), "the recording's")
     covered = "depth.coverage", ", on {:.0%} of the tissue"
     said = _said(figures, *_off("depth"), covered)
-    return said and f"{said}, against {reference}"
+    alone = _said(
+        figures,
+        ("measured_depth.median_mm", "; stereo alone: {:.2f} mm"),
+        ("measured_depth.coverage", " on {:.0%}"),
+    )
+    return said and f"{said}, against {reference}{alone}"
 
 
 def _quality(figures: Flat) -> str:

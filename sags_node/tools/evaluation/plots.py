@@ -1,4 +1,4 @@
-"""Plots by matplotlib, which is an extra: `pip install 'sags-node[report]'`."""
+"""Plots by matplotlib, which is the extra `report`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from io import BytesIO, StringIO
 from typing import TYPE_CHECKING, Any
 
-from sags_node.errors import UsageError
+from sags_node.errors import UsageError, install
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -44,7 +44,7 @@ def check_plots() -> None:
         UsageError: matplotlib is not installed.
     """
     if not has_plots():
-        raise UsageError("plots need matplotlib, which is not installed: pip install 'sags-node[report]'")
+        raise UsageError(f"plots need matplotlib, which is not installed: {install('report')}")
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -49,7 +49,7 @@ def evaluate(
     options: MeasureOptions = DEFAULT_OPTIONS,
     pace: Pace = "step",
     iterations: int | None = None,
-    progress: Progress = lambda what, frames: None,
+    progress: Callable[[str, int, int | None], None] = lambda what, frames, count: None,
 ) -> Evaluation:
     """Run a recorded session once and measure it.
 
@@ -60,7 +60,7 @@ def evaluate(
         pace: `realtime` plays on the recording's clock in a node of its own, and measures what a subscriber
             gets of it (`live`); `step` takes every frame in turn, without threads or sockets.
         iterations: fixed steps per frame instead of the time budget; with `step`, figures are reproducible.
-        progress: called with what is going on and the frames done.
+        progress: called with what is going on, the frames done and those in all.
 
     Raises:
         UsageError: a wrong key, value or path, live cameras, or a segment that is named like a figure.
@@ -78,21 +78,28 @@ def evaluate(
     if iterations is not None:
         forced.append(f"mapping.iterations:={iterations}")
     session = open_session(
-        launch, [*overrides, *forced], lambda done, total: progress("rendering the phantom (once)", done)
+        launch,
+        [*overrides, *forced],
+        lambda done, total: progress("rendering the phantom (once)", done, total),
     )
-    progress("loading kernels", 0)
+    count = session.source.frame_count
+    progress("loading kernels", 0, count)
+
+    def told(what: str, done: int) -> None:
+        progress(what, done, count)
+
     warm_up(session.config)
     with Run() as run:
         if pace == "step":
-            run_step(at_best_scale(session), options, run, progress)
-            return measure(session, run, options, overrides, progress)
+            run_step(at_best_scale(session), options, run, told)
+            return measure(session, run, options, overrides, told)
         # Its own sockets, away from those of a node that may be running on this machine.
         run_dir = run.folder / "run"
         sockets = ["publish.data:=[]", "publish.ipc:=true", "publish.control:=null"]
         arguments = [*overrides, *forced, *sockets, f"publish.run_dir:={run_dir}"]
         node = NodeAddress(session.config.ns, run_dir=run_dir)
-        account = live.play([*([] if launch is None else [str(launch)]), *arguments], node, run, progress)
-        found = measure(_as_shown(session, run), run, options, overrides, progress)
+        account = live.play([*([] if launch is None else [str(launch)]), *arguments], node, run, told)
+        found = measure(_as_shown(session, run), run, options, overrides, told)
         found.summary.update({key: account[key] for key in ("frame_ms", "stage_ms", "skipped")})
         return found  # those figures only the node knows
 

@@ -84,7 +84,7 @@ def test_without_the_extra_the_command_says_how_to_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster_module, "NEEDED", ("fsspec", "no_such_package"))
-    said = ("archives need no_such_package", "pip install 'sags-node[lab]'")
+    said = ("archives need no_such_package", "pip install '.[lab]'")
     out = tmp_path / "out"
     refused(2, "archive", "run", tmp_path / "m.csv", "--job", "eval", "--out", out, said=said)
     refused(2, "archive", "status", out, said=said)
