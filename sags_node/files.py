@@ -32,7 +32,7 @@ _KINDS = (
 
 
 def is_text(name: str) -> bool:
-    """Whether a name is UTF-8; Python reads others by surrogates, which nothing can write."""
+    """Tell whether a name is UTF-8; Python reads others by surrogates, which nothing can write."""
     return not any("\ud800" <= letter <= "\udfff" for letter in name)
 
 
@@ -193,7 +193,7 @@ def check_results(folder: Path, names: Sequence[str], ours: bool) -> None:
 
 
 def is_result(file: Path) -> bool:
-    """Whether this is an empty file, or figures that say where they come from."""
+    """Tell whether this is an empty file, or figures that say where they come from."""
     size = file.stat().st_size
     try:
         return size == 0 or (size <= LARGEST_RESULT and "provenance" in json.loads(file.read_bytes()))

@@ -36,7 +36,8 @@ def core_quota(root: Path = ROOT) -> float | None:
 
 
 def governors(root: Path = ROOT) -> set[str]:
-    """What decides the clock rates of the cores; empty where the machine does not tell, as in most guests.
+    """Return what decides the clock rates of the cores; empty where the machine does not tell, as in most
+    guests.
 
     `powersave` of a processor that chooses its rate itself (`intel_pstate`, `amd-pstate-epp`) is not the
     lowest rate, and is called `balanced` here.

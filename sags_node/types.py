@@ -114,7 +114,8 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What a recording knows to be true of one frame. Only for measuring: the frame path never reads it."""
+    """Hold what a recording knows to be true of one frame. Only for measuring: the frame path never reads
+    it."""
 
     depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified picture at calibration size
     depth_kind: str = "exact"  # exact | structured_light | ct | stereo_network
@@ -236,7 +237,7 @@ class MotionState:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Where the tissue is expected after a frame; `model.forecast` applies it."""
+    """Hold where the tissue is expected after a frame; `model.forecast` applies it."""
 
     state: MotionState
     frame_s: float  # s from one frame to the next
@@ -313,7 +314,8 @@ class Colours:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What consumers are shown of a view: the model with the detail of pictures, see `sags_node.detail`."""
+    """Hold what consumers are shown of a view: the model with the detail of pictures, see
+    `sags_node.detail`."""
 
     rgb: U8  # [H, W, 3]
     taken: U8  # [H, W] 0..255 of it is a picture's
@@ -341,7 +343,7 @@ class RenderedView:
 
 @dataclass(frozen=True, slots=True)
 class AnchorsAhead:
-    """Where anchors are expected some time after a frame."""
+    """Hold where anchors are expected some time after a frame."""
 
     seconds: F32  # [A] after the frame; 0: not predicted
     points: F32  # [A, 3] m, world
@@ -462,7 +464,7 @@ class ClockStatus:
 
 @dataclass(frozen=True, slots=True)
 class NodeHealth:
-    """What the node says of itself once a second, also when no frames come."""
+    """Hold what the node says of itself once a second, also when no frames come."""
 
     state: str  # starting | running | held | waiting | paused | degraded | stopping
     rate_hz: float

@@ -174,7 +174,7 @@ def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Ite
 
 
 def unitless(channel: Channel) -> bool:
-    """Whether lengths have no unit in the messages of a channel."""
+    """Tell whether lengths have no unit in the messages of a channel."""
     return bool(RELATIVE.items() <= channel.metadata.items())
 
 
@@ -194,7 +194,7 @@ def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
 
 
 class Channels:
-    """What the messages of an MCAP file belong to."""
+    """Hold what the messages of an MCAP file belong to."""
 
     def __init__(self) -> None:
         self.missed: list[Head] = []  # chunks that were passed over unread
@@ -215,7 +215,8 @@ class Channels:
         self.missed.clear()
 
     def describe(self, channel_id: int) -> bool:
-        """Whether channel and schema are known; a schema stands only where the first of its channels does."""
+        """Tell whether channel and schema are known; a schema stands only where the first of its channels
+        does."""
         channel = self._channels.get(channel_id)
         return channel is not None and channel.schema_id in self._schemas
 

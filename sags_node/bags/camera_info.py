@@ -53,7 +53,7 @@ def read_eye(data: bytes | memoryview, where: str) -> Eye | None:
 
 
 def changes(said: Sequence[Said]) -> list[Said]:
-    """What is said, in order of time, without what says the same again."""
+    """Return what is said, in order of time, without what says the same again."""
     kept: list[Said] = []
     for each in sorted(said, key=lambda one: one.since_ns):
         if not kept or not same(kept[-1].eye, each.eye):
@@ -68,7 +68,7 @@ def in_force(said: Sequence[Said], stamps: I64) -> I64:
 
 
 def same(one: Eye, other: Eye) -> bool:
-    """Whether two calibrations are equal but for rounding."""
+    """Tell whether two calibrations are equal but for rounding."""
     a, b = (
         np.concatenate([[eye.width, eye.height], *map(np.ravel, (eye.K, eye.R, eye.P, eye.distortion))])
         for eye in (one, other)

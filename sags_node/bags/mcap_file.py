@@ -52,7 +52,7 @@ class DamagedError(SagsError):
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Where one record is."""
+    """Hold where one record is."""
 
     opcode: int
     position: int  # of the head
@@ -129,7 +129,7 @@ def chunk_times(file: BinaryIO, head: Head) -> tuple[int, int]:
 
 
 def summary_start(file: BinaryIO, size: int) -> int:
-    """Where the summary begins, as the footer says.
+    """Find where the summary begins, as the footer says.
 
     Raises:
         DamagedError: there is no footer, or no summary.
@@ -155,7 +155,7 @@ def read_attachment(content: bytes) -> Attachment | None:
 
 
 def chunk_is_consistent(content: bytes | memoryview) -> bool:
-    """Whether the lengths inside a chunk's content add up to its own."""
+    """Tell whether the lengths inside a chunk's content add up to its own."""
     if len(content) < _CHUNK.size:
         return False
     first, last, _, _, named = _CHUNK.unpack_from(content)

@@ -20,7 +20,7 @@ _LENGTH = struct.Struct("<I")
 
 
 def chunk_positions(file: Path) -> frozenset[int]:
-    """Where the chunks of a bag begin; the last file's are remembered until it changes.
+    """Find where the chunks of a bag begin; the last file's are remembered until it changes.
 
     Raises:
         DamagedError: it is no ROS 1 bag, a length does not fit, or a chunk unpacks to too much.

@@ -275,7 +275,7 @@ def play(
 @recording
 @as_json
 def info(path: Path, json_out: bool) -> None:
-    """What a recording holds: topics, types, counts, rates, gaps.
+    """Return what a recording holds: topics, types, counts, rates, gaps.
 
     Reads it through, so a damaged file is found here: rosbag2 folders, .mcap, .db3 and ROS 1 .bag files.
     """

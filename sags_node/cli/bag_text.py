@@ -26,7 +26,7 @@ def remappings(said: Sequence[str], ns: str) -> dict[str, str]:
 
 
 def recorded_table(summary: Mapping[str, Any]) -> Table:
-    """What a recorder wrote and what it could not."""
+    """Return what a recorder wrote and what it could not."""
     from sags_node.node.recorder_state import SILENT_SECONDS  # brings NumPy along, which --help does not need
 
     table = text.table("topic", "messages", "dropped", "lost")
@@ -41,7 +41,7 @@ def recorded_table(summary: Mapping[str, Any]) -> Table:
 
 
 def info_table(info: Mapping[str, Any]) -> Table:
-    """What a bag holds."""
+    """Return what a bag holds."""
     table = text.table("topic", "type", "messages", "Hz", "lost", "longest gap (s)")
     for row in info["topics"]:
         cells = (row[key] for key in ("topic", "type", "messages", "rate_hz", "lost", "longest_gap_s"))
@@ -53,7 +53,7 @@ def info_table(info: Mapping[str, Any]) -> Table:
 
 
 def recovered_text(done: Mapping[str, Any]) -> str:
-    """What was saved and what was not."""
+    """Return what was saved and what was not."""
     saved = f"{done['messages']} messages saved to {done['folder']}"
     if not done["lost"]:
         return f"{saved}; nothing was lost"

@@ -70,7 +70,7 @@ def pin(pixel: tuple[float, float], json_out: bool, node: NodeAddress) -> None:
 @endpoint_option
 @asking
 def list_anchors(json_out: bool, node: NodeAddress) -> None:
-    """Where the anchors are in the newest frame.
+    """Find where the anchors are in the newest frame.
 
     Columns: number, x y z (m, world), pixel, visibility, confidence (it is still on its tissue) and depth
     confidence. Show no anchor as sure whose confidence is below 0.5.

@@ -54,7 +54,7 @@ def check_fit(out: Path) -> None:
 
 
 def device_of(wanted: DeviceName, schedule: Schedule) -> str | None:
-    """Where a fit learns, as `Fit` takes it.
+    """Find where a fit learns, as `Fit` takes it.
 
     Raises:
         UsageError: a GPU is wanted, and none can be used, or not for this schedule.
@@ -188,7 +188,7 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
 
 
 def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
-    """What a fit was worth, a line each; beside it what was published for the same clip."""
+    """Return what a fit was worth, a line each; beside it what was published for the same clip."""
     tested, learnt, depth, track = found["heldout"], found["train"], found["depth"], found["track"]
     mean = (found["between"] or {}).get("mean")
     lines = {}

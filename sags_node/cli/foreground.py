@@ -49,7 +49,7 @@ def run_node(node: Node, seconds: float | None, console: Console, stop: threadin
 
 
 def inputs_text(config: LaunchConfig) -> list[str]:
-    """Where other programs hand in what the node takes; a line each."""
+    """Find where other programs hand in what the node takes; a line each."""
     lines = []
     for what, part in (("pictures", config.source), ("poses", config.robot)):
         if isinstance(part, PushSource | PushRobot):
@@ -74,7 +74,7 @@ def _watch(
 
 
 def ended_text(sent: int, count: int | None) -> str:
-    """What a node that has ended published; `count`: frames of its recording, where it has an end."""
+    """Return what a node that has ended published; `count`: frames of its recording, where it has an end."""
     return f"ended, {sent:,} {'' if count is None else f'of {count:,} '}frames published"
 
 

@@ -99,7 +99,8 @@ session_option = click.option("--session", metavar="RECORDING", help="The record
 
 
 def played_instead(launch: Sequence[str], session: str | None) -> list[str] | None:
-    """What `split` takes, for a command that plays a recording where one is named; None: it asks a node.
+    """Return what `split` takes, for a command that plays a recording where one is named; None: it asks a
+    node.
 
     Args:
         launch: arguments, the recording among them.
@@ -167,7 +168,7 @@ def open_launched(path: str | None, overrides: Sequence[str], guess: Guess | Non
 
 
 def source_text(source: Source) -> str:
-    """What is played, in a line."""
+    """Return what is played, in a line."""
     from sags_node.config.schema import PhantomSource
 
     if isinstance(source, PhantomSource):

@@ -61,7 +61,7 @@ SECTIONS = {
     "Run": "demo run new import doctor phantom health param pause resume reset",
     "Look": "view topic anchor overlay register",
     "Record": "bag export archive",
-    "Measure": "eval fit calib",
+    "Measure": "eval fit measure latency calib",
     "Connect": "bridge keygen",
 }
 

@@ -78,7 +78,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
 
 
 def _asked(out: Path | None) -> tuple[list[Path], Path | None]:
-    """What the user answers."""
+    """Return what the user answers."""
     if not sys.stdin.isatty():
         raise UsageError("name a folder, a video or a device, e.g. sags new my_folder -o mine.yaml")
     said = click.prompt("Folder, video or device (two: left and right, with a space between)", err=True)

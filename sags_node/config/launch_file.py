@@ -90,7 +90,8 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
 
 
 def is_launch(path: Path) -> bool:
-    """Whether it is a launch file, or a folder with one: neither a video nor a folder of something else."""
+    """Tell whether it is a launch file, or a folder with one: neither a video nor a folder of something
+    else."""
     if path.is_dir():
         return (path / "launch.yaml").exists()
     return path.suffix.lower() not in VIDEO_SUFFIXES
@@ -109,8 +110,8 @@ def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def written_in(folder: Path, tree: Mapping[str, Any]) -> dict[str, Any]:
-    """What a launch file in this folder must say to be read as this tree: paths from there if they lie below
-    it, else from the root, and $$ for each $."""
+    """Return what a launch file in this folder must say to be read as this tree: paths from there if they lie
+    below it, else from the root, and $$ for each $."""
     here = folder.resolve()
 
     def written(key: str, text: str, is_path: bool) -> str:
@@ -195,7 +196,7 @@ def _bag_of(path: Path) -> Path | None:
 
 
 def is_sidecar(file: Path) -> bool:
-    """Whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
+    """Tell whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
     if file.suffix != ".json" or not file.is_file():
         return False
     with open_file(file) as opened:

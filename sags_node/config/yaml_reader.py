@@ -79,7 +79,7 @@ def check_dialect(text: str, where: str) -> None:
 
 
 class _RefusedError(ConstructorError):
-    """What PyYAML would take."""
+    """Hold what PyYAML would take."""
 
     def __init__(self, node: yaml.Node, problem: str) -> None:
         super().__init__(None, None, problem, node.start_mark)

@@ -50,8 +50,8 @@ def coarse_camera(camera: Camera) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Where a view's tissue was in a source's picture: for the pixels of `coarse_camera`, and one more on
-    each side."""
+    """Hold where a view's tissue was in a source's picture: for the pixels of `coarse_camera`, and one more
+    on each side."""
 
     places: F32  # [m + 2, n + 2, 2] u and v, px of the picture; `NOWHERE`: not in it
     share: U8  # [m + 2, n + 2] 0..255 of the picture in the view

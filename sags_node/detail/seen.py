@@ -103,7 +103,7 @@ class SeenFrame:
         return self.t_capture_ns if self.whole is None else self.whole.oldest_ns
 
     def rows_of(self, ids: I64) -> tuple[I64, Bool]:
-        """Where Gaussians with these `ids` [M] stand among its own: rows [M], and which it has [M]."""
+        """Find where Gaussians with these `ids` [M] stand among its own: rows [M], and which it has [M]."""
         own = self.gaussians.ids
         if ids is own:
             return np.arange(len(ids)), np.ones(len(ids), np.bool_)

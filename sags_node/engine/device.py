@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """What was chosen; of the CPU, why it is not a GPU and how to fix that."""
+    """Hold what was chosen; of the CPU, why it is not a GPU and how to fix that."""
 
     kind: Literal["cpu", "cuda"]
     name: str
@@ -68,7 +68,7 @@ def gpu() -> wp.Device:
 
 
 def has_gpu() -> bool:
-    """Whether a GPU's driver seems to be here, usable or not."""
+    """Tell whether a GPU's driver seems to be here, usable or not."""
     devices = [*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev").glob("dxg")]  # dxg: Windows' own Linux
     return bool(devices) or shutil.which("nvidia-smi") is not None
 

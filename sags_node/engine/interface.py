@@ -70,6 +70,7 @@ class Rasterizer(Protocol):
         ...
 
     def median(self) -> tuple[F32, I32]:
-        """Where the transmittance of the last `forward` falls to one half: depth [H, W] m and row of that
-        Gaussian [H, W]. Where it stays above: 0 and -1. Tiles that were not drawn keep what was there."""
+        """Find where the transmittance of the last `forward` falls to one half: depth [H, W] m and row of
+        that Gaussian [H, W]. Where it stays above: 0 and -1. Tiles that were not drawn keep what was
+        there."""
         ...

@@ -18,18 +18,18 @@ EPS = 1e-15
 
 @dataclass(frozen=True, slots=True)
 class RowAdam:
-    """What Adam remembers of a table of M rows and C columns, as `AdamState` has it."""
+    """Hold what Adam remembers of a table of M rows and C columns, as `AdamState` has it."""
 
     moments: Tensor  # [M, C, 2]
     shares: Tensor  # [M, 2]
 
     @classmethod
     def of(cls, table: Tensor) -> RowAdam:
-        """Of a table [M, C] that was never touched, on its device."""
+        """Make that of a table [M, C] that was never touched, on its device."""
         return cls(table.new_zeros((*table.shape, 2)), table.new_zeros((len(table), 2)))
 
     def rows(self, rows: slice | Tensor) -> RowAdam:
-        """Of some rows; a slice of them is the same memory."""
+        """The rows of some rows; a slice of them is the same memory."""
         return RowAdam(self.moments[rows], self.shares[rows])
 
     def grown(self, fresh: int) -> RowAdam:

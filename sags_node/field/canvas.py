@@ -14,7 +14,7 @@ from sags_node.types import Camera
 
 
 class Canvas:
-    """As `interface.Rasterizer`, on tensors. Not for two threads."""
+    """Do as `interface.Rasterizer`, on tensors. Not for two threads."""
 
     def __init__(self, width: int, height: int, device: torch.device, antialias: bool = True) -> None:
         """Pictures of `width` x `height` px on a device of torch's: a GPU, or the CPU, which is slow."""

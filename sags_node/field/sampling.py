@@ -31,7 +31,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 
 class Places(NamedTuple):
-    """Where N places lie between the nodes of L levels."""
+    """Hold where N places lie between the nodes of L levels."""
 
     node: Tensor  # [N, L, 4] the nodes before them along x, y, z and t
     share: Tensor  # [N, L, 4] of the nodes after them, differentiable
@@ -47,7 +47,7 @@ class Level(NamedTuple):
 
 
 def has_kernels(cells: Tensor) -> bool:
-    """Whether `sample` can take this table [M, C]."""
+    """Tell whether `sample` can take this table [M, C]."""
     return twins.by_kernels(cells) and cells.shape[1] % LANES == 0
 
 
@@ -102,7 +102,8 @@ def _arrays(cells: Tensor, places: Sequence[Tensor]) -> Iterator[NDArray[Any]]:
 def _corner(
     node: I64, share: F32, first: I64, step: I64, channels: Any, block: Any, i: Any, level: Any, plane: Any
 ) -> Any:
-    """Where a place's cells lie in a plane, in the row before it and in the row after; its two shares."""
+    """Find where a place's cells lie in a plane, in the row before it and in the row after; its two
+    shares."""
     outer, inner = OUTER[plane], INNER[plane]
     row = first[level, plane] + node[i, level, outer] * step[level, plane] + node[i, level, inner]
     low, high = u8(row * channels + block), u8((row + step[level, plane]) * channels + block)

@@ -7,5 +7,5 @@ from torch import Tensor
 
 
 def by_kernels(table: Tensor) -> bool:
-    """Whether kernels can take a table: float32, in the memory of the host."""
+    """Tell whether kernels can take a table: float32, in the memory of the host."""
     return table.dtype == torch.float32 and table.device.type == "cpu"

@@ -50,7 +50,7 @@ class AnchoredField:
         return hexplane.t0_ns + hexplane.oldest * hexplane.slot_ns
 
     def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:
-        """Of all Gaussians: `which` must be None."""
+        """Deform all Gaussians: `which` must be None."""
         return _passed(rows, self._pose_at(self.anchor_ns), self._pose_at(t_ns))
 
     def follow(self, means: F32) -> None:

@@ -41,7 +41,7 @@ class Disparities(NamedTuple):
 
 
 class Eyes(NamedTuple):
-    """What is compared."""
+    """Hold what is compared."""
 
     left: U8  # [H, W] gray
     right: U8  # [H, W] gray
@@ -58,7 +58,7 @@ def eyes(left: U8, right: U8, tools: Bool, row_error: float) -> Eyes:
 
 
 def disparities(seen: Eyes, outline: Outline, limits: tuple[float, float]) -> Disparities | None:
-    """Of an instrument; None: too few patches agree.
+    """The disparities of an instrument; None: too few patches agree.
 
     Args:
         limits: the smallest and the largest disparity, px.
@@ -92,7 +92,7 @@ def disparities(seen: Eyes, outline: Outline, limits: tuple[float, float]) -> Di
 
 
 def _is_solid(tools: U8, centre: F64, width: float) -> bool:
-    """Whether there is instrument around a place of the midline: not between open jaws."""
+    """Tell whether there is instrument around a place of the midline: not between open jaws."""
     side = 2 * round(CORE * width) + 1
     core = cv2.getRectSubPix(tools, (side, side), (float(centre[0]), float(centre[1])))
     return float(core.mean()) > 127
@@ -135,8 +135,8 @@ def _best_line(scores: F32, places: F64) -> I64:
 
 
 def _vertices(scores: F32, best: I64) -> tuple[F64, F64]:
-    """Of the parabola through the best score and both beside it: the place of its vertex from the best, and
-    how sharp it is [S]."""
+    """The vertices of the parabola through the best score and both beside it: the place of its vertex from
+    the best, and how sharp it is [S]."""
     rows = np.arange(len(best))
     before, middle, after = (scores[rows, best + step].astype(np.float64) for step in (-1, 0, 1))
     bend = np.maximum(2 * middle - before - after, 1e-6)

@@ -93,7 +93,7 @@ class Instruments:
 
 
 def _placed(outline: Outline, both: Eyes | None, camera: Camera, baseline: float) -> _One:
-    """Where an instrument is, as far as the eyes tell."""
+    """Find where an instrument is, as far as the eyes tell."""
     one = _One(outline.far)
     scale = float(camera.K[0, 0]) * baseline
     if both is None or outline.is_outside:

@@ -83,7 +83,7 @@ def _disc(side: int) -> U8:
 
 
 def _of_component(mask: U8, edge: U8) -> list[Outline]:
-    """Of one connected region [h, w]."""
+    """The of component of one connected region [h, w]."""
     count, entries = cv2.connectedComponents(cv2.dilate(mask & edge, _disc(APART)))
     entries *= mask & edge
     found: dict[int, tuple[Outline, U8]] = {}  # by entry, and what of the region it was sought in
@@ -107,7 +107,7 @@ def _length(outline: Outline) -> float:
 
 
 def _band(mask: U8, start: U8) -> U8 | None:
-    """What lies straight before an entry; None: too little tells which way that is."""
+    """Return what lies straight before an entry; None: too little tells which way that is."""
     middles, widths, _ = _midline(mask, start)
     if len(middles) < FEWEST:
         return None

@@ -37,7 +37,7 @@ def cache_for(function: Callable[..., Any]) -> FunctionCache | None:
 
 
 def is_cold(function: Callable[..., Any]) -> bool:
-    """Whether a kernel must be compiled and the machine code can be kept."""
+    """Tell whether a kernel must be compiled and the machine code can be kept."""
     folder = _folder(inspect.unwrap(function))
     return folder is not None and not folder.exists()
 

@@ -29,7 +29,7 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]  # Numba has no types
         super()._finalize_final_module()
 
     def _get_module_for_linking(self) -> Any:
-        """What is linked into callers, which name the helpers too."""
+        """Return what is linked into callers, which name the helpers too."""
         module = super()._get_module_for_linking()
         self._link(module, "linkonce_odr")
         return module
@@ -40,5 +40,5 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]  # Numba has no types
 
 
 def keep_helpers_apart() -> None:
-    """For all that Numba compiles in this process from now on."""
+    """Set it for all that Numba compiles in this process from now on."""
     cpu_target.target_context.codegen()._library_class = _Library

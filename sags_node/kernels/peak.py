@@ -44,7 +44,7 @@ class Peak:
 
 
 def peak_row(peak: Peak) -> dict[str, Any]:
-    """What a table says of it."""
+    """Return what a table says of it."""
     return {
         "threads": peak.threads,
         "operations_per_s": peak.operations,

@@ -38,7 +38,7 @@ RECORD = 16  # float32 in a record
 
 
 def _fits_a_register(lanes: int) -> bool:
-    """Whether the compile target adds so many float32 with one instruction."""
+    """Tell whether the compile target adds so many float32 with one instruction."""
     triple, cpu, features = cpu_target.target_context.codegen().magic_tuple()
     machine = llvm.Target.from_triple(triple).create_target_machine(cpu=cpu, features=features)
     vector = f"<{lanes} x float>"
@@ -190,7 +190,7 @@ larger, smaller = _make_choice(">"), _make_choice("<")  # of two vectors or floa
 
 @intrinsic
 def any_of(typing_context: Any, condition: Any) -> Any:
-    """Whether a mask is true in one of its lanes."""
+    """Tell whether a mask is true in one of its lanes."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = ir.IntType(LANES)
@@ -261,7 +261,7 @@ def _shuffle(builder: Any, x: Any, y: Any, lanes: Sequence[int]) -> Any:
 
 
 def _transposed(builder: Any, vectors: Sequence[Any]) -> list[Any]:
-    """Of a square of LANES vectors: blocks of 1, 2, 4 ... lanes change places across the diagonal."""
+    """Transpose a square of LANES vectors: blocks of 1, 2, 4 ... lanes change places across the diagonal."""
     square, step = list(vectors), 1
     while step < LANES:
         upper = [n + LANES - step if n & step else n for n in range(LANES)]
@@ -278,7 +278,7 @@ def _transposed(builder: Any, vectors: Sequence[Any]) -> list[Any]:
 
 
 def _address(context: Any, builder: Any, sig: Any, args: Any, k: int, kind: Any = _F32) -> Any:
-    """Of element args[k + 1] of the array args[k]."""
+    """The address of element args[k + 1] of the array args[k]."""
     data = context.make_array(sig.args[k])(context, builder, args[k]).data
     index = context.cast(builder, args[k + 1], sig.args[k + 1], types.int64)
     return builder.bitcast(builder.gep(data, [index]), kind.as_pointer())
@@ -413,7 +413,7 @@ half_signs = _make_constant([1.0 - 2.0 * (lane // (LANES // 2)) for lane in rang
 
 
 def _fold_masks() -> list[tuple[list[int], list[int]]]:
-    """For each step of `_fold`: which lanes of two vectors, one behind the other, are added to which.
+    """Find for each step of `_fold`: which lanes of two vectors, one behind the other, are added to which.
 
     First whole quarters of a register move (4 lanes), then lanes within them: those are single instructions.
     """

@@ -358,7 +358,7 @@ def _carry(table: _Table, gaussians: Gaussians) -> F64:
 
 
 def _look(table: _Table, observation: Observation, view: RenderedView) -> None:
-    """Where each anchor is and how much of it is seen; it keeps its distance to the drawn surface."""
+    """Find where each anchor is and how much of it is seen; it keeps its distance to the drawn surface."""
     pixels, depths = project(observation.camera, table.points)
     table.pixels[:], table.depths[:] = pixels, depths
     table.visibility[:] = _seen(table.pixels, table.depths, observation.tissue, view.depth)
@@ -485,9 +485,9 @@ def _window(observation: Observation, pixel: F64, radius: int) -> tuple[U8, Bool
 
 
 def _match(window: U8, tissue: Bool, patch: U8, carried: bool = False) -> tuple[F64, float] | None:
-    """Where [2] (x, y) in the window the patch begins, to a part of a pixel, and how well it fits; None where
-    it is not found on tissue. Nor where it fits nearly as well elsewhere, as along an edge: then one that was
-    `carried` to the middle is there, if it fits nearly as well as anywhere."""
+    """Find where [2] (x, y) in the window the patch begins, to a part of a pixel, and how well it fits; None
+    where it is not found on tissue. Nor where it fits nearly as well elsewhere, as along an edge: then one
+    that was `carried` to the middle is there, if it fits nearly as well as anywhere."""
     scores: F32 = np.asarray(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
     if not tissue.all():
         on_tissue = cv2.erode(tissue.view(np.uint8), np.ones((_SIDE, _SIDE), np.uint8))

@@ -19,7 +19,7 @@ FIRST_SECONDS = 0.1  # of its first frame, after which the rest is left to those
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
-    """What one frame gets, decided when it begins."""
+    """Hold what one frame gets, decided when it begins."""
 
     rung: Rung  # at most
     state: RungState | None  # which rung that is and why; None: there is no ladder
@@ -27,7 +27,7 @@ class FramePlan:
 
 
 class Budget(Protocol):
-    """What frames get."""
+    """Hold what frames get."""
 
     @property
     def speed(self) -> float:
@@ -162,7 +162,7 @@ class TimeBudget:
 
 
 class _RunningMean:
-    """Of times, s; begins with the first."""
+    """The running mean of times, s; begins with the first."""
 
     def __init__(self) -> None:
         self.value = 0.0

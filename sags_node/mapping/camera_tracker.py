@@ -126,7 +126,7 @@ class CameraTracker:
         return pose
 
     def _is_found_out(self, observation: Observation) -> bool:
-        """Whether the keyframes have disagreed for long; then what was learnt is undone."""
+        """Tell whether the keyframes have disagreed for long; then what was learnt is undone."""
         now = observation.t_capture_ns
         if 0 <= now - self._looked_ns < LOOK_NS:
             return False
@@ -143,7 +143,7 @@ class CameraTracker:
         return True
 
     def _find_again(self, observation: Observation) -> Tracks | None:
-        """Where the Gaussians are, once the camera is verified to be where it was found."""
+        """Find where the Gaussians are, once the camera is verified to be where it was found."""
         tried = None if self._trial is None else self._tried(observation, self._trial.drawn)
         if tried is None or tried.agreement.problem:
             self._passed = 0
@@ -188,7 +188,7 @@ class CameraTracker:
             self._keyframes.offer(observation, view)
 
     def _best_candidate(self, observation: Observation) -> _Candidate | None:
-        """Where the model agrees best with a frame: near the last pose or those by the keyframes."""
+        """Find where the model agrees best with a frame: near the last pose or those by the keyframes."""
         starts = [self._pose, *self._keyframes.find(observation)[:TRIED]]
         tried = [self._tried(observation, self._seen_from(observation, start)) for start in starts]
         found = [each for each in tried if each is not None]
@@ -199,7 +199,8 @@ class CameraTracker:
         return best
 
     def _tried(self, observation: Observation, before: Drawn) -> _Candidate | None:
-        """Where the camera is if it was there before from where the model is drawn; None: not near it."""
+        """Find where the camera is if it was there before from where the model is drawn; None: not near
+        it."""
         tracks = self._surface.track(self._map.model.means, before, observation)
         fit = self._tissue.fit(observation, before, tracks, before.view.camera.T_world_cam)
         if isinstance(fit, str):

@@ -60,7 +60,7 @@ class GivenCamera:
         self.pose: F64 = np.eye(4)
 
     def guess(self, given: F64 | None) -> F64 | None:
-        """What is given, or None."""
+        """Return what is given, or None."""
         return given if self._follows else None
 
     def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:

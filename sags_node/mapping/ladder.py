@@ -17,7 +17,7 @@ from sags_node.types import RungState
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """What a frame gets."""
+    """Hold what a frame gets."""
 
     gaussians: int  # at most
     scale: float = 1.0  # of the working size: at which the model is drawn and refined
@@ -65,7 +65,7 @@ GPU_RUNGS = (
 
 @dataclass(frozen=True, slots=True)
 class Prices:
-    """What a frame costs on one machine, ms; only ratios count."""
+    """Hold what a frame costs on one machine, ms; only ratios count."""
 
     every_frame: float  # what depends on nothing: the camera's pictures, watches, tracks
     depth: float  # matched once
@@ -105,7 +105,7 @@ WITH_OTHERS = 1.1  # times as long as prices say: the least that live frames tak
 
 
 def price(rung: Rung, gaussians: float, pixels: int, prices: Prices = ON_CPU) -> float:
-    """What a frame costs, ms on the machine of the prices.
+    """Return what a frame costs, ms on the machine of the prices.
 
     Args:
         gaussians: that the model has.
@@ -191,7 +191,7 @@ class Ladder:
 
     @property
     def state(self) -> RungState:
-        """For people."""
+        """Say for people."""
         rung = self.rung
         return RungState(
             self.place, len(self._rungs), self.reason, rung.gaussians, rung.scale, rung.depth_every

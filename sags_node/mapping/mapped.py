@@ -25,14 +25,14 @@ SOME = slice(None, None, 8)  # rows and columns of a picture that are enough to 
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """What the mapper made of one frame."""
+    """Hold what the mapper made of one frame."""
 
     snapshot: Snapshot
     view: RenderedView  # the model drawn for the left eye
 
 
 def can_start(observation: Observation) -> bool:
-    """Whether this frame has depth enough for a first model."""
+    """Tell whether this frame has depth enough for a first model."""
     return bool(np.count_nonzero(observation.depth) >= MIN_FIRST_DEPTHS)
 
 
@@ -44,17 +44,17 @@ def most_steps(still: int, frames: int) -> float:
 
 
 def is_lost(planes: F32, observation: Observation) -> bool:
-    """Whether the model, moved to this frame, hardly covers it: after damage, or where the camera is known to
-    be in another place. What the picture shows is judged before, see `vision.watch.scene_watch`."""
+    """Tell whether the model, moved to this frame, hardly covers it: after damage, or where the camera is
+    known to be in another place. What the picture shows is judged before, see `vision.watch.scene_watch`."""
     tissue = observation.tissue[SOME, SOME]
     covered = tissue & (planes[4, SOME, SOME] > HOLE_ALPHA)
     return bool(np.count_nonzero(covered) < LOST_COVERAGE * np.count_nonzero(tissue))
 
 
 def is_worse_than_one_colour(planes: F32, observation: Observation) -> bool:
-    """Whether one colour would show the tissue of this frame better than the model does, and the model's are
-    wrong on the whole. If it has just learnt from the frame, it is broken, and beside it every later picture
-    seems to show another scene."""
+    """Tell whether one colour would show the tissue of this frame better than the model does, and the model's
+    are wrong on the whole. If it has just learnt from the frame, it is broken, and beside it every later
+    picture seems to show another scene."""
     tissue = observation.tissue[SOME, SOME]
     if not tissue.any():
         return False

@@ -36,7 +36,7 @@ NODE_STEP_PX = 0.08
 
 
 class Kind(Enum):
-    """What a frame is to the mapper."""
+    """Hold what a frame is to the mapper."""
 
     FIRST = auto()  # there is no model yet
     ODD = auto()  # its colours are not the tissue's: the model only follows the motion
@@ -134,7 +134,7 @@ class Mapper:
         return Kind.STILL if still else Kind.MOVED
 
     def pace(self, unhurried: bool) -> None:
-        """Whether there is time for several steps a frame. They are shorter then."""
+        """Tell whether there is time for several steps a frame. They are shorter then."""
         self._rates = LearningRates().scaled(UNHURRIED_RATES) if unhurried else LearningRates()
 
     @property
@@ -256,7 +256,7 @@ class Mapper:
         self._refiner.begin(self.model, self._deformation, observation, step)
 
     def _next_rates(self) -> LearningRates:
-        """Of the next step."""
+        """The rates of the next step."""
         self._first_steps += 1
         return FIRST_RATES if self._first_steps <= FIRST_STEPS else self._rates
 
@@ -272,7 +272,7 @@ class Mapper:
 
     @property
     def _deformation(self) -> NodeDeformation:
-        """Of a map that has tissue."""
+        """The deformation of a map that has tissue."""
         assert self.map.deformation is not None
         return self.map.deformation
 
@@ -305,7 +305,8 @@ class Mapper:
             self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
 
     def _forecast(self, t_ns: int, still: bool) -> Forecast | None:
-        """What the remembered motion, with the nodes' places at the end of this frame, expects next."""
+        """Return what the remembered motion, with the nodes' places at the end of this frame, expects
+        next."""
         motion, deformation, model = self.map.motion, self.map.deformation, self.model
         if motion is None or deformation is None:
             return None

@@ -39,7 +39,7 @@ class Drawn:
 
 
 class Tracks(NamedTuple):
-    """Where Gaussians are found in a frame."""
+    """Hold where Gaussians are found in a frame."""
 
     pixels: F32  # [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now
     seconds: float  # since they were where they are in the model
@@ -53,7 +53,7 @@ class SurfaceTracker:
         self.pace(unhurried)
 
     def pace(self, unhurried: bool) -> None:
-        """Whether there is time for a finer flow."""
+        """Tell whether there is time for a finer flow."""
         self._flow = OpticalFlow(FINE_FLOW if unhurried else COARSE_FLOW)
 
     def track(self, means: F32, last: Drawn, observation: Observation, guess: F32 | None = None) -> Tracks:
@@ -71,7 +71,7 @@ class SurfaceTracker:
 
 
 def found(means: F32, before: RenderedView, clear_before: Bool, flow: F32, clear_after: Bool) -> F32:
-    """Where in the later picture each Gaussian of the earlier one is, as `Tracks.pixels`.
+    """Find where in the later picture each Gaussian of the earlier one is, as `Tracks.pixels`.
 
     Args:
         means: [N, 3] m, world, at the earlier frame.

@@ -177,7 +177,7 @@ class MotionField:
             self._say()
 
     def _learn(self, known: I64) -> None:
-        """What was said of this frame against what came, at probed nodes [K] that were seen."""
+        """Return what was said of this frame against what came, at probed nodes [K] that were seen."""
         if len(known) == 0:
             return
         now = self._count - 1
@@ -194,7 +194,7 @@ class MotionField:
             self._errors[back] = SKILL_MEMORY * self._errors[back] + np.array(errors) / len(known)
 
     def _say(self) -> None:
-        """Of the next frames, from all that is remembered."""
+        """Expect the next frames, from all that is remembered."""
         last = self._count - 1
         nodes = self._places.shape[1]
         frames = np.arange(1, HORIZONS + 1, dtype=np.float32)[:, None, None]

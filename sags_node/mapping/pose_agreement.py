@@ -52,7 +52,7 @@ class Agreement:
 
     @property
     def problem(self) -> str:
-        """What disagrees; empty: nothing."""
+        """Return what disagrees; empty: nothing."""
         if self.covered < LEAST_COVERED:
             return "hardly any known tissue in view"
         if self.correlation < LEAST_CORRELATION:
@@ -76,18 +76,18 @@ def shrunk(gray: U8 | F32, depth: F32, where: Bool) -> Small:
 
 
 def small_frame(observation: Observation) -> Small:
-    """What a frame shows."""
+    """Return what a frame shows."""
     return shrunk(observation.gray, observation.depth, observation.tissue)
 
 
 def small_view(view: RenderedView) -> Small:
-    """What the model shows."""
+    """Return what the model shows."""
     gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     return shrunk(gray, view.depth, (view.alpha > 0.5) & (view.depth > 0))
 
 
 def agreement(expected: Small, frame: Small, camera: Camera, baseline: float) -> Agreement:
-    """Of a frame with what is expected, pixel by pixel; exposure and wide shading do not count.
+    """The agreement of a frame with what is expected, pixel by pixel; exposure and wide shading do not count.
 
     Args:
         camera: of the pictures before they were shrunk, for what a disparity is.

@@ -38,7 +38,7 @@ class _Remembered:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where an anchor seems to be.
+    """Hold where an anchor seems to be.
 
     Attributes:
         linear: [2, 2] px per px: how what surrounds it was turned and scaled since its patch was taken.
@@ -52,7 +52,7 @@ class Place:
 
     @property
     def scale(self) -> float:
-        """Of the picture: above 1 it came nearer."""
+        """The scale of the picture: above 1 it came nearer."""
         return float(np.sqrt(abs(np.linalg.det(self.linear))))
 
 
@@ -76,8 +76,8 @@ class Recall:
         self._pictures.append(_Remembered(features, ids, pixels.copy(), depths.copy(), patches.copy()))
 
     def look(self, features: Features, lost: I64) -> list[Place]:
-        """Where some of the lost anchors may be in a picture, by one of those remembered that show any: each
-        time by another one."""
+        """Find where some of the lost anchors may be in a picture, by one of those remembered that show any:
+        each time by another one."""
         shows = [kept for kept in reversed(self._pictures) if np.isin(kept.ids, lost).any()]
         if not shows:
             return []
@@ -115,7 +115,7 @@ def _placed(kept: _Remembered, lost: I64, start: F32, end: F32, width: int) -> l
 
 
 def fits_depth(place: Place, depth: float) -> bool:
-    """Whether the tissue came nearer in the picture as it did in depth (m)."""
+    """Tell whether the tissue came nearer in the picture as it did in depth (m)."""
     ratio = place.scale * depth / place.depth
     return 1 / SAME_SCALE < ratio < SAME_SCALE
 

@@ -36,7 +36,7 @@ class Refiner(Protocol):
 
     @property
     def problem(self) -> Finding | None:
-        """What is wrong with it and how to fix it; None: nothing. May be read from any thread."""
+        """Return what is wrong with it and how to fix it; None: nothing. May be read from any thread."""
 
     def begin(
         self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float

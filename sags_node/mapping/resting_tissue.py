@@ -29,7 +29,7 @@ LARGEST_SCALE = 4 / 640  # of the width: of the residuals
 
 @dataclass(frozen=True, slots=True)
 class TissueFit:
-    """Where a camera is, `T_world_cam` [4, 4]."""
+    """Hold where a camera is, `T_world_cam` [4, 4]."""
 
     near: F64  # by how the tissue moved since the last frame
     at_rest: F64  # by where it rests; as `near` where too little of it is there
@@ -153,7 +153,7 @@ def _refined(before: U8, after: U8, here: F32, there: F32) -> tuple[I64, F32]:
 
 
 def correlation(a: F32, b: F32) -> float:
-    """Of two lists of numbers; 0 where one of them is constant."""
+    """The correlation of two lists of numbers; 0 where one of them is constant."""
     a, b = a - a.mean(), b - b.mean()
     spread = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / spread if spread > 0 else 0.0

@@ -353,7 +353,7 @@ class SagsMapper:
             kept.popleft()
 
     def _show(self, observation: Observation, frame: Kept) -> F32:
-        """What is drawn."""
+        """Return what is drawn."""
         planes = self._draw(frame)
         self._view = as_view(planes, self.model, observation)
         return planes

@@ -110,8 +110,8 @@ def _look_at_rows(
     means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: U8, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool, first: Any, end: Any,
 ) -> None:  # fmt: skip
-    """Of the Gaussians on the visible tissue, marks those that are to spare, and writes how much those that
-    may be split have to do with residuals of the colour."""
+    """Look at the Gaussians on the visible tissue, marks those that are to spare, and writes how much those
+    that may be split have to do with residuals of the colour."""
     height, width = tissue.shape
     across, down = np.float32(rgb.shape[1] / width), np.float32(rgb.shape[0] / height)
     for i in range(first, end):

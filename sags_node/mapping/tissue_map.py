@@ -25,7 +25,7 @@ class Learnt:
 
 
 class TissueMap:
-    """What the mapper refines, and what a pose is found against.
+    """Hold what the mapper refines, and what a pose is found against.
 
     Attributes:
         model: the Gaussians, where they are now.
@@ -76,7 +76,7 @@ class TissueMap:
             self.motion = MotionField()
 
     def learnt(self) -> Learnt:
-        """What is known now."""
+        """Return what is known now."""
         return Learnt(*deepcopy((self.model, self.deformation)), self.lamp)
 
     def go_back(self, learnt: Learnt) -> None:

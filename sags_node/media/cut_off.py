@@ -24,7 +24,7 @@ _ASF_FILE = bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")  # the File Proper
 
 
 def ends_in_a_packet(path: Path, size: int, container: str) -> bool:
-    """Whether the last packet or sector is not whole, of files of `size` bytes that have such.
+    """Tell whether the last packet or sector is not whole, of files of `size` bytes that have such.
 
     Args:
         container: FFmpeg's name of it.
@@ -43,7 +43,7 @@ def ends_in_a_packet(path: Path, size: int, container: str) -> bool:
 
 
 def lacks_its_end(path: Path, size: int, container: str) -> bool:
-    """Whether a file of `size` bytes says that it is longer, or ends within a unit of its container.
+    """Tell whether a file of `size` bytes says that it is longer, or ends within a unit of its container.
 
     One that was never ended, and stops behind a unit, does not.
     """

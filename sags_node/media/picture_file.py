@@ -97,7 +97,7 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) ->
 
 
 class Complaints:
-    """What decoders say, once of each kind: all pictures of a recording often have the same flaw."""
+    """Hold what decoders say, once of each kind: all pictures of a recording often have the same flaw."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -133,7 +133,7 @@ def claimed_size(data: memoryview) -> tuple[int, int] | None:
 
 
 def is_whole(data: memoryview) -> bool:
-    """Whether the end of a picture is there: its mark, or, where a kind has none, all of its pixels."""
+    """Tell whether the end of a picture is there: its mark, or, where a kind has none, all of its pixels."""
     begin = next((begin for begin in _ENDS if bytes(data[: len(begin)]) == begin), None)
     if begin is not None:
         near = _ENDS[begin] in bytes(data[-_LONGEST_PADDING:])
@@ -151,7 +151,7 @@ def is_whole(data: memoryview) -> bool:
 
 
 def _jpeg_ends(data: memoryview) -> bool:
-    """Whether its segments and scans lead to an end; drivers hand over buffers that are longer."""
+    """Tell whether its segments and scans lead to an end; drivers hand over buffers that are longer."""
     at = 2
     while (found := _JPEG_MARK.search(data, at)) is not None and found[1] != b"\xd9":
         length = int.from_bytes(data[found.end() : found.end() + 2], "big")
@@ -164,7 +164,8 @@ def _is_tiff(data: memoryview) -> bool:
 
 
 def _tiff_tags(data: memoryview) -> Tiff.ImageFileDirectory_v2:
-    """Of the first picture. Pillow has no mode for some that OpenCV reads, such as three floats a pixel."""
+    """The tiff tags of the first picture. Pillow has no mode for some that OpenCV reads, such as three floats
+    a pixel."""
     tags = Tiff.ImageFileDirectory_v2(bytes(data[:8]))
     file = BytesIO(data)
     file.seek(tags.next)

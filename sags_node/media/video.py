@@ -61,7 +61,7 @@ class LostPictureError(SagsError):
 
 @dataclass(frozen=True, slots=True)
 class _Index:
-    """What the packets of a file say, in ticks."""
+    """Hold what the packets of a file say, in ticks."""
 
     count: int
     pts: I64 | None  # [count] rising; None: they do not say when pictures are shown
@@ -363,7 +363,8 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
 
 
 def _why_unused(pts: I64, base: Fraction) -> str:
-    """What is wrong with the stamps of pictures in the order in which they are decoded; nothing: ""."""
+    """Return what is wrong with the stamps of pictures in the order in which they are decoded; nothing:
+    ""."""
     order = np.argsort(pts, kind="stable")
     moved = np.abs(order - np.arange(len(pts)))
     steps = np.diff(pts[order]) * float(base)
@@ -395,5 +396,5 @@ def _bits_used(frame: av.VideoFrame) -> int | None:
 
 
 def _is_hd(width: int, height: int) -> bool:
-    """Whether this is the size of one or two pictures of HD television."""
+    """Tell whether this is the size of one or two pictures of HD television."""
     return not HD.isdisjoint({(width, height), (width // 2, height), (width, height // 2)})

@@ -63,7 +63,8 @@ class Clock(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NodeAddress:
-    """Where a sender is: a node, an overlay, a player. A socket that is not given is in the connection file.
+    """Hold where a sender is: a node, an overlay, a player. A socket that is not given is in the connection
+    file.
 
     Attributes:
         ns: namespace of its topics, and name of its connection file.
@@ -81,7 +82,7 @@ class NodeAddress:
     clock: Clock | None = None
 
     def now_ns(self) -> int:
-        """What the clock that stamps what it sends shows now, at the latest."""
+        """Return what the clock that stamps what it sends shows now, at the latest."""
         return time.time_ns() if self.clock is None else self.clock.latest_ns()
 
     def data(self) -> Address:
@@ -191,7 +192,8 @@ class HandshakeWatch:
         self._last = (0, 0)  # event and value of the last one
 
     def refusal(self) -> str | None:
-        """What the node has against this client, and how to fix it; None while nothing speaks against it."""
+        """Return what the node has against this client, and how to fix it; None while nothing speaks against
+        it."""
         while self._monitor.poll(0):
             said = recv_monitor_message(self._monitor)
             if said["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:

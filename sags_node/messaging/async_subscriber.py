@@ -62,7 +62,7 @@ class AsyncSubscriber(Receiver):
         raise StaleError(f"{topics.full_name(self._ns, name)} is stale: nothing new for {timeout:g} s")
 
     async def _until(self, find: Callable[[], T | None], timeout: float) -> T | None:
-        """What `find` gives, asked anew whenever a message has come."""
+        """Return what `find` gives, asked anew whenever a message has come."""
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:

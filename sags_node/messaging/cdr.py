@@ -45,7 +45,7 @@ _ros = _store.types
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What one message carries, apart from its number and its stamps."""
+    """Hold what one message carries, apart from its number and its stamps."""
 
     type: str
     parts: tuple[Buffer, ...]
@@ -88,7 +88,7 @@ def parse(message: Message) -> Any:
 
 
 def knows(type_name: str) -> bool:
-    """Whether this is a stock ROS 2 type."""
+    """Tell whether this is a stock ROS 2 type."""
     return type_name in _store.fielddefs
 
 
@@ -130,7 +130,7 @@ def compressed_image(file: bytes, form: str, header: Any) -> bytes:
 
 
 def file_form(encoding: str, kind: str) -> str:
-    """What a JPEG or PNG file (`kind`) is made of, in the words of ROS's compressed_image_transport.
+    """Return what a JPEG or PNG file (`kind`) is made of, in the words of ROS's compressed_image_transport.
 
     `encoding` is that of the picture.
     """

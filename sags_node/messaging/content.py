@@ -142,7 +142,7 @@ def view_topics(name: str, stereo: bool, depth: bool) -> list[str]:
 
 
 def view(name: str, drawn: DrawnView) -> dict[str, Content]:
-    """What the topics of a view that a consumer asked for say, by name without the namespace."""
+    """Return what the topics of a view that a consumer asked for say, by name without the namespace."""
     said = {}
     for eye, picture in drawn.eyes.items():
         topic = f"view/{name}/{eye}/" if eye else f"view/{name}/"
@@ -259,8 +259,9 @@ OF_THE_MODEL = (
 
 
 def tells_of(result: FrameResult, topic: str) -> bool:
-    """Whether a frame has something for a topic: there may have been no time to measure its depth, nobody
-    may have looked at its right eye, and nothing of the model belongs to a frame that was not taken in."""
+    """Tell whether a frame has something for a topic: there may have been no time to measure its depth,
+    nobody may have looked at its right eye, and nothing of the model belongs to a frame that was not taken
+    in."""
     if result.held and topic in OF_THE_MODEL:
         return False
     if topic == "right/render/image" and "right" not in result.views:
@@ -281,7 +282,7 @@ def health_fields(health: NodeHealth) -> dict[str, Any]:
 
 
 def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
-    """As `health_fields`, and under `last_frame` its loss, counts and what was skipped."""
+    """Do as `health_fields`, and under `last_frame` its loss, counts and what was skipped."""
     fields = health_fields(health)
     fields["last_frame"] = (
         {}
@@ -297,8 +298,8 @@ def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
 
 
 def health_answer(health: NodeHealth) -> dict[str, Any]:
-    """Whether the node does its work: frames come and are shown, or it was paused; and what it was asked to
-    record is recorded."""
+    """Tell whether the node does its work: frames come and are shown, or it was paused; and what it was asked
+    to record is recorded."""
     codes = list(by_code(health.warnings))
     healthy = health.state in HEALTHY and UNHEALTHY.isdisjoint(codes)
     return {"healthy": healthy, "state": health.state, "warnings": codes}

@@ -171,7 +171,7 @@ class ControlServer:
         self._answer(sender, request.id, lambda: handler(request.args), time.monotonic() + request.left)
 
     def _refusal(self, sender: _Sender, request: Request) -> Reply | None:
-        """What speaks against a request, before it is looked at further."""
+        """Return what speaks against a request, before it is looked at further."""
         wait = self._rate.wait(sender.id)
         if wait:
             self._count("requests_too_often", sender, request.op)
@@ -258,7 +258,7 @@ class ControlClient(Closes):
 
     @property
     def endpoint(self) -> str:
-        """Where the node is, or was when it was last asked."""
+        """Find where the node is, or was when it was last asked."""
         return self._address.endpoint
 
     def request(self, op: str, args: Mapping[str, Any] | None = None, timeout: float = 2.0) -> Any:
@@ -314,7 +314,7 @@ class ControlClient(Closes):
             self._connect(address)
 
     def _has_moved(self) -> bool:
-        """Whether another node has taken the place of the one that was asked."""
+        """Tell whether another node has taken the place of the one that was asked."""
         try:
             return self._find() != self._address
         except SagsError:  # there is none, or it cannot be asked: the next request will say so

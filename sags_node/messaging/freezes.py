@@ -40,7 +40,7 @@ class Freezes:
         self._intervals.append(interval)
 
     def status(self) -> dict[str, float]:
-        """As it stands in figures."""
+        """Give it as it stands in figures."""
         return {"count": self.count, "seconds": round(self.seconds, 3)}
 
 

@@ -122,7 +122,7 @@ class Inbox:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with who sends, and how to fix it. May be read from any thread."""
+        """Return what is wrong with who sends, and how to fix it. May be read from any thread."""
         said, when = self._two
         return (Finding("two_senders", said),) if time.monotonic() - when < 2 * ALONE_S else ()
 
@@ -167,7 +167,7 @@ class Inbox:
             raise SagsError(f"{self._two[0]}; the other's is taken")
 
     def _waiting(self) -> list[tuple[_Sender, Message, int]]:
-        """What has come, in its order; of each sender's topics the newest."""
+        """Return what has come, in its order; of each sender's topics the newest."""
         came: list[tuple[_Sender, Message, int]] = []
         for identity, *frames in waiting(self._socket, MOST_AT_ONCE, wire.MAX_PARTS + 1, self._peers.took):
             arrival_ns = time.time_ns()

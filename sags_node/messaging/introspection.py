@@ -68,7 +68,8 @@ def topic_list(node: NodeAddress = THE_NODE, seconds: float = 3.0) -> list[Recor
 
 
 def _listed(heard: set[str]) -> list[topics.Topic]:
-    """What the sender of these topics may send: only an overlay has nothing but an overlay's topics."""
+    """Return what the sender of these topics may send: only an overlay has nothing but an overlay's
+    topics."""
     of_overlay = heard <= {topic.name for topic in topics.OVERLAY_TOPICS}
     listed = {topic.name: topic for topic in (topics.OVERLAY_TOPICS if of_overlay else topics.TOPICS)}
     for name in sorted(heard - set(listed)):  # views, a clock; not what no contract knows
@@ -117,7 +118,7 @@ def topic_echo(
 
 
 def topic_info(name: str, node: NodeAddress = THE_NODE, seconds: float = 1.0) -> Record:
-    """What a topic is by the contract, and what was heard of it in `seconds`.
+    """Return what a topic is by the contract, and what was heard of it in `seconds`.
 
     Raises:
         UsageError: there is no such topic.
@@ -175,7 +176,7 @@ def topic_figures(
 
 
 def _spread(values: NDArray[np.float64]) -> Record:
-    """Of intervals or delays, s."""
+    """The spread of intervals or delays, s."""
     return {
         "min_s": float(values.min()),
         "max_s": float(values.max()),
@@ -198,7 +199,7 @@ def _listen_to(topic: str, node: NodeAddress, seconds: float) -> list[_Sample]:
 
 
 def _heard(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str, list[_Sample]]:
-    """What came on some topics, each message once: a last value may be sent again for another peer."""
+    """Return what came on some topics, each message once: a last value may be sent again for another peer."""
     heard: dict[str, dict[tuple[str, int], _Sample]] = defaultdict(dict)
     for arrived in listen_to(node, names, seconds):
         if arrived is not None:

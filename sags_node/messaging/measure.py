@@ -64,7 +64,7 @@ class Measured:
 
 
 def check_numbers(numbers: Sequence[int], area: bool) -> None:
-    """Whether something can be measured between anchors of these numbers.
+    """Tell whether something can be measured between anchors of these numbers.
 
     Raises:
         UsageError: too few, or the same one where it makes no sense.
@@ -152,7 +152,7 @@ def area_of(points: F64) -> float:
 def _error(
     of: Callable[[F64], float], points: F64, depth_errors: F64, T_world_cam: F64, info: ReceivedCameraInfo
 ) -> float:
-    """Of what `of` says of the points [N, 3], whose depths have these errors [N] (m)."""
+    """The error of what `of` says of the points [N, 3], whose depths have these errors [N] (m)."""
     depths = transform(invert(T_world_cam), points)[:, 2]
     along = (points - T_world_cam[:3, 3]) * (depth_errors / depths)[:, None]
     beside = SIDEWAYS * info.width / info.K[0, 0] * depths
@@ -170,7 +170,7 @@ def _error(
 
 
 def _crosses(points: F64) -> bool:
-    """Whether two sides of a polygon [N, 3] cross, seen along the normal of its mean plane."""
+    """Tell whether two sides of a polygon [N, 3] cross, seen along the normal of its mean plane."""
     normal = np.linalg.svd(points - points.mean(0))[2][-1]
     count = len(points)
 

@@ -143,13 +143,13 @@ class NodeClock(Closes):
             return self._estimate.jumps
 
     def latest_ns(self) -> int:
-        """What the node's clock shows now at the latest, so that no age is given too young. Where the offset
-        is not known, what the clock here shows."""
+        """Return what the node's clock shows now at the latest, so that no age is given too young. Where the
+        offset is not known, what the clock here shows."""
         offset = self.offset
         return time.time_ns() + (0 if offset is None else round(1e9 * (offset.seconds + offset.bound)))
 
     def status(self) -> dict[str, Any]:
-        """For a status message: `offset_ms`, `bound_ms`, `jumps`, `problem`."""
+        """Give for a status message: `offset_ms`, `bound_ms`, `jumps`, `problem`."""
         offset = self.offset
         return {
             "offset_ms": None if offset is None else round(1e3 * offset.seconds, 3),

@@ -42,7 +42,7 @@ class _Peer:
 
     @property
     def is_local(self) -> bool:
-        """Whether it came by ipc, so that it is a process of the same user."""
+        """Tell whether it came by ipc, so that it is a process of the same user."""
         return self.connection.family == sockets.AF_UNIX
 
     @property

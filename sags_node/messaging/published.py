@@ -50,7 +50,7 @@ def nearest(pair: RectifiedPair, plane: Plane) -> Plane:
 
 
 def colours(pair: RectifiedPair, view: RenderedView) -> U8:
-    """What a view of the frame shows, [H, W, 3] RGB."""
+    """Return what a view of the frame shows, [H, W, 3] RGB."""
     return colours_at(view, size_of(pair))
 
 
@@ -60,7 +60,8 @@ def alpha(pair: RectifiedPair, view: RenderedView) -> F32:
 
 
 def colours_at(view: RenderedView, size: tuple[int, int]) -> U8:
-    """What a view shows in a size of width and height, px: with the detail of pictures, where it has it."""
+    """Return what a view shows in a size of width and height, px: with the detail of pictures, where it has
+    it."""
     if view.shown is not None and view.shown.rgb.shape[1::-1] == size:
         return view.shown.rgb
     return view.colours.at(*size)

@@ -45,7 +45,7 @@ LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """What is sent of a topic, once or again for those who subscribe later."""
+    """Hold what is sent of a topic, once or again for those who subscribe later."""
 
     body: Content
     stamp_ns: int
@@ -159,8 +159,8 @@ class Publisher(Closes):
 
     @property
     def connections(self) -> dict[str, dict[str, int]]:
-        """Of each socket: connections open and refused, see `Peers.counts`; of the control socket also
-        requests that were refused."""
+        """The connections of each socket: connections open and refused, see `Peers.counts`; of the control
+        socket also requests that were refused."""
         counts = {name: peers.counts() for name, peers in self._peers.items()}
         if self._control is not None:
             counts["control"] |= self._control.refused

@@ -35,7 +35,7 @@ class Received:
 
     @property
     def metric(self) -> bool:
-        """Whether lengths are metres; else the node has no calibration, and they have no unit."""
+        """Tell whether lengths are metres; else the node has no calibration, and they have no unit."""
         return self.meta.units is msgspec.UNSET
 
     def age(self, now_ns: int | None = None) -> float:
@@ -100,7 +100,7 @@ class ReceivedText(Received):
     text: str
 
     def warnings(self) -> dict[str, str]:
-        """Of a `status`: code -> what is wrong and how to fix it."""
+        """The warnings of a `status`: code -> what is wrong and how to fix it."""
         try:
             return msgspec.json.decode(self.text, type=_Warnings).warning_codes
         except (msgspec.MsgspecError, RecursionError):

@@ -23,7 +23,7 @@ MAX_UNIX_SOCKET_PATH = 107  # bytes, sun_path of Linux without its final zero
 
 
 class Connection(msgspec.Struct, frozen=True, kw_only=True):
-    """What a client needs to reach a node."""
+    """Hold what a client needs to reach a node."""
 
     protocol: str
     ns: str
@@ -95,7 +95,7 @@ class RunDirectory:
 
     @property
     def is_held(self) -> bool:
-        """Whether the lock file in the directory is the one that this node has locked."""
+        """Tell whether the lock file in the directory is the one that this node has locked."""
         try:
             return os.path.samestat(os.fstat(self._lock), os.stat(self._lock_path))
         except OSError:
@@ -115,7 +115,7 @@ class RunDirectory:
 
     @property
     def ipc_endpoint(self) -> str:
-        """Where to bind the ipc socket.
+        """Find where to bind the ipc socket.
 
         Raises:
             UsageError: the path is too long for a Unix socket.
@@ -148,7 +148,7 @@ def connection_path(folder: Path, ns: str) -> Path:
 
 
 def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
-    """Where the node named `ns` on this machine is.
+    """Find where the node named `ns` on this machine is.
 
     Raises:
         UsageError: others may have written the file.

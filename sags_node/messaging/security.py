@@ -196,13 +196,13 @@ def check_endpoint(endpoint: str, config: Guarded, section: str = "publish") -> 
 
 
 def is_local(endpoint: str) -> bool:
-    """Whether only this machine can be at the other end."""
+    """Tell whether only this machine can be at the other end."""
     transport, _, address = endpoint.partition("://")
     return transport == "ipc" or (transport == "tcp" and is_loopback(address.rpartition(":")[0].strip("[]")))
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a server on this address."""
+    """Tell whether only this machine can reach a server on this address."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

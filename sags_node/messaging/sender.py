@@ -72,7 +72,7 @@ class Sender(Closes):
 
     @property
     def problem(self) -> str | None:
-        """What the node has against what is sent, or that it is not there; None: all is well."""
+        """Return what the node has against what is sent, or that it is not there; None: all is well."""
         self._listen()
         return self._watch.refusal() or (None if self.receipt is None else self.receipt.problem)
 
@@ -175,7 +175,7 @@ class PoseSender(Sender):
         super().__init__(endpoint, ns, keys)
 
     def send(self, T_base_hand: F64, stamp_ns: int | None = None) -> bool:
-        """Where what carries the camera was at a moment, [4, 4], m.
+        """Find where what carries the camera was at a moment, [4, 4], m.
 
         Args:
             stamp_ns: wall clock (`time.time_ns`); default: now.

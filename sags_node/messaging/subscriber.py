@@ -42,7 +42,7 @@ class _Status(msgspec.Struct):
 
 
 class Receiver:
-    """What `Subscriber` and `AsyncSubscriber` have in common: everything but the waiting.
+    """Hold what `Subscriber` and `AsyncSubscriber` have in common: everything but the waiting.
 
     `status` is always received too: a sender that says it is not running makes every topic stale. A node
     that is restarted is followed, to another port, too, when it was found by its connection file.
@@ -127,7 +127,7 @@ class Receiver:
 
     @property
     def endpoint(self) -> str:
-        """Where the node is, or was when it was last heard of; empty before that."""
+        """Find where the node is, or was when it was last heard of; empty before that."""
         return "" if self._address is None else self._address.endpoint
 
     # ---- what has come ---------------------------------------------------------------------------------
@@ -188,7 +188,7 @@ class Receiver:
             return self._fresh[name].period
 
     def now_ns(self) -> int:
-        """What the clock that stamped the messages shows now, at the latest: for `Received.age`."""
+        """Return what the clock that stamped the messages shows now, at the latest: for `Received.age`."""
         return self._clock_ns()
 
     @contextmanager
@@ -238,7 +238,7 @@ class Receiver:
         return problem or unknown or self._sender_problem(name)
 
     def _sender_problem(self, name: str) -> str | None:
-        """What the newest `status` says against the newest message of a topic."""
+        """Return what the newest `status` says against the newest message of a topic."""
         status, newest = self._newest("status"), self._newest(name)
         if not isinstance(status, ReceivedText) or newest is None or newest.meta.frame_id < 0:
             return None  # nothing is said against what shows no frame
@@ -275,7 +275,7 @@ class Receiver:
             self._look_for_node()
 
     def _subscribe(self, socket: zmq.Socket[bytes]) -> None:
-        """As it is asked for now; a socket is used by one thread alone."""
+        """Subscribe as it is asked for now; a socket is used by one thread alone."""
         asked = self._asked
         if asked == self._subscribed:
             return

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 def thin_pictures(
     result: FrameResult, asked: Mapping[str, ThinPicture], logged: set[str] | None = None
 ) -> dict[str, Content]:
-    """What a frame has for thin topics, by topic; a text where it cannot be made.
+    """Return what a frame has for thin topics, by topic; a text where it cannot be made.
 
     Args:
         logged: topics whose failure was logged; those that fail now are added.
@@ -105,7 +105,7 @@ def _alpha(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
 def _numbers(
     result: FrameResult, topic: str, part: tuple[slice, slice], few: tuple[slice, slice]
 ) -> tuple[float, str, NDArray[Any]]:
-    """What must not be averaged: its scale (0: none), its encoding, and itself."""
+    """Return what must not be averaged: its scale (0: none), its encoding, and itself."""
     if topic == "left/tissue_mask":
         tissue = published.nearest(result.pair, result.observation.tissue)
         return 0.0, "mono8", tissue[part][few].view(np.uint8) * np.uint8(255)

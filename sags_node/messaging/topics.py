@@ -34,7 +34,8 @@ class Topic:
 
     @property
     def in_metres(self) -> bool:
-        """Whether it is of lengths. So is a camera_info, but that can say that nobody has calibrated it."""
+        """Tell whether it is of lengths. So is a camera_info, but that can say that nobody has calibrated
+        it."""
         return self.type in (POINT_CLOUD, TF) or self.name.endswith("/depth")
 
 
@@ -112,7 +113,7 @@ class ThinPicture:
 
 
 def thin_picture(name: str) -> ThinPicture:
-    """What a name asks for: `thin/SIZE/[X,Y,WIDTH,HEIGHT/]TOPIC/FORM`, without the namespace.
+    """Return what a name asks for: `thin/SIZE/[X,Y,WIDTH,HEIGHT/]TOPIC/FORM`, without the namespace.
 
     No such name is the beginning of another, so a subscription to one brings no other.
 

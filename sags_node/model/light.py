@@ -36,7 +36,7 @@ def light_gain(means: F32, normals: F32, index: I32, weight: F32, before: F64, a
 
 
 def is_near(before: F64, after: F64) -> bool:
-    """Whether two poses [4, 4] of a lamp give the same light, as far as one can see."""
+    """Tell whether two poses [4, 4] of a lamp give the same light, as far as one can see."""
     moved = float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
     return moved < STEP_M and float(np.abs(after[:3, :3] - before[:3, :3]).max()) < STEP_RAD
 
@@ -71,7 +71,8 @@ def _gains_of_rows(
 
 @inlined
 def _brightness(lamp: F32, x: Any, y: Any, z: Any, nx: Any, ny: Any, nz: Any) -> Any:
-    """Of a place with a normal, of any length, in the light of a lamp [6]: place and direction."""
+    """The brightness of a place with a normal, of any length, in the light of a lamp [6]: place and
+    direction."""
     least = np.float32(LEAST_COSINE)
     x, y, z = lamp[0] - x, lamp[1] - y, lamp[2] - z
     squared = x * x + y * y + z * z

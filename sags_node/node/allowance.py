@@ -30,7 +30,7 @@ class Allowance:
 
     @property
     def share(self) -> float:
-        """Of one core."""
+        """The share of one core."""
         return LEAST_SHARE if self.is_behind else SHARE
 
 

@@ -47,7 +47,7 @@ def why_missed(mapping: MappingConfig, rate: float | None) -> str:
 
 
 class Statistics:
-    """What the last frames tell of rate, latency and cost.
+    """Hold what the last frames tell of rate, latency and cost.
 
     Args:
         source: where they come from.
@@ -110,7 +110,7 @@ class Statistics:
 
     @property
     def flowing(self) -> bool:
-        """Whether frames come, since the last pause."""
+        """Tell whether frames come, since the last pause."""
         with self._lock:
             return bool(self._published) and not self._is_waiting(time.monotonic())
 
@@ -135,7 +135,7 @@ class Statistics:
         working: float = 0.0,
         recording: Mapping[str, object] | None = None,
     ) -> NodeHealth:
-        """What is true now.
+        """Return what is true now.
 
         Args:
             missed: why frames are left out, if they are, and the remedy.
@@ -186,7 +186,7 @@ class Statistics:
     def _findings(
         self, state: str, now: float, missed: str, working: float, consumers: int, known: Findings
     ) -> list[Finding]:
-        """What the flow of frames says; asked with the lock held."""
+        """Return what the flow of frames says; asked with the lock held."""
         found = []
         if state == "waiting" and working > WAITING_AFTER:
             said = f"one frame has been worked on for {working:.0f} s, as {missed}"
@@ -216,7 +216,7 @@ class Statistics:
 
 
 def _relief(consumers: int) -> str:
-    """What leaves a node more of its machine."""
+    """Return what leaves a node more of its machine."""
     if consumers == 0:
         return "end other programs"
     what = "1 consumer takes" if consumers == 1 else f"{consumers} consumers take"
@@ -241,7 +241,7 @@ def _percentiles(values: Sequence[float]) -> dict[str, float]:
 
 
 def _remedies(source: Source | None) -> tuple[str, str]:
-    """What helps where no frame comes, and where over a tenth is left out."""
+    """Return what helps where no frame comes, and where over a tenth is left out."""
     match source:
         case PushSource():
             what = f"start the sender at {source.endpoint}"

@@ -178,16 +178,16 @@ class Node:
 
     @property
     def config(self) -> LaunchConfig:
-        """As it is now: some parameters change while the node runs."""
+        """Give it as it is now: some parameters change while the node runs."""
         return self._state.config
 
     @property
     def endpoints(self) -> list[str]:
-        """Where the data socket is bound."""
+        """Find where the data socket is bound."""
         return self._publisher.connection.data
 
     def health(self) -> NodeHealth:
-        """What is true now; may be called from any thread."""
+        """Return what is true now; may be called from any thread."""
         return self._state.statistics.health(
             dropped=self.dropped,
             stopping=self._stopping.is_set(),
@@ -207,7 +207,7 @@ class Node:
 
     @property
     def failed(self) -> bool:
-        """Whether an error ends it: `wait` raises it."""
+        """Tell whether an error ends it: `wait` raises it."""
         return self._error is not None
 
     @property

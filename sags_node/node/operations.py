@@ -28,7 +28,7 @@ from sags_node.types import DrawnView, FrameResult
 
 @dataclass
 class NodeState:
-    """What the threads of a node and its operations share."""
+    """Hold what the threads of a node and its operations share."""
 
     config: LaunchConfig
     pipeline: Pipeline  # of the mapping thread
@@ -139,7 +139,7 @@ class Operations:
         return {"topics": content.view_topics(request.name, request.stereo, request.depth), **asdict(status)}
 
     def _scene(self) -> FrameResult | None:
-        """What shows the tissue as it is now; None: the next frame that is taken in will."""
+        """Return what shows the tissue as it is now; None: the next frame that is taken in will."""
         state, newest = self._state, self._state.pipeline.newest
         if newest is None or state.pipeline.held or state.paused.is_set() or not state.statistics.flowing:
             return None

@@ -81,7 +81,7 @@ class RecorderProcess:
         return {"folder": str(child.folder), **child.progress, "ended": child.ended}
 
     def findings(self) -> Iterator[Finding]:
-        """What a person should know of the recording. Any thread may call this."""
+        """Return what a person should know of the recording. Any thread may call this."""
         said = self.status()
         if said is not None and said["ended"] is not None:
             text = f"the recording to {said['folder']} has ended: {said['ended']}; begin another one"
@@ -299,7 +299,7 @@ class _Child:
         return line
 
     def _said(self, said: dict[str, Any] | None) -> Any:
-        """What it says; a failure where it says `error`, or nothing more."""
+        """Return what it says; a failure where it says `error`, or nothing more."""
         if said is None:
             raise SagsError(self.ended)
         if "error" in said:
@@ -307,7 +307,7 @@ class _Child:
         return said
 
     def _last_words(self) -> str:
-        """Of a recorder that ended without a line on stdout."""
+        """The last words of a recorder that ended without a line on stdout."""
         try:
             self._process.wait(KILL_SECONDS)
         except subprocess.TimeoutExpired:

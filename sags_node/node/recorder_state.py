@@ -12,7 +12,7 @@ LOW_SECONDS = 300.0  # that the disk has room for
 
 
 def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Of what `Recorder.summary` says."""
+    """The findings of what `Recorder.summary` says."""
     folder, silent, free = summary["folder"], summary["silent_s"], summary["free_bytes"]
     if silent > SILENT_SECONDS:
         yield Finding(

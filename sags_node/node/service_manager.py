@@ -67,7 +67,7 @@ class ServiceManager:
 
 
 def _asked(environment: Mapping[str, str]) -> tuple[str | None, float | None]:
-    """Where to send, and after how many seconds of silence the process is given up."""
+    """Find where to send, and after how many seconds of silence the process is given up."""
     address = environment.get("NOTIFY_SOCKET") or None
     if address is not None and address.startswith("@"):
         address = "\0" + address[1:]

@@ -50,7 +50,7 @@ class Teacher:
         self, scene: FrameResult, seen: Sequence[SeenFrame], gaussians: Gaussians, view: RenderedView,
         ahead: float, right: bool,
     ) -> Shown:  # fmt: skip
-        """What is shown of a view.
+        """Return what is shown of a view.
 
         Args:
             seen: the scene's frame, and older ones.
@@ -72,5 +72,5 @@ class Teacher:
 
 
 def is_of(seen: Sequence[SeenFrame], snapshot: Snapshot) -> bool:
-    """Whether the newest of these frames is that of the snapshot."""
+    """Tell whether the newest of these frames is that of the snapshot."""
     return bool(seen) and np.shares_memory(seen[0].gaussians.means, snapshot.gaussians.means)

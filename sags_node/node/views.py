@@ -198,7 +198,7 @@ class Views:
         return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch, ahead)
 
     def _planes(self, gaussians: Gaussians, camera: Camera) -> F32:
-        """As `Rasterizer.forward`. Where a GPU fails the CPU draws, and ever after."""
+        """Do as `Rasterizer.forward`. Where a GPU fails the CPU draws, and ever after."""
         size = camera.width, camera.height
         try:
             if size not in self._rasterizers:
@@ -260,7 +260,7 @@ def _published(scene: FrameResult, camera: Camera) -> RenderedView | None:
 
 
 def is_aside(request: ViewRequest) -> bool:
-    """Whether a view is asked for that the left eye does not have."""
+    """Tell whether a view is asked for that the left eye does not have."""
     return request.stereo or not np.array_equal(request.pose(), np.eye(4))
 
 

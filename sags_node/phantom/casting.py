@@ -14,7 +14,7 @@ from sags_node.types import F32, I64, Bool
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """What each ray [...] meets first; a ray that meets nothing has neither `tissue` nor `tool`."""
+    """Hold what each ray [...] meets first; a ray that meets nothing has neither `tissue` nor `tool`."""
 
     distance: F32  # [...] in lengths of the ray's direction, inf = nothing
     tissue: Bool  # [...]
@@ -56,7 +56,7 @@ class Bodies:
         )
 
     def occluded(self, rays: F32) -> Bool:
-        """Whether rays [..., 6], whose directions end at the light, are stopped on their way, [...]."""
+        """Tell whether rays [..., 6], whose directions end at the light, are stopped on their way, [...]."""
         import open3d.core as o3c
 
         own_surface = 0.012  # of the way: not to be hidden by the place where the ray starts

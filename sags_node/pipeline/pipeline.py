@@ -74,7 +74,7 @@ NOTICED_LATE = HALVING  # m, error assumed of depth from before wrong matches we
 
 @dataclass(frozen=True, slots=True)
 class FrameRequest:
-    """What consumers want of one frame."""
+    """Hold what consumers want of one frame."""
 
     waited: float = 0.0  # s since it came
     left: bool = False  # somebody looks at the left view: it gets the picture's detail
@@ -190,7 +190,7 @@ class Pipeline:
 
     @property
     def warnings(self) -> Findings:
-        """What is wrong and how to fix it. May be read from any thread."""
+        """Return what is wrong and how to fix it. May be read from any thread."""
         found = [*self.depth.findings]
         for watcher in self._watchers:
             found += watcher.findings
@@ -213,8 +213,8 @@ class Pipeline:
         self._surface.pace(unhurried)
 
     def make_budget(self, speed: float | None = None) -> Budget:
-        """What frames get, by the configuration and how long this machine takes (`Ladder.speed`); None: it is
-        measured now, which takes less than a tenth of a second."""
+        """Return what frames get, by the configuration and how long this machine takes (`Ladder.speed`);
+        None: it is measured now, which takes less than a tenth of a second."""
         camera = self.rectifier.camera
         return make_budget(self._config, camera.width, camera.height, speed, self.rate, self._skips)
 
@@ -287,7 +287,7 @@ class Pipeline:
         return self.rectifier(replace(frame, T_world_cam=self._camera.guess(frame.T_world_cam)))
 
     def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool, instruments: bool) -> Judgement:
-        """What all watchers together say of a frame."""
+        """Return what all watchers together say of a frame."""
         if self._reset_due and frame.pose_problem is None:
             self._forget()
         last = self.newest
@@ -321,7 +321,7 @@ class Pipeline:
         return replace(held, observation=observation, skipped=skipped, held=judged.hold, hurried=False)
 
     def _note_gap(self, t_capture_ns: int) -> None:
-        """Where no frame has come for longer than is usual, nobody watched the tissue."""
+        """Find where no frame has come for longer than is usual, nobody watched the tissue."""
         before, self._came_ns = self._came_ns, t_capture_ns
         seconds = 1e-9 * (t_capture_ns - before) if before is not None else 0.0
         if self._steps and seconds > GAP * median(self._steps):
@@ -334,7 +334,7 @@ class Pipeline:
         return pair if judged.gain is None else exposed(pair, judged.gain)
 
     def _still_frames(self, pair: RectifiedPair) -> int:
-        """For how many frames nothing has moved."""
+        """Count for how many frames nothing has moved."""
         if not self._skips.still:
             return 0
         if self._camera.by_picture:
@@ -458,7 +458,7 @@ class Pipeline:
         )
 
     def _skipped(self, measured: Measured) -> dict[str, str]:
-        """What was left out of a frame that was mapped, and why."""
+        """Return what was left out of a frame that was mapped, and why."""
         skipped = {"mask": self.tissue.problem} if self.tissue.problem else {}
         if self._camera.unsure:
             skipped["refine"] = self._camera.unsure

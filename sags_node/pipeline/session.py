@@ -36,7 +36,7 @@ Guess = Callable[[schema.Source], StereoRig]  # from the pictures of a source
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What a node needs. The source brings no truth with its frames; measuring opens its own."""
+    """Hold what a node needs. The source brings no truth with its frames; measuring opens its own."""
 
     name: str  # of the launch file or folder
     config: LaunchConfig
@@ -113,7 +113,7 @@ def _name(launch: Path | str | None) -> str:
 
 
 def lacks_rig(config: LaunchConfig) -> bool:
-    """Whether `open_session` would guess the calibration."""
+    """Tell whether `open_session` would guess the calibration."""
     opens = isinstance(config.source, RecordedSource | V4l2Source | GstSource)  # by itself: nobody must send
     return config.rig is None and opens and recorded_rig(config.source, judged=False) is None
 

@@ -72,8 +72,8 @@ def compile_vision() -> None:
 
 @contextmanager
 def _vision_beside() -> Iterator[None]:
-    """Where nothing is compiled yet, another process does `compile_vision` meanwhile. It only saves time:
-    what it leaves undone is compiled here."""
+    """Find where nothing is compiled yet, another process does `compile_vision` meanwhile. It only saves
+    time: what it leaves undone is compiled here."""
     if not is_cold(spread_patches):
         yield
         return

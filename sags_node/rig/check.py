@@ -107,7 +107,7 @@ def _check_eyes(rig: StereoRig) -> list[Finding]:
 
 
 def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Finding]:
-    """What is odd or wrong with `K` [3, 3] px of a picture; `where` names it."""
+    """Return what is odd or wrong with `K` [3, 3] px of a picture; `where` names it."""
     if np.any(K[2, :2] != 0):
         what = f"{where} is transposed: its last row is {K[2, 0]:g} {K[2, 1]:g} {K[2, 2]:g}, not 0 0 1"
         return [Finding("error", what, "write its columns as rows (MATLAB's cameraParameters are so)")]
@@ -127,7 +127,7 @@ def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Findin
 
 
 def _check_distortion(file: str, eye: Eye) -> list[Finding]:
-    """Whether the radial distortion reaches the picture's corners before it turns back."""
+    """Tell whether the radial distortion reaches the picture's corners before it turns back."""
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(eye.distortion, (0, 8 - len(eye.distortion)))
     farthest = np.maximum(eye.K[:2, 2], [eye.width, eye.height] - eye.K[:2, 2]) / eye.K[[0, 1], [0, 1]]
     radius = np.linspace(0, LARGEST_RADIUS, RADII)
@@ -237,7 +237,8 @@ def _check_baseline(rig: StereoRig) -> list[Finding]:
 
 
 def _check_unit(rig: StereoRig, metres: float | None) -> list[Finding]:
-    """Whether lengths in the unit that was said are those of no endoscope, and in another one they are."""
+    """Tell whether lengths in the unit that was said are those of no endoscope, and in another one they
+    are."""
     said = next((unit for unit, each in UNITS.items() if each == metres), None)
     least, most = ENDOSCOPE_BASELINE
     baseline = rig.baseline

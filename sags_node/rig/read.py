@@ -155,7 +155,7 @@ def find_form(path: Path) -> Form | None:
 
 
 def unknown_form(path: Path) -> str:
-    """What to say where there is no calibration."""
+    """Return what to say where there is no calibration."""
     if not path.exists():
         what = f"no calibration: no {path / 'left.yaml'}; a rig is a folder with left.yaml and right.yaml"
         return f"{what}; {near(path)}"
@@ -228,7 +228,7 @@ def _needed(key: str) -> str:
 
 
 def is_opencv(file: Path) -> bool:
-    """Whether a file looks like one of `cv2.FileStorage`."""
+    """Tell whether a file looks like one of `cv2.FileStorage`."""
     if file.suffix.lower() not in SUFFIXES or not file.is_file():
         return False
     with open_file(file) as opened:

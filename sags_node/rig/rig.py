@@ -39,7 +39,7 @@ def already_rectified(rig: StereoRig) -> StereoRig:
 
 
 def rectifies(rig: StereoRig) -> bool:
-    """Whether the rig straightens or turns pictures, rather than only zooming them."""
+    """Tell whether the rig straightens or turns pictures, rather than only zooming them."""
     across = np.linspace(0, 1, 9)
     for eye in (rig.left, rig.right):
         pixels = np.stack(np.meshgrid(across * eye.width, across * eye.height), -1).reshape(-1, 1, 2)

@@ -70,7 +70,8 @@ def judge_stamps(
     rate: float | None,
     eyes: tuple[Sequence[Key], Sequence[Key]],
 ) -> tuple[Finding, ...]:
-    """What is odd about pairs of both `eyes`' pictures: few, of clocks that differ, or not of one moment."""
+    """Return what is odd about pairs of both `eyes`' pictures: few, of clocks that differ, or not of one
+    moment."""
     found = []
     for eye, pictures in zip(("left", "right"), eyes, strict=True):
         stamped = [stamp for _, stamp in pictures]

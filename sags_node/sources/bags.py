@@ -43,7 +43,7 @@ class _Topic:
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What one reading of a bag found."""
+    """Hold what one reading of a bag found."""
 
     types: dict[str, str]  # every topic
     pictures: dict[str, _Topic]
@@ -294,7 +294,7 @@ def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:
 
 
 def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> Eye | None:
-    """What a camera_info topic says of the pictures with these stamps; None: nothing.
+    """Return what a camera_info topic says of the pictures with these stamps; None: nothing.
 
     Raises:
         UsageError: it changes while they are played.

@@ -65,7 +65,7 @@ class CaptureClock:
             return stamp_ns + self._offset_at(stamp_ns) if self._bins else None
 
     def status(self) -> ClockStatus | None:
-        """What is known of the clock; None before the first picture."""
+        """Return what is known of the clock; None before the first picture."""
         with self._lock:
             if not self._bins:
                 return None

@@ -57,7 +57,7 @@ class _Frame(msgspec.Struct):
 
 
 class Sidecar(msgspec.Struct):
-    """What is read of the file; other keys are ignored."""
+    """Hold what is read of the file; other keys are ignored."""
 
     type: str
     video_file: str
@@ -148,7 +148,7 @@ def _stamps(file: Path, sidecar: Sidecar, video: Video) -> I64:
 
 
 def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> I64:
-    """For each frame of the video the one of the sidecar at the same presentation time."""
+    """Find for each frame of the video the one of the sidecar at the same presentation time."""
     pts = [frame.gst.pts_ns for frame in sidecar.frames]
     known = np.array([-1 if at is None else at for at in pts], np.int64)
     if (known < 0).any() or video.stamps is None or (np.diff(known) < 0).any():

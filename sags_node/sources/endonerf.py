@@ -33,7 +33,7 @@ NOMINAL_BASELINE = 0.005  # m; without a right picture nothing depends on it
 
 
 class Llff(NamedTuple):
-    """What `poses_bounds.npy` says."""
+    """Hold what `poses_bounds.npy` says."""
 
     width: int  # px
     height: int
@@ -197,7 +197,7 @@ def baseline_of(config: EndoNerfSource) -> float | None:
 
 
 def is_published(config: EndoNerfSource) -> bool:
-    """Whether a clip is one of EndoNeRF's own, whose author states unit and baseline; by its camera.
+    """Tell whether a clip is one of EndoNeRF's own, whose author states unit and baseline; by its camera.
 
     Raises:
         UsageError: as `read_llff`.

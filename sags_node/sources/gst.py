@@ -165,7 +165,7 @@ class Sink:
         self._warned_old = self._warned_still = False
 
     def begin(self, said: dict[str, Any], descriptor: int) -> None:
-        """What kind of pictures come, and where."""
+        """Return what kind of pictures come, and where."""
         self.has_begun = True
         self.size = said["width"], said["height"]
         self.rate, self.interlaced, self.live = said["rate"], said["interlaced"], said["live"]

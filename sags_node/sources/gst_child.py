@@ -53,7 +53,8 @@ class WallClock:
         self._lock = threading.Lock()
 
     def at_zero(self, measured_ns: int, took_ns: int) -> int:
-        """What is held, until a measurement is a millisecond off: one of the clocks was set, or drifts.
+        """Return what is held, until a measurement is a millisecond off: one of the clocks was set, or
+        drifts.
 
         Args:
             took_ns: to measure; where that is long, another process came between.
@@ -121,7 +122,7 @@ class Sink:
         tell(self._there, said)
 
     def show_first(self) -> None:
-        """Of a paused file, say what kind of pictures come; none is taken away.
+        """Say of a paused file what kind of pictures come; none is taken away.
 
         Raises:
             GstError: they are not of a kind that can be handed over.

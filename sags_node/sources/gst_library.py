@@ -25,7 +25,7 @@ class _Error(ctypes.Structure):
 
 
 class GstError(Exception):
-    """What GStreamer says.
+    """Hold what GStreamer says.
 
     Attributes:
         debug: where, for its developers.
@@ -37,7 +37,7 @@ class GstError(Exception):
 
 
 class Picture(NamedTuple):
-    """What is known of a buffer."""
+    """Hold what is known of a buffer."""
 
     pts: int  # ns, `NONE` where it has no stamp
     running: int  # ns since the pipeline's base time, `NONE` where that cannot be said
@@ -45,7 +45,7 @@ class Picture(NamedTuple):
 
 
 class Caps(NamedTuple):
-    """What kind of pictures come."""
+    """Hold what kind of pictures come."""
 
     format: str
     width: int
@@ -120,7 +120,7 @@ class Gst:
         return ctypes.string_at(self.version_string()).decode()
 
     def has(self, element: str) -> bool:
-        """Whether a plugin is installed that brings this element."""
+        """Tell whether a plugin is installed that brings this element."""
         return bool(self.element_factory_find(element.encode()))
 
     def parse(self, launch: str) -> int:
@@ -140,7 +140,7 @@ class Gst:
             self.util_set_object_arg(element, name.replace("_", "-").encode(), value.encode())
 
     def has_ended(self, bus: int, wait_ns: int = 0) -> bool:
-        """Whether the bus says so, waited for at most so long.
+        """Tell whether the bus says so, waited for at most so long.
 
         Raises:
             GstError: it tells of an error instead.

@@ -127,7 +127,7 @@ class GstProcess:
         self._process.stderr.close()
 
     def _keep(self) -> None:
-        """What plugins print: a pipe that is full would stop them."""
+        """Return what plugins print: a pipe that is full would stop them."""
         try:
             printed = os.read(self._stderr, LONGEST_MESSAGE)
         except BlockingIOError:
@@ -142,7 +142,7 @@ class GstProcess:
         return ": ".join(found[-1]) if found else ""
 
     def _last_words(self) -> str:
-        """Of a child that ended without a message."""
+        """The last words of a child that ended without a message."""
         ended = end(self._process, GRACE_S)
         self._keep()
         lines = self._printed.decode(errors="replace").strip().splitlines()
@@ -185,7 +185,7 @@ def installed() -> tuple[str, dict[str, str]]:
 
 
 def check_launch(launch: str) -> None:
-    """Whether GStreamer takes this launch string; nothing is played.
+    """Tell whether GStreamer takes this launch string; nothing is played.
 
     Raises:
         SagsError: an element is missing, or the string is wrong.

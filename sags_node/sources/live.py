@@ -30,7 +30,7 @@ class EndedError(Exception):
 
 
 class CaptureDevice(Protocol):
-    """What delivers pictures.
+    """Hold what delivers pictures.
 
     Attributes:
         rate: pictures per second.

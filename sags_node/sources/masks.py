@@ -90,7 +90,7 @@ class Masks:
             raise _question(file, known, [v for v in known if v and not (labels and v == 255)], labels)
 
     def _of_colours(self, mask: U8, file: Path) -> Bool:
-        """Of a mask [H, W, 3]."""
+        """The same of a mask [H, W, 3]."""
         blue, green, red = (plane.astype(np.int32) for plane in cv2.split(mask))
         codes = blue + (green << 8) + (red << 16)
         listed = [value for value in self._instruments if isinstance(value, str) and value[0] == "#"]

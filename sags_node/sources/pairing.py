@@ -22,7 +22,7 @@ SETTLING_NS = 300_000_000  # stamps that go back by less: their clock is better 
 
 
 class Picture(NamedTuple):
-    """Of one eye."""
+    """The picture of one eye."""
 
     t_ns: int  # wall clock
     image: U8  # [H, W, 3] RGB
@@ -31,7 +31,7 @@ class Picture(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """What a device delivers."""
+    """Hold what a device delivers."""
 
     t_ns: int  # wall clock
     image: Samples  # [H, W, 3] RGB
@@ -232,7 +232,7 @@ def pair(left: I64, right: I64, tolerance: float) -> I64:
 
 
 def nearest(stamps: I64, others: I64) -> I64:
-    """For each of `stamps` [N] the index of the nearest of `others` [M], M > 0."""
+    """Find for each of `stamps` [N] the index of the nearest of `others` [M], M > 0."""
     order = np.argsort(others, kind="stable")
     ordered = others[order]
     after = np.searchsorted(ordered, stamps).clip(0, len(others) - 1)

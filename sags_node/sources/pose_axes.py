@@ -63,7 +63,7 @@ def _pixels(shape: tuple[int, ...]) -> F64:
 
 
 def _moved(first: Seen, poses: F64, K: F64) -> F64:
-    """Where the first frame's `_pixels` lie in the other one; NaN behind it."""
+    """Find where the first frame's `_pixels` lie in the other one; NaN behind it."""
     depth = first.depth[::STEP, ::STEP].astype(np.float64)
     rays = (_pixels(first.depth.shape) - K[:2, 2]) / K[[0, 1], [0, 1]]
     points = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]

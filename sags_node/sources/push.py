@@ -36,7 +36,7 @@ class PushedPictures(SentPictures):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with who sends, and how to fix it. May be read from any thread."""
+        """Return what is wrong with who sends, and how to fix it. May be read from any thread."""
         return self._inbox.findings
 
     def close(self) -> None:

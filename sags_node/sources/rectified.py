@@ -30,8 +30,8 @@ def as_named(rig: StereoRig, *names: Path) -> StereoRig:
 
 
 def come_rectified(config: cfg.LaunchConfig) -> bool:
-    """Whether a session's pictures are rectified: as the launch file says, else by the names of its folders,
-    videos or topics."""
+    """Tell whether a session's pictures are rectified: as the launch file says, else by the names of its
+    folders, videos or topics."""
     source = config.source
     if config.rectified is not None:
         return config.rectified
@@ -46,7 +46,7 @@ def come_rectified(config: cfg.LaunchConfig) -> bool:
 
 
 def named_rectified(*names: Path | str) -> bool:
-    """Whether topics, folders or files say that their pictures are rectified."""
+    """Tell whether topics, folders or files say that their pictures are rectified."""
     return bool(names) and all(_says_rectified(name) for name in names)
 
 

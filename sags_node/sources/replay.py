@@ -228,7 +228,7 @@ class Replay:
         return 0 if self._stamps is None else int(self._stamps[index, 1] - self._stamps[index, 0])
 
     def _is_too_late(self, frame_id: int) -> bool:
-        """Whether to leave this frame out.
+        """Tell whether to leave this frame out.
 
         One frame a second comes through even where skipping itself is slower than the recording.
         """

@@ -37,7 +37,7 @@ WHOLE = 10_000_000  # samples of a bag: all
 
 
 class Robot:
-    """Where poses come from, from its making to `close`."""
+    """Hold where poses come from, from its making to `close`."""
 
     def __init__(self, config: BagRobot | PushRobot | Ros2Robot, kept: int = KEPT) -> None:
         self.track = PoseTrack(config.base, config.hand, kept)
@@ -132,7 +132,7 @@ class _RosPoses(Robot):
                     self._add(topic, reader.kind, data)
 
     def _subscribe(self) -> None:
-        """As soon as somebody publishes: only then the type is known."""
+        """Subscribe as soon as somebody publishes: only then the type is known."""
         if self._topic in self._readers and STATIC in self._readers:
             return
         there = self._graph.publications()
@@ -212,7 +212,7 @@ class Posed:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with who sends pictures or poses, and how to fix it."""
+        """Return what is wrong with who sends pictures or poses, and how to fix it."""
         return findings_of(self._source) + findings_of(self.robot)
 
     @property
@@ -257,7 +257,7 @@ def rectified(T_hand_cam: F64, rig: StereoRig) -> F64:
 
 
 def hand_eye_file(config: LaunchConfig) -> Path:
-    """Where the camera on the robot is said to be.
+    """Find where the camera on the robot is said to be.
 
     Raises:
         UsageError: nowhere.

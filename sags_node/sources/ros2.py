@@ -65,7 +65,7 @@ class RosCameras(SentPictures):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the cameras, and how to fix it. May be read from any thread."""
+        """Return what is wrong with the cameras, and how to fix it. May be read from any thread."""
         changed = ", ".join(self._changed.copy().values())
         if not changed:
             return ()
@@ -96,7 +96,8 @@ class RosCameras(SentPictures):
                 log.warning("%s", self._silence(eye))
 
     def _subscribe(self) -> None:
-        """As soon as somebody publishes: only then it is known whether the pictures are compressed."""
+        """Subscribe as soon as somebody publishes: only then it is known whether the pictures are
+        compressed."""
         if len(self._readers) == len(self._names):
             return
         there = self._graph.publications()
@@ -157,7 +158,7 @@ class RosCameras(SentPictures):
 
 
 def picture_topics(config: Ros2Source) -> dict[Side, str]:
-    """Of each eye; of the left one only where its pictures show both."""
+    """The picture topics of each eye; of the left one only where its pictures show both."""
     if config.geometry.layout != "separate":
         return {"left": absolute(config.left)}
     return {"left": absolute(config.left), "right": absolute(config.right)}
@@ -213,7 +214,7 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
 
 
 class _CameraInfos:
-    """What both eyes' cameras say of their calibration.
+    """Hold what both eyes' cameras say of their calibration.
 
     Attributes:
         names: the topic of each eye.
@@ -227,7 +228,7 @@ class _CameraInfos:
         self._readers = {eye: graph.reader(name, CAMERA_INFO) for eye, name in self.names.items()}
 
     def take(self) -> Iterator[tuple[Side, Calibrated | None]]:
-        """What has come since; None: not calibrated.
+        """Return what has come since; None: not calibrated.
 
         Raises:
             SagsError: see `read_eye`.

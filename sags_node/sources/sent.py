@@ -28,7 +28,7 @@ WINDOW = 90  # stamps that the loss is counted over: three seconds
 
 
 class Arrivals:
-    """What came of one eye's pictures, and what was lost on the way, by the gaps between stamps."""
+    """Hold what came of one eye's pictures, and what was lost on the way, by the gaps between stamps."""
 
     def __init__(self) -> None:
         self._stamps: deque[int] = deque(maxlen=WINDOW + 1)  # with the one before
@@ -51,7 +51,7 @@ class Arrivals:
 
     @property
     def share_lost(self) -> float:
-        """Of the last seconds' pictures; 0 until there are enough to tell."""
+        """The share lost of the last seconds' pictures; 0 until there are enough to tell."""
         if len(self._stamps) < WINDOW:
             return 0.0
         return self._lost_now() / (self._lost_now() + len(self._stamps))
@@ -103,7 +103,7 @@ class SentPictures(LivePairs):
         return max(super().dropped, *(eye.lost for eye in self.arrivals.values()))
 
     def slowness(self) -> str | None:
-        """What is wrong with how pictures come, for who sends them; None: nothing."""
+        """Return what is wrong with how pictures come, for who sends them; None: nothing."""
         rate = min(arrivals.rate for arrivals in self.arrivals.values())
         if rate < ENOUGH * self.rate:
             return (

@@ -46,11 +46,11 @@ class Warns(Protocol):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong, and how to fix it. May be read from any thread."""
+        """Return what is wrong, and how to fix it. May be read from any thread."""
 
 
 def findings_of(source: object) -> tuple[Finding, ...]:
-    """What a source of frames or poses says is wrong."""
+    """Return what a source of frames or poses says is wrong."""
     return source.findings if isinstance(source, Warns) else ()
 
 

@@ -72,7 +72,7 @@ class References:
             self._visible = load_array(config.tracks, "visible", self._points.shape[:2]).astype(np.bool_)
 
     def at(self, index: int) -> Reference | None:
-        """What is known of one frame of the recording, None when that is nothing.
+        """Return what is known of one frame of the recording, None when that is nothing.
 
         Raises:
             SagsError: the depth picture is damaged or not 16 bit.

@@ -138,7 +138,7 @@ class VideoPairs(Pairs):
         return found
 
     def _drifted(self, left: Video, right: Video, period: float) -> I64 | None:
-        """As `_joined`, of two even videos that begin together: rates that differ a little add up."""
+        """Do as `_joined`, of two even videos that begin together: rates that differ a little add up."""
         assert left.stamps is not None and right.stamps is not None
         last = min(left.count, right.count) - 1
         apart = abs(right.stamps[last] - left.stamps[last])
@@ -224,7 +224,7 @@ class OneVideoPairs(Pairs):
 
 
 def _oddities(video: Video, layout: Layout) -> list[str]:
-    """What is to be said of a video that is played so."""
+    """Return what is to be said of a video that is played so."""
     if not video.is_interlaced or layout.takes_fields:
         return video.oddities
     return [*video.oddities, f"{video.path}: {TORN}; set source.geometry.deinterlace:=top, or bottom"]

@@ -59,7 +59,7 @@ class _Lines(logging.Handler):
 
 
 def log_handler() -> logging.Handler:
-    """For people; where the console is quiet, for machines."""
+    """Say for people; where the console is quiet, for machines."""
     if not console.quiet:
         return _Lines()
     handler = logging.StreamHandler()

@@ -30,12 +30,12 @@ def rows_table(rows: Sequence[Record]) -> Table:
 
 
 def findings_table(rows: Sequence[Record]) -> Table:
-    """What was looked at, without what is for programs."""
+    """Return what was looked at, without what is for programs."""
     return rows_table([{k: row[k] for k in row if k not in ("figures", "launch")} for row in rows])
 
 
 def topics_table(rows: Sequence[Record]) -> Table:
-    """Of `topic_list`; a dash where nothing was heard, or too little to tell a rate."""
+    """The table of `topic_list`; a dash where nothing was heard, or too little to tell a rate."""
     made = table("topic", "type")
     made.add_column("rate", justify="right")
     made.add_column("message", justify="right")

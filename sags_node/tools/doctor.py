@@ -92,7 +92,7 @@ def as_rows(looks: Iterable[Look]) -> list[dict[str, str]]:
 
 
 def _launched(config: LaunchConfig) -> list[Look]:
-    """What the launch file names: pictures, calibration, the robot, networks."""
+    """Return what the launch file names: pictures, calibration, the robot, networks."""
     source, robot, vision = config.source, config.robot, config.vision
     looks: list[Look] = []
     if isinstance(source, RecordedSource) and not isinstance(source, PhantomSource):
@@ -227,7 +227,7 @@ def check_memory(root: Path = host.ROOT) -> Finding:
 
 
 def check_gpu(config: LaunchConfig) -> Finding:
-    """Whether Warp can draw there. A machine without one is no worse for it, unless one is wanted."""
+    """Tell whether Warp can draw there. A machine without one is no worse for it, unless one is wanted."""
     if config.device == "cpu":
         return Finding("ok", f"not used: device is {config.device}")
     found = find_gpu()
@@ -291,8 +291,8 @@ class _Timex(ctypes.Structure):
 
 
 def _clock() -> Finding:
-    """Whether anything sets this machine's clock right. Clients on other machines ask the node for its clock,
-    so one that nobody keeps is no fault."""
+    """Tell whether anything sets this machine's clock right. Clients on other machines ask the node for its
+    clock, so one that nobody keeps is no fault."""
     by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
     timex = _Timex()
     if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) in (-1, TIME_ERROR):

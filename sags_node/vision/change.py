@@ -35,7 +35,8 @@ class StillScene:
         self._eyes = None
 
     def __call__(self, pair: RectifiedPair) -> int:
-        """For how many frames, this one included, pictures and pose are the same; 0: something moved."""
+        """Count for how many frames, this one included, pictures and pose are the same; 0: something
+        moved."""
         eyes = [level(eye, min(HALVINGS, len(eye.halves))) for eye in pyramids(pair) if eye is not None]
         before, pose = self._eyes, pair.camera.T_world_cam
         stays = np.array_equal(pose, self._pose)
@@ -52,7 +53,7 @@ def _alike(a: F32, b: F32) -> bool:
 
 @kernel
 def _share_that_differs(a: F32, b: F32) -> Any:
-    """Of the blocks of two pictures with borders."""
+    """The share that differs of the blocks of two pictures with borders."""
     height, width = a.shape[0] - 2 * BORDER, a.shape[1] - 2 * BORDER
     rows, columns = max(1, height // BLOCK), max(1, width // BLOCK)  # the last ones take the rest
     sums, counts = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
@@ -66,7 +67,7 @@ def _share_that_differs(a: F32, b: F32) -> Any:
 
 
 def is_repeat(a: RectifiedPair, b: RectifiedPair) -> bool:
-    """Whether two pairs show the same pictures: one was sent twice. Unlike in a `StillScene` nothing is
+    """Tell whether two pairs show the same pictures: one was sent twice. Unlike in a `StillScene` nothing is
     averaged before, for a camera's noise tells its pictures apart, and no block may differ: something small
     may have moved."""
     return all(
@@ -83,7 +84,8 @@ def _are_same(a: U8, b: U8) -> bool:
 
 @kernel
 def _mean_squares(a: U8, b: U8) -> Any:
-    """Of the differences of every fourth pixel of every fourth row: over all, and the largest of a block."""
+    """The mean squares of the differences of every fourth pixel of every fourth row: over all, and the
+    largest of a block."""
     height, width = a.shape
     rows, columns = max(1, height // SIDE), max(1, width // SIDE)  # the last ones take the rest
     squares, counts = np.zeros((rows, columns), np.int64), np.zeros((rows, columns), np.int64)

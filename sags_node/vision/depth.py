@@ -26,7 +26,7 @@ FARTHEST = 10.0  # m: what a session says to be beyond is no depth
 
 
 class Measured(NamedTuple):
-    """What is known of one frame's depth."""
+    """Hold what is known of one frame's depth."""
 
     depth: F32  # [H, W] m, 0 unknown
     confidence: F32  # [H, W] 0..1
@@ -70,7 +70,7 @@ class DepthChoice:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the eyes, the rig and the network. May be read from any thread."""
+        """Return what is wrong with the eyes, the rig and the network. May be read from any thread."""
         problem = "" if self._network is None else self._network.problem
         failed = (Finding("network_failed", problem),) if problem else ()
         return (*self._matches.findings, *self.stereo.findings, *failed)

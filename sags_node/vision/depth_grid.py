@@ -141,8 +141,8 @@ def _halve(sums: F32, half: F32) -> None:
 
 @kernel
 def _mix(sums: F32, coarse: F32, filled: F32) -> None:
-    """What the sums know themselves, and for what is missing of a weight of 1 what lies between the cells of
-    half the size."""
+    """Return what the sums know themselves, and for what is missing of a weight of 1 what lies between the
+    cells of half the size."""
     _, height, width = filled.shape
     _, rows, columns = coarse.shape
     one, near, far = np.float32(1), np.float32(0.75), np.float32(0.25)
@@ -166,7 +166,8 @@ def _mix(sums: F32, coarse: F32, filled: F32) -> None:
 
 @kernel
 def _gather(depth: F32, confidence: F32, tissue: Bool, side: int, columns: int, sums: F32) -> None:
-    """Of each cell the share of pixels that show tissue, that times trust, and the mean inverse depth."""
+    """Gather for each cell the share of pixels that show tissue, that times trust, and the mean inverse
+    depth."""
     height, width = depth.shape
     line = np.empty((3, width), np.float32)  # sums over the pixels below each other in one row of cells
     for row in range(sums.shape[1] - 2 * AROUND):
@@ -212,8 +213,8 @@ def _add_depth(depth: F32, confidence: F32, trust: F32, inverse: F32) -> None:
 
 @kernel
 def _compare(sums: F32, tolerance: Any, slope: Any, around: F32) -> None:
-    """Of the measured cells: the squared distance from the mean of their neighbours, and the share of the
-    tissue up to four cells around that was measured to be the same surface."""
+    """Compare the measured cells: the squared distance from the mean of their neighbours, and the share of
+    the tissue up to four cells around that was measured to be the same surface."""
     _, high, line = sums.shape
     trusts, inverses = high * line, 2 * high * line
     zero, none = spread(np.float32(0)), np.float32(0)

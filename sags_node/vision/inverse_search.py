@@ -76,7 +76,7 @@ def start(picture: F32, stride: int, coarse: F32, coarse_stride: float, corner: 
 
 
 def search(first: F32, second: F32, stride: int, begin: F32, steps: int, tether: float = 0.0) -> F32:
-    """Where the patches of `first` lie in `second`: [rows, columns, 2] px to the right and down.
+    """Find where the patches of `first` lie in `second`: [rows, columns, 2] px to the right and down.
 
     The result is the same for any number of threads.
 

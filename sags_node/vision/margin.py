@@ -11,7 +11,7 @@ EDGE_MARGIN = 20 / 640  # of the width: depths and flow smear that far across an
 
 
 def clear_of_instruments(tissue: Bool, halvings: int) -> Bool:
-    """Where a mask [H, W] is tissue, and all around it, in a picture after so many halvings."""
+    """Find where a mask [H, W] is tissue, and all around it, in a picture after so many halvings."""
     height, width = (side >> halvings for side in tissue.shape)
     step = 1 << halvings
     small = np.ascontiguousarray(tissue[: height * step : step, : width * step : step])

@@ -135,7 +135,8 @@ class DepthNetwork:
             )
 
     def _warm_up(self) -> float:
-        """What one call costs, ms: the first of all is slower. What it gives for noise tells nothing."""
+        """Return what one call costs, ms: the first of all is slower. What it gives for noise tells
+        nothing."""
         noise = np.random.default_rng(0).integers(0, 256, (self._size[1], self._size[0], 3), np.uint8)
         right = noise if self.is_stereo else None
         self._run(noise, right)

@@ -151,7 +151,7 @@ def _sides(shape: Sequence[Any] | None) -> str:
 
 
 def _first_line(error: Exception) -> str:
-    """What the runtime says, without the lines and paths of its source."""
+    """Return what the runtime says, without the lines and paths of its source."""
     line = str(error).strip().partition("\n")[0]
     return line.rpartition(" : ")[2][:200]
 
@@ -303,12 +303,12 @@ def _layout(tensor: Tensor, said: NetworkFormat, name: str) -> tuple[int, bool]:
 
 
 def has_clear_layout(tensor: Tensor) -> bool:
-    """Whether its shape says which side is the channels'."""
+    """Tell whether its shape says which side is the channels'."""
     return tensor.shape[1] in CHANNELS or tensor.shape[3] in CHANNELS
 
 
 def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Sequence[Tensor]:
-    """As they are named, left and right eye in turn; else in the file's order."""
+    """Give it as they are named, left and right eye in turn; else in the file's order."""
     if said.inputs is None:
         return tensors
     by_name = {tensor.name: tensor for tensor in tensors}
@@ -335,7 +335,7 @@ def maps_of(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
 
 
 def sizes_of_maps(fit: Fit) -> str:
-    """What `maps_of` takes, for messages."""
+    """Return what `maps_of` takes, for messages."""
     width, height = fit.outer
     return f"{width}x{height} px that it was given, or of a half, a quarter or an eighth of them"
 

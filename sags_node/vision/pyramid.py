@@ -17,7 +17,7 @@ NARROW = 60  # px, at least, of the pictures in which motion is only looked at
 
 
 def gray_pyramid(picture: U8) -> GrayPyramid:
-    """Of an RGB picture [H, W, 3] or a gray one [H, W]."""
+    """The gray pyramid of an RGB picture [H, W, 3] or a gray one [H, W]."""
     gray: U8 = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) if picture.ndim == 3 else picture
     height, width = gray.shape
     halves: list[F32] = []

@@ -44,7 +44,7 @@ def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowErr
 
 
 def _found_back(found: Patches, mirrored: Patches) -> Bool:
-    """Where the match of a left patch is matched back to it: anything is matched to something."""
+    """Find where the match of a left patch is matched back to it: anything is matched to something."""
     flow = at_pixels(mirrored.left, mirrored.right, mirrored.stride, mirrored.field)
     back = np.ascontiguousarray(flow[:, ::-1])  # to the right in the mirror is to the left
     columns, rows = centres(found.left, found.stride)

@@ -76,7 +76,7 @@ class StereoDepth:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong with the rig, as far as matching tells. May be read from any thread."""
+        """Return what is wrong with the rig, as far as matching tells. May be read from any thread."""
         return (*self.rows.findings, *self._near.findings)
 
     def judge(self, pair: RectifiedPair, disparity: F32, tissue: Bool) -> tuple[F32, F32]:

@@ -82,7 +82,7 @@ class TissueMask:
 
     @property
     def instruments(self) -> Bool | None:
-        """What shows an instrument in the newest frame [H, W], before it grows; None: nobody looks."""
+        """Return what shows an instrument in the newest frame [H, W], before it grows; None: nobody looks."""
         return None if self._found is None else ~self._found & self.usable
 
     def _given(self, frame: StereoFrame, pair: RectifiedPair) -> Bool | None:
@@ -124,7 +124,7 @@ class TissueMask:
 
 
 def _outside(config: TissueConfig, raw_size: tuple[int, int]) -> Bool:
-    """Where no box is, [H, W] of the raw picture."""
+    """Find where no box is, [H, W] of the raw picture."""
     width, height = raw_size
     outside = np.ones((height, width), np.bool_)
     for x, y, box_width, box_height in config.exclude:

@@ -89,7 +89,7 @@ class InstrumentFinder:
 
 
 class _Memory:
-    """What was found in the frame before, and for how long on doubtful grounds.
+    """Hold what was found in the frame before, and for how long on doubtful grounds.
 
     Attributes:
         found: [h, w]
@@ -114,7 +114,8 @@ class _Memory:
 
 
 def _evidence(red: U8, green: U8, blue: U8) -> tuple[F32, F32]:
-    """What the channels [h, w] of a shrunk picture say alone [h, w]; and 0 on highlights, 1 elsewhere [h, w].
+    """Return what the channels [h, w] of a shrunk picture say alone [h, w]; and 0 on highlights, 1 elsewhere
+    [h, w].
 
     What is said of a highlight is what is said around it.
     """
@@ -169,7 +170,7 @@ def _doubtful(
     drawn_red: F32, drawn_green: F32, drawn_blue: F32, alpha: F32,
     is_open: F32, found: Bool, trusted: Bool,
 ) -> F32:  # fmt: skip
-    """What being less red than the model (0..1) and the frame before add, [h, w].
+    """Return what being less red than the model (0..1) and the frame before add, [h, w].
 
     What is redder than the model is tissue that an instrument has left.
     """

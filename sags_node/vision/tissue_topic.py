@@ -74,7 +74,7 @@ class TopicMasks:
         return white if self._is_white else ~white
 
     def _white(self, values: NDArray[Any], width: int, height: int) -> Bool:
-        """Where a mask is white, at the size of the picture [height, width]."""
+        """Find where a mask is white, at the size of the picture [height, width]."""
         if values.ndim != 2 or values.dtype != np.uint8 or not values.size:
             raise NoMaskError(f"what comes on {self._where} is no mask: mono8 is expected, 255 is white")
         ratio = values.shape[1] / values.shape[0] * height / width

@@ -34,12 +34,13 @@ Pack = Callable[[NDArray[Any]], tuple[bytes, str]]  # the file, and what it is i
 
 
 def suffix(topic: topics.Topic) -> str:
-    """What ROS' image_transport adds to the name of a picture topic, for the file that is made of it."""
+    """Return what ROS' image_transport adds to the name of a picture topic, for the file that is made of
+    it."""
     return "/compressedDepth" if _is_depth(topic.name) else "/compressed"
 
 
 class Compressor:
-    """Of one picture topic."""
+    """The compressor of one picture topic."""
 
     def __init__(self, topic: topics.Topic) -> None:
         self._ways = _ways(topic)  # the finest first

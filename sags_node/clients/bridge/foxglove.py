@@ -180,7 +180,7 @@ class _Audience(ServerListener):
             return self._looking[topic] > 0
 
     def has_grown(self, topic: str) -> bool:
-        """Whether somebody has begun to look since this was asked last."""
+        """Tell whether somebody has begun to look since this was asked last."""
         with self._lock:
             grown = topic in self._grown
             self._grown.discard(topic)

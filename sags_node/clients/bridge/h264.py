@@ -15,7 +15,7 @@ BITS_PER_PIXEL = 0.2  # of a picture: 2 Mbit/s at 640x512 and 30 Hz, with tissue
 
 
 class Encoder:
-    """Of one stream of pictures, whose size may change.
+    """The encoder of one stream of pictures, whose size may change.
 
     No picture refers to a later one, and each key picture says all that a decoder must know.
     """

@@ -86,7 +86,7 @@ def string(device: str, seconds: float, words: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What a peer sent."""
+    """Hold what a peer sent."""
 
     kind: str
     device: str
@@ -107,7 +107,7 @@ def header(raw: bytes) -> dict[str, Any] | None:
 
 
 def said(head: dict[str, Any], body: bytes) -> Said | None:
-    """What a message says, if it is a STRING or a POINT; None for other kinds and for damaged ones."""
+    """Return what a message says, if it is a STRING or a POINT; None for other kinds and for damaged ones."""
     kind, device = head["message_type"], head["device_name"]
     if kind not in ("STRING", "POINT") or CRC64(body) != head["crc"]:
         return None

@@ -74,7 +74,7 @@ class IgtlOptions(ServerOptions):
 
 
 def outputs(options: IgtlOptions) -> list[Output]:
-    """What peers get, one device each: "Sags" and the name.
+    """Return what peers get, one device each: "Sags" and the name.
 
     Raises:
         UsageError: `send` names something else.
@@ -305,7 +305,8 @@ def _in_mm(T: F64) -> F64:
 
 
 def _before_camera(K: F64) -> F64:
-    """Where a picture lies: from (column, row, 0, 1) to mm in the camera's axes, at a distance of `PLANE`."""
+    """Find where a picture lies: from (column, row, 0, 1) to mm in the camera's axes, at a distance of
+    `PLANE`."""
     T = np.eye(4)
     T[0, 0], T[1, 1] = PLANE / K[0, 0], PLANE / K[1, 1]
     T[:3, 3] = [-PLANE * K[0, 2] / K[0, 0], -PLANE * K[1, 2] / K[1, 1], PLANE]

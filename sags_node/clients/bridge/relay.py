@@ -56,10 +56,10 @@ class Output:
 
 
 class Outlet(Protocol):
-    """What a bridge speaks to, and what most of them do; all is called from the thread of the loop."""
+    """Hold what a bridge speaks to, and what most of them do; all is called from the thread of the loop."""
 
     def wants(self, output: Output) -> bool:
-        """Whether any peer asks for it."""
+        """Tell whether any peer asks for it."""
         return True
 
     def send(self, output: Output, frame: Frame) -> bool:
@@ -221,11 +221,11 @@ class Relay:
 
 
 def silent(reason: str) -> str:
-    """What a topic of texts says instead of what has been taken back."""
+    """Return what a topic of texts says instead of what has been taken back."""
     return json.dumps({"state": "silent", "reason": reason})
 
 
 def _is_periodic(output: Output) -> bool:
-    """Whether its leading topic repeats, so that silence means stale."""
+    """Tell whether its leading topic repeats, so that silence means stale."""
     topic = topics.find(output.sources[0].topic)
     return topic is None or topic.periodic

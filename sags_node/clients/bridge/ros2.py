@@ -109,7 +109,7 @@ def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool
 
 
 def _delivery(topic: topics.Topic, max_age: float) -> Delivery:
-    """As ROS users expect it: pictures and clouds as from a sensor, little things reliably."""
+    """Give it as ROS users expect it: pictures and clouds as from a sensor, little things reliably."""
     if topic.type == topics.TF:
         return Delivery(reliable=True, depth=100, lifespan=max_age)
     if topic.type == topics.DIAGNOSTICS:
@@ -194,7 +194,7 @@ class Ros2(Outlet):
     # ---- out -----------------------------------------------------------------------------------------------
 
     def wants(self, output: Output) -> bool:
-        """What is kept for who comes later must always be new, so it is always wanted."""
+        """Return what is kept for who comes later must always be new, so it is always wanted."""
         offer = self._offers[output.name]
         lasts = offer.delivery.kept and offer.delivery.lifespan is None
         return lasts or output.name in self._read
@@ -211,7 +211,7 @@ class Ros2(Outlet):
         return True
 
     def blank(self, output: Output, reason: str) -> None:
-        """What was sent is not sent again. Only texts are kept by the graph, and must be replaced."""
+        """Return what was sent is not sent again. Only texts are kept by the graph, and must be replaced."""
         if self._offers[output.name].kind == topics.STRING:
             self._writers[output.name].write(cdr.string(silent(reason)).cdr(), time.time_ns())
 

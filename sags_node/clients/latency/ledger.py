@@ -62,7 +62,7 @@ class Ledger:
         self._seen.append((number, dict(stamps), at))
 
     def figures(self, since: Moment, until: Moment) -> dict[str, Any]:
-        """Of each code that was shown between two moments the first picture that shows it.
+        """The figures of each code that was shown between two moments the first picture that shows it.
 
         Returns:
             codes, read, lost (in no picture), unreadable (pictures without a code), unknown (pictures with a

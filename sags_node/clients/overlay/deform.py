@@ -42,7 +42,7 @@ UNKNOWN = Anchor(np.full(3, np.nan), 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """What carries the followers' ways to the vertices."""
+    """Hold what carries the followers' ways to the vertices."""
 
     points: F64  # [k, 3] m, of the object: where the followers were pinned
     reach: float  # m, of the kernel: the distance between neighbours
@@ -83,7 +83,7 @@ class Deformation:
             self._beginning.add_done_callback(lambda it: it.exception() or give_back(it.result()[1]))
 
     def status(self) -> dict[str, dict[str, int]]:
-        """For people and programs: how many followers there are, and how many are sure."""
+        """Say for people and programs: how many followers there are, and how many are sure."""
         return {"deform": {"anchors": len(self.ids), "pulling": self._pulling}}
 
     def move(self, frame: TissueFrame, T: F64) -> F64 | None:
@@ -129,7 +129,7 @@ class Deformation:
 
 
 def _field(vertices: F64, depth: float, frame: TissueFrame, T: F64) -> _Field:
-    """Where to pin the followers of an object at T [4, 4], and what they carry."""
+    """Find where to pin the followers of an object at T [4, 4], and what they carry."""
     import open3d as o3d
 
     if frame.confidence is None:
@@ -169,7 +169,7 @@ def _filled(frame: TissueFrame) -> F32:
 
 
 def _weights(field: _Field, pulls: I64, ways: F64, states: Sequence[Anchor]) -> F64:
-    """What each follower [k] adds to where it carries, by how far each has gone [k, 3] (m)."""
+    """Return what each follower [k] adds to where it carries, by how far each has gone [k, 3] (m)."""
     # What is small is noise, what is large counts as it is (the garrote of L. Breiman, Technometrics 1995).
     lengths = np.linalg.norm(ways, axis=1, keepdims=True)
     ways = ways * (1 - (STILL / np.maximum(lengths, STILL)) ** 2)

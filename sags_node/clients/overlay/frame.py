@@ -39,7 +39,7 @@ TOLD = ("visibility", "confidence", "depth_confidence", "ahead")  # of an `Ancho
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """Where the node says that an anchor is."""
+    """Hold where the node says that an anchor is."""
 
     place: F64  # [3] m, world; NaN: lost
     visibility: float  # 0..1
@@ -49,13 +49,13 @@ class Anchor:
 
     @property
     def is_sure(self) -> bool:
-        """Whether it is where it was pinned, as far as anybody knows."""
+        """Tell whether it is where it was pinned, as far as anybody knows."""
         return self.confidence >= SURE_OF_ANCHOR
 
     @property
     def holds(self) -> bool:
-        """Whether an object may be placed by it, if only faintly. Visible is also one that has slipped to
-        other tissue."""
+        """Tell whether an object may be placed by it, if only faintly. Visible is also one that has slipped
+        to other tissue."""
         least = LEAST_IN_SIGHT if self.visibility == 1 else LEAST_HIDDEN
         return bool(np.isfinite(self.place).all()) and self.confidence >= least
 

@@ -161,7 +161,7 @@ class HeldObject:
         return max((state.ahead for state in self._states), default=0.0)
 
     def status(self) -> dict[str, Any]:
-        """For people and programs: what it is, why it is not drawn, and how its anchors do."""
+        """Say for people and programs: what it is, why it is not drawn, and how its anchors do."""
         return {
             "name": self.spec.name,
             "reason": self.reason,
@@ -219,7 +219,7 @@ class HeldObject:
         return "being pinned"
 
     def _requests(self, frame: TissueFrame) -> list[Request] | str:
-        """What to ask the node for, or why not in this frame."""
+        """Return what to ask the node for, or why not in this frame."""
         height, width = frame.depth.shape
         if not self.spec.anchors:
             pixel = _middle(frame)

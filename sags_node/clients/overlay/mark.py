@@ -21,7 +21,7 @@ ENDS = "..."
 
 
 def headlines(warnings: Mapping[str, str]) -> list[str]:
-    """What is wrong in a few words each; how to fix it stands in `status`.
+    """Return what is wrong in a few words each; how to fix it stands in `status`.
 
     Args:
         warnings: code -> what is wrong, up to the first colon or semicolon, and how to fix it.
@@ -60,7 +60,7 @@ def draw_lines(rgba: U8, lines: Sequence[str], shift: int = 0) -> None:
 
 
 def _fitted(text: str, width: int, scale: float, thickness: int) -> str:
-    """As much of it as fits into so many px."""
+    """Return as much of it as fits into so many px."""
     shown = text
     while text and cv2.getTextSize(shown, FONT, scale, thickness)[0][0] > width:
         text = text[:-1]

@@ -168,7 +168,8 @@ def _stl(data: bytes) -> tuple[F64, list[Face]]:
 
 
 def _pcd(data: bytes) -> tuple[F64, list[Face]]:
-    """Of the forms ascii and binary (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
+    """Read the forms ascii and binary
+    (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
     header, _, rest = data.partition(b"\nDATA ")
     form, _, body = rest.partition(b"\n")
     said = {line.split()[0]: line.split()[1:] for line in header.decode("ascii").splitlines() if line.strip()}

@@ -97,7 +97,7 @@ def _look(node: NodeAddress, seconds: float) -> list[TissueFrame]:
 
 
 def _place(pair: PairSpec, number: int, seen: Sequence[TissueFrame]) -> F64:
-    """Where the tissue of a pair is: [3] m, world; the middle of what the frames say."""
+    """Find where the tissue of a pair is: [3] m, world; the middle of what the frames say."""
     found = [place for frame in seen if (place := _place_in(pair, number, frame)) is not None]
     if len(found) < LEAST_SHARE * len(seen):
         what = f"pixel {pair.pixel[0]:g} {pair.pixel[1]:g}" if pair.pixel else f"anchor {pair.anchor}"

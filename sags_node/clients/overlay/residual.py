@@ -49,7 +49,8 @@ class Residual:
         self._stamp_ns = -math.inf  # of the last frame that was looked at
 
     def status(self) -> dict[str, float | None]:
-        """For people and programs; None: nothing was looked at yet, or too little of it is measured now."""
+        """Say for people and programs; None: nothing was looked at yet, or too little of it is measured
+        now."""
         told = (None, None) if self._found is None else (self._found[0], self._stated + self._found[1])
         named = zip(("residual_mm", "residual_limit_mm"), told, strict=True)
         return {name: None if each is None else round(1e3 * each, 2) for name, each in named}

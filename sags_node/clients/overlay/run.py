@@ -287,7 +287,7 @@ class _Overlay:
     # ---- what is not right ---------------------------------------------------------------------------------
 
     def _stale(self) -> str | None:
-        """What may not be shown as new any more, of all that is needed."""
+        """Return what may not be shown as new any more, of all that is needed."""
         if self._clock is not None and self._clock.problem is not None:
             return "the node's clock is not known"
         for name in NEEDED:
@@ -306,7 +306,7 @@ class _Overlay:
     # ---- what is said --------------------------------------------------------------------------------------
 
     def _figures(self, recent: int = REMEMBERED) -> dict[str, Any]:
-        """What was shown; durations of the newest `recent` frames, or of all."""
+        """Return what was shown; durations of the newest `recent` frames, or of all."""
         return {
             "frames": self._frames,
             "overlay": self._frames - self._blanked.total(),
@@ -328,7 +328,7 @@ class _Overlay:
 
     @property
     def _warnings(self) -> dict[str, str]:
-        """What the node warned of last."""
+        """Return what the node warned of last."""
         status = None if self._subscriber is None else self._subscriber.latest("status")
         return status.warnings() if isinstance(status, ReceivedText) else {}
 

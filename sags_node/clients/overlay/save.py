@@ -21,7 +21,8 @@ _LAYER = struct.Struct("<5i")  # frame, first row and column, height and width o
 
 
 class Layers:
-    """What was drawn over each frame, and nothing else. A video can be made of it when the node has ended.
+    """Hold what was drawn over each frame, and nothing else. A video can be made of it when the node has
+    ended.
 
     Args:
         force: replace a file that exists.
@@ -38,7 +39,7 @@ class Layers:
             self._file: BinaryIO = file.open("wb")
 
     def add(self, frame_id: int, rgba: U8 | None) -> None:
-        """Of one frame [H, W, 4]; None: it was blank."""
+        """Add one frame [H, W, 4]; None: it was blank."""
         top = left = height = width = 0
         if rgba is not None and rgba[..., 3].any():
             left, top, width, height = cv2.boundingRect(rgba[..., 3])
@@ -53,7 +54,7 @@ class Layers:
 
 
 class Layer(NamedTuple):
-    """Where something was drawn over a frame."""
+    """Hold where something was drawn over a frame."""
 
     top: int
     left: int
@@ -61,7 +62,7 @@ class Layer(NamedTuple):
 
 
 def read_layers(file: Path) -> dict[int, Layer]:
-    """Of every frame that came, by its number, until where an overlay that was killed had written."""
+    """Read every frame that came, by its number, until where an overlay that was killed had written."""
     data, at, found = file.read_bytes(), 0, {}
     while at + _LAYER.size <= len(data):
         frame_id, top, left, height, width = _LAYER.unpack_from(data, at)

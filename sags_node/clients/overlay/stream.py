@@ -100,7 +100,8 @@ class OverlayStream(Closes):
                 self._send(eye, self.notice(), -1, stamp_ns)
 
     def notice(self, size: tuple[int, int] | None = None) -> U8:
-        """What stands in the place of an overlay: nothing, or for some seconds why. `size`: see `blank`."""
+        """Return what stands in the place of an overlay: nothing, or for some seconds why. `size`: see
+        `blank`."""
         rgba, since = self._empty(size), time.monotonic() - self._blank_since
         if self.reason is not None and BLANK_PERIOD <= since < BLANK_PERIOD + SAID:
             draw_lines(rgba, [f"no overlay: {self.reason}"])

@@ -28,7 +28,7 @@ _COMPRESSIBLE = ("rgb8", "rgba8", "mono8")
 
 
 def is_latched(name: str, ns: str) -> bool:
-    """Whether late subscribers of a node `ns` get the last message of a topic, too."""
+    """Tell whether late subscribers of a node `ns` get the last message of a topic, too."""
     known = topics.BY_NAME.get(name.removeprefix(f"{ns}/"))
     return known is not None and known.cached
 

@@ -24,7 +24,7 @@ _FROM_OPENCV = {"rgb8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_BGRA2RGBA}
 
 
 def original_stamp(message: BagMessage) -> int:
-    """What the message itself says of its time, ns; when it was published where it says nothing.
+    """Return what the message itself says of its time, ns; when it was published where it says nothing.
 
     Raises:
         SagsError: it is too short.

@@ -41,7 +41,7 @@ Tell = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True, slots=True)
 class RecordOptions:
-    """What to record, and how.
+    """Hold what to record, and how.
 
     Attributes:
         topics: with or without the namespace; empty: all.
@@ -113,7 +113,7 @@ class Recorder:
         return self.summary()
 
     def summary(self) -> dict[str, Any]:
-        """What was recorded until now, see `run`. Any thread may call this."""
+        """Return what was recorded until now, see `run`. Any thread may call this."""
         now = time.monotonic()
         recorded = max(self._last_came - self._began, 1e-3)
         rows = {
@@ -258,7 +258,7 @@ class Recorder:
 
 
 def _told(folder: Path, error: Exception) -> SagsError:
-    """What a failure of a thread that writes is for people."""
+    """Return what a failure of a thread that writes is for people."""
     if isinstance(error, SagsError):
         return error
     if isinstance(error, OSError):

@@ -29,7 +29,7 @@ from sags_node.files import open_file
 
 @dataclass(slots=True)
 class Recovery:
-    """What became of the files. `lost` is False only where nothing can be missing."""
+    """Hold what became of the files. `lost` is False only where nothing can be missing."""
 
     messages: int = 0
     chunks: int = 0  # whole ones
@@ -192,7 +192,7 @@ def _copy_records(
 
 
 def _next_chunk(mapped: mmap.mmap, position: int) -> int | None:
-    """Where the next record begins that can only be a chunk: its inner lengths add up."""
+    """Find where the next record begins that can only be a chunk: its inner lengths add up."""
     opcode = bytes([Opcode.CHUNK])
     while (position := mapped.find(opcode, position)) >= 0:
         if position + HEAD.size > len(mapped):

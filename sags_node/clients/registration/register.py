@@ -39,7 +39,7 @@ Verdict = Literal["good", "doubtful", "refused"]
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where the model lies. Lengths in m; None: it was not come to."""
+    """Hold where the model lies. Lengths in m; None: it was not come to."""
 
     verdict: Verdict
     reason: str = ""  # and its remedy; empty: it is good
@@ -53,7 +53,7 @@ class Registration:
     matched: Bool | None = None  # [N] which points of the surface these are
 
     def figures(self, targets: F64) -> dict[str, Any]:
-        """For people and programs, in mm; without what was not come to. `targets` [t, 3] are told as they
+        """Say for people and programs, in mm; without what was not come to. `targets` [t, 3] are told as they
         are."""
         said: dict[str, Any] = {"verdict": self.verdict, "reason": self.reason or None}
         if self.fiducials is not None:
@@ -92,7 +92,7 @@ def register(model: Shape, at: F64, places: F64, surface: Surface, targets: F64)
 
 
 def _wrong_unit(factor: float) -> str:
-    """What is wrong with a model that is `factor` times as large as where its points were picked."""
+    """Return what is wrong with a model that is `factor` times as large as where its points were picked."""
     times, verb = (factor, "divide") if factor > 1 else (1 / factor, "multiply")
     said = f"the model is {times:.3g} times too {'large' if factor > 1 else 'small'} for where its points lie"
     unit = min(UNITS, key=lambda each: abs(np.log(times / each)))

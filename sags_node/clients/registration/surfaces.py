@@ -32,8 +32,8 @@ class Shape:
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(corners))
 
     def facing(self, eye: Array) -> Shape:
-        """What of it an eye at [3] sees: triangles whose middles nothing hides. Files wind their triangles
-        either way, so that does not count."""
+        """Return what of it an eye at [3] sees: triangles whose middles nothing hides. Files wind their
+        triangles either way, so that does not count."""
         middles = self.vertices[self.triangles].mean(1)
         seen = self._meets(eye, middles) > 1 / BEHIND
         return Shape(self.vertices, self.triangles[seen])
@@ -54,7 +54,8 @@ class Shape:
         return Shape(self.vertices * MIRROR, self.triangles[:, ::-1])
 
     def _meets(self, eye: Array, points: Array) -> F32:
-        """Where rays from an eye through points [N, 3] meet it first, in lengths of the way; inf: nowhere."""
+        """Find where rays from an eye through points [N, 3] meet it first, in lengths of the way; inf:
+        nowhere."""
         rays = np.hstack([np.broadcast_to(eye, points.shape), points - eye]).astype(np.float32)
         found: F32 = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))["t_hit"].numpy()
         return found

@@ -56,14 +56,14 @@ _STATES = {
 
 
 class Rung(msgspec.Struct, frozen=True):
-    """Of the ladder of quality."""
+    """The rung of the ladder of quality."""
 
     number: int
     of: int
 
 
 class Status(msgspec.Struct, frozen=True):
-    """What the node says of itself, as far as it is shown."""
+    """Hold what the node says of itself, as far as it is shown."""
 
     state: str = ""  # "" before it has said anything
     rate_hz: float = 0.0
@@ -112,7 +112,8 @@ class Feed:
         self._overlay = OverlayFeed(node.run_dir)
 
     def now(self, pictures: Iterable[str], overlaid: Iterable[str] = (), steady: bool = False) -> Moment:
-        """What may be shown now, newer than what was shown before; `WAIT_FOR_PICTURE` is waited for it.
+        """Return what may be shown now, newer than what was shown before; `WAIT_FOR_PICTURE` is waited for
+        it.
 
         Args:
             pictures: those of `PICTURES` that are looked at. The node makes no others.
@@ -192,7 +193,7 @@ class Feed:
         return subscriber.problem(LEFT, MAX_AGE)
 
     def _is_fresh(self, shown: Received, newest: Received) -> bool:
-        """Whether a frame may stand for the newest picture, of which not everything came."""
+        """Tell whether a frame may stand for the newest picture, of which not everything came."""
         same = (shown.meta.session, shown.meta.epoch) == (newest.meta.session, newest.meta.epoch)
         return same and shown.age(self._subscriber.now_ns()) <= MAX_AGE
 

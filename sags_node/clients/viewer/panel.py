@@ -97,7 +97,7 @@ class Panel:
 
     @property
     def frozen(self) -> bool:
-        """Whether somebody wants to look at one moment."""
+        """Tell whether somebody wants to look at one moment."""
         return self._frozen_since is not None
 
     def fit(self, client: viser.ClientHandle) -> None:
@@ -393,7 +393,7 @@ def _overlay_table(overlay: Overlay | None) -> str:
 
 
 def _anchor_table(rows: list[Any], unit: str) -> str:
-    """Where each anchor is, and how sure it is."""
+    """Find where each anchor is, and how sure it is."""
     if not rows:
         return _line("none yet")
     cells = []

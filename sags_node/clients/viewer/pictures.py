@@ -122,7 +122,7 @@ def overlaid_in(view: str) -> list[str]:
 
 
 def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
-    """What came of a frame, as small as its numbers are: all that follows costs by the pixel."""
+    """Return what came of a frame, as small as its numbers are: all that follows costs by the pixel."""
     tissue = pictures.get(TISSUE, _NOTHING)
     size = tissue.shape[::-1]
     truth, render = (

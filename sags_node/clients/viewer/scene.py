@@ -157,7 +157,8 @@ class Scene:
 
 
 def names_of(overlay: Overlay) -> dict[int, str]:
-    """Of each anchor that holds an object of the overlay: what that is, with a `?` where it is not sure."""
+    """The names of each anchor that holds an object of the overlay: what that is, with a `?` where it is not
+    sure."""
     return {
         int(anchor["id"] or 0): thing.name + ("" if thing.unsure is None else " ?")
         for thing in overlay.objects

@@ -34,7 +34,8 @@ class Splats:
         return np.asarray(np.einsum("nik,njk->nij", sides, sides))
 
     def hit(self, origin: F64, direction: F64) -> F64 | None:
-        """Where a ray from `origin` (m) along `direction` meets the tissue: half of its light is taken there.
+        """Find where a ray from `origin` (m) along `direction` meets the tissue: half of its light is taken
+        there.
 
         Each Gaussian counts where it is densest along the ray, front to back. None when the ray meets nothing
         that is more opaque than clear.

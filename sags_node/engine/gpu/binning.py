@@ -60,7 +60,7 @@ def count_pairs(
     splats: wp.array2d(dtype=wp.vec4), keys: wp.array(dtype=int), order: wp.array(dtype=int),
     width: int, height: int, active: wp.array(dtype=int), counts: wp.array(dtype=int),
 ):  # fmt: skip
-    """Of each splat, in the order of depth, with the tiles that are active."""
+    """Count for each splat, in the order of depth, with the tiles that are active."""
     n = wp.tid()
     total = int(0)
     if keys[n] != FAR_KEY:

@@ -129,7 +129,7 @@ def pixel_moments(
     s: wp.vec4, r: wp.vec4, place_x: float, place_y: float, w: float, g: float, v_color: wp.vec4,
     luminance: float, weight: float,
 ):  # fmt: skip
-    """What a pixel adds to a pair's sums."""
+    """Return what a pixel adds to a pair's sums."""
     u, v = whitened(s, r, place_x, place_y)
     lit, counted = w * luminance, w * weight
     return vec16(

@@ -244,7 +244,7 @@ class WarpRasterizer:
 
 
 def sent(gaussians: Gaussians, device: wp.Device) -> dict[str, wp.array]:
-    """What `DeviceRasterizer.forward` takes of Gaussians, copied to the device."""
+    """Return what `DeviceRasterizer.forward` takes of Gaussians, copied to the device."""
     count = len(gaussians)
     absent = {"slopes": np.zeros((count, 3), np.float32), "smoothing": np.zeros(count, np.float32)}
     given = {name: getattr(gaussians, name) for name in KINDS}

@@ -43,7 +43,8 @@ def load_mask(scratch: F32, plane: Any, mask: Bool, start: Any, count: int) -> N
 def load_frame(
     scratch: F32, planes: F32, image: U8, tissue: Bool, depth: F32, start: Any, count: int
 ) -> None:
-    """What was drawn, `planes` [5, P], and what was seen: `image` [3 P] interleaved, `depth`, `tissue`."""
+    """Return what was drawn, `planes` [5, P], and what was seen: `image` [3 P] interleaved, `depth`,
+    `tissue`."""
     for plane in range(5):
         load(scratch, u8(plane * PLANE), planes[plane], start, count)
     for k in range(count):

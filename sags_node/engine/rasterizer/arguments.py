@@ -49,7 +49,7 @@ def check_size(width: int, height: int, camera: Camera, tiles: Bool | None) -> N
 
 
 def drawn(last: Gaussians | None, call: str) -> Gaussians:
-    """What was drawn last, before this call. UsageError: nothing."""
+    """Return what was drawn last, before this call. UsageError: nothing."""
     if last is None:
         raise UsageError(f"nothing was drawn yet; call forward before {call}")
     return last

@@ -63,8 +63,8 @@ def _pixels(mean: Any, radius: Any, size: int) -> Any:
 
 @inlined
 def _box(splat: Any, width: int, height: int, tile_width_bits: int) -> Any:
-    """What a splat's box touches: the columns of tiles, first and one after the last; the first and last row
-    of pixels. No column and no row where the box lies outside."""
+    """Return what a splat's box touches: the columns of tiles, first and one after the last; the first and
+    last row of pixels. No column and no row where the box lies outside."""
     x_first, x_last = _pixels(splat.mean_x, splat.reach_x, width)
     y_first, y_last = _pixels(splat.mean_y, splat.reach_y, height)
     left, right = x_first >> tile_width_bits, (x_last >> tile_width_bits) + 1

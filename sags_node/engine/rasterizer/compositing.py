@@ -103,13 +103,13 @@ def place_of(t: int, width: int, height: int) -> Any:
 
 @inlined
 def is_whole(columns: int, rows: int) -> bool:
-    """Whether all of a tile lies in the picture."""
+    """Tell whether all of a tile lies in the picture."""
     return columns == TILE_WIDTH and rows == TILE_HEIGHT
 
 
 @inlined
 def place_in_scratch(x: int, y: int, stride: int) -> int:
-    """Of a pixel of the tile, in the first plane."""
+    """The place of a pixel of the tile, in the first plane."""
     block = x // BLOCK_WIDTH * BLOCKS + y // BLOCK_HEIGHT
     return block * stride + y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH
 
@@ -128,7 +128,7 @@ def open_tile(tile: F32, stride: int, columns: int, rows: int) -> None:
 
 @inlined
 def any_above(tile: F32, stride: int, transmittance: Any) -> Any:
-    """Whether a pixel of the tile still has more than this transmittance."""
+    """Tell whether a pixel of the tile still has more than this transmittance."""
     above = load(tile, TRANSMITTANCE) > transmittance
     for block in range(1, COLUMNS * BLOCKS):
         above |= load(tile, block * stride + TRANSMITTANCE) > transmittance

@@ -87,7 +87,8 @@ def _add_up_rows(
     means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, per_px: Any, every: int,
     sums: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
-    """Of each cell, what the Gaussians in it cover of the drawn surface, and that times the squared error."""
+    """Add up for each cell, what the Gaussians in it cover of the drawn surface, and that times the squared
+    error."""
     height, width = depth.shape
     half = np.float32(0.5)
     for i in range(first, end, every):

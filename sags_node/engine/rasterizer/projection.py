@@ -158,7 +158,7 @@ def unit_quaternion(w: Any, x: Any, y: Any, z: Any) -> Row:
 
 @inlined
 def log2_of(x: Any) -> Any:
-    """Of positive numbers; relative error 1e-7."""
+    """The log2 of positive numbers; relative error 1e-7."""
     m, n = split_powers(x)
     s = (m - ONE) / (m + ONE)
     ss = s * s

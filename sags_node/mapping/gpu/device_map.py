@@ -74,7 +74,7 @@ class DeviceMap:
         self._deformation.nodes[:] = nodes
 
     def drawn(self) -> dict[str, wp.array]:
-        """What `DeviceRasterizer.forward` takes."""
+        """Return what `DeviceRasterizer.forward` takes."""
         return {name: self._live(name) for name in KINDS}
 
     def descend(self, gradients: dict[str, wp.array], step: float) -> None:

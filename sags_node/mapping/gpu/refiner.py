@@ -33,7 +33,7 @@ Result = TypeVar("Result")
 def _or_on_the_cpu(
     method: Callable[Concatenate[GpuRefiner, Given], Result],
 ) -> Callable[Concatenate[GpuRefiner, Given], Result]:
-    """Where the GPU fails, and ever after, the CPU's method of that name does it."""
+    """Find where the GPU fails, and ever after, the CPU's method of that name does it."""
 
     @functools.wraps(method)
     def guarded(self: GpuRefiner, /, *args: Given.args, **names: Given.kwargs) -> Result:

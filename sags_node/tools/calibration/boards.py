@@ -43,7 +43,7 @@ class Board(Protocol):
         """The corners in a picture [H, W]; None where the board is not seen."""
 
     def explain(self, gray: U8) -> str:
-        """What is in a picture [H, W] instead of this board, as far as one can tell; or nothing."""
+        """Return what is in a picture [H, W] instead of this board, as far as one can tell; or nothing."""
 
 
 class Chessboard:

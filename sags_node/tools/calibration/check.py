@@ -101,7 +101,7 @@ def judge(
 
 
 def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
-    """What raw pictures say of a rig whose numbers are sound.
+    """Return what raw pictures say of a rig whose numbers are sound.
 
     Args:
         depths: what is known of each pair's depth, [H, W] m of the left rectified picture, 0 unknown.
@@ -125,8 +125,8 @@ def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 |
 
 
 def rectified_before(config: LaunchConfig) -> bool:
-    """Whether the first pictures of a session show that they were rectified, though their names do not say
-    so; False where they cannot be read."""
+    """Tell whether the first pictures of a session show that they were rectified, though their names do not
+    say so; False where they cannot be read."""
     try:
         rig = _rig_of(config, None, None)
         if config.rectified is not None or not rectifies(rig):

@@ -18,7 +18,7 @@ ROW_NAMES, COLUMN_NAMES = ("top", "middle", "bottom"), ("left", "centre", "right
 
 
 def coverage_hints(views: Sequence[StereoView], board_poses: F64, size: tuple[int, int]) -> list[str]:
-    """What to add for a better calibration; empty where nothing is lacking.
+    """Return what to add for a better calibration; empty where nothing is lacking.
 
     Args:
         board_poses: [V, 4, 4] m, board to left camera.

@@ -116,7 +116,7 @@ def _known(T: F64 | None) -> F64:
 
 
 def _around(pose_at: PoseAt, t_ns: int) -> bool:
-    """Whether the pose is known also for the steps of the search."""
+    """Tell whether the pose is known also for the steps of the search."""
     reach = 2 * OFFSET_STEP_NS
     return all(pose_at(t_ns + step) is not None for step in (-reach, 0, reach))
 

@@ -71,7 +71,7 @@ def grab_views(
 def _advice(
     view: StereoView | None, before: StereoView | None, taken: list[StereoView], diagonal: float
 ) -> str:
-    """What keeps this frame from being a new view; empty: nothing."""
+    """Return what keeps this frame from being a new view; empty: nothing."""
     if view is None:
         return "show the whole board to both eyes"
     if before is None or _moved(view, before) > STILL_AT * diagonal:

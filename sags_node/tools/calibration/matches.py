@@ -39,14 +39,14 @@ def match_eyes(left: U8, right: U8) -> F64:
 
 
 def _dull(gray: U8) -> Bool:
-    """Where nothing shines, [H, W]."""
+    """Find where nothing shines, [H, W]."""
     window = np.ones((2 * HIGHLIGHT_MARGIN + 1,) * 2, np.uint8)
     dull: Bool = cv2.dilate(gray, window) < HIGHLIGHT
     return dull
 
 
 def _nearest(said: np.ndarray, other: np.ndarray) -> dict[int, int]:
-    """For each descriptor the one that is clearly the most similar, where there is one."""
+    """Find for each descriptor the one that is clearly the most similar, where there is one."""
     two = cv2.BFMatcher(cv2.NORM_L2).knnMatch(said, other, k=2)
     return {a.queryIdx: a.trainIdx for a, b in two if a.distance < LARGEST_RATIO * b.distance}
 

@@ -24,7 +24,7 @@ OUTLIER = 3.0 * 1.4826  # times the median distance: 3 sigma
 
 
 def judge_known_depths(rig: StereoRig, matches: Sequence[F64], depths: Sequence[F32 | None]) -> list[Finding]:
-    """What known depths say of a rig's principal points; nothing where there are too few.
+    """Return what known depths say of a rig's principal points; nothing where there are too few.
 
     Args:
         matches: of each picture pair, [M, 4] raw pixels, as `match_eyes` gives them.

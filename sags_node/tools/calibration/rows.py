@@ -53,7 +53,7 @@ class Rows(NamedTuple):
 
     @property
     def scale_differs(self) -> bool:
-        """Whether one eye's scale is off, beyond doubt."""
+        """Tell whether one eye's scale is off, beyond doubt."""
         return abs(self.scale) > max(LEAST_SCALE, SURE_SCALE * self.scale_error)
 
 
@@ -80,7 +80,7 @@ def rectified_rows(rig: StereoRig, matches: F64) -> Rows:
 
 
 def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
-    """What the matches [M, 4] (raw pixels) of a picture pair, or of several, say of a rig.
+    """Return what the matches [M, 4] (raw pixels) of a picture pair, or of several, say of a rig.
 
     An error says which end is wrong: the calibration or the pictures.
     """
@@ -126,7 +126,7 @@ def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
 
 
 def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
-    """As it is, then all that users get wrong; of two that fit alike the first is meant."""
+    """Give it as it is, then all that users get wrong; of two that fit alike the first is meant."""
     rows = rectified_rows(rig, matches)
     exchanged = rectified_rows(StereoRig(rig.name, rig.right, rig.left), matches)
     exchanged_files = Reading(
@@ -165,7 +165,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
 
 
 def _other_directions(rig: StereoRig, matches: F64) -> Iterator[Reading]:
-    """What becomes of R and T, from left to right camera, on their way between programs."""
+    """Return what becomes of R and T, from left to right camera, on their way between programs."""
     R, T = rig.T_right_left[:3, :3], rig.T_right_left[:3, 3]
     if not T.any():
         return
@@ -205,7 +205,7 @@ def _other_size(rig: StereoRig, factor: float) -> StereoRig:
 
 
 def _undistorted(eye: Eye, pixels: F64) -> F64:
-    """Where pixels [M, 2] lie in the rectified camera, at distance 1."""
+    """Find where pixels [M, 2] lie in the rectified camera, at distance 1."""
     rays: F64 = cv2.undistortPoints(pixels[:, None], eye.K, eye.distortion, R=eye.R)[:, 0]
     return rays
 
@@ -225,7 +225,7 @@ def _figures(rows: Rows) -> dict[str, float]:
 
 
 def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
-    """Whether one eye's picture is larger than its calibration says: its rows then drift apart over the
+    """Tell whether one eye's picture is larger than its calibration says: its rows then drift apart over the
     height, and depth leans over the width. Nothing where both have one scale."""
     if not rows.scale_differs:
         return []

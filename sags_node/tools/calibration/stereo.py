@@ -128,7 +128,7 @@ def _eyes(solution: Solution) -> Any:
 
 
 def _instead(board: Board, pictures: FolderPairs) -> str:
-    """What most of some pictures show instead of the board."""
+    """Return what most of some pictures show instead of the board."""
     pictures.seek(0)
     said: Counter[str] = Counter()
     for _ in range(min(LOOKED_AT, pictures.count)):

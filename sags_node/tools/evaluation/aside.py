@@ -40,7 +40,7 @@ class Aside:
         self._next = frames // TIMES // 2
 
     def due(self, shown: MappedFrame) -> bool:
-        """Whether a frame is one of those that are looked at: it needs a measured depth."""
+        """Tell whether a frame is one of those that are looked at: it needs a measured depth."""
         number = shown.snapshot.frame_id
         if number < self._next or not shown.measured_depth.any():
             return False

@@ -36,9 +36,9 @@ def tally(depth: F32, confidence: F32, truth: F32, tissue: Bool) -> I64:
 
 
 def figures(tallies: Sequence[I64]) -> dict[str, Any]:
-    """Of all frames: how much is sure (confidence of at least 0.5, so 3 mm) and how right that is, and for
-    each group of predicted errors its share and the real ones. A group below `LEAST_SHARE` counts as
-    empty."""
+    """The figures of all frames: how much is sure (confidence of at least 0.5, so 3 mm) and how right that
+    is, and for each group of predicted errors its share and the real ones. A group below `LEAST_SHARE` counts
+    as empty."""
     counts = np.sum(tallies, axis=0)
     total = max(int(counts.sum()), 1)
     sure = counts[:SURE_GROUPS].sum(0)
@@ -58,8 +58,8 @@ def figures(tallies: Sequence[I64]) -> dict[str, Any]:
 
 
 def points(tallies: Sequence[I64], share: float) -> list[tuple[float, float]]:
-    """For each group, the middle of its predicted errors and what that share of its real ones stays below,
-    mm."""
+    """Find for each group, the middle of its predicted errors and what that share of its real ones stays
+    below, mm."""
     if not tallies:
         return []
     middles = [(low + high) / 2 for low, high in pairwise(PREDICTED_MM)]

@@ -171,7 +171,7 @@ Row = tuple[str, list[str], str]  # what, its values, what the first is compared
 
 
 def headings(summary: Mapping[str, Any]) -> list[str]:
-    """Of the values of a row."""
+    """The headings of the values of a row."""
     segments = list(summary.get("segments") or {})
     return ["all frames", *segments] if segments else ["value"]
 
@@ -298,8 +298,8 @@ def _latency(figures: Flat) -> str:
 
 
 def _picture(figures: Flat) -> str:
-    """What a view shows of the next frame, as the left render of a frame is mostly its own picture; of a live
-    run, whose views are not known, that render."""
+    """Return what a view shows of the next frame, as the left render of a frame is mostly its own picture; of
+    a live run, whose views are not known, that render."""
     shown = {
         "predict.psnr": "of the next frame",
         "shown.psnr": "of the frame itself, mostly its own picture",

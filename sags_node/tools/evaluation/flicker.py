@@ -98,7 +98,7 @@ class _Spread:
         self._count += 1
 
     def deviation(self) -> F32:
-        """Of the values so far, not of what they were drawn from."""
+        """The deviation of the values so far, not of what they were drawn from."""
         mean = self._sum / np.float32(self._count)
         found: F32 = np.sqrt(np.maximum(self._squares / np.float32(self._count) - mean * mean, 0))
         return found

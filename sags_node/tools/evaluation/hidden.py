@@ -91,6 +91,6 @@ def _boxes(width: int, height: int) -> list[Bool]:
 
 
 def _small(view: RenderedView) -> U8:
-    """What consumers are shown of a view, in the size that is worked at."""
+    """Return what consumers are shown of a view, in the size that is worked at."""
     size = view.camera.width, view.camera.height
     return view.rgb if view.shown is None else cv2.resize(view.shown.rgb, size, interpolation=cv2.INTER_AREA)

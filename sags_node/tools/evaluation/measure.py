@@ -47,7 +47,7 @@ OnPicture = Callable[[int, U8], None]  # a frame's number and its rectified left
 
 @dataclass(frozen=True, slots=True)
 class MeasureOptions:
-    """What to measure, and what the run must leave out for it.
+    """Hold what to measure, and what the run must leave out for it.
 
     Raises:
         UsageError: a count is out of range, or there is no file of weights.
@@ -73,7 +73,7 @@ class MeasureOptions:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Of one frame's camera, `T_world_cam` [4, 4]."""
+    """The poses of one frame's camera, `T_world_cam` [4, 4]."""
 
     known: F64  # as the session says
     shown: F64  # as the run had it
@@ -112,7 +112,7 @@ class _Mapped:
     lent: SeenFrame  # as views have its detail
 
     def seen(self, weight: float) -> Seen:
-        """As a part of the mean of several, with a share of `weight`."""
+        """Give it as a part of the mean of several, with a share of `weight`."""
         snapshot = self.shown.snapshot
         return Seen(snapshot.gaussians, snapshot.camera, self.recorded.truth, self.shown.tissue, weight)
 
@@ -211,7 +211,7 @@ class Measurer:
         return self._options.holds_out(frame.frame_id) and frame.pose_problem is None
 
     def _shown(self, now: _Recorded, shown: ShownFrame) -> FrameRow:
-        """Of what consumers got; the model's own figures where it is known."""
+        """The shown of what consumers got; the model's own figures where it is known."""
         frame, left, place = now.frame, now.pair.left, next(self._places)
         self._receipt.add(frame, shown.tissue)
         costly = place % self._options.every == 0
@@ -279,7 +279,7 @@ class Measurer:
         return replace(given, T_world_cam=world @ given.T_world_cam)
 
     def _learn(self, now: _Mapped) -> None:
-        """As a node that draws views learns from a frame."""
+        """Give it as a node that draws views learns from a frame."""
         if self._detail is None or len(self.rows) % LESSON_EVERY:
             return
         right = now.recorded.pair.right
@@ -312,7 +312,7 @@ class Measurer:
         return {name: metrics.psnr(picture, now.truth, shown.tissue) for name, picture in pictures.items()}
 
     def _view(self, of: _Mapped, gaussians: Gaussians, camera: Camera, ahead: int) -> tuple[F32, F32]:
-        """What a view of a frame shows, and the model alone in it, [H, W, 3] 0..1.
+        """Return what a view of a frame shows, and the model alone in it, [H, W, 3] 0..1.
 
         Args:
             gaussians: of the frame, moved `ahead` frames.

@@ -87,8 +87,8 @@ def carried(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, around: S
 
 
 def _displaced(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, seen: Seen) -> F32:
-    """Where each pixel's tissue is in a picture, [H, W, 2] px: the mean over the Gaussians that show there of
-    how far each is from there. One that was not known there stays where it is."""
+    """Find where each pixel's tissue is in a picture, [H, W, 2] px: the mean over the Gaussians that show
+    there of how far each is from there. One that was not known there stays where it is."""
     pixels, _ = project(camera, middle.means)
     displacement = np.zeros_like(middle.colors)
     rows, shared = _found(seen.gaussians, middle)

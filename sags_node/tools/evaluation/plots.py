@@ -33,7 +33,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def has_plots() -> bool:
-    """Whether matplotlib is installed."""
+    """Tell whether matplotlib is installed."""
     return find_spec("matplotlib") is not None
 
 

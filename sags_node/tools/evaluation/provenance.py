@@ -69,7 +69,7 @@ def _processor() -> str:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    """What git says; nothing where it has nothing to say."""
+    """Return what git says; nothing where it has nothing to say."""
     try:
         found = subprocess.run(
             ["git", *arguments], cwd=root, capture_output=True, text=True, check=False, timeout=GIT_SECONDS

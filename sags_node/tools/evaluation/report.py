@@ -111,7 +111,7 @@ def _pictures(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -> str
 
 
 def warning_table(rows: Sequence[FrameRow]) -> str:
-    """What the run warned of, when, and what to do; nothing where it did not."""
+    """Return what the run warned of, when, and what to do; nothing where it did not."""
     frames: dict[str, list[int]] = {}
     said: dict[str, str] = {}
     for row in rows:
@@ -128,7 +128,7 @@ def warning_table(rows: Sequence[FrameRow]) -> str:
 
 def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> str:
     def series(label: str, colour: str, key: str, dots: bool = False) -> Series:
-        """Of a figure (`depth.p90_mm`), or of what the run says itself (`frame_ms`)."""
+        """The series of a figure (`depth.p90_mm`), or of what the run says itself (`frame_ms`)."""
         group, _, name = key.partition(".")
         points = []
         for row in rows if name else ran[1:]:  # the first frame takes long

@@ -30,7 +30,7 @@ _MAPPED = "mapped"
 
 @dataclass(frozen=True, slots=True)
 class RunFacts:
-    """What the run itself says of one processed frame."""
+    """Hold what the run itself says of one processed frame."""
 
     t_shown_ns: int  # when its result was done or published; monotonic clock
     frame_ms: float | None  # wall time of all stages; None: the node alone knows
@@ -47,7 +47,7 @@ class RunFacts:
 
 @dataclass(frozen=True, slots=True)
 class ShownFrame:
-    """What consumers got of one frame."""
+    """Hold what consumers got of one frame."""
 
     facts: RunFacts
     rgb: U8  # [H, W, 3] the left view, drawn after this frame's update
@@ -162,7 +162,7 @@ class Run:
         return width, height
 
     def read(self, frame_id: int) -> ShownFrame | None:
-        """What was shown of that frame; None: nothing."""
+        """Return what was shown of that frame; None: nothing."""
         file = self._file(frame_id, _MAPPED)
         if file.exists():
             mapped: MappedFrame = _FRAMES.decode(file.read_bytes())
@@ -179,7 +179,8 @@ class Run:
         )
 
     def _facts(self, image: Meta) -> RunFacts:
-        """Of the frame itself: its stamps. The rest by the status that came before, or the first one."""
+        """The facts of the frame itself: its stamps. The rest by the status that came before, or the first
+        one."""
         published_ns = image.publish_ns
         told = [status for at_ns, status in self._statuses if at_ns <= published_ns]
         status = told[-1] if told else self._statuses[0][1] if self._statuses else {}

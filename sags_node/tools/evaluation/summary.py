@@ -142,7 +142,7 @@ def _track(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
 
 
 def _mean(values: Sequence[float]) -> float | None:
-    """Of those that are no NaN."""
+    """The mean of those that are no NaN."""
     known = [value for value in values if not math.isnan(value)]
     return float(np.mean(known)) if known else None
 

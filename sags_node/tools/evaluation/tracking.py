@@ -57,7 +57,7 @@ class PointTracks:
         )
 
     def _estimates(self, gaussians: Gaussians) -> tuple[F64, Bool]:
-        """Where the points are according to the model, [P, 3], and for which of them it knows, [P]."""
+        """Find where the points are according to the model, [P, 3], and for which of them it knows, [P]."""
         if len(gaussians) == 0:
             return self._start, np.zeros(len(self._start), bool)
         order = np.argsort(gaussians.ids)

@@ -81,7 +81,7 @@ def right_figures(
 
 
 def right_pixels(rectifier: Rectifier, frame: StereoFrame, exclude: Sequence[Box]) -> Bool:
-    """Where the rectified right picture shows the raw one outside the boxes, [H, W]."""
+    """Find where the rectified right picture shows the raw one outside the boxes, [H, W]."""
     white = np.full_like(frame.left, 255)
     for x, y, width, height in exclude:
         white[y : y + height, x : x + width] = 0

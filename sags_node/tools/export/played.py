@@ -36,7 +36,7 @@ class Product(Protocol):
 
 
 class Kind(NamedTuple):
-    """What makes a product at a path, from frames of a rate (1/s) and size (px)."""
+    """Hold what makes a product at a path, from frames of a rate (1/s) and size (px)."""
 
     make: Callable[[Path, float, tuple[int, int]], Product]
     is_folder: bool = False
@@ -82,7 +82,7 @@ def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance)
 
 
 def _size(path: Path) -> int:
-    """Of a file, or of all in a folder, bytes."""
+    """The size of a file, or of all in a folder, bytes."""
     return sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
 
 

@@ -131,7 +131,7 @@ def scenes_of_session(session: Session) -> Iterator[Scene]:
 
 
 def from_fit(folder: Path, session: Session, at: float | None, advance: Advance) -> Scene:
-    """What `sags fit` made of a recording, at a time.
+    """Return what `sags fit` made of a recording, at a time.
 
     Args:
         folder: holds its `checkpoint.npz` and `figures.json`.
@@ -151,7 +151,7 @@ def from_fit(folder: Path, session: Session, at: float | None, advance: Advance)
 
 
 def scenes_of_fit(folder: Path, session: Session, advance: Advance) -> Iterator[Scene]:
-    """What `sags fit` made of a recording, at the time of each of its frames; as `from_fit`."""
+    """Return what `sags fit` made of a recording, at the time of each of its frames; as `from_fit`."""
     fit, frames = _read_fit(folder, session, advance)
     for frame in frames:
         yield Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns)

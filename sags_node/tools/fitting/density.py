@@ -57,7 +57,7 @@ class Density:
 
 
 def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
-    """What becomes of rows [M, 14]: smaller ones, shifted along their longest axis to either side."""
+    """Return what becomes of rows [M, 14]: smaller ones, shifted along their longest axis to either side."""
     every = np.arange(len(parents))
     longest = parents[:, columns.LOG_SCALE].argmax(1)
     along = _axes(parents[:, columns.QUAT])[every, :, longest]

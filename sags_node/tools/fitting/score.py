@@ -82,7 +82,7 @@ def score(
 def score_between(
     fit: Fit, frames: Iterable[ClipFrame], segments: Segments, lpips: Lpips | None = None
 ) -> dict[str, Any] | None:
-    """What the two training pictures around a frame say of it.
+    """Return what the two training pictures around a frame say of it.
 
     Args:
         fit: started.

@@ -27,8 +27,8 @@ MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # of these weights: dep
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """What an output of 1 of the decoder is. A step of Adam has a fixed length in these, so they say how fast
-    each part is learnt, and how restless it is. 0: that part is not deformed."""
+    """Hold what an output of 1 of the decoder is. A step of Adam has a fixed length in these, so they say how
+    fast each part is learnt, and how restless it is. 0: that part is not deformed."""
 
     mean: float = 0.01  # m
     log_scale: float = 1.0
@@ -39,7 +39,7 @@ class Units:
 
 @dataclass(frozen=True, slots=True)
 class FieldShape:
-    """Of the HexPlane and of what its decoder says."""
+    """The shape of the HexPlane and of what its decoder says."""
 
     levels: int = 2
     cells: int = 64  # along each axis, coarsest level
@@ -124,7 +124,7 @@ class FitSettings:
             raise UsageError(f"batch_size is at least 1 frame, not {self.batch_size}")
 
     def rate_share(self, done: int, of: int) -> float:
-        """Of rates that decay: the share that is left after `done` of a stage's iterations."""
+        """The rate share of rates that decay: the share that is left after `done` of a stage's iterations."""
         if self.stable is None:
             falling: float = self.decay ** (done / (self.decay_over or max(1, of)))
             return falling

@@ -117,7 +117,7 @@ def _nearest(points: F32, queries: F32, count: int) -> tuple[I64, F32]:
 
 
 def _is_cut(before: ClipFrame, after: ClipFrame) -> bool:
-    """Whether two frames show different scenes. Every eighth pixel is enough."""
+    """Tell whether two frames show different scenes. Every eighth pixel is enough."""
     both = (before.tissue & after.tissue)[::8, ::8]
     apart = cv2.absdiff(before.image, after.image)[::8, ::8][both]
     return bool(apart.size > 0 and apart.mean() > CUT * 255)
@@ -182,7 +182,7 @@ def follow_online(
 
 
 class _Places:
-    """Where each Gaussian lay in the first frame. One that appears later is carried back there by the
+    """Hold where each Gaussian lay in the first frame. One that appears later is carried back there by the
     displacement of those around it."""
 
     def __init__(self) -> None:
@@ -190,7 +190,7 @@ class _Places:
         self._known = np.zeros(0, np.bool_)
 
     def add(self, ids: I64, means: F32) -> None:
-        """Where they are in the next frame: ids [N], means [N, 3] m."""
+        """Find where they are in the next frame: ids [N], means [N, 3] m."""
         more = max(int(ids.max(initial=-1)) + 1 - len(self._known), 0)
         self._places = np.pad(self._places, ((0, more), (0, 0)))
         self._known = np.pad(self._known, (0, more))
@@ -225,7 +225,7 @@ def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, pr
 
 
 def remainder(field: Field, rows: F32, paths: Paths) -> Residuals:
-    """What the paths are beyond the field. Where the mapper did not know a Gaussian, it does as at the
+    """Return what the paths are beyond the field. Where the mapper did not know a Gaussian, it does as at the
     nearest time it was known, but hides."""
     residuals = Residuals(paths.times_ns, len(rows))
     for slot, t_ns in enumerate(paths.times_ns.tolist()):

@@ -44,7 +44,8 @@ MOST_SAID = 1 << 16  # lines in the log
 
 
 def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
-    """What a folder is, what is missing or odd, each with a way to fix it; the last says how to play it.
+    """Return what a folder is, what is missing or odd, each with a way to fix it; the last says how to play
+    it.
 
     It is opened and played as `sags run` does it: what that refuses is an error here, with its words.
 
@@ -81,7 +82,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
 
 
 def _quoted(word: Path | str) -> str:
-    """As a shell takes it; brackets stay, as no file is named like the lists in which they stand."""
+    """Give it as a shell takes it; brackets stay, as no file is named like the lists in which they stand."""
     return shlex.quote(str(word)) if shlex.quote(re.sub(r"[\[\]]", "", str(word)))[0] == "'" else str(word)
 
 
@@ -106,7 +107,7 @@ def overrides_of(path: Path) -> list[str]:
 
 
 def _once(found: list[Finding]) -> list[Finding]:
-    """What is wrong is met by several who look; the first says it."""
+    """Return what is wrong is met by several who look; the first says it."""
     said: set[str] = set()
     kept = []
     for finding in found:
@@ -118,7 +119,7 @@ def _once(found: list[Finding]) -> list[Finding]:
 
 
 def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
-    """What some pictures show, before anything plays them."""
+    """Return what some pictures show, before anything plays them."""
     if contents.right is None and contents.config is None:
         return _tried("pictures", lambda: _in_one_folder(left_folder))
 
@@ -140,7 +141,7 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
 
 
 def _in_one_folder(folder: Path) -> list[Finding]:
-    """Where the names tell the eyes both are looked at, else what there is."""
+    """Find where the names tell the eyes both are looked at, else what there is."""
     apart = both_eyes(folder)
     if not apart:
         return pictures.check_eye("pictures", _some(folder))
@@ -153,8 +154,8 @@ def _some(folder: Path) -> list[U8]:
 
 
 def played(config: LaunchConfig) -> list[Finding]:
-    """Whether frames come as `sags run` reads them, by the same code: all of both eyes, both at one time, and
-    of the calibration's size. What that says in the log is a finding, too."""
+    """Tell whether frames come as `sags run` reads them, by the same code: all of both eyes, both at one
+    time, and of the calibration's size. What that says in the log is a finding, too."""
     source = config.source
     if not isinstance(source, RecordedSource):
         return [
@@ -232,7 +233,7 @@ def calibrated(config: LaunchConfig) -> list[Finding]:
 
 
 def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:
-    """What is found, what is said in the log meanwhile, and an error as a finding."""
+    """Return what is found, what is said in the log meanwhile, and an error as a finding."""
     log, said = logging.getLogger("sags_node"), BufferingHandler(MOST_SAID)
     said.setLevel(logging.WARNING)
     log.addHandler(said)

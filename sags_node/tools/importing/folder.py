@@ -34,7 +34,7 @@ DEPTHS = ("depth", "depths", "depth01", "depth_mm_x100")
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What was found; None: it is not there."""
+    """Hold what was found; None: it is not there."""
 
     what: str
     instead: str = ""  # what to do where it is not played as it is
@@ -166,7 +166,7 @@ def _pairs(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def calibration_of(folder: Path) -> Path | None:
-    """What lies beside the pictures, in a folder of a usual name or with them."""
+    """Return what lies beside the pictures, in a folder of a usual name or with them."""
     places = [place for name in CALIBRATIONS if (place := folder / name).is_dir()]
     known = next((place for place in places if find_form(place) is not None), None)
     files = [file for place in places for file in place.glob(SHOWN) if is_opencv(file)]
@@ -175,7 +175,7 @@ def calibration_of(folder: Path) -> Path | None:
 
 
 def is_video(file: Path) -> bool:
-    """Whether it is called like one."""
+    """Tell whether it is called like one."""
     return file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()
 
 

@@ -102,7 +102,7 @@ def lit_box(brightest: U8) -> tuple[int, int, int, int]:
 
 
 def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
-    """Of both eyes without a calibration: are they in order, and are rows aligned?"""
+    """Check both eyes without a calibration: are they in order, and are rows aligned?"""
     pairs = [(a, b) for a, b in zip(left, right, strict=False) if a.shape == b.shape]
     if not pairs:
         return [Finding("error", "the eyes' pictures have not one size", "resize both eyes alike")]
@@ -131,7 +131,7 @@ def check_both(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
 
 
 def check_shares(shares: Sequence[float]) -> list[Finding]:
-    """What masks say of frames: the share of each that is instrument."""
+    """Return what masks say of frames: the share of each that is instrument."""
     if not shares:
         return []
     if not any(shares):

@@ -28,7 +28,7 @@ WHOLE = "source.geometry.layout:=over_under"  # takes any picture apart so that 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What a launch file should say, and why."""
+    """Hold what a launch file should say, and why."""
 
     launch: list[str]  # key:=value
     findings: list[Finding]
@@ -116,7 +116,7 @@ def _opened(config: LaunchConfig) -> list[Finding]:
 
 
 def _looked_at(config: LaunchConfig) -> list[Finding]:
-    """What some of its pictures show, spread over it."""
+    """Return what some of its pictures show, spread over it."""
     pairs, _ = pairs_of_session(config)
     return pictures.check_both(*zip(*pairs, strict=True))
 

@@ -68,8 +68,8 @@ _WAYS = (  # a part before the whole: what is found in the one is found in the o
 
 
 def look(files: tuple[Path, ...]) -> list[Finding]:
-    """What some pictures show, of the videos of the left and the right eye, or of one of both. They are
-    played as `launch_of` says.
+    """Return what some pictures show, of the videos of the left and the right eye, or of one of both. They
+    are played as `launch_of` says.
 
     Raises:
         SagsError: they cannot be read.
@@ -135,7 +135,7 @@ def _file(file: Path) -> list[Finding]:
 
 
 def check_pixels(aspect: float) -> list[Finding]:
-    """Whether they are square; `aspect` is their width over their height."""
+    """Tell whether they are square; `aspect` is their width over their height."""
     if abs(aspect - 1) < NOT_SQUARE:
         return []
     what = f"pixels are {aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
@@ -144,7 +144,7 @@ def check_pixels(aspect: float) -> list[Finding]:
 
 
 def check_ends(pairs: VideoPairs, needed: int) -> list[Finding]:
-    """Whether the right video reaches as far as the left one is played, so many frames."""
+    """Tell whether the right video reaches as far as the left one is played, so many frames."""
     if pairs.right is None or not pairs.by_number:
         return []
     left, right, count = pairs.left.path.name, pairs.right.path.name, pairs.right.count
@@ -216,7 +216,7 @@ def _both_needed(file: Path) -> str:
 
 
 def _are_eyes(pairs: Sequence[tuple[U8, U8]]) -> bool:
-    """Whether pictures match as two eyes do: in the same rows, and in other columns."""
+    """Tell whether pictures match as two eyes do: in the same rows, and in other columns."""
     matches = np.concatenate([match_eyes(*pair) for pair in pairs])
     if len(matches) < pictures.FEWEST_MATCHES:
         return False

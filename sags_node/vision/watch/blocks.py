@@ -19,7 +19,7 @@ BLOCKY = 1.0
 
 
 def is_blocky(picture: U8) -> bool:
-    """Whether blocks show in a picture [H, W, 3] as it came. Resizing and rectifying hide them."""
+    """Tell whether blocks show in a picture [H, W, 3] as it came. Resizing and rectifying hide them."""
     return bool(_excess(picture) > BLOCKY)
 
 

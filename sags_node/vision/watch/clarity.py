@@ -33,7 +33,7 @@ SMOKE = Finding(
 
 
 class Unclear(NamedTuple):
-    """What one frame lacks."""
+    """Hold what one frame lacks."""
 
     eye: str = ""  # the one that is fogged: left or right
     all: str = ""  # what all eyes are: blurred or veiled
@@ -78,7 +78,7 @@ class Clarity:
 
 
 def structure(pyramid: GrayPyramid) -> F32:
-    """What is no shading, in a small picture [h, w]."""
+    """Return what is no shading, in a small picture [h, w]."""
     small = small_level(pyramid)
     found = np.empty(inner(small).shape, np.float32)
     _leave_shading_out(small, found)
@@ -117,7 +117,7 @@ def _leave_shading_out(bordered: F32, found: F32) -> None:
 
 @kernel
 def _sums(structure: F32, bordered: F32) -> Any:
-    """Of the squares of the structure, and of the picture that it was found in."""
+    """The sums of the squares of the structure, and of the picture that it was found in."""
     squares, light = np.float32(0), np.float32(0)
     for y in range(structure.shape[0]):
         for i in range(structure.shape[1]):

@@ -30,13 +30,13 @@ class ColorWatch(Debounced):
     """Looks at the left picture of every frame."""
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """What was judged before: colours hold nothing back."""
+        """Return what was judged before: colours hold nothing back."""
         self.note(evidence.pair.t_capture_ns, [EXCHANGED] if is_blue(evidence.pair.left) else [])
         return judged
 
 
 def is_blue(picture: U8) -> bool:
-    """Whether most of a picture [H, W, 3] is far bluer than red."""
+    """Tell whether most of a picture [H, W, 3] is far bluer than red."""
     step = max(1, picture.shape[1] // ACROSS)
     pixels = picture[::step, ::step].reshape(-1, 3).astype(np.int32)
     light = pixels.sum(axis=1)

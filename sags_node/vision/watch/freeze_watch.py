@@ -115,7 +115,8 @@ class FreezeWatch:
         return _Change.RECODED if _are_recoded(squares, RECODED_CELLS) else _Change.NEW
 
     def _squares(self, eyes: Eyes, others: Eyes) -> list[F32]:
-        """Of the differences of each eye, the mean in each cell [rows, columns]; 0 under known captions."""
+        """The squares of the differences of each eye, the mean in each cell [rows, columns]; 0 under known
+        captions."""
         return [self._squares_of(eye, other) for eye, other in zip(eyes, others, strict=True)]
 
     def _squares_of(self, picture: U8, other: U8) -> F32:

@@ -9,7 +9,7 @@ from sags_node.types import F32, Bool, Finding, FrameResult, RectifiedPair, Ster
 
 
 class Evidence(NamedTuple):
-    """What a frame is judged by."""
+    """Hold what a frame is judged by."""
 
     frame: StereoFrame
     pair: RectifiedPair
@@ -20,7 +20,7 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What of a frame may be used."""
+    """Hold what of a frame may be used."""
 
     hold: str = ""  # why nothing of it is taken in; empty: it is
     stage: str = "picture"  # what that is about
@@ -40,7 +40,7 @@ class Watcher(Protocol):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What is wrong, and how to fix it. May be read from any thread."""
+        """Return what is wrong, and how to fix it. May be read from any thread."""
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """What may be used of a frame: `judged`, which those that were asked before say, or less."""
+        """Return what may be used of a frame: `judged`, which those that were asked before say, or less."""

@@ -45,7 +45,7 @@ _KNOCKED = Finding(
 
 
 class _Sums(NamedTuple):
-    """Of one frame, over its matches."""
+    """The sums of one frame, over its matches."""
 
     stamp_ns: int
     matches: int
@@ -107,8 +107,8 @@ class MatchWatch(Debounced):
         return "far fewer places match than usual" if matched < LEAST_MATCHED * usual else ""
 
     def _follows_motion(self, stamp_ns: int, rows: RowErrors, knocked: bool) -> bool:
-        """Whether row errors follow the vertical motion of the last frames; where the scope may have been
-        `knocked`, whether that explains more of them than that they differ."""
+        """Tell whether row errors follow the vertical motion of the last frames; where the scope may have
+        been `knocked`, whether that explains more of them than that they differ."""
         small, sums = self._seen[-1][1], self._sums
         before = [shown for then, shown in self._seen if stamp_ns - then >= SHORTEST_STEP_NS]
         while sums:

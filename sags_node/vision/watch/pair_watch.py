@@ -89,7 +89,7 @@ class PairWatch(Debounced):
         return replace(judged, hold=hold, no_stereo=no_stereo, learn=judged.learn and learn)
 
     def _look(self, frame: StereoFrame, pair: RectifiedPair) -> list[Finding]:
-        """What is wrong in one frame."""
+        """Return what is wrong in one frame."""
         eyes = {"left": _small(frame.left)}
         if frame.right is not None:
             eyes["right"] = _small(frame.right)

@@ -30,7 +30,8 @@ class Palette:
         self._stamp_ns = 0
 
     def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
-        """Where [h, w] a small picture [h, w, 3] has colours that the tissue has far more of than usual."""
+        """Find where [h, w] a small picture [h, w, 3] has colours that the tissue has far more of than
+        usual."""
         self._colors, self._is_new = np.empty(tissue.shape, np.int64), np.zeros(tissue.shape, np.bool_)
         self._counted = tissue
         _sort_colors(cv2.blur(picture, (FINE, FINE)), self._colors)
@@ -79,7 +80,7 @@ def _sort_colors(picture: U8, colors: I64) -> None:
 
 @kernel
 def _look_up(colors: I64, of_bins: Bool, of_pixels: Bool) -> None:
-    """What is said of each pixel's colour; nothing of those without."""
+    """Return what is said of each pixel's colour; nothing of those without."""
     for y in range(colors.shape[0]):
         for x in range(colors.shape[1]):
             color = colors[y, x]

@@ -53,13 +53,13 @@ class Fit:
 
 
 def structure(gray: F32) -> F32:
-    """What of a small picture [h, w] is neither noise nor shading."""
+    """Return what of a small picture [h, w] is neither noise nor shading."""
     found: F32 = cv2.blur(gray, (FINE, FINE)) - cv2.blur(gray, (LOCAL, LOCAL))
     return found
 
 
 def _misfit(seen: F32, drawn: F32, known: Bool, fair: Bool, gain: F32) -> tuple[Bool, float]:
-    """Where pictures do not agree [h, w], and the share of what is known there."""
+    """Find where pictures do not agree [h, w], and the share of what is known there."""
     difference, wrong = np.empty(seen.shape, np.float32), np.empty(known.shape, np.bool_)
     _subtract(seen, drawn, fair, np.reciprocal(gain), difference)
     count, misfit = _judge(cv2.blur(difference, (FINE, FINE)), known, fair, wrong)
@@ -68,8 +68,8 @@ def _misfit(seen: F32, drawn: F32, known: Bool, fair: Bool, gain: F32) -> tuple[
 
 @kernel
 def _compare(seen: F32, drawn: F32, known: Bool, fair: Bool, ratios: F32, counts: I64) -> Any:
-    """Where both can be compared (`fair`), in how many pixels of each channel (`counts`), and every `SOME`
-    th of the ratios there. Returns how many channels of the model could be."""
+    """Find where both can be compared (`fair`), in how many pixels of each channel (`counts`), and every
+    `SOME` th of the ratios there. Returns how many channels of the model could be."""
     dark, bright = np.float32(DARK), np.float32(BRIGHT)
     channels = 0
     for y in range(known.shape[0]):
@@ -113,8 +113,8 @@ def _subtract(seen: F32, drawn: F32, fair: Bool, factors: F32, difference: F32) 
 
 @kernel
 def _judge(difference: F32, known: Bool, fair: Bool, wrong: Bool) -> Any:
-    """Where the residual, the mean over the channels that can be compared, is too large. Returns how many
-    pixels are known, and how many of them are wrong."""
+    """Find where the residual, the mean over the channels that can be compared, is too large. Returns how
+    many pixels are known, and how many of them are wrong."""
     count, misfit = 0, 0
     for y in range(known.shape[0]):
         for x in range(known.shape[1]):

@@ -63,7 +63,7 @@ _UNKNOWN = Finding(
 
 
 class Look(NamedTuple):
-    """What one picture is, beside the model as it was drawn last."""
+    """Hold what one picture is, beside the model as it was drawn last."""
 
     wrong: Finding | None = None  # why it cannot be followed
     veiled: bool = False  # its colours and contrast are not the scene's
@@ -99,7 +99,7 @@ class SceneWatch(Debounced):
         self._gain = self._taken_out = np.ones(3, np.float32)
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Where it is known that a frame is not to be learnt, its colours tell nothing."""
+        """Find where it is known that a frame is not to be learnt, its colours tell nothing."""
         pair, last = evidence.pair, evidence.last
         if last is None or judged.hold or evidence.is_repeat:
             return judged
@@ -151,7 +151,7 @@ class SceneWatch(Debounced):
         return grown.view(np.bool_)
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
-        """What to take out of the pictures; None: the model follows their exposure by itself."""
+        """Return what to take out of the pictures; None: the model follows their exposure by itself."""
         steady = _strength(gain / self._gain) < STEADY
         self._gain = gain
         if _strength(gain) <= LARGEST_GAIN:
@@ -164,7 +164,7 @@ class SceneWatch(Debounced):
         return self._taken_out
 
     def _lasts(self, what: str, is_so: bool, now: int) -> int:
-        """For how long it has been so, ns."""
+        """Count for how long it has been so, ns."""
         if not is_so:
             self._since.pop(what, None)
             return 0
@@ -203,7 +203,7 @@ def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
 
 
 def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> Look:
-    """What a picture is, beside the frame mapped last.
+    """Return what a picture is, beside the frame mapped last.
 
     Args:
         picture: [h, w, 3] the left one, small.
@@ -268,7 +268,7 @@ def _after_motion(
 
 
 def _around(landmarks: Landmarks, step: int, shape: tuple[int, ...]) -> Bool:
-    """Where [h, w] of a small picture tissue was found again: nothing covers it."""
+    """Find where [h, w] of a small picture tissue was found again: nothing covers it."""
     found = np.zeros(shape, np.uint8)
     columns, rows = np.rint(landmarks.after / step).astype(np.intp).T
     found[rows.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)] = 1
