@@ -15,6 +15,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.media.video import Video
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.types import U8
 from sags_node.vision.watch.color_watch import is_blue
@@ -42,7 +43,7 @@ def test_a_folder_is_told_by_check_and_run_alike(eyes: str, tmp_path: Path) -> N
     folder = recorded(tmp_path, eyes)
     said = [each for each in check_folder(folder) if "red and blue" in each.what]
     assert [each.level for each in said] == ["warning"] * (eyes == "exchanged")
-    session = open_session(folder, [*overrides_of(folder), "source.pace:=step"], guess=True)
+    session = open_session(folder, [*overrides_of(folder), "source.pace:=step"], guess=guess_rig)
     pipeline = Pipeline(session.config, session.rig)
     codes = []
     for frame in frames_of(session):
