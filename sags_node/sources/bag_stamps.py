@@ -18,6 +18,8 @@ REPEATED = 0.3  # distinct stamps of all: messages that were recorded twice or t
 FEW_PAIRS = 0.9  # of the left pictures; fewer are worth a warning
 SYNCHRONISED_MS = 5.0  # between the eyes of a pair: as live pictures are paired
 LATE_STEPS = 1.5  # from one picture to the next: one eye's way to the recorder is not so much longer
+LONG = 3.0  # usual steps between pictures, and
+OFTEN = 0.1  # of all steps: so many that long ones are no pauses
 DIFFER_FIX = (
     "set source.clocks:=two, which sets one by the other by when pictures were recorded; better, set both "
     "machines' clocks (chrony, PTP) before recording"
@@ -98,6 +100,15 @@ def judge_stamps(
         )
         fix = "depth is wrong where tissue moves: trigger both cameras together, or use genlock"
         found.append(Finding("warning", what, fix, {"skew_ms": round(skew, 2)}))
+    steps = np.diff(stamps[:, 0]) * 1e-6
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if np.count_nonzero(steps > LONG * usual) > OFTEN * len(steps):
+        what = (
+            f"stamps come in bursts, or pictures are missing: mostly {usual:.3g} ms from one to the next, "
+            f"{float(steps.mean()):.3g} ms on the average"
+        )
+        fix = "let the driver stamp each picture when it is taken, and record without losses"
+        found.append(Finding("warning", what, fix))
     counts = [len(set(pictures)) for pictures in eyes]
     if len(keys) < FEW_PAIRS * counts[0]:
         what = f"{len(keys)} pairs of {counts[0]} left and {counts[1]} right pictures"

@@ -25,6 +25,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr
 from sags_node.pipeline.session import open_session
 from sags_node.rig import save_rig
+from sags_node.sources.bag_stamps import judge_stamps
 from sags_node.sources.bags import read_rig
 from sags_node.sources.pairing import pair
 from sags_node.sources.replay import Replay
@@ -362,3 +363,18 @@ def test_one_eye_calibrated_or_nonsense_is_refused(tmp_path: Path) -> None:
         if message.__msgtype__ == files.INFO:
             message.k[:] = 0  # ROS: not calibrated
     assert read_rig(BagSource(path=files.write_rosbag2(tmp_path / "zero", rows))) is None
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "told"),
+    [
+        ([230 * (i // 3) + 5 * (i % 3) for i in range(30)], "mostly 5 ms from one to the next, 71.7 ms"),
+        ([77 * i for i in range(30)], ""),
+        ([77 * i + (5000 if i > 15 else 0) for i in range(30)], ""),  # a pause
+    ],
+)
+def test_stamps_that_come_in_bursts_are_told(stamps_ms: list[int], told: str) -> None:
+    keys = [(1_000_000 * ms, 1_000_000 * ms) for ms in stamps_ms]
+    stamps = np.array([[own, own] for _, own in keys], np.int64)
+    found = judge_stamps([(key, key) for key in keys], stamps, None, (keys, keys))
+    assert [told in finding.what for finding in found] == ([True] if told else [])
