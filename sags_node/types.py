@@ -114,7 +114,7 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Hold what a recording knows to be true of one frame. Only for measuring: the frame path never reads
+    """What a recording knows to be true of one frame. Only for measuring: the frame path never reads
     it."""
 
     depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified picture at calibration size
@@ -237,7 +237,7 @@ class MotionState:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Hold where the tissue is expected after a frame; `model.forecast` applies it."""
+    """Where the tissue is expected after a frame; `model.forecast` applies it."""
 
     state: MotionState
     frame_s: float  # s from one frame to the next
@@ -314,7 +314,7 @@ class Colours:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """Hold what consumers are shown of a view: the model with the detail of pictures, see
+    """What consumers are shown of a view: the model with the detail of pictures, see
     `sags_node.detail`."""
 
     rgb: U8  # [H, W, 3]
@@ -343,7 +343,7 @@ class RenderedView:
 
 @dataclass(frozen=True, slots=True)
 class AnchorsAhead:
-    """Hold where anchors are expected some time after a frame."""
+    """Where anchors are expected some time after a frame."""
 
     seconds: F32  # [A] after the frame; 0: not predicted
     points: F32  # [A, 3] m, world
@@ -464,7 +464,7 @@ class ClockStatus:
 
 @dataclass(frozen=True, slots=True)
 class NodeHealth:
-    """Hold what the node says of itself once a second, also when no frames come."""
+    """What the node says of itself once a second, also when no frames come."""
 
     state: str  # starting | running | held | waiting | paused | degraded | stopping
     rate_hz: float

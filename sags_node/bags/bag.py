@@ -194,7 +194,7 @@ def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
 
 
 class Channels:
-    """Hold what the messages of an MCAP file belong to."""
+    """What the messages of an MCAP file belong to."""
 
     def __init__(self) -> None:
         self.missed: list[Head] = []  # chunks that were passed over unread

@@ -52,7 +52,7 @@ class DamagedError(SagsError):
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Hold where one record is."""
+    """Where one record is."""
 
     opcode: int
     position: int  # of the head

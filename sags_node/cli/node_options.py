@@ -24,7 +24,7 @@ WHICH_NODE = {  # said once, by `sags --help`
 
 
 class NodeOption(click.Option):
-    """Hold where a node is: the help of a command names those that it takes in one line."""
+    """Where a node is: the help of a command names those that it takes in one line."""
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         taken = [each for each in ctx.command.params if isinstance(each, NodeOption)]

@@ -67,7 +67,7 @@ class Section(BaseModel):
 
 
 class ReferenceConfig(Section):
-    """Hold where a recording keeps what is known to be true. Used by `sags eval` only."""
+    """Where a recording keeps what is known to be true. Used by `sags eval` only."""
 
     depth: Path | None = Field(None, description="folder of 16-bit PNGs named by frame number")
     depth_unit: DepthUnit = Field(1e-5, description="metres per count")
@@ -78,7 +78,7 @@ class ReferenceConfig(Section):
 
 
 class RecordedSource(Section):
-    """Hold what every recording has in common."""
+    """What every recording has in common."""
 
     pace: Literal["realtime", "fast", "step"] = Field(
         "realtime",
@@ -283,7 +283,7 @@ class PhantomSource(RecordedSource):
 
 
 class LiveSource(Section):
-    """Hold what every live source has in common."""
+    """What every live source has in common."""
 
     latency_ms: float = Field(
         0.0, ge=-1000, le=1000, description="from the exposure to the stamp; taken off every stamp"
@@ -366,7 +366,7 @@ class GstSource(LiveSource):
 
 
 class SentSource(LiveSource):
-    """Hold what all live pictures have in common that another program stamps and sends."""
+    """What all live pictures have in common that another program stamps and sends."""
 
     rate: Rate = Field(30.0, description="pictures per second that each eye should come with")
     pair_tolerance_ms: Apart = Field(5.0, description="how far the stamps of a pair may lie apart")
@@ -384,7 +384,7 @@ class SentSource(LiveSource):
 
 
 class RosGraph(Section):
-    """Hold where a ROS 2 graph is; needs the extra `ros2`, and no ROS."""
+    """Where a ROS 2 graph is; needs the extra `ros2`, and no ROS."""
 
     domain: int | None = Field(
         None, ge=0, le=232, description="number of the graph; default: `$ROS_DOMAIN_ID`, else 0"
@@ -453,7 +453,7 @@ Source = Annotated[
 
 
 class RobotPoses(Section):
-    """Hold what all poses of a robot have in common."""
+    """What all poses of a robot have in common."""
 
     base: str | None = Field(None, description="frame of tf that is the world; not for topics of poses")
     hand: str | None = Field(None, description="frame of tf that carries the camera")
@@ -685,7 +685,7 @@ class VisionConfig(Section):
 
 
 class EngineConfig(Section):
-    """Hold what draws the Gaussians."""
+    """What draws the Gaussians."""
 
     threads: int | None = Field(
         None, ge=1, le=64, description="of the kernels; default: all cores of this process"

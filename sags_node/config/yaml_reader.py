@@ -79,7 +79,7 @@ def check_dialect(text: str, where: str) -> None:
 
 
 class _RefusedError(ConstructorError):
-    """Hold what PyYAML would take."""
+    """What PyYAML would take."""
 
     def __init__(self, node: yaml.Node, problem: str) -> None:
         super().__init__(None, None, problem, node.start_mark)

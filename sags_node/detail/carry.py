@@ -50,7 +50,7 @@ def coarse_camera(camera: Camera) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Hold where a view's tissue was in a source's picture: for the pixels of `coarse_camera`, and one more
+    """Where a view's tissue was in a source's picture: for the pixels of `coarse_camera`, and one more
     on each side."""
 
     places: F32  # [m + 2, n + 2, 2] u and v, px of the picture; `NOWHERE`: not in it

@@ -32,7 +32,7 @@ u8 = np.uint64
 
 @dataclass(frozen=True, slots=True)
 class Lessons:
-    """Hold what was learnt of the trust in pictures. One thread teaches; any may ask."""
+    """What was learnt of the trust in pictures. One thread teaches; any may ask."""
 
     moved: Share = field(default_factory=Share)  # of the expected motion, against none
     ahead: Share = field(default_factory=Share)  # of the picture in the next frame, against the model

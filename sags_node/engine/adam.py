@@ -72,7 +72,7 @@ def _step(
 
 @dataclass(frozen=True, slots=True)
 class AdamState:
-    """Hold what Adam remembers of a table of M rows and C columns. All zeros: a row was never touched."""
+    """What Adam remembers of a table of M rows and C columns. All zeros: a row was never touched."""
 
     moments: F32  # [M, C, 2] running means of the gradient and of its square: one stream to read, not two
     shares: F32  # [M, 2] the same of a gradient that is always 1: 1 - beta^t after t steps of the row

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """Hold what was chosen; of the CPU, why it is not a GPU and how to fix that."""
+    """What was chosen; of the CPU, why it is not a GPU and how to fix that."""
 
     kind: Literal["cpu", "cuda"]
     name: str

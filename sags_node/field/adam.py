@@ -18,7 +18,7 @@ EPS = 1e-15
 
 @dataclass(frozen=True, slots=True)
 class RowAdam:
-    """Hold what Adam remembers of a table of M rows and C columns, as `AdamState` has it."""
+    """What Adam remembers of a table of M rows and C columns, as `AdamState` has it."""
 
     moments: Tensor  # [M, C, 2]
     shares: Tensor  # [M, 2]

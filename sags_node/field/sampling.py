@@ -31,7 +31,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 
 class Places(NamedTuple):
-    """Hold where N places lie between the nodes of L levels."""
+    """Where N places lie between the nodes of L levels."""
 
     node: Tensor  # [N, L, 4] the nodes before them along x, y, z and t
     share: Tensor  # [N, L, 4] of the nodes after them, differentiable

@@ -41,7 +41,7 @@ class Disparities(NamedTuple):
 
 
 class Eyes(NamedTuple):
-    """Hold what is compared."""
+    """What is compared."""
 
     left: U8  # [H, W] gray
     right: U8  # [H, W] gray

@@ -19,7 +19,7 @@ FIRST_SECONDS = 0.1  # of its first frame, after which the rest is left to those
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
-    """Hold what one frame gets, decided when it begins."""
+    """What one frame gets, decided when it begins."""
 
     rung: Rung  # at most
     state: RungState | None  # which rung that is and why; None: there is no ladder
@@ -27,7 +27,7 @@ class FramePlan:
 
 
 class Budget(Protocol):
-    """Hold what frames get."""
+    """What frames get."""
 
     @property
     def speed(self) -> float:

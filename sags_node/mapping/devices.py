@@ -31,7 +31,7 @@ GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; se
 
 @dataclass(frozen=True, slots=True)
 class Skips:
-    """Hold what a frame may leave out. All of it, but in an ablation."""
+    """What a frame may leave out. All of it, but in an ablation."""
 
     duplicates: bool = True  # a frame equal to its predecessor is not mapped again
     depth: bool = True  # when time is short, depth is matched in some of the frames only

@@ -17,7 +17,7 @@ from sags_node.types import RungState
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """Hold what a frame gets."""
+    """What a frame gets."""
 
     gaussians: int  # at most
     scale: float = 1.0  # of the working size: at which the model is drawn and refined
@@ -65,7 +65,7 @@ GPU_RUNGS = (
 
 @dataclass(frozen=True, slots=True)
 class Prices:
-    """Hold what a frame costs on one machine, ms; only ratios count."""
+    """What a frame costs on one machine, ms; only ratios count."""
 
     every_frame: float  # what depends on nothing: the camera's pictures, watches, tracks
     depth: float  # matched once

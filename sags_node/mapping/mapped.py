@@ -25,7 +25,7 @@ SOME = slice(None, None, 8)  # rows and columns of a picture that are enough to 
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """Hold what the mapper made of one frame."""
+    """What the mapper made of one frame."""
 
     snapshot: Snapshot
     view: RenderedView  # the model drawn for the left eye

@@ -36,7 +36,7 @@ NODE_STEP_PX = 0.08
 
 
 class Kind(Enum):
-    """Hold what a frame is to the mapper."""
+    """What a frame is to the mapper."""
 
     FIRST = auto()  # there is no model yet
     ODD = auto()  # its colours are not the tissue's: the model only follows the motion

@@ -39,7 +39,7 @@ class Drawn:
 
 
 class Tracks(NamedTuple):
-    """Hold where Gaussians are found in a frame."""
+    """Where Gaussians are found in a frame."""
 
     pixels: F32  # [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now
     seconds: float  # since they were where they are in the model

@@ -38,7 +38,7 @@ class _Remembered:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Hold where an anchor seems to be.
+    """Where an anchor seems to be.
 
     Attributes:
         linear: [2, 2] px per px: how what surrounds it was turned and scaled since its patch was taken.

@@ -29,7 +29,7 @@ LARGEST_SCALE = 4 / 640  # of the width: of the residuals
 
 @dataclass(frozen=True, slots=True)
 class TissueFit:
-    """Hold where a camera is, `T_world_cam` [4, 4]."""
+    """Where a camera is, `T_world_cam` [4, 4]."""
 
     near: F64  # by how the tissue moved since the last frame
     at_rest: F64  # by where it rests; as `near` where too little of it is there

@@ -25,7 +25,7 @@ class Learnt:
 
 
 class TissueMap:
-    """Hold what the mapper refines, and what a pose is found against.
+    """What the mapper refines, and what a pose is found against.
 
     Attributes:
         model: the Gaussians, where they are now.

@@ -97,7 +97,7 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) ->
 
 
 class Complaints:
-    """Hold what decoders say, once of each kind: all pictures of a recording often have the same flaw."""
+    """What decoders say, once of each kind: all pictures of a recording often have the same flaw."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -61,7 +61,7 @@ class LostPictureError(SagsError):
 
 @dataclass(frozen=True, slots=True)
 class _Index:
-    """Hold what the packets of a file say, in ticks."""
+    """What the packets of a file say, in ticks."""
 
     count: int
     pts: I64 | None  # [count] rising; None: they do not say when pictures are shown

@@ -63,7 +63,7 @@ class Clock(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NodeAddress:
-    """Hold where a sender is: a node, an overlay, a player. A socket that is not given is in the connection
+    """Where a sender is: a node, an overlay, a player. A socket that is not given is in the connection
     file.
 
     Attributes:

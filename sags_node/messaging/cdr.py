@@ -45,7 +45,7 @@ _ros = _store.types
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """Hold what one message carries, apart from its number and its stamps."""
+    """What one message carries, apart from its number and its stamps."""
 
     type: str
     parts: tuple[Buffer, ...]

@@ -40,7 +40,7 @@ class Freezes:
         self._intervals.append(interval)
 
     def status(self) -> dict[str, float]:
-        """Give it as it stands in figures."""
+        """As it stands in figures."""
         return {"count": self.count, "seconds": round(self.seconds, 3)}
 
 

@@ -45,7 +45,7 @@ LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """Hold what is sent of a topic, once or again for those who subscribe later."""
+    """What is sent of a topic, once or again for those who subscribe later."""
 
     body: Content
     stamp_ns: int

@@ -23,7 +23,7 @@ MAX_UNIX_SOCKET_PATH = 107  # bytes, sun_path of Linux without its final zero
 
 
 class Connection(msgspec.Struct, frozen=True, kw_only=True):
-    """Hold what a client needs to reach a node."""
+    """What a client needs to reach a node."""
 
     protocol: str
     ns: str

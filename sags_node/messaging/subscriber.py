@@ -42,7 +42,7 @@ class _Status(msgspec.Struct):
 
 
 class Receiver:
-    """Hold what `Subscriber` and `AsyncSubscriber` have in common: everything but the waiting.
+    """What `Subscriber` and `AsyncSubscriber` have in common: everything but the waiting.
 
     `status` is always received too: a sender that says it is not running makes every topic stale. A node
     that is restarted is followed, to another port, too, when it was found by its connection file.

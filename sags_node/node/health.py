@@ -47,7 +47,7 @@ def why_missed(mapping: MappingConfig, rate: float | None) -> str:
 
 
 class Statistics:
-    """Hold what the last frames tell of rate, latency and cost.
+    """What the last frames tell of rate, latency and cost.
 
     Args:
         source: where they come from.

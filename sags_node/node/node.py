@@ -178,7 +178,7 @@ class Node:
 
     @property
     def config(self) -> LaunchConfig:
-        """Give it as it is now: some parameters change while the node runs."""
+        """As it is now: some parameters change while the node runs."""
         return self._state.config
 
     @property

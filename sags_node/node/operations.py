@@ -28,7 +28,7 @@ from sags_node.types import DrawnView, FrameResult
 
 @dataclass
 class NodeState:
-    """Hold what the threads of a node and its operations share."""
+    """What the threads of a node and its operations share."""
 
     config: LaunchConfig
     pipeline: Pipeline  # of the mapping thread

@@ -17,7 +17,7 @@ LENS_BLUR = 0.6  # px
 
 @dataclass(frozen=True, slots=True)
 class PrintedBoard:
-    """Hold what lies on the table."""
+    """What lies on the table."""
 
     picture: U8  # [h, w]
     origin: float  # px: where its first inner corner lies in it, along both sides

@@ -14,7 +14,7 @@ from sags_node.types import F32, I64, Bool
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """Hold what each ray [...] meets first; a ray that meets nothing has neither `tissue` nor `tool`."""
+    """What each ray [...] meets first; a ray that meets nothing has neither `tissue` nor `tool`."""
 
     distance: F32  # [...] in lengths of the ray's direction, inf = nothing
     tissue: Bool  # [...]

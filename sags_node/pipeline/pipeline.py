@@ -74,7 +74,7 @@ NOTICED_LATE = HALVING  # m, error assumed of depth from before wrong matches we
 
 @dataclass(frozen=True, slots=True)
 class FrameRequest:
-    """Hold what consumers want of one frame."""
+    """What consumers want of one frame."""
 
     waited: float = 0.0  # s since it came
     left: bool = False  # somebody looks at the left view: it gets the picture's detail

@@ -36,7 +36,7 @@ Guess = Callable[[schema.Source], StereoRig]  # from the pictures of a source
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Hold what a node needs. The source brings no truth with its frames; measuring opens its own."""
+    """What a node needs. The source brings no truth with its frames; measuring opens its own."""
 
     name: str  # of the launch file or folder
     config: LaunchConfig

@@ -43,7 +43,7 @@ class _Topic:
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """Hold what one reading of a bag found."""
+    """What one reading of a bag found."""
 
     types: dict[str, str]  # every topic
     pictures: dict[str, _Topic]

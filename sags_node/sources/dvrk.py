@@ -57,7 +57,7 @@ class _Frame(msgspec.Struct):
 
 
 class Sidecar(msgspec.Struct):
-    """Hold what is read of the file; other keys are ignored."""
+    """What is read of the file; other keys are ignored."""
 
     type: str
     video_file: str

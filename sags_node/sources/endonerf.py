@@ -33,7 +33,7 @@ NOMINAL_BASELINE = 0.005  # m; without a right picture nothing depends on it
 
 
 class Llff(NamedTuple):
-    """Hold what `poses_bounds.npy` says."""
+    """What `poses_bounds.npy` says."""
 
     width: int  # px
     height: int

@@ -25,7 +25,7 @@ class _Error(ctypes.Structure):
 
 
 class GstError(Exception):
-    """Hold what GStreamer says.
+    """What GStreamer says.
 
     Attributes:
         debug: where, for its developers.
@@ -37,7 +37,7 @@ class GstError(Exception):
 
 
 class Picture(NamedTuple):
-    """Hold what is known of a buffer."""
+    """What is known of a buffer."""
 
     pts: int  # ns, `NONE` where it has no stamp
     running: int  # ns since the pipeline's base time, `NONE` where that cannot be said
@@ -45,7 +45,7 @@ class Picture(NamedTuple):
 
 
 class Caps(NamedTuple):
-    """Hold what kind of pictures come."""
+    """What kind of pictures come."""
 
     format: str
     width: int

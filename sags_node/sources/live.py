@@ -30,7 +30,7 @@ class EndedError(Exception):
 
 
 class CaptureDevice(Protocol):
-    """Hold what delivers pictures.
+    """What delivers pictures.
 
     Attributes:
         rate: pictures per second.

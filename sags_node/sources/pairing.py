@@ -31,7 +31,7 @@ class Picture(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """Hold what a device delivers."""
+    """What a device delivers."""
 
     t_ns: int  # wall clock
     image: Samples  # [H, W, 3] RGB

@@ -216,7 +216,7 @@ def read_samples(file: Path) -> NDArray[Any]:
 
 
 def size_text(width: int, height: int) -> str:
-    """Give it as people write a picture size: 640x480."""
+    """As people write a picture size: 640x480."""
     return f"{width}x{height}"
 
 

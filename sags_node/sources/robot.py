@@ -37,7 +37,7 @@ WHOLE = 10_000_000  # samples of a bag: all
 
 
 class Robot:
-    """Hold where poses come from, from its making to `close`."""
+    """Where poses come from, from its making to `close`."""
 
     def __init__(self, config: BagRobot | PushRobot | Ros2Robot, kept: int = KEPT) -> None:
         self.track = PoseTrack(config.base, config.hand, kept)

@@ -214,7 +214,7 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
 
 
 class _CameraInfos:
-    """Hold what both eyes' cameras say of their calibration.
+    """What both eyes' cameras say of their calibration.
 
     Attributes:
         names: the topic of each eye.

@@ -28,7 +28,7 @@ WINDOW = 90  # stamps that the loss is counted over: three seconds
 
 
 class Arrivals:
-    """Hold what came of one eye's pictures, and what was lost on the way, by the gaps between stamps."""
+    """What came of one eye's pictures, and what was lost on the way, by the gaps between stamps."""
 
     def __init__(self) -> None:
         self._stamps: deque[int] = deque(maxlen=WINDOW + 1)  # with the one before

@@ -38,7 +38,7 @@ _OPTIONS = MeasureOptions(hold_out=0)
 
 @dataclass(frozen=True, slots=True)
 class Demo:
-    """Hold what a demo leaves behind."""
+    """What a demo leaves behind."""
 
     summary: dict[str, Any]  # as `sags eval`, and what the overlay subscriber counted under "overlay"
     report: Path
@@ -93,7 +93,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
 
 
 class Shown:
-    """Hold what a display showed: the camera's picture, and what the overlay drew over it. For a missed
+    """What a display showed: the camera's picture, and what the overlay drew over it. For a missed
     frame, what was there before."""
 
     def __init__(self, file: VideoFile, layers: Mapping[int, Layer]) -> None:

@@ -26,7 +26,7 @@ FARTHEST = 10.0  # m: what a session says to be beyond is no depth
 
 
 class Measured(NamedTuple):
-    """Hold what is known of one frame's depth."""
+    """What is known of one frame's depth."""
 
     depth: F32  # [H, W] m, 0 unknown
     confidence: F32  # [H, W] 0..1

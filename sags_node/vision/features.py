@@ -17,7 +17,7 @@ RATIO = 0.8  # of the distance to the second best match
 
 
 class Features(NamedTuple):
-    """Hold what can be recognised in a picture."""
+    """What can be recognised in a picture."""
 
     places: F32  # [F, 2] px
     angles: F32  # [F] degrees

@@ -26,7 +26,7 @@ TETHER = 0.7  # of the texture along rows: how firmly a patch is held to that me
 
 
 class Patches(NamedTuple):
-    """Hold where patches of the left picture lie in the right one; see `inverse_search`."""
+    """Where patches of the left picture lie in the right one; see `inverse_search`."""
 
     left: F32  # the pictures they were searched in, with their borders
     right: F32

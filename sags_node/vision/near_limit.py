@@ -31,7 +31,7 @@ PLAIN = 2.0  # grey levels, standard deviation in a window: less cannot be match
 
 
 class NearLimit:
-    """Hold where matching may end.
+    """Where matching may end.
 
     Attributes:
         limit: m, no tissue is nearer as far as is known.

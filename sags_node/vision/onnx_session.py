@@ -308,7 +308,7 @@ def has_clear_layout(tensor: Tensor) -> bool:
 
 
 def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Sequence[Tensor]:
-    """Give it as they are named, left and right eye in turn; else in the file's order."""
+    """As they are named, left and right eye in turn; else in the file's order."""
     if said.inputs is None:
         return tensors
     by_name = {tensor.name: tensor for tensor in tensors}

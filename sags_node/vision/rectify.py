@@ -15,7 +15,7 @@ from sags_node.vision.pyramid import gray_pyramid
 
 
 class _EyeMap:
-    """Hold where each working pixel of one eye lies in its raw picture. The look-up maps are made once.
+    """Where each working pixel of one eye lies in its raw picture. The look-up maps are made once.
 
     A raw picture much larger than the working one is shrunk before the look-up, so that fine texture is
     averaged instead of aliased. An eye that is rectified already needs no look-up, only a new size.

@@ -89,7 +89,7 @@ class InstrumentFinder:
 
 
 class _Memory:
-    """Hold what was found in the frame before, and for how long on doubtful grounds.
+    """What was found in the frame before, and for how long on doubtful grounds.
 
     Attributes:
         found: [h, w]

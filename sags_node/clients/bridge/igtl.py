@@ -86,7 +86,7 @@ def string(device: str, seconds: float, words: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """Hold what a peer sent."""
+    """What a peer sent."""
 
     kind: str
     device: str

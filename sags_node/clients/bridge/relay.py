@@ -56,7 +56,7 @@ class Output:
 
 
 class Outlet(Protocol):
-    """Hold what a bridge speaks to, and what most of them do; all is called from the thread of the loop."""
+    """What a bridge speaks to, and what most of them do; all is called from the thread of the loop."""
 
     def wants(self, output: Output) -> bool:
         """Tell whether any peer asks for it."""

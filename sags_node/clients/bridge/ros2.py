@@ -109,7 +109,7 @@ def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool
 
 
 def _delivery(topic: topics.Topic, max_age: float) -> Delivery:
-    """Give it as ROS users expect it: pictures and clouds as from a sensor, little things reliably."""
+    """As ROS users expect it: pictures and clouds as from a sensor, little things reliably."""
     if topic.type == topics.TF:
         return Delivery(reliable=True, depth=100, lifespan=max_age)
     if topic.type == topics.DIAGNOSTICS:

@@ -53,7 +53,7 @@ class WebOptions(ServerOptions):
 
 
 class _Said(msgspec.Struct):
-    """Hold what a peer says: which topics it wants from now on, or a request as on the control socket."""
+    """What a peer says: which topics it wants from now on, or a request as on the control socket."""
 
     subscribe: list[str] | None = None
     id: int | None = None

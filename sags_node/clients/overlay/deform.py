@@ -42,7 +42,7 @@ UNKNOWN = Anchor(np.full(3, np.nan), 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """Hold what carries the followers' ways to the vertices."""
+    """What carries the followers' ways to the vertices."""
 
     points: F64  # [k, 3] m, of the object: where the followers were pinned
     reach: float  # m, of the kernel: the distance between neighbours

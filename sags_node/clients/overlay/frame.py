@@ -39,7 +39,7 @@ TOLD = ("visibility", "confidence", "depth_confidence", "ahead")  # of an `Ancho
 
 @dataclass(frozen=True, slots=True)
 class Anchor:
-    """Hold where the node says that an anchor is."""
+    """Where the node says that an anchor is."""
 
     place: F64  # [3] m, world; NaN: lost
     visibility: float  # 0..1

@@ -21,7 +21,7 @@ _LAYER = struct.Struct("<5i")  # frame, first row and column, height and width o
 
 
 class Layers:
-    """Hold what was drawn over each frame, and nothing else. A video can be made of it when the node has
+    """What was drawn over each frame, and nothing else. A video can be made of it when the node has
     ended.
 
     Args:
@@ -54,7 +54,7 @@ class Layers:
 
 
 class Layer(NamedTuple):
-    """Hold where something was drawn over a frame."""
+    """Where something was drawn over a frame."""
 
     top: int
     left: int

@@ -38,7 +38,7 @@ class AnchorSpec(Section):
 
 
 class Registered(BaseModel):
-    """Hold what the overlay uses of what sags register found; the rest is for people."""
+    """What the overlay uses of what sags register found; the rest is for people."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     residual_p90_mm: float | None = Field(None, ge=0)

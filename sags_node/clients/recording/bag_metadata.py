@@ -20,7 +20,7 @@ class Topic:
 
 @dataclass(slots=True)
 class Part:
-    """Hold what one file of a bag holds."""
+    """What one file of a bag holds."""
 
     file: str  # name
     counts: Counter[int] = field(default_factory=Counter)  # messages of each topic, by its number

@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Hold where a file of the bag ends and the next one begins; 0: never.
+    """Where a file of the bag ends and the next one begins; 0: never.
 
     Attributes:
         bytes: of messages in one file; its index comes on top. A larger message has its own file.

@@ -41,7 +41,7 @@ Tell = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True, slots=True)
 class RecordOptions:
-    """Hold what to record, and how.
+    """What to record, and how.
 
     Attributes:
         topics: with or without the namespace; empty: all.

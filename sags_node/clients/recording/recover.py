@@ -29,7 +29,7 @@ from sags_node.files import open_file
 
 @dataclass(slots=True)
 class Recovery:
-    """Hold what became of the files. `lost` is False only where nothing can be missing."""
+    """What became of the files. `lost` is False only where nothing can be missing."""
 
     messages: int = 0
     chunks: int = 0  # whole ones

@@ -39,7 +39,7 @@ Verdict = Literal["good", "doubtful", "refused"]
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Hold where the model lies. Lengths in m; None: it was not come to."""
+    """Where the model lies. Lengths in m; None: it was not come to."""
 
     verdict: Verdict
     reason: str = ""  # and its remedy; empty: it is good

@@ -63,7 +63,7 @@ class Rung(msgspec.Struct, frozen=True):
 
 
 class Status(msgspec.Struct, frozen=True):
-    """Hold what the node says of itself, as far as it is shown."""
+    """What the node says of itself, as far as it is shown."""
 
     state: str = ""  # "" before it has said anything
     rate_hz: float = 0.0

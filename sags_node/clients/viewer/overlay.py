@@ -28,7 +28,7 @@ class Thing(msgspec.Struct, frozen=True):
 
 
 class Overlay(msgspec.Struct, frozen=True):
-    """Hold what the overlay says of itself, see docs/wire.md."""
+    """What the overlay says of itself, see docs/wire.md."""
 
     state: str = ""
     reason: str | None = None  # why it is blank

@@ -126,7 +126,7 @@ def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
 
 
 def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
-    """Give it as it is, then all that users get wrong; of two that fit alike the first is meant."""
+    """As it is, then all that users get wrong; of two that fit alike the first is meant."""
     rows = rectified_rows(rig, matches)
     exchanged = rectified_rows(StereoRig(rig.name, rig.right, rig.left), matches)
     exchanged_files = Reading(

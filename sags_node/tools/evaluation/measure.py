@@ -47,7 +47,7 @@ OnPicture = Callable[[int, U8], None]  # a frame's number and its rectified left
 
 @dataclass(frozen=True, slots=True)
 class MeasureOptions:
-    """Hold what to measure, and what the run must leave out for it.
+    """What to measure, and what the run must leave out for it.
 
     Raises:
         UsageError: a count is out of range, or there is no file of weights.
@@ -112,7 +112,7 @@ class _Mapped:
     lent: SeenFrame  # as views have its detail
 
     def seen(self, weight: float) -> Seen:
-        """Give it as a part of the mean of several, with a share of `weight`."""
+        """As a part of the mean of several, with a share of `weight`."""
         snapshot = self.shown.snapshot
         return Seen(snapshot.gaussians, snapshot.camera, self.recorded.truth, self.shown.tissue, weight)
 
@@ -279,7 +279,7 @@ class Measurer:
         return replace(given, T_world_cam=world @ given.T_world_cam)
 
     def _learn(self, now: _Mapped) -> None:
-        """Give it as a node that draws views learns from a frame."""
+        """As a node that draws views learns from a frame."""
         if self._detail is None or len(self.rows) % LESSON_EVERY:
             return
         right = now.recorded.pair.right

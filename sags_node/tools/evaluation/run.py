@@ -30,7 +30,7 @@ _MAPPED = "mapped"
 
 @dataclass(frozen=True, slots=True)
 class RunFacts:
-    """Hold what the run itself says of one processed frame."""
+    """What the run itself says of one processed frame."""
 
     t_shown_ns: int  # when its result was done or published; monotonic clock
     frame_ms: float | None  # wall time of all stages; None: the node alone knows
@@ -47,7 +47,7 @@ class RunFacts:
 
 @dataclass(frozen=True, slots=True)
 class ShownFrame:
-    """Hold what consumers got of one frame."""
+    """What consumers got of one frame."""
 
     facts: RunFacts
     rgb: U8  # [H, W, 3] the left view, drawn after this frame's update

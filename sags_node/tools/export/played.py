@@ -36,7 +36,7 @@ class Product(Protocol):
 
 
 class Kind(NamedTuple):
-    """Hold what makes a product at a path, from frames of a rate (1/s) and size (px)."""
+    """What makes a product at a path, from frames of a rate (1/s) and size (px)."""
 
     make: Callable[[Path, float, tuple[int, int]], Product]
     is_folder: bool = False

@@ -27,7 +27,7 @@ MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # of these weights: dep
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """Hold what an output of 1 of the decoder is. A step of Adam has a fixed length in these, so they say how
+    """What an output of 1 of the decoder is. A step of Adam has a fixed length in these, so they say how
     fast each part is learnt, and how restless it is. 0: that part is not deformed."""
 
     mean: float = 0.01  # m

@@ -182,7 +182,7 @@ def follow_online(
 
 
 class _Places:
-    """Hold where each Gaussian lay in the first frame. One that appears later is carried back there by the
+    """Where each Gaussian lay in the first frame. One that appears later is carried back there by the
     displacement of those around it."""
 
     def __init__(self) -> None:

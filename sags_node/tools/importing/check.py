@@ -82,7 +82,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
 
 
 def _quoted(word: Path | str) -> str:
-    """Give it as a shell takes it; brackets stay, as no file is named like the lists in which they stand."""
+    """As a shell takes it; brackets stay, as no file is named like the lists in which they stand."""
     return shlex.quote(str(word)) if shlex.quote(re.sub(r"[\[\]]", "", str(word)))[0] == "'" else str(word)
 
 

@@ -34,7 +34,7 @@ DEPTHS = ("depth", "depths", "depth01", "depth_mm_x100")
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """Hold what was found; None: it is not there."""
+    """What was found; None: it is not there."""
 
     what: str
     instead: str = ""  # what to do where it is not played as it is

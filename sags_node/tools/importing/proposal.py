@@ -28,7 +28,7 @@ WHOLE = "source.geometry.layout:=over_under"  # takes any picture apart so that 
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """Hold what a launch file should say, and why."""
+    """What a launch file should say, and why."""
 
     launch: list[str]  # key:=value
     findings: list[Finding]

@@ -33,7 +33,7 @@ SMOKE = Finding(
 
 
 class Unclear(NamedTuple):
-    """Hold what one frame lacks."""
+    """What one frame lacks."""
 
     eye: str = ""  # the one that is fogged: left or right
     all: str = ""  # what all eyes are: blurred or veiled

@@ -9,7 +9,7 @@ from sags_node.types import F32, Bool, Finding, FrameResult, RectifiedPair, Ster
 
 
 class Evidence(NamedTuple):
-    """Hold what a frame is judged by."""
+    """What a frame is judged by."""
 
     frame: StereoFrame
     pair: RectifiedPair
@@ -20,7 +20,7 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Hold what of a frame may be used."""
+    """What of a frame may be used."""
 
     hold: str = ""  # why nothing of it is taken in; empty: it is
     stage: str = "picture"  # what that is about

@@ -63,7 +63,7 @@ _UNKNOWN = Finding(
 
 
 class Look(NamedTuple):
-    """Hold what one picture is, beside the model as it was drawn last."""
+    """What one picture is, beside the model as it was drawn last."""
 
     wrong: Finding | None = None  # why it cannot be followed
     veiled: bool = False  # its colours and contrast are not the scene's

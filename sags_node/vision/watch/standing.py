@@ -13,7 +13,7 @@ FEWEST = 2  # frames
 
 
 class Debounced:
-    """Hold what watchers have in common: the findings of the last frames, and those of them that last.
+    """What watchers have in common: the findings of the last frames, and those of them that last.
 
     Attributes:
         findings: those that stand. May be read from any thread.
