@@ -10,6 +10,7 @@ is looked up for each pixel (`carry`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -19,7 +20,7 @@ from numba import prange
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.geometry import resized_camera, scale_intrinsics
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only
-from sags_node.types import F32, U8, U32, Camera
+from sags_node.types import F32, I32, U8, Camera
 
 EVERY = 4  # px of the view
 EVERYWHERE = np.ones((1, 1), np.uint8)
@@ -31,11 +32,9 @@ LEAST_KNOWN = 0.5  # of them, to fill it
 COVERED = 0.3  # by Gaussians whose motion is known
 NOWHERE = -1e6  # px
 FINDINGS = 3  # of a ray's place in the source, each from where the last one met its surface
+CLOSE = 1e-3  # of the depth: nearer to that surface it is found
 LITTLE = 3.0  # px of motion from one frame to the next: depths at edges differ by more than SAME all the same
-ONE, HALF = 1 << 16, 1 << 15
-TISSUE = np.uint32(0xFF000000)
-_LANES = np.uint64(0x00FF00FF00FF00FF)
-_ROUND = np.uint64(0x0080008000800080)
+BAND = 16  # places, one below the other
 _STILL = np.zeros((4, 1, 1), np.float32)
 f4 = np.float32
 u8 = np.uint64
@@ -156,11 +155,11 @@ def _trace_row(
             across, down = (u + f4(0.5)) / wide, (v + f4(0.5)) / high
             row = min(max(np.int64(down * f4(rows)), 0), rows - 1)
             column = min(max(np.int64(across * f4(columns)), 0), columns - 1)
-            was = source_depth[row, column]
-            surface = _between(source_depth, across, down)
-            if was == f4(0) or not abs(surface - c) < f4(SAME) * c:
+            was = source_depth[u8(row), u8(column)]
+            off = _between(source_depth, across, down) - c
+            if was == f4(0) or not f4(CLOSE) * c < abs(off) < f4(SAME) * c:
                 break
-            z += surface - c  # the source knows its surface finer: look again where the ray meets that
+            z += off  # the source knows its surface finer: look again where the ray meets that
         if not near:
             u = v = f4(NOWHERE)
         elif (unmoved and lag < f4(LITTLE)) or was == f4(0) or abs(was - c) < f4(SAME) * c:
@@ -178,124 +177,80 @@ def _between(tiles: F32, across: Any, down: Any) -> Any:
     y = min(max(down * f4(rows) - f4(0.5), f4(0)), f4(rows - 1))
     i, j = np.int64(y), np.int64(x)
     s, t, k, n = x - f4(j), y - f4(i), min(i + 1, rows - 1), min(j + 1, columns - 1)
-    above = tiles[i, j] + s * (tiles[i, n] - tiles[i, j])
-    return above + t * (tiles[k, j] + s * (tiles[k, n] - tiles[k, j]) - above)
+    a, b, c, d = tiles[u8(i), u8(j)], tiles[u8(i), u8(n)], tiles[u8(k), u8(j)], tiles[u8(k), u8(n)]
+    above = a + s * (b - a)
+    return above + t * (c + s * (d - c) - above)
 
 
 def carry(
     shown: U8, taken: U8, traced: Trace, lent: U8, gain: F32 = NO_GAIN, tint: F32 | None = None
 ) -> None:
-    """Blend the picture of a source into a view.
+    """Blend the picture of a source into a view, where all that a pixel is made of shows tissue.
 
     Args:
         shown: [H, W, 3] RGB of the view; written.
         taken: [H, W] the share that each pixel got, 0..255; written. Pixels that have one already stay.
         lent: [H', W', 4] of `SeenFrame.lent`.
         gain: [3] factor that brings the source's light to that of the view.
-        tint: [m, n, 3] for the coarse camera: added to what is carried, in the place of colours 0..1.
+        tint: [m, n, 3] for the coarse camera: added to the picture, in the place of colours 0..1.
     """
-    pixels, more = lent.view(np.uint32)[..., 0], np.zeros((*traced.share.shape, 3), f4)
-    if tint is not None:
-        more += np.pad(tint, ((1, 1), (1, 1), (0, 0)), mode="edge") * f4(255)
-    lit = tint is not None or bool((gain != 1).any())
-    _carry(
-        shown, taken, read_only(traced.places), read_only(traced.share), read_only(pixels), lit, gain,
-        read_only(more),
-    )  # fmt: skip
+    more = None if tint is None else np.pad(tint * f4(255), ((1, 1), (1, 1), (0, 1)), mode="edge")
+    # The boxes around what is to be carried, band by band: one around all of it would hold much that is not.
+    for begin in range(0, len(traced.share), BAND):
+        column, row, columns, rows = cv2.boundingRect(traced.share[begin : begin + BAND])
+        if not columns:
+            continue
+        top, left = max(EVERY * (begin + row - 2), 0), max(EVERY * (column - 2), 0)  # px that they reach
+        free = taken[top : EVERY * (begin + row + rows), left : EVERY * (column + columns)]
+        by_pixel = partial(_by_pixel, top=top, left=left, size=free.shape)
+        found = cv2.remap(lent, by_pixel(traced.places), None, cv2.INTER_LINEAR)  # outside: black, no tissue
+        if more is not None:
+            found = cv2.add(found, by_pixel(more), dtype=cv2.CV_8U)
+        tissue = cv2.compare(cv2.extractChannel(found, 3), 255, cv2.CMP_EQ)
+        share = cv2.bitwise_and(by_pixel(traced.share), cv2.compare(free, 0, cv2.CMP_EQ), mask=tissue)
+        paste(cv2.cvtColor(found, cv2.COLOR_RGBA2RGB), share, shown[top:], left, gain)
+        cv2.max(free, share, dst=free)
+
+
+def _by_pixel(coarse: Any, top: int, left: int, size: tuple[int, int]) -> Any:
+    """A box of the view from a map [m + 2, n + 2, ...]: on straight lines between the pixels of its coarse
+    camera, and one more on each side.
+
+    Args:
+        top, left: px of the view, where a coarse pixel begins.
+        size: rows and columns, px.
+    """
+    (height, width), row, column = size, top // EVERY, left // EVERY
+    around = coarse[row : row - (-height // EVERY) + 2, column : column - (-width // EVERY) + 2]
+    fine = cv2.resize(around, None, fx=EVERY, fy=EVERY, interpolation=cv2.INTER_LINEAR)
+    return fine[EVERY : EVERY + height, EVERY : EVERY + width]
+
+
+def paste(picture: U8, share: U8, shown: U8, left: int = 0, gain: F32 = NO_GAIN) -> None:
+    """Blend the `share` [H, W] 0..255 of a picture [H, W, 3] into one that is as large or larger.
+
+    Args:
+        shown: written, in the first rows from column `left` on.
+        gain: [3] factor of the picture's colours, at most 100.
+    """
+    _paste(read_only(picture), read_only(share), shown, left, np.rint(256 * gain).astype(np.int32))
 
 
 @parallel_kernel
-def _carry(shown: U8, taken: U8, places: F32, share: U8, lent: U32, lit: Any, gain: F32, more: F32) -> None:
-    for row in prange(len(taken)):
+def _paste(picture: U8, share: U8, shown: U8, left: Any, gain: I32) -> None:
+    for row in prange(len(picture)):
         y = np.int64(row)
-        _carry_row(y, shown[y].reshape(-1), taken[y], places, share, lent, lit, gain, more)
+        _paste_row(picture[y].reshape(-1), share[y], shown[y].reshape(-1)[3 * left :], gain)
 
 
 @kernel
-def _carry_row(
-    y: Any, shown: U8, taken: U8, places: F32, share: U8, lent: U32, lit: Any, gain: F32, more: F32
-) -> None:
-    width, few = len(taken), share.shape[1]
-    high, wide = lent.shape
-    pixels = lent.reshape(-1)
-    above = (y + 2) // EVERY
-    part = f4(y - EVERY * above + 2.5) * f4(1 / EVERY)
-    line = np.empty((6, few), f4)
-    for n in range(few):
-        line[0, n] = f4(share[above, n]) + part * (f4(share[above + 1, n]) - f4(share[above, n]))
-        for k in range(2):
-            line[1 + k, n] = places[above, n, k] + part * (places[above + 1, n, k] - places[above, n, k])
-        if lit:
-            for k in range(3):
-                line[3 + k, n] = more[above, n, k] + part * (more[above + 1, n, k] - more[above, n, k])
-    for j in range(few - 1):
-        if line[0, j] <= f4(0) and line[0, j + 1] <= f4(0):
-            continue
-        begin, end = max(EVERY * j - 2, 0), min(EVERY * j + 2, width)
-        t = f4(begin - EVERY * j + 2.5) * f4(1 / EVERY)
-        # In steps of 1/65536 px, so that a pixel costs additions only.
-        u, slope_u = _steps(line[1, j], line[1, j + 1], t)
-        v, slope_v = _steps(line[2, j], line[2, j + 1], t)
-        w, slope_w = _steps(line[0, j], line[0, j + 1], t)
-        for i in range(begin, end):
-            x = u8(i)
-            if (
-                taken[x] == np.uint8(0) and w >= ONE
-                and u > -HALF and v > -HALF and u < wide * ONE - HALF and v < high * ONE - HALF
-            ):  # fmt: skip
-                across, down = min(max(u, 0), (wide - 1) * ONE), min(max(v, 0), (high - 1) * ONE)
-                left, top = min(across >> 16, wide - 2), min(down >> 16, high - 2)
-                s, r = u8((across - left * ONE + 128) >> 8), u8((down - top * ONE + 128) >> 8)
-                at = u8(top * wide + left)
-                a, b, c, d = pixels[at], pixels[at + u8(1)], pixels[at + u8(wide)], pixels[at + u8(wide + 1)]
-                nearest = (b if s > u8(128) else a) if r <= u8(128) else (d if s > u8(128) else c)
-                if nearest >= TISSUE:
-                    # Weights of 256 in all, so that there is one rounding.
-                    last = (s * r + u8(128)) >> u8(8)
-                    first = u8(256) - s - r + last
-                    there = (
-                        _lanes(a) * first + _lanes(b) * (s - last) + _lanes(c) * (r - last) + _lanes(d) * last
-                    )
-                    there = ((there + _ROUND) >> u8(8)) & _LANES
-                    if lit:
-                        t = f4(i - EVERY * j + 2.5) * f4(1 / EVERY)
-                        red = _lit(there, u8(0), gain[0], line[3, j], line[3, j + 1], t)
-                        green = _lit(there, u8(32), gain[1], line[4, j], line[4, j + 1], t)
-                        blue = _lit(there, u8(16), gain[2], line[5, j], line[5, j + 1], t)
-                        there = red | blue << u8(16) | green << u8(32)
-                    own = u8(w >> 16)
-                    taken[x] = np.uint8(own)
-                    to = u8(3) * x
-                    drawn = u8(shown[to]) | u8(shown[to + u8(1)]) << u8(32) | u8(shown[to + u8(2)]) << u8(16)
-                    drawn = _mix(drawn, there, own + (own >> u8(7)))  # 255 of 255 is 256 of 256
-                    shown[to] = np.uint8(drawn & u8(255))
-                    shown[to + u8(1)] = np.uint8((drawn >> u8(32)) & u8(255))
-                    shown[to + u8(2)] = np.uint8((drawn >> u8(16)) & u8(255))
-            u, v, w = u + slope_u, v + slope_v, w + slope_w
-
-
-@inlined
-def _steps(first: Any, second: Any, t: Any) -> Any:
-    """The value at t between two places, and its slope by pixel, in steps of 1/65536."""
-    slope = second - first
-    return np.int64((first + t * slope) * f4(ONE)), np.int64(slope * f4(ONE / EVERY))
-
-
-@inlined
-def _lanes(pixel: Any) -> Any:
-    """Four bytes in 16 bits each: red, blue, green, tissue. One multiplication weighs all of them."""
-    wide = u8(pixel)
-    return (wide | wide << u8(24)) & _LANES
-
-
-@inlined
-def _mix(first: Any, second: Any, part: Any) -> Any:
-    """`part` 0..256 of the second, the rest of the first, in all lanes."""
-    return ((first * (u8(256) - part) + second * part + _ROUND) >> u8(8)) & _LANES
-
-
-@inlined
-def _lit(pixel: Any, lane: Any, gain: Any, first: Any, second: Any, t: Any) -> Any:
-    """A colour 0..255 in other light."""
-    level = f4(np.int64((pixel >> lane) & u8(255))) * gain + first + t * (second - first)
-    return u8(np.int64(min(max(level, f4(0)), f4(255)) + f4(0.5)))
+def _paste_row(picture: U8, share: U8, shown: U8, gain: I32) -> None:
+    half, eight = np.int32(128), np.int32(8)
+    for x in range(u8(len(share))):
+        part = np.int32(share[x])
+        part += part >> np.int32(7)  # 255 of 255 is 256 of 256
+        for c in range(u8(3)):
+            at = u8(3) * x + c
+            level = min((np.int32(picture[at]) * gain[c] + half) >> eight, np.int32(255))
+            was = np.int32(shown[at])
+            shown[at] = np.uint8(was + (((level - was) * part + half) >> eight))

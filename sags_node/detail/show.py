@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numba import prange
 
-from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
+from sags_node.detail.carry import carry, coarse_camera, every_fourth, paste, trace
 from sags_node.detail.memory import hidden_source
 from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.share import Share
 from sags_node.engine.rasterizer.views import to_view
-from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.model.gaussians import for_right_eye
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
@@ -27,7 +25,6 @@ AROUND = np.ones((5, 5), np.uint8)  # px of the working size: what is seen there
 UNSURE = 0.2  # of the way that hidden tissue has moved: so much of it nobody saw
 ANOTHER_EYE = 0.5  # of what the right eye taught: it has a light of its own, which no other view has
 f4 = np.float32
-u8 = np.uint64
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,21 +59,21 @@ class Detail:
         rgb, size = drawn.copy(), (camera.width, camera.height)
         hidden = cv2.dilate(1 - now.tissue, AROUND)
         taken = np.asarray(cv2.resize(255 - 255 * hidden, size, interpolation=cv2.INTER_NEAREST))
-        oldest = self._from_memory(rgb, taken, depth, camera, now, older)
+        oldest = self._from_memory(rgb, taken, hidden, depth, camera, now, older)
         seen = cv2.blur(now.sure_tissue * np.uint8(255), (5, 5))  # seams over five pixels
         seen = cv2.resize(seen, size, interpolation=cv2.INTER_LINEAR)
-        _paste(now.picture(), read_only(seen), rgb)
+        paste(now.picture(), seen, rgb)
         return Shown(rgb, np.maximum(taken, seen), oldest)
 
     def _from_memory(
-        self, rgb: U8, taken: U8, depth: F32, camera: Camera, now: SeenFrame, older: Sequence[SeenFrame]
-    ) -> int:
-        """Carry what an older frame saw to where nothing is taken yet; returns when that was, or now."""
+        self, rgb: U8, taken: U8, hidden: U8, depth: F32, camera: Camera, now: SeenFrame,
+        older: Sequence[SeenFrame],
+    ) -> int:  # fmt: skip
+        """Carry what an older frame saw to where nothing is taken yet, which lies in `hidden` [h, w]; returns
+        when that was, or now."""
         now_ns = now.t_capture_ns
         small = coarse_camera(camera)
-        free = cv2.resize(
-            cv2.compare(taken, 0, cv2.CMP_EQ), (small.width, small.height), interpolation=cv2.INTER_AREA
-        )
+        free = cv2.resize(255 * hidden, (small.width, small.height), interpolation=cv2.INTER_AREA)
         if not len(older) or not free.any():
             return now_ns
         wanted = cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3])  # pixels lie between two places
@@ -236,21 +233,3 @@ def _in_light_of(drawn: U8, picture: U8, where: Bool) -> U8:
     gain = (spread * (shown - shown.mean(0))).sum(0) / np.maximum((spread * spread).sum(0), f4(1))
     alike = (picture - seen.mean(0)) * gain + shown.mean(0) + f4(0.5)
     return np.asarray(np.clip(alike, 0, 255).astype(np.uint8))
-
-
-@parallel_kernel
-def _paste(picture: U8, share: U8, shown: U8) -> None:
-    """Blends the `share` [H, W] 0..255 of a picture [H, W, 3] into another."""
-    for row in prange(len(picture)):
-        y = np.int64(row)
-        _paste_row(picture[y].reshape(-1), share[y], shown[y].reshape(-1))
-
-
-@kernel
-def _paste_row(picture: U8, share: U8, shown: U8) -> None:
-    for x in range(u8(len(share))):
-        part = f4(share[x]) * f4(1 / 255)
-        for c in range(u8(3)):
-            at = u8(3) * x + c
-            was = f4(shown[at])
-            shown[at] = np.uint8(np.int32(was + part * (f4(picture[at]) - was) + f4(0.5)))

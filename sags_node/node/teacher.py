@@ -22,35 +22,38 @@ class Teacher:
     def __init__(self) -> None:
         self._detail = Detail(Lessons())
         self._before: tuple[Snapshot, SeenFrame] | None = None
+        self._now: tuple[Snapshot, SeenFrame] | None = None
         self._whole: SeenFrame | None = None  # with its left view, where nobody else looks at that
         self._step = 0.0  # s between the last two scenes
-        self._scenes = 0
+        self._ahead = self._aside = 0  # views of either kind that were drawn
 
-    def take(self, scene: FrameResult, now: SeenFrame, ahead: bool, aside: bool) -> None:
-        """Learn from a new scene what views of it, and those before it, are worth.
-
-        Args:
-            ahead: somebody wants views of later moments.
-            aside: somebody wants views from elsewhere than the left eye.
-        """
-        before, self._before = self._before, (scene.snapshot, now)
-        self._scenes += 1
-        if before is not None:
-            snapshot, seen = before
-            seconds = (now.t_capture_ns - seen.t_capture_ns) * 1e-9
+    def take(self, scene: FrameResult, now: SeenFrame) -> None:
+        """Remember a scene: the next one tells what views of it, ahead of it, were worth."""
+        self._before, self._now = self._now, (scene.snapshot, now)
+        if self._before is not None:
+            seconds = (now.t_capture_ns - self._before[1].t_capture_ns) * 1e-9
             self._step = seconds if seconds > 0 else self._step
-            due = ahead and self._scenes % LESSON_EVERY == 0
-            if due and 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
-                self._detail.learn_ahead(seen, gaussians_ahead(snapshot, seconds), now)
+
+    def _learn_ahead(self, now: SeenFrame) -> None:
+        self._ahead += 1
+        if self._before is None or self._ahead % LESSON_EVERY:
+            return
+        snapshot, seen = self._before
+        seconds = (now.t_capture_ns - seen.t_capture_ns) * 1e-9
+        if 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
+            self._detail.learn_ahead(seen, gaussians_ahead(snapshot, seconds), now)
+
+    def _learn_aside(self, scene: FrameResult, now: SeenFrame) -> None:
+        self._aside += 1
         pair = scene.pair
-        if aside and pair.right is not None and self._scenes % LESSON_EVERY == 2:
+        if pair.right is not None and self._aside % LESSON_EVERY == 0:
             self._detail.learn_aside(now, scene.snapshot, published.picture(pair, "right"), pair.baseline)
 
     def detail(
         self, scene: FrameResult, seen: Sequence[SeenFrame], gaussians: Gaussians, view: RenderedView,
         ahead: float, right: bool,
     ) -> Shown:  # fmt: skip
-        """Return what is shown of a view.
+        """Return what is shown of a view. Every few of its kind, learn first how far to trust it.
 
         Args:
             seen: the scene's frame, and older ones.
@@ -58,6 +61,10 @@ class Teacher:
             right: it has the colours that the right eye sees.
         """
         now, *older = seen
+        if ahead > 0:
+            self._learn_ahead(now)
+        if not np.array_equal(view.camera.T_world_cam, now.camera.T_world_cam):
+            self._learn_aside(scene, now)
         if now.whole is None:
             if self._whole is None or self._whole.t_capture_ns != now.t_capture_ns:
                 left, camera = scene.views["left"], published.camera_of(scene.pair)

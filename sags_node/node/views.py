@@ -145,10 +145,7 @@ class Views:
         """
         self._watched = watched
         if self._teacher is not None and seen:
-            asked = [view.request for name, view in self._views.items() if name in watched]
-            self._teacher.take(
-                scene, seen[0], ahead=any(one.ahead_ms for one in asked), aside=any(map(is_aside, asked))
-            )
+            self._teacher.take(scene, seen[0])
         for name, view in sorted(self._views.items(), key=lambda item: item[1].due):
             if view.finished or (view.cost > 0 and name not in watched):
                 continue
@@ -257,11 +254,6 @@ def _published(scene: FrameResult, camera: Camera) -> RenderedView | None:
     ):
         return None
     return published.view(scene.pair, shown)
-
-
-def is_aside(request: ViewRequest) -> bool:
-    """Tell whether a view is asked for that the left eye does not have."""
-    return request.stereo or not np.array_equal(request.pose(), np.eye(4))
 
 
 def view_camera(request: ViewRequest, left: Camera) -> Camera:
