@@ -203,10 +203,13 @@ def carry(
         top, left = max(EVERY * (begin + row - 2), 0), max(EVERY * (column - 2), 0)  # px that they reach
         free = taken[top : EVERY * (begin + row + rows), left : EVERY * (column + columns)]
         by_pixel = partial(_by_pixel, top=top, left=left, size=free.shape)
-        found = cv2.remap(lent, by_pixel(traced.places), None, cv2.INTER_LINEAR)  # outside: black, no tissue
+        places = by_pixel(traced.places)
+        found = cv2.remap(lent, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         if more is not None:
             found = cv2.add(found, by_pixel(more), dtype=cv2.CV_8U)
         tissue = cv2.compare(cv2.extractChannel(found, 3), 255, cv2.CMP_EQ)
+        inside = cv2.inRange(places, (-0.5, -0.5), (lent.shape[1] - 0.5, lent.shape[0] - 0.5))
+        tissue = cv2.bitwise_and(tissue, inside)
         share = cv2.bitwise_and(by_pixel(traced.share), cv2.compare(free, 0, cv2.CMP_EQ), mask=tissue)
         paste(cv2.cvtColor(found, cv2.COLOR_RGBA2RGB), share, shown[top:], left, gain)
         cv2.max(free, share, dst=free)

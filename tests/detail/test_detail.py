@@ -56,9 +56,10 @@ def twin(shown: U8, depth: F32, camera: Camera, source: SeenFrame, share: float)
             there = source.camera.K @ (source.camera.viewmat @ point)[:3]
             u, v = there[:2] / there[2]
             u, v = np.round(u, 6), np.round(v, 6)
-            if not (0 <= u <= WIDTH - 1 and 0 <= v <= HEIGHT - 1):
+            if not (-0.5 < u < WIDTH - 0.5 and -0.5 < v < HEIGHT - 0.5):
                 continue
             cell = min(int(v + 0.5), HEIGHT - 1), min(int(u + 0.5), WIDTH - 1)
+            u, v = np.clip(u, 0, WIDTH - 1), np.clip(v, 0, HEIGHT - 1)
             left, top = min(int(u), WIDTH - 2), min(int(v), HEIGHT - 2)
             tissue = source.mask[top : top + 1 + (v > top), left : left + 1 + (u > left)].all()
             if not (abs(source.depth[cell] - there[2]) < SAME * there[2] and tissue):
