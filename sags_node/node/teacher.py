@@ -36,7 +36,7 @@ class Teacher:
 
     def _learn_ahead(self, now: SeenFrame) -> None:
         self._ahead += 1
-        if self._before is None or self._ahead % LESSON_EVERY:
+        if self._before is None or self._ahead % LESSON_EVERY != 1:
             return
         snapshot, seen = self._before
         seconds = (now.t_capture_ns - seen.t_capture_ns) * 1e-9
@@ -46,7 +46,7 @@ class Teacher:
     def _learn_aside(self, scene: FrameResult, now: SeenFrame) -> None:
         self._aside += 1
         pair = scene.pair
-        if pair.right is not None and self._aside % LESSON_EVERY == 0:
+        if pair.right is not None and self._aside % LESSON_EVERY == 1:
             self._detail.learn_aside(now, scene.snapshot, published.picture(pair, "right"), pair.baseline)
 
     def detail(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +14,12 @@ from sags_node.detail.memory import EVERY, MATCHED, MOST, OLDEST, Matched, Memor
 from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.detail.share import Share
+from sags_node.detail.show import Detail
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
+from sags_node.messaging.requests import ViewRequest
+from sags_node.node.allowance import Allowance
+from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.quality import metrics
@@ -22,6 +27,7 @@ from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
 from sags_node.types import F32, U8, Camera, Gaussians, Shown
 
+MOVED = ((1.0, 0.0, 0.0, 0.005), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # m, right
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 CAMERA = Camera(
     WIDTH, HEIGHT, np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]]), np.eye(4)
@@ -268,6 +274,24 @@ def test_what_is_seen_is_the_picture_and_what_is_hidden_comes_from_before() -> N
     far[90:160, 110:190] = False
     agree = (view.shown.rgb == truth).all(-1)[far]
     assert agree.mean() > 0.9  # the rest lies at seams
+
+
+def test_lessons_cost_nothing_until_a_view_that_needs_them_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    learnt = []
+    for kind in ("learn_ahead", "learn_aside"):
+        monkeypatch.setattr(Detail, kind, lambda *_, kind=kind: learnt.append(kind))
+    session = open_session(SESSION, ["source.pace:=step", "source.frames:=12", "mapping.max_gaussians:=3000"])
+    seconds = itertools.count()
+    pipeline = Pipeline(session.config, session.rig)
+    views = Views(Allowance(), clock=lambda: float(next(seconds)), detail=True)
+    with session.source as source:
+        for number, frame in enumerate(source):
+            scene = pipeline.process(frame, StepBudget(1), FrameRequest())
+            if number == 6:
+                views.open(ViewRequest("aside", fov=60, T_left_cam=MOVED), None)
+            drawn = dict(views.draw_due(scene, {"aside"}, pipeline.seen))
+            assert bool(drawn) == bool(learnt) == (number >= 6)
+    assert set(learnt) == {"learn_aside"}  # nobody looked ahead
 
 
 def test_measuring_tells_detail_from_the_model_alone() -> None:
