@@ -22,7 +22,7 @@ from sags_node.errors import UsageError
 from sags_node.geometry import invert, transform
 from sags_node.messaging.received import Frame, ReceivedCameraInfo, ReceivedCloud, ReceivedRos, TopicName
 from sags_node.messaging.wire import WireError
-from sags_node.types import F64, Bool
+from sags_node.types import F64, AnchorStates, Bool, Camera
 
 ANCHORS = TopicName("anchors", ReceivedCloud)
 POSE = TopicName("tf", ReceivedRos)
@@ -94,23 +94,40 @@ def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measure
     Raises:
         UsageError: see `check_numbers`.
     """
-    check_numbers(numbers, area)
     anchors, info = frame[ANCHORS], frame[INFO]
-    rows = {int(row["id"]): row for row in anchors.points}
-    if missing := [number for number in numbers if number not in rows]:
-        listed = ", ".join(map(str, missing))
-        return Measured(None, None, f"there is no anchor {listed}", anchors.metric)
     try:
         T_world_cam = frame[POSE].pose()
     except WireError as problem:
         return Measured(None, None, str(problem), anchors.metric)
+    columns = {name: np.ascontiguousarray(anchors.points[name]) for name in anchors.points.dtype.names or ()}
+    states = AnchorStates(
+        ids=columns["id"].astype(np.int64),
+        points=np.stack([columns[axis] for axis in "xyz"], 1),
+        pixels=np.stack([columns[axis] for axis in "uv"], 1),
+        visibility=columns["visibility"],
+        confidence=columns["confidence"],
+        ages=columns["age"],
+        depth_confidence=columns["depth_confidence"],
+    )
+    camera = Camera(info.width, info.height, info.K, T_world_cam)
+    return measured(states, camera, numbers, area, anchors.metric)
+
+
+def measured(
+    states: AnchorStates, camera: Camera, numbers: Sequence[int], area: bool = False, metric: bool = True
+) -> Measured:
+    """Do as `measure`, of the anchors of a frame and the left camera that sees them."""
+    check_numbers(numbers, area)
+    rows = {int(number): row for row, number in enumerate(states.ids)}
+    if missing := [number for number in numbers if number not in rows]:
+        listed = ", ".join(map(str, missing))
+        return Measured(None, None, f"there is no anchor {listed}", metric)
     distinct = list(dict.fromkeys(numbers))  # a way may come back to an anchor, which errs once
     order = [distinct.index(number) for number in numbers]
-    points = np.array([[rows[number][axis] for axis in "xyz"] for number in distinct], np.float64)
-    visibility, confidence, depth_confidence = (
-        np.array([rows[number][column] for number in distinct], np.float32)
-        for column in ("visibility", "confidence", "depth_confidence")
-    )
+    chosen = [rows[number] for number in distinct]
+    points = states.points[chosen].astype(np.float64)
+    visibility, confidence = states.visibility[chosen], states.confidence[chosen]
+    depth_confidence = states.depth_confidence[chosen]
 
     def named(which: Bool | np.bool_, what: str) -> list[str]:
         listed = ", ".join(
@@ -119,10 +136,10 @@ def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measure
         return [f"anchor {listed} {what}"] if listed else []
 
     if lost := named(~np.isfinite(points).all(1), "is lost"):
-        return Measured(None, None, lost[0], anchors.metric)
+        return Measured(None, None, lost[0], metric)
     if area and _crosses(points):
         why = "the polygon crosses itself: name its anchors in the order in which they lie around it"
-        return Measured(None, None, why, anchors.metric)
+        return Measured(None, None, why, metric)
     slipped = named(confidence < SURE_OF_ANCHOR, "may be on other tissue")
     unsure = [
         *slipped,
@@ -133,9 +150,9 @@ def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measure
     def value_of(places: F64) -> float:
         return (area_of if area else length_of)(places[order])
 
-    error = _error(value_of, points, error_of(depth_confidence).astype(np.float64), T_world_cam, info)
+    error = _error(value_of, points, error_of(depth_confidence).astype(np.float64), camera)
     known = not slipped and math.isfinite(error)
-    return Measured(value_of(points), error if known else None, "; ".join(unsure) or None, anchors.metric)
+    return Measured(value_of(points), error if known else None, "; ".join(unsure) or None, metric)
 
 
 def length_of(points: F64) -> float:
@@ -149,13 +166,12 @@ def area_of(points: F64) -> float:
     return 0.5 * float(np.linalg.norm(np.cross(arms[:-1], arms[1:]).sum(0)))
 
 
-def _error(
-    of: Callable[[F64], float], points: F64, depth_errors: F64, T_world_cam: F64, info: ReceivedCameraInfo
-) -> float:
+def _error(of: Callable[[F64], float], points: F64, depth_errors: F64, camera: Camera) -> float:
     """The error of what `of` says of the points [N, 3], whose depths have these errors [N] (m)."""
+    T_world_cam = camera.T_world_cam
     depths = transform(invert(T_world_cam), points)[:, 2]
     along = (points - T_world_cam[:3, 3]) * (depth_errors / depths)[:, None]
-    beside = SIDEWAYS * info.width / info.K[0, 0] * depths
+    beside = SIDEWAYS * camera.width / camera.K[0, 0] * depths
     value = of(points)
 
     def change(moves: F64) -> float:

@@ -53,6 +53,13 @@ class AnchorName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     id: int
 
 
+class MeasureRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`measure`: the anchors along a way, or around an area."""
+
+    anchors: tuple[int, ...]
+    area: bool = False
+
+
 class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`open_view`: a viewpoint, in the world or as seen from the left camera, which it then follows."""
 

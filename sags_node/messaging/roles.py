@@ -14,7 +14,7 @@ ROLES: tuple[Role, ...] = get_args(Role)
 ALL: Role = "files"  # of keys in a folder of another name, and of everybody where there are no keys
 
 _OPERATIONS: dict[Role, frozenset[str]] = {
-    "listen": frozenset({"ping", "get_clock", "get_status", "get_health", "get_parameters"}),
+    "listen": frozenset({"ping", "get_clock", "get_status", "get_health", "get_parameters", "measure"}),
     "control": frozenset(
         {"set_parameters", "reset_model", "pause", "resume", "add_anchor", "remove_anchor"}
         | {"open_view", "close_view"}

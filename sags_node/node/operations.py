@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -17,7 +17,15 @@ from sags_node.config.schema import LIVE_PARAMETERS, LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.mapping.budget import Budget
 from sags_node.messaging import content, published
-from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
+from sags_node.messaging.measure import measured
+from sags_node.messaging.requests import (
+    AnchorName,
+    AnchorRequest,
+    MeasureRequest,
+    ViewName,
+    ViewRequest,
+    parse,
+)
 from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
 from sags_node.node.views import Views
@@ -65,6 +73,7 @@ class Operations:
             "resume": lambda args: self.for_mapping.post(self._resume),
             "add_anchor": lambda args: self.for_mapping.post(lambda: self._add_anchor(args)),
             "remove_anchor": lambda args: self.for_mapping.post(lambda: self._remove_anchor(args)),
+            "measure": lambda args: self.for_mapping.post(lambda: self._measure(args)),
             "open_view": lambda args: self.for_drawing.post(lambda: self._open_view(args)),
             "close_view": lambda args: self.for_drawing.post(lambda: self._close_view(args)),
             "save_model": self._save_model,
@@ -127,6 +136,17 @@ class Operations:
     def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
         self._state.pipeline.anchors.remove(parse(AnchorName, args).id)
         return {}
+
+    def _measure(self, args: dict[str, Any]) -> dict[str, Any]:
+        request, newest = parse(MeasureRequest, args), self._scene()
+        if newest is None:
+            raise SagsError("the tissue of now is not known; measure when frames are taken in")
+        camera = replace(published.camera_of(newest.pair), T_world_cam=newest.snapshot.camera.T_world_cam)
+        states, metric = newest.anchors, self._state.pipeline.metric
+        return {
+            **asdict(measured(states, camera, request.anchors, request.area, metric)),
+            "stamp_ns": newest.pair.t_capture_ns,
+        }
 
     def _open_view(self, args: dict[str, Any]) -> dict[str, Any]:
         request = parse(ViewRequest, args)

@@ -48,7 +48,14 @@ from sags_node.media.picture_file import claimed_size
 from sags_node.messaging import cdr, content, thin, topics
 from sags_node.messaging.control import ControlServer
 from sags_node.messaging.received import ReceivedImage, interpret
-from sags_node.messaging.requests import AnchorName, AnchorRequest, ViewName, ViewRequest, parse
+from sags_node.messaging.requests import (
+    AnchorName,
+    AnchorRequest,
+    MeasureRequest,
+    ViewName,
+    ViewRequest,
+    parse,
+)
 from sags_node.messaging.wire import decode, encode
 from sags_node.rig.check import check_rig
 from sags_node.rig.read import read_rig
@@ -192,6 +199,7 @@ def requests(_: Path) -> list[bytes]:
         ("add_anchor", {"u": 3, "v": 4.5, "ahead_ms": "auto"}),
         ("add_anchor", {"x": 0.1, "y": 0.0, "z": -1e-3}),
         ("remove_anchor", {"id": 5}),
+        ("measure", {"anchors": [1, 2], "area": False}),
         ("close_view", {"name": "top"}),
         (
             "open_view",
@@ -207,6 +215,7 @@ HANDLERS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "echo": lambda args: args,
     "add_anchor": lambda args: msgspec.to_builtins(parse(AnchorRequest, args)),
     "remove_anchor": lambda args: parse(AnchorName, args).id,
+    "measure": lambda args: msgspec.to_builtins(parse(MeasureRequest, args)),
     "close_view": lambda args: parse(ViewName, args).name,
     "open_view": lambda args: msgspec.to_builtins(parse(ViewRequest, args)),
 }

@@ -86,6 +86,12 @@ def test_anchors_are_added_followed_and_removed(node: RunningNode, control: Cont
     assert (np.diff(tracks[:, 7]) > 0).all(), "age grows"
     assert 0.01 < np.ptp(tracks[:, 4:6], axis=0).max() < 40, "it moves with the tissue, not away"
     assert tracks[:, 6].mean() > 0.5 and tracks[:, 8].min() > 0.3
+    told = control.request("measure", {"anchors": [by_pixel, by_point]})
+    assert 0 <= told["value"] < 1e-3 and told["error"] > 0 and told["metric"] and told["stamp_ns"] > 0
+    for wrong, why in (([by_pixel], "2 anchors or more"), ([by_pixel, by_pixel], "the same anchor twice")):
+        with pytest.raises(SagsError, match=why):
+            control.request("measure", {"anchors": wrong})
+    assert "no anchor 999" in control.request("measure", {"anchors": [by_pixel, 999]})["unsure"]
     assert control.request("remove_anchor", {"id": by_pixel}) == {}
     left = anchor_rows(collect(node, ["anchors"], count=3)["anchors"][-1])
     assert by_pixel not in left and by_point in left
