@@ -185,7 +185,7 @@ def _between(tiles: F32, across: Any, down: Any) -> Any:
 def carry(
     shown: U8, taken: U8, traced: Trace, lent: U8, gain: F32 = NO_GAIN, tint: F32 | None = None
 ) -> None:
-    """Blend the picture of a source into a view, where all that a pixel is made of shows tissue.
+    """Blend the picture of a source into a view, where most of what a pixel is made of is tissue.
 
     Args:
         shown: [H, W, 3] RGB of the view; written.
@@ -207,7 +207,7 @@ def carry(
         found = cv2.remap(lent, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         if more is not None:
             found = cv2.add(found, by_pixel(more), dtype=cv2.CV_8U)
-        tissue = cv2.compare(cv2.extractChannel(found, 3), 255, cv2.CMP_EQ)
+        tissue = cv2.compare(cv2.extractChannel(found, 3), 127, cv2.CMP_GT)
         inside = cv2.inRange(places, (-0.5, -0.5), (lent.shape[1] - 0.5, lent.shape[0] - 0.5))
         tissue = cv2.bitwise_and(tissue, inside)
         share = cv2.bitwise_and(by_pixel(traced.share), cv2.compare(free, 0, cv2.CMP_EQ), mask=tissue)

@@ -67,10 +67,12 @@ def twin(shown: U8, depth: F32, camera: Camera, source: SeenFrame, share: float)
             cell = min(int(v + 0.5), HEIGHT - 1), min(int(u + 0.5), WIDTH - 1)
             u, v = np.clip(u, 0, WIDTH - 1), np.clip(v, 0, HEIGHT - 1)
             left, top = min(int(u), WIDTH - 2), min(int(v), HEIGHT - 2)
-            tissue = source.mask[top : top + 1 + (v > top), left : left + 1 + (u > left)].all()
-            if not (abs(source.depth[cell] - there[2]) < SAME * there[2] and tissue):
+            if not (abs(source.depth[cell] - there[2]) < SAME * there[2]):
                 continue
             s, t = u - left, v - top
+            weights = np.outer((1 - t, t), (1 - s, s))
+            if (weights * source.mask[top : top + 2, left : left + 2]).sum() < 0.5:
+                continue
             above = picture[top, left] + s * (picture[top, left + 1] - picture[top, left])
             below = picture[top + 1, left] + s * (picture[top + 1, left + 1] - picture[top + 1, left])
             level = above + t * (below - above)
