@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -115,6 +116,11 @@ PLANTED = {
         "masks/000.png holds the values 0, 1, which do not tell",
         "source.instruments:=[1]",
     ),
+    "masks_of_nothing": (
+        lambda folder: edit(folder / "masks", np.zeros_like),
+        "none of 4 masks that were looked at marks an instrument",
+        "leave masks out",
+    ),
     "masks_small": (
         lambda folder: edit(folder / "masks", lambda mask: mask[::2, ::2]),
         "masks/000.png is 80x60 px but",
@@ -175,6 +181,23 @@ def test_a_planted_oddity_is_named_with_its_fix(name: str, tmp_path: Path) -> No
     # One cause may show twice: both eyes have borders, fields in one eye hide its matches.
     assert name in ("interlaced", "borders", "right_one_missing", "gap") or not other, other
     assert is_refused(folder) == any(each.level == "error" for each in found)
+
+
+@pytest.mark.parametrize("kind", ["pictures", "videos"])
+def test_check_says_what_run_says(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    if kind == "pictures":
+        gap(made(tmp_path))
+        edit(tmp_path / "masks", np.zeros_like)
+    for side in ("left", "right") if kind == "videos" else ():
+        shown = [number / 25 + 2 * (number > 9) for number in range(20)]
+        write(
+            tmp_path / f"{side}.mkv", moving(20, -DISPARITY * (side == "right")), shown, aspect=Fraction(4, 3)
+        )
+    assert not is_refused(tmp_path)
+    said = {record.getMessage() for record in caplog.records}
+    checked = {f"{each.what}; {each.fix}" for each in odd(tmp_path)}
+    once = {each for each in said if "right.mkv" in each}  # the check has said it of the left one
+    assert len(said) == 2 + len(once) == (3 if kind == "videos" else 2) and said - checked == once
 
 
 def is_refused(folder: Path) -> bool:
@@ -304,6 +327,19 @@ def test_a_video_says_how_it_shows_both_eyes(name: str, tmp_path: Path) -> None:
     assert ("exchanged" in str(found)) == (name == "exchanged")
 
 
+@pytest.mark.parametrize("height", [1470, 1471, 1469])
+def test_frame_packing_of_hdmi_is_taken_apart(height: int, tmp_path: Path) -> None:
+    """720 rows, 30 blank ones, 720 rows; as codecs keep an even height, one row more or less."""
+    big = [cv2.resize(texture(0, shift), (1280, 720)) for shift in (0, -DISPARITY)]
+    picture = np.vstack([big[0], np.zeros((30, 1280, 3), np.uint8), big[1], big[1][-1:]])[:height]
+    write(tmp_path / "scope.mkv", [picture] * 2, codec="ffv1", pixels="bgr0")
+    with open_session(tmp_path, overrides_of(tmp_path), guess=guess_rig).source as source:
+        frame = next(iter(source))
+    rows = min(720, height - 750)
+    assert np.array_equal(frame.left, big[0][:rows]) and np.array_equal(frame.right, big[1][:rows])
+    assert "frame packing" in check_folder(tmp_path)[2].what
+
+
 def test_two_videos_are_looked_at(tmp_path: Path) -> None:
     for side, shift in (("right", -DISPARITY), ("left", 0)):
         write_video(tmp_path / f"{side}.avi", [texture(number, shift) for number in range(3)])
@@ -415,7 +451,7 @@ def moving(count: int, shift: int = 0) -> list[U8]:
     ("right", "rate", "said"),
     [
         (40, 30.0, ("25.0 frames/s", "30.0", "not one stereo pair")),
-        (25, 25.0, ("right.avi ends after 25 frames but left.avi goes on", "source.frames:=25")),
+        (25, 25.0, ("right.avi has 25 pictures, ", "left.avi 40", "source.frames:=25")),
     ],
     ids=["another rate", "too short"],
 )
@@ -500,6 +536,21 @@ def test_an_eye_that_is_late_is_found(tmp_path: Path, late: int, how: str) -> No
     assert [each.partition(":")[0] for each in said] == [f"the {eye} eye is {abs(late)} frames late"] * (
         late != 0
     )
+
+
+@pytest.mark.parametrize("late", [0, 14, -14])
+def test_of_videos_of_other_lengths_it_is_told_whether_one_was_begun_later(tmp_path: Path, late: int) -> None:
+    """Both count from zero: only their pictures tell. 0: the right one was ended sooner."""
+    left, right = moving(60), moving(60, -DISPARITY)
+    folder = write_eyes(tmp_path / "case", left[max(0, -late) :], right[max(0, late) : 60 - 14 * (late == 0)])
+    found = check_folder(folder)
+    said = [f"{each.what}: {each.fix}" for each in found if "frames late" in each.what]
+    assert len(said) == (late != 0) and is_refused(folder) == (late >= 0)
+    if late:
+        eye = "left" if late > 0 else "right"
+        assert f"the {eye} eye is 14 frames late" in said[0] and f"first 14 frames off the {eye}" in said[0]
+    else:
+        assert "error" not in {each.level for each in check_folder(folder, ["source.frames:=46"])}
 
 
 def test_where_nothing_moves_no_eye_is_late(tmp_path: Path) -> None:

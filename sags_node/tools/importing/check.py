@@ -20,6 +20,7 @@ from sags_node.config.schema import (
     RecordedSource,
 )
 from sags_node.errors import SagsError, UsageError
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
 from sags_node.rig import read_rig
 from sags_node.sources.endonerf import is_published
@@ -27,7 +28,6 @@ from sags_node.sources.pictures import list_pictures, size_text
 from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source, recorded_rig
-from sags_node.sources.videos import VideoPairs
 from sags_node.tools.calibration.check import judge, rectified_before
 from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.calibration.pictures import pairs_of_session
@@ -36,7 +36,6 @@ from sags_node.tools.importing import pictures, videos
 from sags_node.tools.importing.folder import Contents, both_eyes, calibration_of, override, recognise
 from sags_node.tools.importing.timing import LOOKED_AT, Timing
 from sags_node.types import U8
-from sags_node.vision.rectify import Rectifier
 from sags_node.vision.watch.color_watch import EXCHANGED, is_blue
 
 MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
@@ -124,7 +123,8 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
         return _tried("pictures", lambda: _in_one_folder(left_folder))
 
     def look() -> list[Finding]:
-        found = pictures.check_numbers({"left": left_folder, "right": contents.right})
+        counts = {len(list_pictures(each)) for each in (left_folder, contents.right) if each is not None}
+        found = [Finding("ok", f"{' and '.join(map(str, sorted(counts)))} pictures each")]
         left = _some(left_folder)
         right = [] if contents.right is None else _some(contents.right)
         found += pictures.check_both(left, right) if right else pictures.check_eye("left", left)
@@ -173,21 +173,13 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
     """The first frame, and those in the middle: do masks mark something, are the eyes of one time?"""
     with open_source(source, references=False) as opened:
         count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
-        stamped, said, ends = [], [], []
+        said, stamped = list[Finding](), False
         if isinstance(opened, Replay):
-            stamped = list(opened.pairs.judged)
-            said = [
-                *(parted("warning", each) for each in opened.pairs.oddities),
-                *videos.check_pixels(opened.pairs.pixel_aspect),
-            ]
-            if isinstance(opened.pairs, VideoPairs):
-                ends = videos.check_ends(opened.pairs, (opened.first + count) * source.stride)
+            said, stamped = opened.pairs.findings, bool(opened.pairs.judged)
     if first is None:
         return [Finding("error", "not one frame can be read", "check the files")]
     found = [Finding("ok", f"{count} frames of {size_text(*first.left.shape[1::-1])} px at {rate:g} Hz")]
-    found += [*said, *ends]
-    if is_wrong(found):
-        return found
+    found += said
     timing, shares, blue = Timing(), [], []
     middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate
     with open_source(source.model_copy(update={"start": middle}), references=False) as opened:
@@ -199,15 +191,16 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
                 shares.append(1 - float(frame.tissue.mean()))
     if sum(blue) > len(blue) / 2:
         found.append(parted("warning", EXCHANGED.text))
-    return [*found, *pictures.check_shares(shares), *(stamped or timing.findings())]
+    return [*found, *pictures.check_shares(shares), *([] if stamped else timing.findings())]
 
 
 def _fits(config: LaunchConfig) -> list[Finding]:
-    """Nothing, where a frame and the robot's poses are of the calibration."""
+    """Nothing, where a node can be made, and a frame and the robot's poses are of the calibration."""
     rig = rig_to_play(config, guess=guess_rig)
     with open_posed(config, rig, references=False) as opened:
+        pipeline = Pipeline(config, rig, rate=opened.rate)
         for frame in islice(opened, 1):
-            Rectifier(rig, rig.left.width, rig.left.height)(frame)
+            pipeline.rectifier(frame)
     return []
 
 
