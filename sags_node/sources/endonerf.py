@@ -144,8 +144,8 @@ class EndoNerfPairs(FolderPairs):
             )
         if read_picture(file, cv2.IMREAD_UNCHANGED).dtype == np.uint8 and not is_published(self._config):
             self.oddities.append(
-                f"{file.parent}: {median * 1e3:.0f} mm (median) with {self._config.depth_unit:g} m per count, "
-                "of only 8 bit; the files do not say that unit: ask who made them"
+                f"{file.parent}: {median * 1e3:.0f} mm (median) with {self._config.depth_unit:g} m per "
+                "count, of only 8 bit; the files do not say that unit: ask who made them"
             )
 
 

@@ -150,8 +150,8 @@ class VideoPairs(Pairs):
             )
         elif not self.cut_off:
             self.cut_off = (
-                f"{said}; if one was begun later (sags import --check looks), cut so much off the beginning of "
-                "the other one"
+                f"{said}; if one was begun later (sags import --check looks), cut so much off the "
+                "beginning of the other one"
             )
 
     def _drifted(self, left: Video, right: Video, period: float) -> I64 | None:

@@ -54,7 +54,7 @@ class StereoDepth:
             unit = f"{in_metres(units)}; " if units else ""
             raise UsageError(
                 f"eyes that stand {baseline * 1e3:.3g} mm apart see nothing alike within "
-                f"vision.stereo.max_depth, {config.max_depth:g} m: is that baseline right? {unit}if it is, set "
+                f"vision.stereo.max_depth, {config.max_depth:g} m; {unit}if that baseline is right, set "
                 "vision.stereo.max_depth to how far away tissue can be"
             )
         self.rows = RowMonitor(camera.width)

@@ -250,17 +250,15 @@ def test_an_order_that_names_do_not_tell_is_said(tmp_path: Path, caplog: pytest.
 
 @pytest.mark.parametrize(
     ("form", "per_second"),
-    [("{}", 10**9), ("t{}_x", 10**6), ("{}", 10**3), ("{0:.0f}.{1:03.0f}", 1), ("2023112710{:04}", None)],
+    [("{}", 10**9), ("t{}_x", 10**6), ("{}", 10**3), ("{}.{:03}", 1), ("2023112710{:04}", None)],
 )
 def test_names_that_are_times_are_the_times(form: str, per_second: int | None, tmp_path: Path) -> None:
     """20 Hz, with a pause of a second behind the tenth picture; a date is no time since 1970."""
     ms = [1_700_000_000_000 + 50 * n + 1000 * (n > 9) for n in range(24)]
-    if per_second == 1:
-        names = [form.format(each // 1000, each % 1000) for each in ms]
+    if per_second is None:
+        names = [form.format(n) for n in range(24)]
     else:
-        names = [
-            form.format(n if per_second is None else each * per_second // 1000) for n, each in enumerate(ms)
-        ]
+        names = [form.format(t * per_second // 1000, t % 1000) for t in ms]
     config = eyes(tmp_path, names)
     with open_source(config.model_copy(update={"rate": None})) as source:
         stamps, rate = [frame.t_capture_ns for frame in source], source.rate

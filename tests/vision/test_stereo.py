@@ -167,7 +167,12 @@ def test_depth_ends_at_the_tissue_edge_and_at_the_range() -> None:
     [
         (StereoConfig(scale=4), Camera(100, 100, CAMERA.K, np.eye(4)), BASELINE, "too few"),
         (StereoConfig(), CAMERA, 4.3, "baseline"),
-        (StereoConfig(), CAMERA, BASELINE / 0.0254, "169 mm apart .* --unit inch; if it is, set vision"),
+        (
+            StereoConfig(),
+            CAMERA,
+            BASELINE / 0.0254,
+            "169 mm apart .* --unit inch; if that baseline is right, set vision",
+        ),
     ],
 )
 def test_what_cannot_be_matched_is_refused(

@@ -31,7 +31,7 @@ from sags_node.sources.source import open_source, recorded_rig
 from sags_node.tools.calibration.check import judge, rectified_before
 from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.calibration.pictures import pairs_of_session
-from sags_node.tools.calibration.rows import RECTIFIED
+from sags_node.tools.calibration.rows import PLAUSIBLE_DEPTH, RECTIFIED
 from sags_node.tools.importing import pictures, videos
 from sags_node.tools.importing.folder import Contents, both_eyes, calibration_of, override, recognise
 from sags_node.tools.importing.timing import LOOKED_AT, Timing
@@ -218,11 +218,24 @@ def calibrated(config: LaunchConfig) -> list[Finding]:
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
         rig = recorded_rig(source) if config.rig is None else read_rig(config.rig, size)
         assert rig is not None  # else it lacks one
-        judged = judge(as_pictures_come(rig, config), pairs, depths)
+        judged = _within_reach(judge(as_pictures_come(rig, config), pairs, depths), config)
         last = Finding("ok", f"calibration: {judged[-1].what}", "", judged[-1].figures)
         return [each for each in judged if each.level != "ok"] or [last]  # all is well in one line
 
     return _tried("calibration", compare)
+
+
+def _within_reach(judged: list[Finding], config: LaunchConfig) -> list[Finding]:
+    """The same with how far depth is matched: an endoscope's view, or what the launch says."""
+    reach = config.vision.stereo.max_depth
+    depth = max((each.figures.get("depth_median_m", 0.0) for each in judged), default=0.0)
+    if depth > reach:
+        what = f"points lie at {depth:.3g} m (median), and nothing is matched beyond {reach:g} m"
+        fix = "if the calibration is right, set vision.stereo.max_depth to how far away tissue can be"
+        return [*judged, Finding("warning", what, fix)]
+    if depth <= PLAUSIBLE_DEPTH[1]:
+        return judged
+    return [each for each in judged if "depth_median_m" not in each.figures]
 
 
 def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:

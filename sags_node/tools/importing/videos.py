@@ -15,6 +15,7 @@ from sags_node.config.schema import GeometryConfig
 from sags_node.errors import UsageError
 from sags_node.media.video import SPLIT, LostPictureError, Video
 from sags_node.sources.layout import Layout
+from sags_node.sources.names import EYE
 from sags_node.sources.pictures import size_text
 from sags_node.sources.videos import VideoPairs
 from sags_node.tools.calibration.matches import match_eyes
@@ -97,13 +98,20 @@ def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
 
     Raises:
         SagsError: it cannot be read.
-        UsageError: one alone does not show both eyes in a way that is known.
+        UsageError: one alone does not show both eyes in a way that is known; or one of two does.
     """
     launch = "source.kind:=videos", override("source.left", files[0])
-    if len(files) == 2:
+    if len(files) == 2 and all(EYE.search(file.stem) for file in files):
         return *launch, override("source.right", files[1])
     shown = _some(files[0])
     way = way_of(shown)
+    if len(files) == 2:
+        if way is None:
+            return *launch, override("source.right", files[1])
+        raise UsageError(
+            f"{files[0].name} shows both eyes, {way.what}, and {files[1].name} lies beside it: are they "
+            f"parts of one recording? Play one after the other: sags run {shlex.quote(str(files[0]))}"
+        )
     if way is None:
         raise UsageError(f"{files[0]}: {ONE_EYE}; {_both_needed(files[0])}")
     return *launch, *layout_of(way, shown)
