@@ -145,7 +145,7 @@ class FolderPairs(Pairs):
         self._eight_bits: EightBits | None = None  # there is nothing to do
         if first.dtype != np.uint8 or levels is not None:
             eyes = [file for files in self._files for file in files[: 1 + self._has_right]]
-            self._eight_bits = EightBits(map(read_samples, _spread(eyes)), levels)
+            self._eight_bits = EightBits(map(self._samples, _spread(eyes)), levels)
             if levels is None:
                 self._eight_bits.tell(left)
         self.read()  # the first pair shows whether the eyes fit each other
@@ -166,10 +166,15 @@ class FolderPairs(Pairs):
         return RawPair(left, right, tissue)
 
     def _eye(self, file: Path) -> U8:
+        samples = self._samples(file)
+        return samples if self._eight_bits is None else self._eight_bits(samples, file)
+
+    def _samples(self, file: Path) -> NDArray[Any]:
+        """Of one type."""
         samples = self._checked(read_samples(file), file)
         if samples.dtype != self._type:
             raise SagsError(f"{file} holds {samples.dtype}, others {self._type}; save all pictures alike")
-        return samples if self._eight_bits is None else self._eight_bits(samples, file)
+        return samples
 
     def _checked(self, picture: NDArray[Any], file: Path) -> NDArray[Any]:
         """Of one size."""

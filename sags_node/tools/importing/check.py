@@ -23,6 +23,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
 from sags_node.rig import read_rig
+from sags_node.rig.check import RECALIBRATE
 from sags_node.sources.endonerf import is_published
 from sags_node.sources.pictures import list_pictures, size_text
 from sags_node.sources.rectified import as_pictures_come
@@ -107,13 +108,13 @@ def overrides_of(path: Path) -> list[str]:
 
 def _once(found: list[Finding]) -> list[Finding]:
     """Return what is wrong is met by several who look; the first says it."""
-    said: set[str] = set()
+    said: list[str] = []
     kept = []
     for finding in found:
         why = finding.what.removeprefix(f"{finding.what.partition(': ')[0]}: ")
-        if finding.level == "ok" or why not in said:
+        if finding.level == "ok" or not any(each.endswith(why) for each in said):
             kept.append(finding)
-        said.add(why)
+        said.append(finding.what)
     return kept
 
 
@@ -226,16 +227,17 @@ def calibrated(config: LaunchConfig) -> list[Finding]:
 
 
 def _within_reach(judged: list[Finding], config: LaunchConfig) -> list[Finding]:
-    """The same with how far depth is matched: an endoscope's view, or what the launch says."""
+    """The same where lengths may be right with how far depth is matched: as far as the launch says."""
     reach = config.vision.stereo.max_depth
-    depth = max((each.figures.get("depth_median_m", 0.0) for each in judged), default=0.0)
-    if depth > reach:
-        what = f"points lie at {depth:.3g} m (median), and nothing is matched beyond {reach:g} m"
-        fix = "if the calibration is right, set vision.stereo.max_depth to how far away tissue can be"
-        return [*judged, Finding("warning", what, fix)]
-    if depth <= PLAUSIBLE_DEPTH[1]:
+    found = next((each for each in judged if "depth_median_m" in each.figures), None)
+    if found is None or (found.level == "error" and found.fix != RECALIBRATE):  # another unit fits
         return judged
-    return [each for each in judged if "depth_median_m" not in each.figures]
+    depth, others = found.figures["depth_median_m"], [each for each in judged if each is not found]
+    if depth <= reach:
+        return others if depth > PLAUSIBLE_DEPTH[1] else judged
+    what = f"points lie at {depth:.3g} m (median), and nothing is matched beyond {reach:g} m"
+    fix = "if the calibration is right, set vision.stereo.max_depth to how far away tissue can be"
+    return [*others, Finding("warning", what, fix, found.figures)]
 
 
 def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:
