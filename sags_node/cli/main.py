@@ -176,7 +176,7 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     that shows both eyes; without any the built-in phantom session in a loop. Without a calibration it plays
     all the same: depth then has no unit, and all that is published says so. Of the table at its end, dropped
     frames were not shown; skipped counts frames by the step that they went without, or by "frame": they
-    equalled the one before.
+    equalled the one before. Depth is matched as often as the line "quality" says.
 
     \b
     sags run my_folder

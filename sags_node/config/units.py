@@ -12,7 +12,8 @@ def fitting_units(length: float, least: float, most: float) -> list[str]:
 def in_metres(units: list[str]) -> str:
     """How to fix lengths that are in one of these units."""
     ways = [
-        f"of {NAMES[unit]} divide it by {1 / UNITS[unit]:.5g}, or read it with --unit {unit}"
+        f"of {NAMES[unit]} divide it by {1 / UNITS[unit]:.5g}, or sags calib convert PATH -o FOLDER "
+        f"--unit {unit}"
         for unit in units
     ]
     return f"projection_matrix[3] in right.yaml (or T) is in metres: {'; '.join(ways)}"

@@ -139,6 +139,12 @@ class Video:
                 f"{path} has the tones of HDR ({tones}), which are shown as they are, with little contrast; "
                 "record SDR (BT.709), or convert it (ffmpeg's zscale and tonemap)"
             )
+        if gaps := self.gaps:
+            many, (before, lost) = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the first", gaps[0]
+            self.oddities.append(
+                f"{path}: its stamps have {many} behind picture {before}, as long as {lost} pictures; it is "
+                "played by its stamps: were pictures lost, or was the recording paused?"
+            )
         if (bits := _bits_used(first)) is not None:
             self.oddities.append(
                 f"{path} has samples of {DEEP} bits, of which its first picture uses {bits}: it may be "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,12 +23,9 @@ from sags_node.mapping.devices import with_scale
 from sags_node.rig import load_camera, load_rig
 from sags_node.sources.endonerf import baseline_of
 from sags_node.sources.rectified import as_pictures_come
-from sags_node.sources.replay import Replay
 from sags_node.sources.robot import Posed
 from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
-
-log = logging.getLogger(__name__)
 
 Guess = Callable[[schema.Source], StereoRig]  # from the pictures of a source
 
@@ -100,8 +96,6 @@ def open_posed(config: LaunchConfig, rig: StereoRig, references: bool = True) ->
     """
     size = rig.left.width, rig.left.height
     source = open_source(config.source, references, size=size, rig=rig if config.rig is None else None)
-    for finding in source.pairs.judged if isinstance(source, Replay) else ():
-        log.warning("%s; %s", finding.what, finding.fix)
     return source if config.robot is None else Posed(source, config, rig)
 
 

@@ -49,7 +49,7 @@ class EndoNerfPairs(FolderPairs):
     """
 
     def __init__(self, config: EndoNerfSource) -> None:
-        folder = config.folder
+        self._config, folder = config, config.folder
         right = None if baseline_of(config) is None else folder / "images_right"
         self._llff = read_llff(config)
         self._T_world_cam = self._llff.T_world_cam
@@ -57,7 +57,6 @@ class EndoNerfPairs(FolderPairs):
         super().__init__(
             folder / "images", right, folder / "masks", instruments=config.instruments, numbered=True
         )
-        self._depth_unit = config.depth_unit
         self._check_camera(folder)
         if (folder / "depth").is_dir():
             pairs = pair_files((folder / "images", folder / "depth"), numbered=True)
@@ -113,7 +112,9 @@ class EndoNerfPairs(FolderPairs):
         if not known.any():
             return np.zeros(counts.shape, np.float32)
         near, far = np.percentile(counts[known], DEPTH_PERCENTILES)
-        depth: F32 = np.where(known, np.clip(counts, near, far) * self._depth_unit, 0).astype(np.float32)
+        depth: F32 = np.where(known, np.clip(counts, near, far) * self._config.depth_unit, 0).astype(
+            np.float32
+        )
         return depth
 
     def _check_camera(self, folder: Path) -> None:
@@ -139,7 +140,12 @@ class EndoNerfPairs(FolderPairs):
             raise UsageError(
                 f"{file}: the median depth would be {median:.3g} m, but an endoscope sees "
                 f"{PLAUSIBLE_DEPTH[0]:g} to {PLAUSIBLE_DEPTH[1]:g} m; set source.depth_unit (m per count, "
-                f"now {self._depth_unit:g})"
+                f"now {self._config.depth_unit:g})"
+            )
+        if read_picture(file, cv2.IMREAD_UNCHANGED).dtype == np.uint8 and not is_published(self._config):
+            self.oddities.append(
+                f"{file.parent}: {median * 1e3:.0f} mm (median) with {self._config.depth_unit:g} m per "
+                "count, of only 8 bit; the files do not say that unit: ask who made them"
             )
 
 

@@ -36,6 +36,9 @@ class Masks:
     else is asked about: `instruments` then lists the values that are instruments, and the others are tissue.
     What lies between areas, at soft edges, is no value.
 
+    Attributes:
+        oddities: what is to be said of them, each with a remedy after a semicolon.
+
     Args:
         some: masks spread over the recording.
 
@@ -48,7 +51,14 @@ class Masks:
     ) -> None:
         self._instruments = instruments
         self._values: set[int] = set()
-        share = float(np.median([np.mean(~self.tissue(mask, file)) for file, mask in some]))
+        shares = [float(np.mean(~self.tissue(mask, file))) for file, mask in some]
+        share = float(np.median(shares))
+        self.oddities: list[str] = []
+        if not any(shares):
+            self.oddities.append(
+                f"{folder}: none of {len(shares)} masks that were looked at marks an instrument; leave masks "
+                "out, and tissue is found by colour (docs/networks.md)"
+            )
         if share > MOST and isinstance(instruments, str):
             other = "black" if instruments == "white" else "white"
             raise UsageError(

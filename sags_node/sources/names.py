@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sags_node.types import I64
+
 log = logging.getLogger(__name__)
 
 EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
@@ -19,6 +21,8 @@ _CLOCK = re.compile(
 )  # hours, minutes, seconds
 HALF_DAY = 12 * 3600  # s
 CLEARLY = 2.0  # times as uneven as the other order
+EPOCH = 10**9, 2 * 10**9  # s since 1970: a time from 2001 to 2033; dates as 20260101120000 are none
+GAP = 1.5  # times the usual step from number to number
 
 
 def in_order(files: Sequence[Path]) -> list[Path]:
@@ -68,6 +72,29 @@ def numbers(files: Sequence[Path]) -> list[int]:
     if found != sorted(found):
         found = [number for number in plain if number is not None]
     return found if len(found) == len(files) else []
+
+
+def times_in(files: Sequence[Path]) -> I64 | None:
+    """When pictures of these names, in order, were taken, ns since 1970; None: the names do not say it."""
+    counts, unit = numbers(files), 10 ** _longest(files)
+    for each in (unit, unit * 10**3, unit * 10**6, unit * 10**9):  # a second: names are of s, ms, us or ns
+        if counts and all(EPOCH[0] * each <= count < EPOCH[1] * each for count in counts):
+            times = np.array([count * 10**9 // each for count in counts], np.int64)
+            return times if (np.diff(times) > 0).all() else None
+    return None
+
+
+def gaps_in(files: Sequence[Path], are_times: bool) -> list[str]:
+    """What is to be said of files in order whose numbers, or times, jump; empty: nothing."""
+    steps = np.diff(np.array(numbers(files), np.float64))
+    odd = np.flatnonzero(steps > GAP * np.median(steps)) if len(steps) else steps
+    if not 0 < 3 * len(odd) <= len(steps):  # so many are none: times of day go from 59 to 100
+        return []
+    where = f"{files[odd[0]].name} and {files[odd[0] + 1].name}"
+    fix = "frames are played evenly: fill the gap or split the recording there"
+    if are_times:
+        fix = "they are played by these times: were pictures lost, or was the recording paused?"
+    return [f"{files[0].parent}: {len(odd)} gaps in the numbers, first between {where}; {fix}"]
 
 
 def together(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:

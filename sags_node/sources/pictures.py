@@ -11,20 +11,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.checks import Finding
+from sags_node.checks import Finding, parted
 from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import SHOWN, read_file
 from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
-from sags_node.sources.names import in_order, numbers, together
+from sags_node.sources.names import gaps_in, in_order, numbers, times_in, together
 from sags_node.types import F32, F64, I64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
 
 LARGEST_FILE = 256 << 20  # bytes: more than the largest picture that is decoded can need
 MEND = "replace or remove the pair"
+NOT_SQUARE = 0.01
 LOOKED_AT = 9  # pictures, spread over a recording, that tell which value is white
 STORED = cv2.IMREAD_UNCHANGED
 
@@ -51,9 +52,9 @@ class Pairs:
         stamps: [count, 2] ns, of the left and the right picture; None: they are even.
         pixel_aspect: width of a pixel over its height, as far as the recording says it.
         oddities: what is to be said of its files, each with a remedy after a semicolon.
-        cut_off: why a file must have been longer; "": all are whole.
-        reach: how many pairs are there, also of the right eye, where a file is cut off.
-        judged: what is odd about its stamps or poses, as `sags import --check` says it.
+        cut_off: why pairs are missing at its end, with a remedy after a semicolon; "": none are.
+        reach: how many pairs are there, also of the right eye, where some are missing.
+        judged: what is odd about its stamps or poses.
     """
 
     count: int
@@ -65,6 +66,16 @@ class Pairs:
     reach: int
     judged: tuple[Finding, ...] = ()
     _next = 0
+
+    @property
+    def findings(self) -> list[Finding]:
+        """All that is to be said of it before it plays: `sags run` and `sags import --check` say the same."""
+        found = [*(parted("warning", each) for each in self.oddities), *self.judged]
+        if abs(self.pixel_aspect - 1) < NOT_SQUARE:
+            return found
+        what = f"pixels are {self.pixel_aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
+        fix = "calibrate pictures as they are played; a camera that is guessed has such pixels"
+        return [*found, Finding("warning", what, fix, {"pixel_aspect": self.pixel_aspect})]
 
     def seek(self, index: int) -> None:
         """Make `index` the next pair."""
@@ -92,14 +103,18 @@ class Pairs:
 
 class FolderPairs(Pairs):
     """Pictures of two folders, paired by sorted name (numbers in names sort as numbers), or of the left one.
+    Names that are times since 1970 stamp them.
 
     Attributes:
         files: the left pictures in order.
         size: width and height of all pictures, px.
+        oddities: see `Pairs`.
 
     Raises:
         UsageError: a folder is missing or empty, or the folders do not fit each other.
     """
+
+    oddities: list[str]
 
     def __init__(
         self,
@@ -114,18 +129,23 @@ class FolderPairs(Pairs):
         there = [folder for folder in (left, right, tools) if folder is not None]
         self._files = pair_files(there, numbered)
         self.files = [files[0] for files in self._files]
+        times = times_in(self.files)
+        if times is not None and len(times) > 1:
+            self.stamps, self.rate = np.stack([times, times], axis=1), 1e9 / float(np.median(np.diff(times)))
+        self.oddities = gaps_in(self.files, times is not None)
         self._has_right = right is not None
         self._masks: Masks | None = None
         if tools is not None:
             some = (files[-1] for files in _spread(self._files))
             self._masks = Masks(tools, ((file, read_picture(file, STORED)) for file in some), instruments)
+            self.oddities += self._masks.oddities
         self.count = len(self.files)
         first = read_samples(self.files[0])
         self.size, self._type = _size(first), first.dtype
         self._eight_bits: EightBits | None = None  # there is nothing to do
         if first.dtype != np.uint8 or levels is not None:
             eyes = [file for files in self._files for file in files[: 1 + self._has_right]]
-            self._eight_bits = EightBits(map(read_samples, _spread(eyes)), levels)
+            self._eight_bits = EightBits(map(self._samples, _spread(eyes)), levels)
             if levels is None:
                 self._eight_bits.tell(left)
         self.read()  # the first pair shows whether the eyes fit each other
@@ -146,10 +166,15 @@ class FolderPairs(Pairs):
         return RawPair(left, right, tissue)
 
     def _eye(self, file: Path) -> U8:
+        samples = self._samples(file)
+        return samples if self._eight_bits is None else self._eight_bits(samples, file)
+
+    def _samples(self, file: Path) -> NDArray[Any]:
+        """Of one type."""
         samples = self._checked(read_samples(file), file)
         if samples.dtype != self._type:
             raise SagsError(f"{file} holds {samples.dtype}, others {self._type}; save all pictures alike")
-        return samples if self._eight_bits is None else self._eight_bits(samples, file)
+        return samples
 
     def _checked(self, picture: NDArray[Any], file: Path) -> NDArray[Any]:
         """Of one size."""

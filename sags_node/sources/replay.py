@@ -64,7 +64,7 @@ class Replay:
         sleep: waits for seconds; the default is cut short by `stop`.
 
     Raises:
-        UsageError: files are missing or do not fit each other, a video is cut off before `frames`, or `start`
+        UsageError: files are missing or do not fit each other, pairs are missing before `frames`, or `start`
             lies behind the end.
     """
 
@@ -87,8 +87,8 @@ class Replay:
         self.pairs = open_pairs(config, references)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
-        for oddity in self.pairs.oddities:
-            _say(oddity)
+        for finding in self.pairs.findings:
+            _say(f"{finding.what}; {finding.fix}")
         stamps = None if self.pairs.stamps is None else self.pairs.stamps[:: config.stride]
         self._stamps = stamps if config.rate is None else None  # [turns, 2] ns, of both eyes' pictures
         # Those of the left pictures, ns: by them poses of the same recording are found.
@@ -107,9 +107,7 @@ class Replay:
             there = -(-self.pairs.reach // config.stride) - self.first
             if config.frames is None or config.frames > there:
                 self.pairs.close()
-                raise UsageError(
-                    f"{self.pairs.cut_off}; copy it again, or play what is there with source.frames:={there}"
-                )
+                raise UsageError(f"{self.pairs.cut_off}, or play what is there with source.frames:={there}")
 
     def frame_at(self, start: float) -> int:
         """Number of the frame that this `source.start` begins with."""

@@ -61,8 +61,9 @@ class VideoPairs(Pairs):
         self.count = len(self._numbers)
         self.stamps = self._find_stamps()
         self.pixel_aspect = layout.pixel_aspect(*self.left.size, self.left.pixel_aspect)
-        self.cut_off = next((f"{each.path} {each.cut_off}" for each in self._videos if each.cut_off), "")
+        self.cut_off = next((_cut_off(each) for each in self._videos if each.cut_off), "")
         self.reach = min(self.count, *(each.count for each in self._videos))
+        self._compare_lengths()
 
     def read(self) -> RawPair | None:
         if self._next >= self.count:
@@ -137,6 +138,22 @@ class VideoPairs(Pairs):
             )
         return found
 
+    def _compare_lengths(self) -> None:
+        """Say what it means that pictures are paired by number, and one eye has more of them."""
+        left, right = self.left, self.right
+        if right is None or not self.by_number or left.count == right.count:
+            return
+        said = f"{right.path} has {right.count} pictures, {left.path} {left.count}"
+        if right.count > left.count:
+            self.oddities.append(
+                f"{said}; were both begun at the same moment? What the left one has is played"
+            )
+        elif not self.cut_off:
+            self.cut_off = (
+                f"{said}; if one was begun later (sags import --check looks), cut so much off the "
+                "beginning of the other one"
+            )
+
     def _drifted(self, left: Video, right: Video, period: float) -> I64 | None:
         """Do as `_joined`, of two even videos that begin together: rates that differ a little add up."""
         assert left.stamps is not None and right.stamps is not None
@@ -199,7 +216,7 @@ class OneVideoPairs(Pairs):
             left = layout.order.index("left") if layout.is_sequential else 0
             self.stamps = np.stack([of_eyes[:, left], of_eyes[:, -1 - left]], axis=1)
         self.pixel_aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
-        self.cut_off = f"{video.path} {video.cut_off}" if video.cut_off else ""
+        self.cut_off = _cut_off(video) if video.cut_off else ""
         self.reach = self.count
         self.oddities = _oddities(video, layout)
 
@@ -228,6 +245,10 @@ def _oddities(video: Video, layout: Layout) -> list[str]:
     if not video.is_interlaced or layout.takes_fields:
         return video.oddities
     return [*video.oddities, f"{video.path}: {TORN}; set source.geometry.deinterlace:=top, or bottom"]
+
+
+def _cut_off(video: Video) -> str:
+    return f"{video.path} {video.cut_off}; copy it again"
 
 
 def _turns(video: Video) -> I64:

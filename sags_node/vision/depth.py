@@ -19,8 +19,8 @@ from sags_node.vision.watch.match_watch import MatchWatch
 
 LEAST_MATCHED = 0.05  # of the tissue that both eyes see; less is chance. Clear recordings have over a half
 TOO_FEW = (
-    "hardly anything matches between the eyes, so there is no depth: the tissue is too near or too far, or "
-    "the calibration is of another scope; sags calib check tells"
+    "hardly anything matches between the eyes, so there is no depth: the tissue is too near, or beyond "
+    "vision.stereo.max_depth, or the calibration is of another scope; sags calib check tells"
 )
 FARTHEST = 10.0  # m: what a session says to be beyond is no depth
 

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 
 from sags_node.config.schema import StereoConfig
+from sags_node.config.units import fitting_units, in_metres
 from sags_node.errors import UsageError
+from sags_node.rig.check import ENDOSCOPE_BASELINE
 from sags_node.types import F32, Bool, Camera, Finding, GrayPyramid, RectifiedPair
 from sags_node.vision.alignment import RowMonitor
 from sags_node.vision.dense_depth import depth_of_patches, depth_of_pixels
@@ -17,6 +19,7 @@ from sags_node.vision.pyramid import inner, level, pyramids
 
 FULL_SIZE_BELOW = 480  # px width: matching at half of less costs half of the accuracy and saves little
 SMALLEST_SIDE = 32  # px of the matching picture: four patches of the inverse search
+WIDEST = 1 / 3  # of the largest depth, between the eyes: what they see of one thing differs too much beyond
 SMOOTHING_RADIUS = 1 / 100  # of the matching picture's width
 
 
@@ -29,7 +32,7 @@ class StereoDepth:
     zero-mean normalised cross-correlation (ZNCC) of 0.57 and below, where the depth is unknown, and 1 at 1.
 
     Raises:
-        UsageError: the pictures are too small to match, or no disparity fits the depth range.
+        UsageError: the pictures are too small to match, or the eyes too far apart for the depth range.
     """
 
     def __init__(self, config: StereoConfig, camera: Camera, baseline: float) -> None:
@@ -46,10 +49,13 @@ class StereoDepth:
         self._smallest = self._focal_baseline / config.max_depth
         self._near = NearLimit(config, float(camera.K[0, 0]) * baseline)
         self._end_at(self._near.limit)
-        if self._smallest >= self._largest:
+        if self._smallest >= self._largest or baseline > WIDEST * config.max_depth:
+            units = fitting_units(baseline, *ENDOSCOPE_BASELINE)
+            unit = f"{in_metres(units)}; " if units else ""
             raise UsageError(
-                f"the eyes' pictures do not overlap at vision.stereo.max_depth {config.max_depth} m; raise "
-                f"it or check the calibration's baseline, {baseline * 1e3:.3g} mm"
+                f"eyes that stand {baseline * 1e3:.3g} mm apart see nothing alike within "
+                f"vision.stereo.max_depth, {config.max_depth:g} m; {unit}if that baseline is right, set "
+                "vision.stereo.max_depth to how far away tissue can be"
             )
         self.rows = RowMonitor(camera.width)
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import shutil
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -20,10 +23,11 @@ from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.pipeline.session import open_session
+from sags_node.rig import read_rig, save_rig
 from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.tools.importing.pictures import combing, lit_box
-from sags_node.types import U8
+from sags_node.types import U8, StereoRig
 
 WIDTH, HEIGHT, FRAMES, DISPARITY = 160, 120, 4, 9
 
@@ -115,6 +119,11 @@ PLANTED = {
         "masks/000.png holds the values 0, 1, which do not tell",
         "source.instruments:=[1]",
     ),
+    "masks_of_nothing": (
+        lambda folder: edit(folder / "masks", np.zeros_like),
+        "none of 4 masks that were looked at marks an instrument",
+        "leave masks out",
+    ),
     "masks_small": (
         lambda folder: edit(folder / "masks", lambda mask: mask[::2, ::2]),
         "masks/000.png is 80x60 px but",
@@ -175,6 +184,23 @@ def test_a_planted_oddity_is_named_with_its_fix(name: str, tmp_path: Path) -> No
     # One cause may show twice: both eyes have borders, fields in one eye hide its matches.
     assert name in ("interlaced", "borders", "right_one_missing", "gap") or not other, other
     assert is_refused(folder) == any(each.level == "error" for each in found)
+
+
+@pytest.mark.parametrize("kind", ["pictures", "videos"])
+def test_check_says_what_run_says(kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    if kind == "pictures":
+        gap(made(tmp_path))
+        edit(tmp_path / "masks", np.zeros_like)
+    for side in ("left", "right") if kind == "videos" else ():
+        shown = [number / 25 + 2 * (number > 9) for number in range(20)]
+        write(
+            tmp_path / f"{side}.mkv", moving(20, -DISPARITY * (side == "right")), shown, aspect=Fraction(4, 3)
+        )
+    assert not is_refused(tmp_path)
+    said = {record.getMessage() for record in caplog.records}
+    checked = {f"{each.what}; {each.fix}" for each in odd(tmp_path)}
+    once = {each for each in said if "right.mkv" in each}  # the check has said it of the left one
+    assert len(said) == 2 + len(once) == (3 if kind == "videos" else 2) and said - checked == once
 
 
 def is_refused(folder: Path) -> bool:
@@ -304,6 +330,28 @@ def test_a_video_says_how_it_shows_both_eyes(name: str, tmp_path: Path) -> None:
     assert ("exchanged" in str(found)) == (name == "exchanged")
 
 
+@pytest.mark.parametrize("height", [1470, 1471, 1469])
+def test_frame_packing_of_hdmi_is_taken_apart(height: int, tmp_path: Path) -> None:
+    """720 rows, 30 blank ones, 720 rows; as codecs keep an even height, one row more or less."""
+    big = [cv2.resize(texture(0, shift), (1280, 720)) for shift in (0, -DISPARITY)]
+    picture = np.vstack([big[0], np.zeros((30, 1280, 3), np.uint8), big[1], big[1][-1:]])[:height]
+    write(tmp_path / "scope.mkv", [picture] * 2, codec="ffv1", pixels="bgr0")
+    with open_session(tmp_path, overrides_of(tmp_path), guess=guess_rig).source as source:
+        frame = next(iter(source))
+    rows = min(720, height - 750)
+    assert np.array_equal(frame.left, big[0][:rows]) and np.array_equal(frame.right, big[1][:rows])
+    assert "frame packing" in check_folder(tmp_path)[2].what
+
+
+def test_two_parts_of_a_recording_are_no_pair(tmp_path: Path) -> None:
+    for part in (1, 2):
+        both = [np.hstack([texture(part, 0), texture(part, -DISPARITY)]) for _ in range(3)]
+        write_video(tmp_path / f"REC000{part}.avi", [cv2.resize(each, None, fx=2, fy=2) for each in both])
+    with pytest.raises(UsageError, match=r"REC0001.avi shows both eyes, side by side, and REC0002"):
+        overrides_of(tmp_path)
+    assert "side_by_side" in overrides_of(tmp_path / "REC0001.avi")[-1]
+
+
 def test_two_videos_are_looked_at(tmp_path: Path) -> None:
     for side, shift in (("right", -DISPARITY), ("left", 0)):
         write_video(tmp_path / f"{side}.avi", [texture(number, shift) for number in range(3)])
@@ -353,6 +401,19 @@ def test_a_session_is_checked_with_its_calibration() -> None:
     said = "\n".join(each.what for each in found)
     assert "40 frames of 320x256 px at 10 Hz" in said and "calibration: " in said
     assert found[-1].what == f"to play it: sags run {SESSION}"
+
+
+def test_a_camera_that_looks_farther_is_asked_how_far(tmp_path: Path) -> None:
+    """A ZED mini: eyes 15 times as far apart as a scope's put the phantom at a metre."""
+    for side in ("left", "right"):
+        shutil.copytree(SESSION / side, tmp_path / side)
+    rig = read_rig(SESSION / "calib")
+    wide = [replace(eye, P=eye.P * [1, 1, 1, 15]) for eye in (rig.left, rig.right)]
+    save_rig(StereoRig("wide", *wide), tmp_path / "calib")
+    (far,) = [each for each in odd(tmp_path) if "nothing is matched beyond 0.3 m" in each.what]
+    assert re.search(r"points lie at (0.9|1.0)\d? m", far.what) and "vision.stereo.max_depth" in far.fix
+    (left_over,) = odd_of(check_folder(tmp_path, ["vision.stereo.max_depth:=3"]))
+    assert "is unusual for a stereo endoscope" in left_over.what
 
 
 def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
@@ -415,7 +476,7 @@ def moving(count: int, shift: int = 0) -> list[U8]:
     ("right", "rate", "said"),
     [
         (40, 30.0, ("25.0 frames/s", "30.0", "not one stereo pair")),
-        (25, 25.0, ("right.avi ends after 25 frames but left.avi goes on", "source.frames:=25")),
+        (25, 25.0, ("right.avi has 25 pictures, ", "left.avi 40", "source.frames:=25")),
     ],
     ids=["another rate", "too short"],
 )
@@ -500,6 +561,21 @@ def test_an_eye_that_is_late_is_found(tmp_path: Path, late: int, how: str) -> No
     assert [each.partition(":")[0] for each in said] == [f"the {eye} eye is {abs(late)} frames late"] * (
         late != 0
     )
+
+
+@pytest.mark.parametrize("late", [0, 14, -14])
+def test_of_videos_of_other_lengths_it_is_told_whether_one_was_begun_later(tmp_path: Path, late: int) -> None:
+    """Both count from zero: only their pictures tell. 0: the right one was ended sooner."""
+    left, right = moving(60), moving(60, -DISPARITY)
+    folder = write_eyes(tmp_path / "case", left[max(0, -late) :], right[max(0, late) : 60 - 14 * (late == 0)])
+    found = check_folder(folder)
+    said = [f"{each.what}: {each.fix}" for each in found if "frames late" in each.what]
+    assert len(said) == (late != 0) and is_refused(folder) == (late >= 0)
+    if late:
+        eye = "left" if late > 0 else "right"
+        assert f"the {eye} eye is 14 frames late" in said[0] and f"first 14 frames off the {eye}" in said[0]
+    else:
+        assert not odd_of(check_folder(folder, ["source.frames:=46"]))[:-1]  # it lacks a calibration
 
 
 def test_where_nothing_moves_no_eye_is_late(tmp_path: Path) -> None:

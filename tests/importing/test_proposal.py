@@ -86,7 +86,7 @@ def test_what_cannot_be_played_gets_no_file(tmp_path: Path) -> None:
     left, right = videos(tmp_path, LEFT, RIGHT[:3])
     file = tmp_path / "mine.yaml"
     code, out, said = ran("new", left, right, "-o", file)
-    assert code == 1 and "ends after 3 frames" in out and "cannot be played" in said and not file.exists()
+    assert code == 1 and "source.frames:=3" in out and "cannot be played" in said and not file.exists()
     refused(2, "new", "-o", file, said=("name a folder, a video or a device",))  # there is nobody to ask
     refused(2, "new", tmp_path / "gone", "-o", file, said=("does not exist",))
     refused(2, "new", left, SESSION, "-o", file, said=("neither two videos nor two folders",))

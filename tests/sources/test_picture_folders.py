@@ -248,6 +248,27 @@ def test_an_order_that_names_do_not_tell_is_said(tmp_path: Path, caplog: pytest.
     assert "may be whole numbers or fractions" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("form", "per_second"),
+    [("{}", 10**9), ("t{}_x", 10**6), ("{}", 10**3), ("{}.{:03}", 1), ("2023112710{:04}", None)],
+)
+def test_names_that_are_times_are_the_times(form: str, per_second: int | None, tmp_path: Path) -> None:
+    """20 Hz, with a pause of a second behind the tenth picture; a date is no time since 1970."""
+    ms = [1_700_000_000_000 + 50 * n + 1000 * (n > 9) for n in range(24)]
+    if per_second is None:
+        names = [form.format(n) for n in range(24)]
+    else:
+        names = [form.format(t * per_second // 1000, t % 1000) for t in ms]
+    config = eyes(tmp_path, names)
+    with open_source(config.model_copy(update={"rate": None})) as source:
+        stamps, rate = [frame.t_capture_ns for frame in source], source.rate
+        said = [each.what + each.fix for each in source.pairs.findings]
+    assert rate == (30 if per_second is None else 20)
+    if per_second is not None:
+        assert stamps == [each * 10**6 for each in ms]
+        assert len(said) == 1 and "1 gaps in the numbers" in said[0] and "played by these times" in said[0]
+
+
 PARTNERS = {
     "one missing each": [f"{'-' if n == 6 else '+' if n == 18 else ''}{n:03}" for n in range(24)],
     "times": [f"{'-' if n in (0, 6) else ''}{n / 30:.4g}" for n in range(24)],

@@ -167,6 +167,12 @@ def test_depth_ends_at_the_tissue_edge_and_at_the_range() -> None:
     [
         (StereoConfig(scale=4), Camera(100, 100, CAMERA.K, np.eye(4)), BASELINE, "too few"),
         (StereoConfig(), CAMERA, 4.3, "baseline"),
+        (
+            StereoConfig(),
+            CAMERA,
+            BASELINE / 0.0254,
+            "169 mm apart .* --unit inch; if that baseline is right, set vision",
+        ),
     ],
 )
 def test_what_cannot_be_matched_is_refused(
@@ -174,6 +180,12 @@ def test_what_cannot_be_matched_is_refused(
 ) -> None:
     with pytest.raises(UsageError, match=words):
         StereoDepth(config, camera, baseline)
+
+
+@pytest.mark.parametrize(("baseline", "max_depth"), [(0.012, 0.3), (0.063, 0.3), (0.12, 1.0)])
+def test_eyes_of_devices_that_are_no_endoscope_are_taken(baseline: float, max_depth: float) -> None:
+    """A wide endoscope; a ZED mini; a ZED, whose user says how far it looks."""
+    assert not StereoDepth(StereoConfig(max_depth=max_depth), CAMERA, baseline).findings
 
 
 def test_observation_carries_the_frame() -> None:

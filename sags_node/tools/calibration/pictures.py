@@ -58,6 +58,8 @@ def pairs_of_session(
         if stride > REFERENCE_EVERY:
             stride -= stride % REFERENCE_EVERY
         playing = {"stride": source.stride * stride, "pace": "step", "loop": False}
+        if source.frames is not None:  # behind them the recording may be cut off
+            playing["frames"] = -(-source.frames // stride)
         source, stride = source.model_copy(update=playing), 1
     pairs: list[Pair] = []
     depths: list[F32 | None] = []

@@ -20,23 +20,23 @@ from sags_node.config.schema import (
     RecordedSource,
 )
 from sags_node.errors import SagsError, UsageError
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
 from sags_node.rig import read_rig
+from sags_node.rig.check import RECALIBRATE
 from sags_node.sources.endonerf import is_published
 from sags_node.sources.pictures import list_pictures, size_text
 from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source, recorded_rig
-from sags_node.sources.videos import VideoPairs
 from sags_node.tools.calibration.check import judge, rectified_before
 from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.calibration.pictures import pairs_of_session
-from sags_node.tools.calibration.rows import RECTIFIED
+from sags_node.tools.calibration.rows import PLAUSIBLE_DEPTH, RECTIFIED
 from sags_node.tools.importing import pictures, videos
 from sags_node.tools.importing.folder import Contents, both_eyes, calibration_of, override, recognise
 from sags_node.tools.importing.timing import LOOKED_AT, Timing
 from sags_node.types import U8
-from sags_node.vision.rectify import Rectifier
 from sags_node.vision.watch.color_watch import EXCHANGED, is_blue
 
 MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
@@ -108,13 +108,13 @@ def overrides_of(path: Path) -> list[str]:
 
 def _once(found: list[Finding]) -> list[Finding]:
     """Return what is wrong is met by several who look; the first says it."""
-    said: set[str] = set()
+    said: list[str] = []
     kept = []
     for finding in found:
         why = finding.what.removeprefix(f"{finding.what.partition(': ')[0]}: ")
-        if finding.level == "ok" or why not in said:
+        if finding.level == "ok" or not any(each.endswith(why) for each in said):
             kept.append(finding)
-        said.add(why)
+        said.append(finding.what)
     return kept
 
 
@@ -124,7 +124,8 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
         return _tried("pictures", lambda: _in_one_folder(left_folder))
 
     def look() -> list[Finding]:
-        found = pictures.check_numbers({"left": left_folder, "right": contents.right})
+        counts = {len(list_pictures(each)) for each in (left_folder, contents.right) if each is not None}
+        found = [Finding("ok", f"{' and '.join(map(str, sorted(counts)))} pictures each")]
         left = _some(left_folder)
         right = [] if contents.right is None else _some(contents.right)
         found += pictures.check_both(left, right) if right else pictures.check_eye("left", left)
@@ -173,21 +174,13 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
     """The first frame, and those in the middle: do masks mark something, are the eyes of one time?"""
     with open_source(source, references=False) as opened:
         count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
-        stamped, said, ends = [], [], []
+        said, stamped = list[Finding](), False
         if isinstance(opened, Replay):
-            stamped = list(opened.pairs.judged)
-            said = [
-                *(parted("warning", each) for each in opened.pairs.oddities),
-                *videos.check_pixels(opened.pairs.pixel_aspect),
-            ]
-            if isinstance(opened.pairs, VideoPairs):
-                ends = videos.check_ends(opened.pairs, (opened.first + count) * source.stride)
+            said, stamped = opened.pairs.findings, bool(opened.pairs.judged)
     if first is None:
         return [Finding("error", "not one frame can be read", "check the files")]
     found = [Finding("ok", f"{count} frames of {size_text(*first.left.shape[1::-1])} px at {rate:g} Hz")]
-    found += [*said, *ends]
-    if is_wrong(found):
-        return found
+    found += said
     timing, shares, blue = Timing(), [], []
     middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate
     with open_source(source.model_copy(update={"start": middle}), references=False) as opened:
@@ -199,15 +192,16 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
                 shares.append(1 - float(frame.tissue.mean()))
     if sum(blue) > len(blue) / 2:
         found.append(parted("warning", EXCHANGED.text))
-    return [*found, *pictures.check_shares(shares), *(stamped or timing.findings())]
+    return [*found, *pictures.check_shares(shares), *([] if stamped else timing.findings())]
 
 
 def _fits(config: LaunchConfig) -> list[Finding]:
-    """Nothing, where a frame and the robot's poses are of the calibration."""
+    """Nothing, where a node can be made, and a frame and the robot's poses are of the calibration."""
     rig = rig_to_play(config, guess=guess_rig)
     with open_posed(config, rig, references=False) as opened:
+        pipeline = Pipeline(config, rig, rate=opened.rate)
         for frame in islice(opened, 1):
-            Rectifier(rig, rig.left.width, rig.left.height)(frame)
+            pipeline.rectifier(frame)
     return []
 
 
@@ -225,11 +219,25 @@ def calibrated(config: LaunchConfig) -> list[Finding]:
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
         rig = recorded_rig(source) if config.rig is None else read_rig(config.rig, size)
         assert rig is not None  # else it lacks one
-        judged = judge(as_pictures_come(rig, config), pairs, depths)
+        judged = _within_reach(judge(as_pictures_come(rig, config), pairs, depths), config)
         last = Finding("ok", f"calibration: {judged[-1].what}", "", judged[-1].figures)
         return [each for each in judged if each.level != "ok"] or [last]  # all is well in one line
 
     return _tried("calibration", compare)
+
+
+def _within_reach(judged: list[Finding], config: LaunchConfig) -> list[Finding]:
+    """The same where lengths may be right with how far depth is matched: as far as the launch says."""
+    reach = config.vision.stereo.max_depth
+    found = next((each for each in judged if "depth_median_m" in each.figures), None)
+    if found is None or (found.level == "error" and found.fix != RECALIBRATE):  # another unit fits
+        return judged
+    depth, others = found.figures["depth_median_m"], [each for each in judged if each is not found]
+    if depth <= reach:
+        return others if depth > PLAUSIBLE_DEPTH[1] else judged
+    what = f"points lie at {depth:.3g} m (median), and nothing is matched beyond {reach:g} m"
+    fix = "if the calibration is right, set vision.stereo.max_depth to how far away tissue can be"
+    return [*others, Finding("warning", what, fix, found.figures)]
 
 
 def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:

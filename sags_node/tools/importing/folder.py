@@ -105,8 +105,9 @@ def _plain(folder: Path) -> Contents:
         what = "one video" if len(videos) == 1 else f"{len(videos)} videos"
         of_eyes = _eye_videos(videos)
         if len(of_eyes) > 2:
+            what += ", whose names do not tell which are the eyes of one recording"
             both = "name both: sags new LEFT RIGHT -o FILE.yaml, or leave only them in the folder"
-            return Contents(f"{what}, whose names do not tell which are the eyes", both, "error")
+            return Contents(what, f"{both}. Parts of one recording are played one by one", "error")
         return Contents(what, videos=of_eyes)
     if has_pictures(folder):
         apart = both_eyes(folder)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from sags_node.checks import Finding
-from sags_node.sources.names import numbers
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.tools.calibration.matches import match_eyes
 from sags_node.types import U8, Bool
@@ -20,28 +19,10 @@ COMB_SHARE = 0.02  # of the pixels, and
 COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direction
 DARK = 12  # grey level of a border
 NARROWEST_BORDER = 4  # px
-GAP = 1.5  # times the usual step from number to number
 ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median
 DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0)  # m per count, the usual ones first
 FEWEST_MATCHES = 30
 RIGHT_FIRST = "source.geometry.first:=right"
-
-
-def check_numbers(named: Mapping[str, Path | None]) -> list[Finding]:
-    """How many pictures there are, and gaps in their numbers or times."""
-    files = {what: list_pictures(folder) for what, folder in named.items() if folder is not None}
-    found = []
-    for what, each in files.items():
-        steps = np.diff(np.array(numbers(each), np.float64))
-        if len(steps) and (odd := np.flatnonzero(steps > GAP * np.median(steps))).size:
-            where = f"{each[odd[0]].name} and {each[odd[0] + 1].name}"
-            fix = "frames are played evenly: fill the gap or split the recording there"
-            found.append(
-                Finding("warning", f"{what}: {odd.size} gaps in the numbers, first between {where}", fix)
-            )
-    counts = {len(each) for each in files.values()}
-    said = " and ".join(map(str, sorted(counts)))
-    return found or [Finding("ok", f"{said} pictures each, numbered without gaps")]
 
 
 def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path, U8]:
@@ -132,11 +113,8 @@ def check_both(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
 
 def check_shares(shares: Sequence[float]) -> list[Finding]:
     """Return what masks say of frames: the share of each that is instrument."""
-    if not shares:
+    if not any(shares):  # of those spread over the recording the source says so
         return []
-    if not any(shares):
-        fix = "leave masks out, and tissue is found by colour (docs/networks.md)"
-        return [Finding("warning", f"masks: none of {len(shares)} marks an instrument", fix)]
     return [Finding("ok", f"masks: {np.median(shares):.0%} of the picture is instrument")]
 
 
@@ -157,12 +135,11 @@ def check_depth(
     median = float(np.median(medians))
     fitting = [one for one in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= median * one <= ENDOSCOPE_DEPTH[1]]
     ask = "the files do not say it: ask who made them"
-    few = "only 8 bit"
     if unit is not None and unit in fitting:
         said = f"depth: {median * unit * 1e3:.0f} mm (median) with {unit:g} m per count"
         if stated:
             return [Finding("ok", f"{said}, as their author states")]
-        return [Finding("warning" if coarse else "ok", f"{said}; {few}" if coarse else said, ask)]
+        return [Finding("ok", said, ask)]
     if not fitting:
         what = f"depth: a median of {median:g} counts is no distance in an endoscope's view in any usual unit"
         return [Finding("error", what, "is it a disparity, or inverse depth? Convert it to depth")]
@@ -177,7 +154,7 @@ def check_depth(
     ]
     if coarse:
         fix = "steps of a whole count: export 16 bit"
-        found.append(Finding("warning", f"depth: {few}", fix))
+        found.append(Finding("warning", "depth: only 8 bit", fix))
     return found
 
 

@@ -23,9 +23,14 @@ CLEARLY = 0.2  # beyond that of no delay
 
 
 class Timing:
-    """Takes pairs one after the other; of each it keeps a few numbers."""
+    """Takes pairs one after the other; of each it keeps a few numbers.
 
-    def __init__(self) -> None:
+    Args:
+        longer: by how many pictures one eye has more than the other: it may have been begun so much sooner.
+    """
+
+    def __init__(self, longer: int = 0) -> None:
+        self._longer = longer
         self._rows: tuple[list[F32], list[F32]] = [], []
 
     def add(self, left: U8, right: U8) -> None:
@@ -39,7 +44,13 @@ class Timing:
         if len(self._rows[0]) < FEWEST:
             return []
         left, right = (np.diff(np.stack(rows), axis=0) for rows in self._rows)
-        alike = {late: _alike(left, right, late) for late in range(-MOST, MOST + 1)}
+        near = range(-MOST, MOST + 1)
+        tried = {*near, *(side * (self._longer + few) for side in (-1, 1) for few in range(-2, 3))}
+        alike = {
+            late: _alike(left, right, late)
+            for late in sorted(tried, key=abs)
+            if abs(late) <= len(left) - FEWEST or late in near
+        }
         late = max(alike, key=lambda frames: alike[frames])
         if alike[late] < LEAST or alike[late] < alike[0] + CLEARLY:
             return []

@@ -15,24 +15,25 @@ from sags_node.config.schema import GeometryConfig
 from sags_node.errors import UsageError
 from sags_node.media.video import SPLIT, LostPictureError, Video
 from sags_node.sources.layout import Layout
+from sags_node.sources.names import EYE
 from sags_node.sources.pictures import size_text
 from sags_node.sources.videos import VideoPairs
 from sags_node.tools.calibration.matches import match_eyes
 from sags_node.tools.calibration.pictures import Pair
-from sags_node.tools.importing import pictures
+from sags_node.tools.importing import pictures, timing
 from sags_node.tools.importing.folder import override
 from sags_node.types import U8
 
 LOOKED_AT = 4  # pictures, spread over the video
+MOST_LATE = 900  # pictures that an eye is looked for to have been begun late
 LEAST_ALONG = 0.8  # share of the matches whose rows agree, of two eyes
 ROWS = 1 / 40  # of the width: as far as rows of eyes that are not rectified differ
 ONE_EYE = "one eye is shown, or both in a way that was not recognised"
-NOT_SQUARE = 0.01
 APART = 1.0  # px: eyes see the tissue in different columns; fields of one picture do not
 
 
 LAYOUT = "source.geometry.layout:="
-PANES = "source.geometry.crop:=[0,0,{w},{h}]", "source.geometry.crop_right:=[{w},0,{w},{h}]"
+PACKED = {1080: 45, 720: 30}  # rows of an eye, and blank ones below the first: frame packing of HDMI 1.4a
 
 
 class Way(NamedTuple):
@@ -41,6 +42,7 @@ class Way(NamedTuple):
     what: str
     layout: str
     eyes: Callable[[U8], tuple[U8, U8]]
+    right: tuple[int, int] | None = None  # x, y of the right pane, px
 
 
 def _halves(picture: U8, axis: int = 1) -> tuple[U8, U8]:
@@ -67,6 +69,15 @@ _WAYS = (  # a part before the whole: what is found in the one is found in the o
 )
 
 
+def _packed(start: int, rows: int) -> Way:
+    """The right eye's picture, of so many rows, begins in row `start`."""
+
+    def eyes(picture: U8) -> tuple[U8, U8]:
+        return picture[:rows], picture[start : start + rows]
+
+    return Way("one above the other, blank rows between them (frame packing)", "panes", eyes, (0, start))
+
+
 def look(files: tuple[Path, ...]) -> list[Finding]:
     """Return what some pictures show, of the videos of the left and the right eye, or of one of both. They
     are played as `launch_of` says.
@@ -78,7 +89,8 @@ def look(files: tuple[Path, ...]) -> list[Finding]:
     if len(files) == 1:
         return found + _one(files[0], _some(files[0]))
     with closing(VideoPairs(files[0], files[1], Layout(GeometryConfig()))) as pairs:
-        return [*found, *pictures.check_both(*zip(*_some_pairs(pairs), strict=True))]
+        found += pictures.check_both(*zip(*_some_pairs(pairs), strict=True))
+        return [*found, *_late(pairs)]
 
 
 def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
@@ -86,13 +98,20 @@ def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
 
     Raises:
         SagsError: it cannot be read.
-        UsageError: one alone does not show both eyes in a way that is known.
+        UsageError: one alone does not show both eyes in a way that is known; or one of two does.
     """
     launch = "source.kind:=videos", override("source.left", files[0])
-    if len(files) == 2:
+    if len(files) == 2 and all(EYE.search(file.stem) for file in files):
         return *launch, override("source.right", files[1])
     shown = _some(files[0])
     way = way_of(shown)
+    if len(files) == 2:
+        if way is None:
+            return *launch, override("source.right", files[1])
+        raise UsageError(
+            f"{files[0].name} shows both eyes, {way.what}, and {files[1].name} lies beside it: are they "
+            f"parts of one recording? Play one after the other: sags run {shlex.quote(str(files[0]))}"
+        )
     if way is None:
         raise UsageError(f"{files[0]}: {ONE_EYE}; {_both_needed(files[0])}")
     return *launch, *layout_of(way, shown)
@@ -100,19 +119,24 @@ def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
 
 def way_of(shown: Sequence[U8]) -> Way | None:
     """How pictures [H, W, 3] RGB show both eyes; None: in no way that is known."""
+    height, width = shown[0].shape[:2]
+    for rows, blank in PACKED.items():
+        if abs(height - 2 * rows - blank) <= 1:  # some codecs take even heights only
+            return _packed(rows + blank, min(rows, height - rows - blank))
     for way in _WAYS:
         pairs = [way.eyes(picture) for picture in shown]
         lower = way.layout == "panes" and _are_eyes([_quarters(picture)[1] for picture in shown])
         if _are_eyes(pairs) and not lower:
-            return way
+            return way._replace(right=(width // 2, 0)) if way.layout == "panes" else way
     return None
 
 
 def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
     """`key:=value` that take these pictures apart, the left eye first."""
-    height, width = shown[0].shape[:2]
-    if way.layout == "panes":
-        return f"{LAYOUT}panes", *(box.format(w=width // 2, h=height // 2) for box in PANES)
+    if way.right is not None:
+        (x, y), (height, width) = way.right, way.eyes(shown[0])[0].shape[:2]
+        crops = f"crop:=[0,0,{width},{height}]", f"crop_right:=[{x},{y},{width},{height}]"
+        return f"{LAYOUT}panes", *(f"source.geometry.{crop}" for crop in crops)
     eyes = zip(*map(way.eyes, shown), strict=True)
     fixes = [fix for finding in pictures.check_eyes(*eyes) for fix in finding.launch]
     return f"{LAYOUT}{way.layout}", *fixes
@@ -122,40 +146,7 @@ def _file(file: Path) -> list[Finding]:
     with closing(Video(file)) as video:
         rate = "" if video.rate is None else f" at {video.rate:g} Hz, {video.count / video.rate:.1f} s"
         what = f"{file.name}: {video.count} frames of {size_text(*video.size)} px{rate}"
-        found = [Finding("ok", what), *(parted("warning", each) for each in video.oddities)]
-        if video.gaps:
-            before, missing = video.gaps[0]
-            many = "a gap" if len(video.gaps) == 1 else f"{len(video.gaps)} gaps, the first"
-            what = (
-                f"{file.name}: its stamps have {many} behind picture {before}, as long as {missing} pictures"
-            )
-            fix = "it is played by its stamps: were pictures lost, or was the recording paused?"
-            found.append(Finding("warning", what, fix))
-        return found
-
-
-def check_pixels(aspect: float) -> list[Finding]:
-    """Tell whether they are square; `aspect` is their width over their height."""
-    if abs(aspect - 1) < NOT_SQUARE:
-        return []
-    what = f"pixels are {aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
-    fix = "calibrate pictures as they are played; a camera that is guessed has such pixels"
-    return [Finding("warning", what, fix, {"pixel_aspect": aspect})]
-
-
-def check_ends(pairs: VideoPairs, needed: int) -> list[Finding]:
-    """Tell whether the right video reaches as far as the left one is played, so many frames."""
-    if pairs.right is None or not pairs.by_number:
-        return []
-    left, right, count = pairs.left.path.name, pairs.right.path.name, pairs.right.count
-    if count < needed:
-        what = f"{right} ends after {count} frames but {left} goes on: there playing fails"
-        return [Finding("error", what, f"set source.frames:={count} to stop there, or give both one length")]
-    if count == pairs.left.count:
-        return []
-    what = f"{right} has {count} frames, {left} {pairs.left.count}"
-    fix = "were both begun at the same moment? What the left one has is played"
-    return [Finding("warning", what, fix)]
+        return [Finding("ok", what), *(parted("warning", each) for each in video.oddities)]
 
 
 def _some(file: Path) -> list[U8]:
@@ -183,6 +174,21 @@ def _some_pairs(pairs: VideoPairs) -> list[Pair]:
     return found
 
 
+def _late(pairs: VideoPairs) -> list[Finding]:
+    """Which eye was begun later, of two videos of other lengths that are paired by number."""
+    if pairs.right is None or not pairs.by_number or pairs.left.count == pairs.right.count:
+        return []
+    longer = abs(pairs.left.count - pairs.right.count)
+    looked = timing.Timing(longer)
+    pairs.seek(0)
+    for _ in range(min(pairs.reach, timing.LOOKED_AT + min(longer, MOST_LATE))):
+        with suppress(LostPictureError):
+            pair = pairs.read()
+            if pair is not None and pair.right is not None:
+                looked.add(pair.left, pair.right)
+    return looked.findings()
+
+
 def _spread(count: int) -> list[int]:
     return sorted({round(at) for at in np.linspace(0, count - 1, LOOKED_AT)})
 
@@ -196,11 +202,7 @@ def _one(file: Path, shown: list[U8]) -> list[Finding]:
     looked = pictures.check_both(*zip(*map(way.eyes, shown), strict=True))
     if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
-    layout = Layout(GeometryConfig(layout="separate" if way.layout == "panes" else way.layout))
-    with closing(Video(file)) as video:
-        aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
-    found = Finding("ok", f"{size} px show both eyes: {way.what}")
-    return [found, *check_pixels(aspect), *looked]
+    return [Finding("ok", f"{size} px show both eyes: {way.what}"), *looked]
 
 
 def _both_needed(file: Path) -> str:
