@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from sags_node.instruments.geodesic import geodesic
 from sags_node.types import F64, I32, U8, Bool
 
 WIDTH = 320  # px, of the mask in which midlines are sought
@@ -155,14 +156,8 @@ def _midline(mask: U8, start: U8) -> tuple[F64, F64, I32]:
     rows, columns = np.nonzero(mask)
     box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
     inside, reached = np.ascontiguousarray(mask[box]), np.ascontiguousarray((start & mask)[box])
-    distance = reached.astype(np.int32)
-    shapes = [cv2.getStructuringElement(shape, (3, 3)) for shape in (cv2.MORPH_RECT, cv2.MORPH_CROSS)]
-    steps, before, count = 1, 0, cv2.countNonZero(reached)
-    while count > before:
-        reached = cv2.bitwise_and(cv2.dilate(reached, shapes[steps % 2]), inside)
-        distance += reached
-        steps, before, count = steps + 1, count, cv2.countNonZero(reached)
-    distance = np.where(distance > 0, steps + 1 - distance, 0)
+    distance = np.zeros(inside.shape, np.int32)
+    geodesic(inside, reached, distance)
     whole = np.zeros(mask.shape, np.int32)
     whole[box] = distance
     rows, columns = np.nonzero(whole)

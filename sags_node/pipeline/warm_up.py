@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from sags_node.config.schema import LaunchConfig, MappingConfig, VisionConfig
+from sags_node.instruments.outlines import outlines
 from sags_node.kernels.cache import is_cold
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.devices import device_of
@@ -58,6 +59,9 @@ def warm_up(config: LaunchConfig) -> None:
     for frame in frames[3:]:
         result = pipeline.process(frame, budget, request)
     InstrumentFinder()(frames[-1].left, result.views["left"])  # for sessions without masks
+    tools = np.zeros((_HEIGHT, _WIDTH), np.bool_)
+    tools[: _HEIGHT // 2, : _WIDTH // 8] = True
+    outlines(tools, np.ones_like(tools))  # somebody may ask for instruments
 
 
 def compile_vision() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from running_node import RunningNode
 from sags_node.confidence import confidence_of, error_of
 from sags_node.config.schema import LaunchConfig
 from sags_node.instruments.depths import disparities, eyes
+from sags_node.instruments.geodesic import geodesic
 from sags_node.instruments.instruments import Instruments
 from sags_node.instruments.outlines import outlines
 from sags_node.mapping.budget import StepBudget
@@ -34,10 +36,11 @@ def instruments_in(tools: Bool | None, right: bool = True, plane: float = 0.08) 
         cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (scene.pair.left, scene.pair.right)
     )
     surface = replace(scene.surface, depth=np.full_like(scene.surface.depth, plane))
-    found = Instruments(EVERYWHERE)
-    return found.update(
+    states = Instruments(EVERYWHERE).update(
         tools, left, there if right else None, scene.pair.camera, scene.pair.baseline, surface
     )
+    assert states is not None
+    return states
 
 
 # ---- in the picture --------------------------------------------------------------------------------------
@@ -105,6 +108,28 @@ def test_any_mask_gives_places_or_nothing(seed: int) -> None:
         assert line is None or np.isfinite(line.covariance).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_ways_inside_of_a_mask_are_as_long_as_openings_by_octagons_say(seed: int) -> None:
+    """Against OpenCV, which grows the start by a cross and by a square in turn."""
+    rng = np.random.default_rng(seed)
+    inside = (cv2.GaussianBlur(rng.normal(size=(70, 90)), (0, 0), 3) > -0.02).astype(np.uint8)
+    start = inside.copy()
+    start[:, 3:] = 0
+    compiled, source = np.zeros(inside.shape, np.int32), np.zeros(inside.shape, np.int32)
+    geodesic(inside, start, compiled)
+    geodesic.py_func(inside, start, source)
+    expected, reached, step = start.astype(np.int32), start, 1
+    shapes = [cv2.getStructuringElement(shape, (3, 3)) for shape in (cv2.MORPH_RECT, cv2.MORPH_CROSS)]
+    while True:
+        more = cv2.dilate(reached, shapes[step % 2]) & inside
+        if np.array_equal(more, reached):
+            break
+        step += 1
+        expected[(more > 0) & (reached == 0)] = step
+        reached = more
+    assert step > 60 and np.array_equal(compiled, expected) and np.array_equal(source, expected)
+
+
 # ---- in the world ----------------------------------------------------------------------------------------
 
 
@@ -119,6 +144,8 @@ def test_a_tip_is_where_it_is_told_and_so_is_the_tissue() -> None:
     assert ahead / found.axes[0, 2] <= found.distance[0] < ahead / found.axes[0, 2] + step
     aside = 4 * 0.065 / scene.pair.camera.K[0, 0]  # of every fourth pixel, the nearest
     assert ahead - 1e-6 <= found.clearance[0] < np.hypot(ahead, aside)
+    apart = np.linalg.norm(found.nearest[0] - found.tips[0])
+    assert apart == pytest.approx(found.clearance[0], rel=1e-5) and found.nearest[0, 2] == np.float32(0.065)
     assert found.distance_confidence[0] <= found.clearance_confidence[0] <= found.confidence[0]
 
 
@@ -126,7 +153,7 @@ def test_a_tip_is_where_it_is_told_and_so_is_the_tissue() -> None:
 def test_a_depth_that_cannot_be_measured_is_not_guessed() -> None:
     found = instruments_in(filmed().tools, right=False)
     assert len(found) == 1
-    for unknown in (found.tips, found.axes, found.pixels, found.distance, found.clearance):
+    for unknown in (found.tips, found.axes, found.pixels, found.distance, found.clearance, found.nearest):
         assert np.isnan(unknown).all()
     assert not any([found.confidence[0], found.distance_confidence[0], found.clearance_confidence[0]])
 
@@ -149,8 +176,9 @@ def test_an_instrument_keeps_its_number() -> None:
     def numbers(at_s: float, *tips: int) -> list[int]:
         mask = bars(*(((tip, 300), (tip, 128)) for tip in tips)) if tips else ~EVERYWHERE
         view = replace(scene.surface, t_capture_ns=round(at_s * 1e9))
-        ids = found.update(mask, gray, None, scene.pair.camera, scene.pair.baseline, view).ids
-        return sorted(ids.tolist())
+        states = found.update(mask, gray, None, scene.pair.camera, scene.pair.baseline, view)
+        assert states is not None
+        return sorted(states.ids.tolist())
 
     assert numbers(0.0, 80) == [1]
     assert numbers(0.1, 90, 240) == [1, 2]
@@ -159,6 +187,21 @@ def test_an_instrument_keeps_its_number() -> None:
     assert numbers(0.4) == []
     assert numbers(1.0, 100) == [3]  # away for longer: it may be another one
     assert numbers(1.1, 300) == [4]  # too far to be the same
+
+
+@pytest.mark.parametrize(("rate", "looks"), [(8, 80), (10, 100), (15, 100), (30, 100), (60, 100)])
+def test_they_are_looked_for_ten_times_a_second(rate: int, looks: int) -> None:
+    """In ten seconds, and again when the clock goes back."""
+    scene, found = filmed(), Instruments(EVERYWHERE)
+    for begins in (100.0, 50.0):
+        made = []
+        for frame in range(10 * rate):
+            view = replace(scene.surface, t_capture_ns=round((begins + frame / rate) * 1e9))
+            made.append(
+                found.update(None, scene.pair.left[..., 0], None, scene.pair.camera, 0.004, view) is not None
+            )
+        assert made[0] and abs(sum(made) - looks) <= 1
+        assert not any(first and second for first, second in pairwise(made)) or rate < 20
 
 
 # ---- in the node -----------------------------------------------------------------------------------------
@@ -172,16 +215,20 @@ def test_nothing_is_made_until_somebody_asks() -> None:
     later = replace(scene.frame, frame_id=1, t_capture_ns=2 * 10**9)  # it equals the one before
     found = pipeline.process(later, StepBudget(1), ASKED).instruments
     assert found is not None and len(found) == 1 and found.confidence[0] > 0
+    again = replace(later, frame_id=2, t_capture_ns=3 * 10**9)
+    assert pipeline.process(again, StepBudget(1), ASKED).instruments is None  # nothing was looked at
     config = LaunchConfig.model_validate({"vision": {**size, "tissue": {"method": "none"}}})
     without = Pipeline(config, scene.phantom.rig).process(scene.frame, StepBudget(1), ASKED).instruments
     assert without is not None and len(without) == 0
 
 
 @pytest.mark.live
-def test_a_subscriber_gets_them_with_every_frame(phantom_session: Path, tmp_path: Path) -> None:
+def test_a_subscriber_gets_them_ten_times_a_second(phantom_session: Path, tmp_path: Path) -> None:
     node = RunningNode(phantom_session, tmp_path, "source.pace:=fast")
     messages = client.collect(node.data, ["sags/instruments"], 5, 60)["sags/instruments"]
     assert node.stop() == 0
+    stamps = [message.meta["stamp_ns"] for message in messages]
+    assert np.mean(np.diff(stamps)) >= 0.9e8
     for message in messages:
         client.check_meta(message, "sensor_msgs/msg/PointCloud2")
         names = message.meta["encoding"].split(",")

@@ -30,7 +30,7 @@ from sags_node.clients.overlay.run import UNSEEN, OverlayOptions, run_overlay
 from sags_node.geometry import project
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
-from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText
+from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.sources.pictures import read_picture
@@ -265,6 +265,35 @@ def test_it_leaves_no_anchors_behind(run_dir: Path) -> None:
             until(lambda: anchors() == 1)
             running.end()
             until(lambda: anchors() == 0)
+
+
+@pytest.mark.usefixtures("node")
+def test_tips_that_are_too_near_are_told_of_the_frame_in_which_they_were_seen(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    """Of every message with one the node has said the same of that very frame."""
+    scene = tmp_path / "zones.yaml"
+    scene.write_text("{tissue_margin: 0.05, objects: [{shape: sphere, label: vessel, margin: 0.05}]}")
+    near, tips = TopicName("proximity", ReceivedCloud), TopicName("instruments", ReceivedCloud)
+    seen = {0: 0, 1: 0}
+    with overlay(run_dir, scene=scene) as (_, watcher), Subscriber([tips], run_dir=run_dir) as node:
+        with Subscriber([near], ns="overlay", run_dir=run_dir) as told:
+            said, deadline = None, time.monotonic() + 60
+            while min(seen.values()) < 10:
+                assert time.monotonic() < deadline, (seen, watcher.status())
+                said = told.wait(near, 1.0, after=said)
+                whole = None if said is None else node.aligned([tips], said.stamp_ns, 1.0)
+                if said is None or whole is None:
+                    continue
+                rows = {int(row["id"]): row for row in whole[tips].points}
+                for row in said.points[np.isfinite(said.points["distance"])]:
+                    truth, zone = rows[int(row["id"])], int(row["zone"])
+                    assert all(row[axis] == truth[axis] for axis in "xyz")
+                    apart = np.linalg.norm([row[f"near_{axis}"] - row[axis] for axis in "xyz"])
+                    assert row["distance"] == pytest.approx(apart, abs=1e-6) and row["distance"] < 0.05
+                    assert zone == 1 or row["distance"] == truth["clearance"]
+                    seen[zone] += 1
+        assert {each["zone"] for each in watcher.status()["proximity"]["near"]} <= {"vessel", "tissue"}
 
 
 @pytest.mark.fault("process: the node is stopped (SIGSTOP), reset or killed under an overlay")
