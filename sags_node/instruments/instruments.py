@@ -90,10 +90,11 @@ class Instruments:
         """
         if not self._is_due(tissue.t_capture_ns):
             return None
-        found = []
-        if tools is not None:
-            both = None if right is None else eyes(left, right, tools, row_error)
-            found = [_placed(outline, both, camera, baseline) for outline in outlines(tools, self._usable)]
+        shown = [] if tools is None else outlines(tools, self._usable)
+        both = None
+        if shown and tools is not None and right is not None:
+            both = eyes(left, right, tools, row_error)
+        found = [_placed(outline, both, camera, baseline) for outline in shown]
         if any(np.isfinite(one.tip[0]) for one in found):
             surface = _Tissue.of(tissue)
             found = [one if np.isnan(one.tip[0]) else _beside_tissue(one, surface) for one in found]

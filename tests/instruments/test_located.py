@@ -15,6 +15,7 @@ from running_node import RunningNode
 
 from sags_node.confidence import confidence_of, error_of
 from sags_node.config.schema import LaunchConfig
+from sags_node.instruments.agreement import agreements
 from sags_node.instruments.depths import disparities, eyes
 from sags_node.instruments.geodesic import geodesic
 from sags_node.instruments.instruments import Instruments
@@ -115,9 +116,10 @@ def test_ways_inside_of_a_mask_are_as_long_as_openings_by_octagons_say(seed: int
     inside = (cv2.GaussianBlur(rng.normal(size=(70, 90)), (0, 0), 3) > -0.02).astype(np.uint8)
     start = inside.copy()
     start[:, 3:] = 0
-    compiled, source = np.zeros(inside.shape, np.int32), np.zeros(inside.shape, np.int32)
-    geodesic(inside, start, compiled)
-    geodesic.py_func(inside, start, source)
+    compiled, source = geodesic(inside, start), geodesic.py_func(inside, start)
+    assert all(map(np.array_equal, compiled, source))
+    found = np.zeros(inside.shape, np.int32)
+    found[compiled[0], compiled[1]] = compiled[2]
     expected, reached, step = start.astype(np.int32), start, 1
     shapes = [cv2.getStructuringElement(shape, (3, 3)) for shape in (cv2.MORPH_RECT, cv2.MORPH_CROSS)]
     while True:
@@ -127,7 +129,22 @@ def test_ways_inside_of_a_mask_are_as_long_as_openings_by_octagons_say(seed: int
         step += 1
         expected[(more > 0) & (reached == 0)] = step
         reached = more
-    assert step > 60 and np.array_equal(compiled, expected) and np.array_equal(source, expected)
+    assert step > 60 and np.array_equal(found, expected)
+
+
+def test_a_patch_agrees_where_it_is_found_again() -> None:
+    """In a picture that is shifted by 7.5 px, 2 down, brighter and flatter; not with what lies beyond it."""
+    smooth = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 1, (80, 200)), (0, 0), 3)
+    left = cv2.normalize(smooth, None, 0, 250, cv2.NORM_MINMAX)
+    right = cv2.warpAffine(left, np.array([[1, 0, -7.5], [0, 1, 2.0]]), (200, 80))
+    pictures = np.rint(left).astype(np.uint8), np.rint(0.5 * right + 90).astype(np.uint8)
+    counts = np.full(left.shape, 255, np.uint8)
+    counts[:, 105:] = 0
+    tried = np.array([3.5, 7.5, 11.5, 95.0])
+    given = *pictures, counts, 100.25, 40.5, 2.0, 9, 2, tried
+    found = agreements(*given)
+    assert found[1] > 0.999 and max(found[0], found[2]) < 0.9 and found[3] == -1
+    np.testing.assert_allclose(found, agreements.py_func(*given), atol=1e-5)
 
 
 # ---- in the world ----------------------------------------------------------------------------------------
