@@ -83,6 +83,7 @@ class Placed:
     T_world_body: F64  # [4, 4]
     is_sure: bool = True
     vertices: F64 | None = None  # [V, 3] m, of the body, bent with the tissue; None: it is rigid
+    depth_confidence: float = 1.0  # 0..1, of what holds it
 
     def shape(self, T: F64) -> F64:
         """Its vertices [V, 3] (m) as T [4, 4] transforms its body's coordinates."""

@@ -26,7 +26,7 @@ MAX_POINTS = 20_000
 LARGEST = 1.0  # m across: nothing in a body is larger
 HEADER_BYTES = 1 << 16
 GREEN = (60, 230, 120)  # RGB
-ROD = 0.0002  # m, the radius of a line
+ROD = 0.0003  # m, the radius of a line
 LEAN = np.radians(35)  # of the target's arrow: along the line of sight it would be a dot
 
 _MESHES, _POINTS = (".ply", ".obj", ".stl"), (".ply", ".pcd", ".xyz")

@@ -133,7 +133,7 @@ class Proximity:
         source = frame.session, frame.epoch
         if source != self._source:
             self._source, self._stamp_ns = source, None
-            self._past.clear()
+            self._past, self._found, self._unknown = {}, [], []
         if (said.meta.session, said.meta.epoch) != source or said.stamp_ns == self._stamp_ns:
             return None
         self.reason = _unusable(said)
@@ -206,7 +206,8 @@ class Proximity:
             put = placed[zone.number - 1]
             if put is None:
                 continue
-            errors = np.hypot(error_of(known["confidence"]), zone.error)
+            own = np.hypot(error_of(np.float32(put.depth_confidence)), zone.error)
+            errors = np.hypot(error_of(known["confidence"]), own)
             sure = np.minimum(confidence_of(errors), 1.0 if put.is_sure else UNSURE).tolist()
             for row, tip, place, each in zip(known, tips, zone.nearest(put, tips), sure, strict=True):
                 off = float(np.linalg.norm(tip - place))
