@@ -44,7 +44,8 @@ def agreements(
     side = 2 * radius // every + 1
     patch, there, share = np.empty((side, side)), np.empty((side, side)), np.empty((side, side))
     _taken(counts, u, v, radius, every, share)
-    share = (share > HALF_SEEN) / max(1, np.count_nonzero(share > HALF_SEEN))
+    share = np.where(share > HALF_SEEN, 1.0, 0.0)
+    share /= max(1.0, share.sum())
     _taken(left, u, v, radius, every, patch)
     patch -= (patch * share).sum()
     own = (patch * patch * share).sum()

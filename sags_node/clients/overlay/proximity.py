@@ -79,7 +79,7 @@ class Near:
 
     def status(self) -> dict[str, Any]:
         """Say it for people and programs."""
-        error = float(error_of(np.float32(self.confidence)))  # nine of ten are meant to be smaller
+        error = float(error_of(np.array(self.confidence, np.float32)))  # nine of ten are meant to be smaller
         told = {"distance_mm": 1e3 * self.distance, "margin_mm": 1e3 * self.margin}
         told |= {"error_mm": 1e3 * error, "closing_mm_s": 1e3 * self.closing, "contact_s": self.contact}
         figures = {name: round(value, 2) if np.isfinite(value) else None for name, value in told.items()}
@@ -206,7 +206,7 @@ class Proximity:
             put = placed[zone.number - 1]
             if put is None:
                 continue
-            own = np.hypot(error_of(np.float32(put.depth_confidence)), zone.error)
+            own = np.hypot(error_of(np.array(put.depth_confidence, np.float32)), zone.error)
             errors = np.hypot(error_of(known["confidence"]), own)
             sure = np.minimum(confidence_of(errors), 1.0 if put.is_sure else UNSURE).tolist()
             for row, tip, place, each in zip(known, tips, zone.nearest(put, tips), sure, strict=True):
