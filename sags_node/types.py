@@ -387,6 +387,7 @@ class InstrumentStates:
     distance_confidence: F32  # [I] 0..1
     clearance: F32  # [I] m, from the tip to the nearest tissue
     clearance_confidence: F32  # [I] 0..1
+    nearest: F32  # [I, 3] m, world, of the tissue
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -69,7 +69,7 @@ def overlay(json_out: bool, **options: Any) -> None:
 
     It is tested against the depth of the tissue, hidden behind instruments, and blank as soon as anything it
     needs is stale. The node may be started later and restarted. docs/overlay.md describes the scene file,
-    docs/wire.md what is published.
+    also its forbidden zones, docs/wire.md what is published.
     """
     from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 

@@ -1,4 +1,4 @@
 """Instruments as objects: where their tips are, how they point, how far the tissue is.
 
-Imports no other folder.
+Imports kernels.
 """

@@ -12,7 +12,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from sags_node.instruments.agreement import agreements
 from sags_node.instruments.outlines import Outline
+from sags_node.kernels.jit import read_only
 from sags_node.types import F32, F64, I64, U8, Bool
 
 PATCHES = 12
@@ -26,7 +28,6 @@ FINE = 3  # px around the line that is found
 REFINED = 2  # times
 FITS = 8
 TILT = 0.3  # of its disparity: by so much it usually changes along what is seen of an instrument
-FLAT = 1.0  # grey levels^4, of patches in which nothing is seen
 CORE = 0.15  # of the width, around the midline, that is instrument where it is not between jaws
 AGREES = 0.6  # zero-mean normalised cross-correlation (ZNCC) from which on a patch counts
 LEAST_SPREAD = 0.25  # px, of the patches around their line: fewer would be chance
@@ -54,7 +55,7 @@ def eyes(left: U8, right: U8, tools: Bool, row_error: float) -> Eyes:
     """Both gray pictures [H, W], and the instruments [H, W] in the left one."""
     around = np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)
     shown = tools.view(np.uint8) * np.uint8(255)
-    return Eyes(left, right, shown, cv2.dilate(shown, around), row_error)
+    return Eyes(read_only(left), read_only(right), shown, cv2.dilate(shown, around), float(row_error))
 
 
 def disparities(seen: Eyes, outline: Outline, limits: tuple[float, float]) -> Disparities | None:
@@ -99,29 +100,10 @@ def _is_solid(tools: U8, centre: F64, width: float) -> bool:
 
 
 def _scores(seen: Eyes, centre: F64, radius: int, tried: F64, every: int) -> F32:
-    """ZNCC [D] of the patch around a place [2] (u v) with those at the disparities [D] that are tried; -1:
-    beyond the right picture. Every so many rows and columns are compared."""
-    around = np.arange(-radius, radius + 1, every, dtype=np.float64)
-    patch = _taken(seen.left, centre[0] + around[None], centre[1] + around)[0]
-    counts = _taken(seen.counts, centre[0] + around[None], centre[1] + around)[0] > 127
-    columns = centre[0] - tried[:, None] + around
-    there = _taken(seen.right, columns, centre[1] + seen.row_error + around)
-    share = counts / np.float32(max(1, int(np.count_nonzero(counts))))
-    patch = patch - (patch * share).sum()
-    there = there - (there * share).sum((1, 2), keepdims=True)
-    spread = (patch * patch * share).sum() * (there * there * share).sum((1, 2))
-    inside = (columns[:, 0] >= 0) & (columns[:, -1] <= seen.right.shape[1] - 1)
-    agreement = (patch * there * share).sum((1, 2)) / np.sqrt(np.maximum(spread, FLAT))
-    return np.where(inside, agreement, np.float32(-1))
-
-
-def _taken(picture: U8, columns: F64, rows: F64) -> F32:
-    """A picture at every row [h] of every set of columns [D, w], as [D, h, w]."""
-    shape = len(columns), len(rows), columns.shape[1]
-    x = np.broadcast_to(columns[:, None], shape).astype(np.float32).reshape(-1, shape[2])
-    y = np.broadcast_to(rows[:, None], shape).astype(np.float32).reshape(-1, shape[2])
-    taken = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(taken.reshape(shape), np.float32)
+    u, v = float(centre[0]), float(centre[1])
+    return agreements(
+        seen.left, seen.right, seen.counts, u, v, seen.row_error, int(radius), int(every), tried
+    )
 
 
 def _best_line(scores: F32, places: F64) -> I64:

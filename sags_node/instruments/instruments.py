@@ -1,8 +1,9 @@
-"""Which instruments there are in each frame, as consumers are told of them."""
+"""Which instruments there are, as consumers are told of them: looked for in some frames a second."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +11,9 @@ from sags_node.confidence import confidence_of, error_of
 from sags_node.geometry import project, unproject
 from sags_node.instruments.depths import Disparities, Eyes, disparities, eyes
 from sags_node.instruments.outlines import Outline, outlines
-from sags_node.types import F32, F64, U8, Bool, Camera, InstrumentStates, RenderedView
+from sags_node.types import F32, F64, I64, U8, Bool, Camera, InstrumentStates, RenderedView
 
+PERIOD_NS = 100_000_000  # a hand, and who reads a distance, are not quicker; each look costs the mapping time
 NEAREST, FARTHEST = 0.02, 0.2  # m, that an instrument may be away
 NINE_OF_TEN = 1.645  # standard deviations
 HALF = 0.75  # of the spread of its end, by which the tip of open jaws or of a hook is uncertain
@@ -38,6 +40,27 @@ class _One:
     distance_error: float = np.inf
     clearance: float = np.nan
     clearance_error: float = np.inf
+    nearest: F64 = field(default_factory=lambda: np.full(3, np.nan))  # m, of the tissue
+
+
+class _Tissue(NamedTuple):
+    """The model as the left eye sees it, made ready once for all instruments of a frame."""
+
+    camera: Camera
+    depth: F32  # [H, W] m, 0: none
+    confidence: F32 | None
+    at: I64  # [N, 2] row and column of some of its pixels
+    places: F32  # [N, 3] m, world, of these
+
+    @classmethod
+    def of(cls, view: RenderedView) -> _Tissue:
+        at = EVERY * np.argwhere(view.depth[::EVERY, ::EVERY])
+        places = unproject(view.camera, at[:, ::-1].astype(np.float32), view.depth[at[:, 0], at[:, 1]])
+        return cls(view.camera, view.depth, view.confidence, at, np.asarray(places, np.float32))
+
+    def error(self, row: int, column: int) -> float:
+        """Of its depth there, m."""
+        return 0.0 if self.confidence is None else float(error_of(self.confidence[row, column]))
 
 
 class Instruments:
@@ -51,12 +74,13 @@ class Instruments:
         self._usable = usable
         self._known: dict[int, tuple[F64, int]] = {}  # number -> px, and when it was there
         self._next = 1
+        self._due_ns = 0
 
     def update(
         self, tools: Bool | None, left: U8, right: U8 | None, camera: Camera, baseline: float,
         tissue: RenderedView, row_error: float = 0.0,
-    ) -> InstrumentStates:  # fmt: skip
-        """Those of one frame.
+    ) -> InstrumentStates | None:  # fmt: skip
+        """Those of one frame; None: they were looked for less than `PERIOD_NS` before, on the average.
 
         Args:
             tools: [H, W] what shows an instrument; None: nobody looks for any.
@@ -64,13 +88,25 @@ class Instruments:
             tissue: the model as the left eye sees it.
             row_error: by how much the right picture is too low, px.
         """
-        found = []
-        if tools is not None:
-            both = None if right is None else eyes(left, right, tools, row_error)
-            for outline in outlines(tools, self._usable):
-                one = _placed(outline, both, camera, baseline)
-                found.append(one if np.isnan(one.tip[0]) else _beside_tissue(one, tissue))
+        if not self._is_due(tissue.t_capture_ns):
+            return None
+        shown = [] if tools is None else outlines(tools, self._usable)
+        both = None
+        if shown and tools is not None and right is not None:
+            both = eyes(left, right, tools, row_error)
+        found = [_placed(outline, both, camera, baseline) for outline in shown]
+        if any(np.isfinite(one.tip[0]) for one in found):
+            surface = _Tissue.of(tissue)
+            found = [one if np.isnan(one.tip[0]) else _beside_tissue(one, surface) for one in found]
         return _states(self._numbers([one.end for one in found], tissue.t_capture_ns), found)
+
+    def _is_due(self, now_ns: int) -> bool:
+        """Keeps the rate also where frames do not come at multiples of the period."""
+        late = now_ns - self._due_ns
+        if -PERIOD_NS <= late < 0:  # earlier still: the clock was set back
+            return False
+        self._due_ns = now_ns + PERIOD_NS - (late if 0 <= late < PERIOD_NS else 0)
+        return True
 
     def _numbers(self, ends: list[F64], now_ns: int) -> list[int]:
         """Each keeps the number of the one that was the nearest before."""
@@ -129,36 +165,25 @@ def _others(camera: Camera, ends: F64, scale: float, found: Disparities) -> tupl
     return tuple(_tip_and_axis(camera, ends, scale / other)[1] for other in others)
 
 
-def _beside_tissue(one: _One, tissue: RenderedView) -> _One:
+def _beside_tissue(one: _One, tissue: _Tissue) -> _One:
     """How far the tissue is from a tip, and how sure that is."""
-    camera, sure = tissue.camera, tissue.confidence
-    errors = np.zeros_like(tissue.depth) if sure is None else error_of(sure)
-    rows, columns = np.nonzero(tissue.depth[::EVERY, ::EVERY])
-    rows, columns = EVERY * rows, EVERY * columns
-    if len(rows) == 0:
+    if len(tissue.at) == 0:
         return one
-    pixels = np.stack([columns, rows], -1).astype(np.float32)
-    surface = unproject(camera, pixels, tissue.depth[rows, columns])
-    apart = np.linalg.norm(surface - one.tip.astype(np.float32), axis=1)
+    apart = np.linalg.norm(tissue.places - one.tip.astype(np.float32), axis=1)
     nearest = int(apart.argmin())
-    u, v = np.clip(np.rint(one.pixel), 0, [camera.width - 1, camera.height - 1]).astype(int)
+    u, v = np.clip(np.rint(one.pixel), 0, [tissue.camera.width - 1, tissue.camera.height - 1]).astype(int)
     if tissue.depth[v, u] > 0:  # what lies behind the tissue is hidden by it, or is not there
-        behind = max(0.0, float(project(camera, one.tip)[1]) - float(tissue.depth[v, u]))
+        behind = max(0.0, float(project(tissue.camera, one.tip)[1]) - float(tissue.depth[v, u]))
         one = replace(one, error=float(np.hypot(one.error, behind)))
-    error = float(np.hypot(one.error, errors[rows[nearest], columns[nearest]]))
-    one = replace(one, clearance=float(apart[nearest]), clearance_error=error)
+    error = float(np.hypot(one.error, tissue.error(*tissue.at[nearest])))
+    one = replace(one, clearance=float(apart[nearest]), clearance_error=error, nearest=tissue.places[nearest])
     if np.isnan(one.axis[0]):
         return one
-    met = _met(one.tip, one.axis, camera, tissue.depth)
-    if met is None:
+    met, place = _met(one.tip, np.stack([one.axis, *one.others, *_tilted(one.axis)]), tissue)
+    if np.isinf(met[0]):
         return one
-    distance, place = met
-    apart_by_axis = 0.0
-    for other in (*one.others, *_tilted(one.axis)):
-        met = _met(one.tip, other, camera, tissue.depth)
-        apart_by_axis = max(apart_by_axis, np.inf if met is None else abs(met[0] - distance))
-    error = float(np.linalg.norm([one.error, errors[place], apart_by_axis]))
-    return replace(one, distance=distance, distance_error=error)
+    error = float(np.linalg.norm([one.error, tissue.error(*place), np.abs(met[1:] - met[0]).max()]))
+    return replace(one, distance=float(met[0]), distance_error=error)
 
 
 def _tilted(axis: F64) -> list[F64]:
@@ -168,18 +193,18 @@ def _tilted(axis: F64) -> list[F64]:
     return [each / np.linalg.norm(each) for each in turned]
 
 
-def _met(tip: F64, axis: F64, camera: Camera, depth: F32) -> tuple[float, tuple[int, int]] | None:
-    """How far along an axis the tissue [H, W] is (m), and in which row and column; None: it meets none."""
+def _met(tip: F64, axes: F64, tissue: _Tissue) -> tuple[F64, I64]:
+    """How far along axes [A, 3] the tissue is ([A] m; inf: they meet none), and in which row and column the
+    first one meets it."""
     along = np.arange(0, AHEAD, STEP)
-    pixels, depths = project(camera, tip + along[:, None] * axis)
-    columns, rows = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.intp).T
-    inside = (columns >= 0) & (rows >= 0) & (columns < depth.shape[1]) & (rows < depth.shape[0])
-    surface = np.where(inside, depth[np.where(inside, rows, 0), np.where(inside, columns, 0)], 0)
-    behind = np.nonzero((surface > 0) & (depths >= surface))[0]
-    if len(behind) == 0:
-        return None
-    first = int(behind[0])
-    return float(along[first]), (int(rows[first]), int(columns[first]))
+    pixels, depths = project(tissue.camera, tip + along[:, None] * axes[:, None])
+    at = np.rint(np.nan_to_num(pixels, nan=-1.0))[..., ::-1].astype(np.intp)
+    inside = np.all((at >= 0) & (at < tissue.depth.shape), axis=-1)
+    at[~inside] = 0
+    surface = np.where(inside, tissue.depth[at[..., 0], at[..., 1]], 0)
+    behind = (surface > 0) & (depths >= surface)
+    first = behind.argmax(1)
+    return np.where(behind.any(1), along[first], np.inf), at[0, first[0]]
 
 
 def _states(numbers: list[int], found: list[_One]) -> InstrumentStates:
@@ -196,4 +221,5 @@ def _states(numbers: list[int], found: list[_One]) -> InstrumentStates:
         distance_confidence=confidence_of(column([one.distance_error for one in found])),
         clearance=column([one.clearance for one in found]),
         clearance_confidence=confidence_of(column([one.clearance_error for one in found])),
+        nearest=column([one.nearest for one in found], 3),
     )

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from sags_node.instruments.geodesic import geodesic
 from sags_node.types import F64, I32, U8, Bool
 
 WIDTH = 320  # px, of the mask in which midlines are sought
@@ -126,7 +127,7 @@ def _band(mask: U8, start: U8) -> U8 | None:
 
 
 def _of_band(mask: U8, start: U8, edge: U8, alone: bool) -> Outline | None:
-    middles, widths, distance = _midline(mask, start)
+    middles, widths, reached = _midline(mask, start)
     if len(middles) < FEWEST:
         return None
     # The longest part that ends at the far end and is straight.
@@ -136,42 +137,30 @@ def _of_band(mask: U8, start: U8, edge: U8, alone: bool) -> Outline | None:
         direction, middle, off = _line(part, weights, STRAIGHT * width + 1)
         if weights[off].sum() <= SIDEWAYS * weights.sum():
             break
-    rows, columns = np.nonzero(distance > max(0.0, distance.max() - max(3 * BIN, width)))
+    rows, columns, steps = reached[:, reached[2] > reached[2, -1] - max(3 * BIN, width)]
     away = np.stack([columns, rows], -1) - middle
     reach = float((away @ direction).max()) + 0.5
-    end = distance[rows, columns] > distance.max() - 3 * BIN
+    end = steps > steps[-1] - 3 * BIN
     spread = float(np.abs(away[end] @ np.array([direction[1], -direction[0]])).max())
     far = middle + reach * direction
     back = middle + direction * float((middles[first] - middle) @ direction)
-    last = distance[rows, columns] > distance.max() - 2
+    last = steps > steps[-1] - 2
     at_edge = (edge[rows[last], columns[last]] > 0).any()
     is_outside = bool(at_edge or np.linalg.norm(far - back) < SHORTEST * width)
     return Outline(far, back, part[~off][::-1], weights[~off][::-1], spread, is_outside, alone)
 
 
 def _midline(mask: U8, start: U8) -> tuple[F64, F64, I32]:
-    """Middles [K, 2] (u v) and widths [K] (px) of what is ever farther from the start within a mask, and that
-    distance [h, w]; 0: not reached."""
-    rows, columns = np.nonzero(mask)
-    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    inside, reached = np.ascontiguousarray(mask[box]), np.ascontiguousarray((start & mask)[box])
-    distance = reached.astype(np.int32)
-    shapes = [cv2.getStructuringElement(shape, (3, 3)) for shape in (cv2.MORPH_RECT, cv2.MORPH_CROSS)]
-    steps, before, count = 1, 0, cv2.countNonZero(reached)
-    while count > before:
-        reached = cv2.bitwise_and(cv2.dilate(reached, shapes[steps % 2]), inside)
-        distance += reached
-        steps, before, count = steps + 1, count, cv2.countNonZero(reached)
-    distance = np.where(distance > 0, steps + 1 - distance, 0)
-    whole = np.zeros(mask.shape, np.int32)
-    whole[box] = distance
-    rows, columns = np.nonzero(whole)
-    if len(rows) == 0:
-        return np.zeros((0, 2)), np.zeros(0), whole
-    bins = (whole[rows, columns] - 1) // BIN
+    """Middles [K, 2] (u v) and widths [K] (px) of what is ever farther from the start within a mask; and all
+    that is reached, [3, N]: row, column, steps."""
+    reached = np.stack(geodesic(mask, start & mask))
+    if reached.size == 0:
+        return np.zeros((0, 2)), np.zeros(0), reached
+    rows, columns, steps = reached
+    bins = (steps - 1) // BIN
     counts = np.maximum(np.bincount(bins), 1)
     middles = np.stack([np.bincount(bins, places) / counts for places in (columns, rows)], -1)
-    return middles, counts / BIN, whole
+    return middles, counts / BIN, reached
 
 
 def _line(points: F64, weights: F64, tolerance: float) -> tuple[F64, F64, Bool]:

@@ -48,6 +48,7 @@ ANCHOR_FIELDS = (
 INSTRUMENT_FIELDS = (
     *("x", "y", "z", "id", "axis_x", "axis_y", "axis_z", "u", "v", "confidence"),
     *("distance", "distance_confidence", "clearance", "clearance_confidence", "source"),
+    *("near_x", "near_y", "near_z"),
 )
 BY_MASK = 1  # in the column source: by the tissue mask and both eyes
 POINT_MIN_OPACITY = 0.1
@@ -128,7 +129,7 @@ def instruments(result: FrameResult) -> Content:
     rows[:, 7:9] = published.pixels(result.pair, states.pixels)
     rows[:, 10], rows[:, 11] = states.distance, states.distance_confidence
     rows[:, 12], rows[:, 13] = states.clearance, states.clearance_confidence
-    rows[:, 14] = BY_MASK
+    rows[:, 14], rows[:, 15:18] = BY_MASK, states.nearest
     dense = bool(np.isfinite(states.tips).all())
     return cdr.point_cloud(rows, INSTRUMENT_FIELDS, result.pair.t_capture_ns, dense)
 

@@ -72,6 +72,7 @@ OVERLAY_TOPICS = (
     Topic("right/overlay/image", IMAGE, "rgba8, virtual geometry, not premultiplied"),
     Topic("left/overlay/color_key", IMAGE, _KEYED),
     Topic("right/overlay/color_key", IMAGE, _KEYED),
+    Topic("proximity", POINT_CLOUD, "tips that are nearer to a zone or to tissue than its margin (m, world)"),
     Topic("status", STRING, "JSON: what is drawn, or why nothing is; latency", cached=True),
 )
 _OF_OTHERS = {topic.name: topic for topic in (*PLAYER_TOPICS, *OVERLAY_TOPICS)}

@@ -143,6 +143,7 @@ class Pipeline:
             self._camera = PoseRefiner(self.map)
         self.anchors = Anchors(self.tissue.usable)
         self._instruments = Instruments(self.tissue.usable)
+        self._instruments_asked = False  # for the last frame that was mapped
         self._pose = PoseWatch(needed=vision.pose in ("session", "refine"))
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._freeze = FreezeWatch(vision.tissue.exclude)
@@ -273,6 +274,7 @@ class Pipeline:
             self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
             self.anchors.age(pair.t_capture_ns)
             anchors = self.anchors.ahead(self.anchors.states(), mapped.snapshot, request.latency)
+        self._instruments_asked = request.instruments
         with clock("instruments"):
             instruments = self._located_instruments(seen, observation, mapped, judged, request)
         self.newest = FrameResult(
@@ -292,7 +294,7 @@ class Pipeline:
             self._forget()
         last = self.newest
         lacks = last is not None and (  # somebody has just come
-            (right and "right" not in last.views) or (instruments and last.instruments is None)
+            (right and "right" not in last.views) or (instruments and not self._instruments_asked)
         )
         equal = last is not None and self._skips.duplicates and not lacks and is_repeat(pair, last.pair)
         evidence = Evidence(frame, pair, last, equal, self.depth.eyes_are_late)

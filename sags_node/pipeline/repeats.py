@@ -37,6 +37,7 @@ def repeated(
         timings_ms=timings,
         skipped={**mapped.skipped, "frame": "equals its predecessor"},
         anchors=anchors,
+        instruments=None,  # they are told of the frame in which they were found
     )
 
 

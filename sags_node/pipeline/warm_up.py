@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from sags_node.config.schema import LaunchConfig, MappingConfig, VisionConfig
+from sags_node.instruments.instruments import Instruments
 from sags_node.kernels.cache import is_cold
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.devices import device_of
@@ -58,6 +59,10 @@ def warm_up(config: LaunchConfig) -> None:
     for frame in frames[3:]:
         result = pipeline.process(frame, budget, request)
     InstrumentFinder()(frames[-1].left, result.views["left"])  # for sessions without masks
+    view, gray = result.views["left"], result.observation.gray
+    tools = np.zeros((_HEIGHT, _WIDTH), np.bool_)
+    tools[: _HEIGHT // 2, : _WIDTH // 8] = True
+    Instruments(np.ones_like(tools)).update(tools, gray, gray, view.camera, _BASELINE, view)  # if asked for
 
 
 def compile_vision() -> None:

@@ -14,7 +14,9 @@ from running_node import RunningNode
 
 from sags_node.confidence import confidence_of, error_of
 from sags_node.config.schema import LaunchConfig
+from sags_node.instruments.agreement import agreements
 from sags_node.instruments.depths import disparities, eyes
+from sags_node.instruments.geodesic import geodesic
 from sags_node.instruments.instruments import Instruments
 from sags_node.instruments.outlines import outlines
 from sags_node.mapping.budget import StepBudget
@@ -22,6 +24,7 @@ from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.types import Bool, InstrumentStates
 
 EVERYWHERE = np.ones((HEIGHT, WIDTH), np.bool_)
+CROSS, SQUARE = (cv2.getStructuringElement(kind, (3, 3)) for kind in (cv2.MORPH_CROSS, cv2.MORPH_RECT))
 COARSE = 3  # px: distances from the entry are counted in these
 ASKED = FrameRequest(instruments=True)
 OUTSIDE = [((-40, 120), (360, 150)), ((300, 300), (360, 220))]  # from edge to edge; the corner of a shaft
@@ -34,10 +37,11 @@ def instruments_in(tools: Bool | None, right: bool = True, plane: float = 0.08) 
         cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (scene.pair.left, scene.pair.right)
     )
     surface = replace(scene.surface, depth=np.full_like(scene.surface.depth, plane))
-    found = Instruments(EVERYWHERE)
-    return found.update(
+    states = Instruments(EVERYWHERE).update(
         tools, left, there if right else None, scene.pair.camera, scene.pair.baseline, surface
     )
+    assert states is not None
+    return states
 
 
 # ---- in the picture --------------------------------------------------------------------------------------
@@ -105,6 +109,33 @@ def test_any_mask_gives_places_or_nothing(seed: int) -> None:
         assert line is None or np.isfinite(line.covariance).all()
 
 
+def test_ways_inside_of_a_mask_are_as_long_as_growing_says() -> None:
+    """Against OpenCV, which grows the start by a cross and by a square in turn, and its own source."""
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(70, 90)), (0, 0), 3)
+    inside = (noise > -0.02).astype(np.uint8)
+    reached = inside * (np.arange(90) < 3).astype(np.uint8)
+    found, expected = np.zeros((2, 70, 90), np.int32)
+    rows, columns, steps = geodesic(inside, reached)
+    assert all(map(np.array_equal, (rows, columns, steps), geodesic.py_func(inside, reached)))
+    found[rows, columns] = steps
+    for step in range(1, steps[-1] + 2):
+        expected[(reached > 0) & (expected == 0)] = step
+        reached = cv2.dilate(reached, CROSS if step % 2 else SQUARE) & inside
+    assert steps[-1] > 60 and np.array_equal(found, expected)
+
+
+def test_a_patch_agrees_where_it_is_found_again() -> None:
+    """In a picture that is shifted by 7.5 px, 2 down, brighter and flatter; not with what lies beyond it."""
+    left = 128 + 700 * cv2.GaussianBlur(np.random.default_rng(0).uniform(-1, 1, (80, 200)), (0, 0), 3)
+    right = cv2.warpAffine(left, np.array([[1, 0, -7.5], [0, 1, 2.0]]), (200, 80))
+    pictures = np.rint(left).astype(np.uint8), np.rint(0.5 * right + 90).astype(np.uint8)
+    counts = np.where(np.arange(200) < 105, 255, np.zeros((80, 1), np.uint8)).astype(np.uint8)
+    given = *pictures, counts, 100.25, 40.5, 2.0, 9, 2, np.array([3.5, 7.5, 11.5, 95.0])
+    found = agreements(*given)
+    assert found[1] > 0.999 and max(found[0], found[2]) < 0.9 and found[3] == -1
+    np.testing.assert_allclose(found, agreements.py_func(*given), atol=1e-5)
+
+
 # ---- in the world ----------------------------------------------------------------------------------------
 
 
@@ -119,6 +150,8 @@ def test_a_tip_is_where_it_is_told_and_so_is_the_tissue() -> None:
     assert ahead / found.axes[0, 2] <= found.distance[0] < ahead / found.axes[0, 2] + step
     aside = 4 * 0.065 / scene.pair.camera.K[0, 0]  # of every fourth pixel, the nearest
     assert ahead - 1e-6 <= found.clearance[0] < np.hypot(ahead, aside)
+    apart = np.linalg.norm(found.nearest[0] - found.tips[0])
+    assert apart == pytest.approx(found.clearance[0], rel=1e-5) and found.nearest[0, 2] == np.float32(0.065)
     assert found.distance_confidence[0] <= found.clearance_confidence[0] <= found.confidence[0]
 
 
@@ -126,7 +159,7 @@ def test_a_tip_is_where_it_is_told_and_so_is_the_tissue() -> None:
 def test_a_depth_that_cannot_be_measured_is_not_guessed() -> None:
     found = instruments_in(filmed().tools, right=False)
     assert len(found) == 1
-    for unknown in (found.tips, found.axes, found.pixels, found.distance, found.clearance):
+    for unknown in (found.tips, found.axes, found.pixels, found.distance, found.clearance, found.nearest):
         assert np.isnan(unknown).all()
     assert not any([found.confidence[0], found.distance_confidence[0], found.clearance_confidence[0]])
 
@@ -149,8 +182,9 @@ def test_an_instrument_keeps_its_number() -> None:
     def numbers(at_s: float, *tips: int) -> list[int]:
         mask = bars(*(((tip, 300), (tip, 128)) for tip in tips)) if tips else ~EVERYWHERE
         view = replace(scene.surface, t_capture_ns=round(at_s * 1e9))
-        ids = found.update(mask, gray, None, scene.pair.camera, scene.pair.baseline, view).ids
-        return sorted(ids.tolist())
+        states = found.update(mask, gray, None, scene.pair.camera, scene.pair.baseline, view)
+        assert states is not None
+        return sorted(states.ids.tolist())
 
     assert numbers(0.0, 80) == [1]
     assert numbers(0.1, 90, 240) == [1, 2]
@@ -159,6 +193,20 @@ def test_an_instrument_keeps_its_number() -> None:
     assert numbers(0.4) == []
     assert numbers(1.0, 100) == [3]  # away for longer: it may be another one
     assert numbers(1.1, 300) == [4]  # too far to be the same
+
+
+@pytest.mark.parametrize(("rate", "looks"), [(8, 80), (10, 100), (15, 100), (30, 100), (60, 100)])
+def test_they_are_looked_for_ten_times_a_second(rate: int, looks: int) -> None:
+    """In ten seconds, and again when the clock goes back."""
+    scene, found = filmed(), Instruments(EVERYWHERE)
+    for begins in (100.0, 50.0):
+        stamps = [round((begins + frame / rate) * 1e9) for frame in range(10 * rate)]
+        views = (replace(scene.surface, t_capture_ns=stamp) for stamp in stamps)
+        made = [
+            found.update(None, scene.frame.left[..., 0], None, scene.pair.camera, 0.004, view)
+            for view in views
+        ]
+        assert abs(sum(each is not None for each in made) - looks) <= 1
 
 
 # ---- in the node -----------------------------------------------------------------------------------------
@@ -172,16 +220,20 @@ def test_nothing_is_made_until_somebody_asks() -> None:
     later = replace(scene.frame, frame_id=1, t_capture_ns=2 * 10**9)  # it equals the one before
     found = pipeline.process(later, StepBudget(1), ASKED).instruments
     assert found is not None and len(found) == 1 and found.confidence[0] > 0
+    again = replace(later, frame_id=2, t_capture_ns=3 * 10**9)
+    assert pipeline.process(again, StepBudget(1), ASKED).instruments is None  # nothing was looked at
     config = LaunchConfig.model_validate({"vision": {**size, "tissue": {"method": "none"}}})
     without = Pipeline(config, scene.phantom.rig).process(scene.frame, StepBudget(1), ASKED).instruments
     assert without is not None and len(without) == 0
 
 
 @pytest.mark.live
-def test_a_subscriber_gets_them_with_every_frame(phantom_session: Path, tmp_path: Path) -> None:
+def test_a_subscriber_gets_them_ten_times_a_second(phantom_session: Path, tmp_path: Path) -> None:
     node = RunningNode(phantom_session, tmp_path, "source.pace:=fast")
     messages = client.collect(node.data, ["sags/instruments"], 5, 60)["sags/instruments"]
     assert node.stop() == 0
+    stamps = [message.meta["stamp_ns"] for message in messages]
+    assert np.mean(np.diff(stamps)) >= 0.9e8
     for message in messages:
         client.check_meta(message, "sensor_msgs/msg/PointCloud2")
         names = message.meta["encoding"].split(",")

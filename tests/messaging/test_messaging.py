@@ -141,8 +141,9 @@ def test_instruments_are_rows_and_what_is_not_known_of_them_is_nan(
     found = dict(zip(message.meta["encoding"].split(","), rows.T, strict=True))
     truth = plane_instruments()
     assert found["id"].view(np.uint32).tolist() == [2, 5] and set(found["source"].tolist()) == {1.0}
-    told = np.stack([found[name] for name in ("x", "y", "z", "axis_x", "axis_y", "axis_z", "u", "v")], 1)
-    expected = np.hstack([truth.tips, truth.axes, truth.pixels])
+    names = (*"xyz", "axis_x", "axis_y", "axis_z", "u", "v", "near_x", "near_y", "near_z")
+    told = np.stack([found[name] for name in names], 1)
+    expected = np.hstack([truth.tips, truth.axes, truth.pixels, truth.nearest])
     assert np.array_equal(told, expected, equal_nan=True)
     for name in ("confidence", "distance", "distance_confidence", "clearance", "clearance_confidence"):
         assert np.array_equal(found[name], getattr(truth, name), equal_nan=True), name

@@ -30,7 +30,7 @@ from sags_node.clients.overlay.run import UNSEEN, OverlayOptions, run_overlay
 from sags_node.geometry import project
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
-from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText
+from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.sources.pictures import read_picture
@@ -265,6 +265,33 @@ def test_it_leaves_no_anchors_behind(run_dir: Path) -> None:
             until(lambda: anchors() == 1)
             running.end()
             until(lambda: anchors() == 0)
+
+
+@pytest.mark.usefixtures("node")
+def test_tips_that_are_too_near_are_told_of_the_frame_in_which_they_were_seen(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    """Of every message with one the node has said the same of that very frame."""
+    scene = tmp_path / "zones.yaml"
+    scene.write_text("{tissue_margin: 0.05, objects: [{shape: sphere, label: vessel, margin: 0.05}]}")
+    near, tips = TopicName("proximity", ReceivedCloud), TopicName("instruments", ReceivedCloud)
+    seen, said = {0: 0, 1: 0}, None
+    with (
+        overlay(run_dir, scene=scene) as (_, watcher),
+        Subscriber([tips], run_dir=run_dir) as node,
+        Subscriber([near], ns="overlay", run_dir=run_dir) as told,
+    ):
+        while min(seen.values()) < 10:
+            said = until(lambda last=said: told.wait(near, 1.0, after=last))
+            whole = node.aligned([tips], said.stamp_ns, 1.0)
+            rows = {} if whole is None else {int(row["id"]): row for row in whole[tips].points}
+            for row in said.points[[int(each) in rows for each in said.points["id"]]]:
+                truth, zone = rows[int(row["id"])], int(row["zone"])
+                apart = np.linalg.norm([row[f"near_{axis}"] - truth[axis] for axis in "xyz"])
+                assert zone == -1 or row["distance"] == pytest.approx(apart, abs=1e-6)
+                assert zone != 0 or row["distance"] == truth["clearance"] < 0.05
+                seen[zone] = seen.get(zone, 0) + 1
+        assert {each["zone"] for each in watcher.status()["proximity"]["near"]} <= {"vessel", "tissue"}
 
 
 @pytest.mark.fault("process: the node is stopped (SIGSTOP), reset or killed under an overlay")

@@ -167,6 +167,13 @@ def test_a_bad_mesh_is_one_clear_message(name: str, tmp_path: Path) -> None:
         ("objects: [{shape: target, deform: deep}]", "objects.0.deform: "),
         ("objects: [{shape: target, registration: {share: 2}}]", "objects.0.registration.share: "),
         ("objects: [{shape: target, registration: {residual_p90_mm: -1}}]", "registration.residual_p90_mm: "),
+        ("objects: [{shape: target, margins: 0.005}]", "'objects.0.margins'; did you mean 'margin'?"),
+        ("objects: [{shape: target, margin: 5}]", "objects.0.margin: a margin is in metres"),
+        ("objects: [{shape: target, margin: 0}]", "for 5 mm write 0.005"),
+        ("objects: [{label: a, margin: 0.005}]", "margin makes a forbidden zone of a file or a shape"),
+        ("{tissue_margn: 0.005, objects: [{shape: target}]}", "did you mean 'tissue_margin'?"),
+        ("{tissue_margin: .nan, objects: [{shape: target}]}", "tissue_margin: "),
+        ("{color_key: [255, 90, 40], objects: [{shape: target, margin: 0.01}]}", "what a tip is too near to"),
         ("objects: [{shape: target, color: red}]", "this should be a list, e.g. [40, 220, 255]"),
     ],
 )  # fmt: skip

@@ -12,6 +12,7 @@ tissue and `NEAREST`; all of that stays free.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import cv2
@@ -59,6 +60,13 @@ class Body:
         self._colors, self._alpha = mesh.colors, np.uint8(round(255 * opacity))
         self.corners = np.stack([self.vertices.min(0), self.vertices.max(0)])
 
+    def painted(self, color: tuple[int, int, int], label: str) -> Body:
+        """It in one colour, opaque."""
+        other = copy(self)
+        other.label, other._alpha = label, np.uint8(255)
+        other._colors = np.broadcast_to(np.array(color, np.float32), self._colors.shape)
+        return other
+
     def lit(self, eye: F64) -> U8:
         """Colours [T, 4] lit from the eye (at [3], m), as an endoscope lights; bent or not."""
         rays = self._centres - eye
@@ -75,6 +83,7 @@ class Placed:
     T_world_body: F64  # [4, 4]
     is_sure: bool = True
     vertices: F64 | None = None  # [V, 3] m, of the body, bent with the tissue; None: it is rigid
+    depth_confidence: float = 1.0  # 0..1, of what holds it
 
     def shape(self, T: F64) -> F64:
         """Its vertices [V, 3] (m) as T [4, 4] transforms its body's coordinates."""

@@ -112,7 +112,8 @@ class HeldObject:
             doubts.append(self._residual.look(frame, put, again=self.ahead_s == 0))
         for doubt in filter(None, doubts):
             self.is_sure, self.unsure = False, self.unsure or doubt
-        return replace(put, is_sure=self.is_sure)
+        known = [state.depth_confidence for state in self._states]
+        return replace(put, is_sure=self.is_sure, depth_confidence=float(np.median(known)))
 
     def place(self, frame: TissueFrame) -> F64 | None:
         """The pose [4, 4] of the object in the world, or None and a `reason`. Pins it when it is not yet.

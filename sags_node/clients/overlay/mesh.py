@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from sags_node.clients.overlay.mesh_files import STL_START, STL_TRIANGLE, parse_mesh, stl_triangles
+from sags_node.clients.overlay.pose import on_surface
 from sags_node.clients.overlay.scene import ObjectSpec
 from sags_node.errors import UsageError
 from sags_node.files import read_file
+from sags_node.geometry import transform
 from sags_node.types import F32, F64, I32
 
 MAX_FILE_BYTES = 64 << 20
@@ -24,6 +26,7 @@ MAX_POINTS = 20_000
 LARGEST = 1.0  # m across: nothing in a body is larger
 HEADER_BYTES = 1 << 16
 GREEN = (60, 230, 120)  # RGB
+ROD = 0.0003  # m, the radius of a line
 LEAN = np.radians(35)  # of the target's arrow: along the line of sight it would be a dot
 
 _MESHES, _POINTS = (".ply", ".obj", ".stl"), (".ply", ".pcd", ".xyz")
@@ -157,6 +160,15 @@ def _marker(color: tuple[int, int, int]) -> Mesh:
     """A ball of 2 mm in the surface."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 17)
     return _joined([(_turned(0.002 * np.cos(angles), 0.002 * np.sin(angles), 32), color)])
+
+
+def rod(start: F64, end: F64, color: tuple[int, int, int]) -> Mesh:
+    """A thin line between two places [3] (m) that are not the same."""
+    length = float(np.linalg.norm(end - start))
+    points, triangles = _turned(np.array([0, ROD, ROD, 0]), np.array([0, 0, length, length]), 8)
+    way = (end - start) / length
+    T = on_surface(start, np.zeros(3), way, np.eye(3)[int(np.abs(way).argmin())])
+    return Mesh(np.asarray(transform(T, points), np.float32), triangles, _painted(len(triangles), color))
 
 
 def _turned(radii: F64, heights: F64, segments: int) -> tuple[F64, I32]:

@@ -27,6 +27,7 @@ from sags_node.clients.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISS
 from sags_node.clients.overlay.held import HeldObject
 from sags_node.clients.overlay.mesh import mesh_of
 from sags_node.clients.overlay.pinner import Pinner
+from sags_node.clients.overlay.proximity import INSTRUMENTS, Proximity
 from sags_node.clients.overlay.save import Layers, Output
 from sags_node.clients.overlay.scene import SceneSpec, built_in, read_scene
 from sags_node.clients.overlay.stream import OverlayStream
@@ -131,6 +132,7 @@ class _Overlay:
             HeldObject(spec, name, self._pinner, options.repin, options.ahead, body, self._worker)
             for spec, name, body in zip(scene.objects, called, bodies, strict=True)
         ]
+        self._proximity = Proximity(scene, bodies) if scene.asks_for_instruments else None
         self._source: tuple[str, int] | None = None  # session and epoch of the node
         self._epoch = -1  # of what is published: grows with every new `_source`
         self._right = "nothing received yet"  # why there is no right eye
@@ -152,6 +154,7 @@ class _Overlay:
         options, seconds = self._options, self._options.seconds
         end = math.inf if seconds is None else time.monotonic() + seconds
         wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
+        wanted += [] if self._proximity is None else [INSTRUMENTS]
         if options.node.endpoint is not None:
             self._clock = NodeClock.at(options.node)
         self._subscriber = Subscriber.at(options.node, wanted, clock=self._clock, may_be_absent=True)
@@ -189,6 +192,10 @@ class _Overlay:
     def _node(self) -> Subscriber:
         assert self._subscriber is not None  # `run` begins with it
         return self._subscriber
+
+    @property
+    def _now_ns(self) -> int:
+        return time.time_ns() if self._subscriber is None else self._subscriber.now_ns()
 
     @property
     def _silence(self) -> str:
@@ -253,20 +260,35 @@ class _Overlay:
             frame = tissue_frame(messages, self._right_info(), sure)
         if frame is None:  # the next one may be whole; if not, the clock takes the overlay away
             return None, "incomplete frame"
-        placed = [put for held in self._objects if (put := held.placed(frame)) is not None]
+        if (frame.session, frame.epoch) != self._source:
+            self._source, self._epoch = (frame.session, frame.epoch), self._epoch + 1
+        every = [held.placed(frame) for held in self._objects]
+        placed = [put for put in every if put is not None]
+        if self._proximity is not None:
+            self._look_for_tips(self._proximity, frame, every)
+            placed = self._proximity.shown(frame, every) if placed else []
         if not placed:
             reason = self._objects[0].reason or "nothing to draw"
             self._stream.blank(reason, (frame.camera.height, frame.camera.width))
             return None, reason
         return self._show(frame, placed)
 
+    def _look_for_tips(
+        self, proximity: Proximity, frame: TissueFrame, placed: Sequence[Placed | None]
+    ) -> None:
+        said = None if (problem := self._node.problem(INSTRUMENTS)) else self._node.latest(INSTRUMENTS)
+        if said is None:
+            proximity.reason = f"no instruments: {problem}"
+        elif (rows := proximity.look(said, frame, placed)) is not None:
+            self._stream.tell_proximity(rows, said.meta.frame_id, said.stamp_ns, self._epoch)
+
     def _show(self, frame: TissueFrame, placed: Sequence[Placed]) -> tuple[U8, str | None]:
-        if (frame.session, frame.epoch) != self._source:
-            self._source, self._epoch = (frame.session, frame.epoch), self._epoch + 1
         began = time.perf_counter()
         warnings = {
             code: said for code, said in self._warnings.items() if STAGES.get(code) not in OF_THE_FLOW
         }
+        if self._proximity is not None and self._proximity.reason is not None:
+            warnings["proximity"] = f"no distances of instruments: {self._proximity.reason}"
         pictures = {"left": overlay_draw.draw(frame, placed)}
         is_seen = cv2.hasNonZero(cv2.extractChannel(pictures["left"], 3))
         overlay_draw.annotate(pictures["left"], frame, 0.0, self._note(), warnings)
@@ -315,6 +337,7 @@ class _Overlay:
             "draw_ms": self._draw_ms.percentiles(recent),
             "freezes": self._freezes.status(),
             "objects": [held.status() for held in self._objects],
+            **({} if self._proximity is None else {"proximity": self._proximity.status(self._now_ns)}),
         }
 
     def _facts(self) -> dict[str, Any]:

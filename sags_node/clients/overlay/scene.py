@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sags_node.config.schema import Section
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import UsageError
 
+ALARM: tuple[int, int, int] = (255, 70, 40)  # RGB, of a zone that a tip is too near to
+WIDEST_MARGIN = 0.05  # m
 KEY_DISTANCE = 64  # of 255: an object's colour nearer than this to the key colour could be taken for it
 
 Place = tuple[float, float, float]  # m
@@ -21,6 +23,18 @@ Color = tuple[Byte, Byte, Byte]  # RGB
 Shape = Literal["target", "sphere"]
 SHAPES: tuple[str, ...] = get_args(Shape)
 S = TypeVar("S", bound=Section)
+
+
+def _margin(value: float) -> float:
+    if not 0 < value <= WIDEST_MARGIN:
+        raise ValueError(
+            f"a margin is in metres, above 0 and at most {WIDEST_MARGIN:g}, it is {value:g}; for 5 mm write "
+            "0.005"
+        )
+    return value
+
+
+Margin = Annotated[float, AfterValidator(_margin)]
 
 
 class AnchorSpec(Section):
@@ -70,6 +84,9 @@ class ObjectSpec(Section):
     deform: bool = Field(False, description="bend it with the tissue over it")
     deform_depth_mm: float = Field(15.0, gt=0, le=100, description="below the surface it stays rigid")
     registration: Registered | None = Field(None, description="what sags register found")
+    margin: Margin | None = Field(
+        None, description="m; it is a forbidden zone: tips of instruments that are nearer are told"
+    )
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -83,6 +100,8 @@ class ObjectSpec(Section):
             raise ValueError("deform: true needs a file, and three anchors or more that hold it")
         if "deform_depth_mm" in self.model_fields_set and not self.deform:
             raise ValueError("deform_depth_mm says how deep `deform: true` reaches: add it")
+        if self.margin is not None and self.file is None and self.shape is None:
+            raise ValueError("margin makes a forbidden zone of a file or a shape: add one")
         said = [anchor.at is not None for anchor in self.anchors]
         if len(said) > 1 and any(said) and not all(said):
             raise ValueError("either every anchor says `at`, or none does")
@@ -97,12 +116,24 @@ class SceneSpec(Section):
     objects: tuple[ObjectSpec, ...] = Field(min_length=1, max_length=32)
     color_key: Color = Field((0, 0, 255), description="RGB that a display replaces by the video")
 
+    tissue_margin: Margin | None = Field(
+        None, description="m; tips of instruments that are nearer to tissue are told, and all distances drawn"
+    )
+
+    @property
+    def asks_for_instruments(self) -> bool:
+        """Tell whether it has margins."""
+        return self.tissue_margin is not None or any(thing.margin is not None for thing in self.objects)
+
     @model_validator(mode="after")
     def _colors_apart(self) -> Self:
-        for thing in self.objects:
-            if max(abs(a - b) for a, b in zip(thing.color, self.color_key, strict=True)) < KEY_DISTANCE:
+        shown = [(thing.name, thing.color) for thing in self.objects]
+        if self.asks_for_instruments:
+            shown.append(("what a tip is too near to", ALARM))
+        for name, color in shown:
+            if max(abs(a - b) for a, b in zip(color, self.color_key, strict=True)) < KEY_DISTANCE:
                 raise ValueError(
-                    f"the colour of {thing.name} {list(thing.color)} is too near the key colour "
+                    f"the colour of {name} {list(color)} is too near the key colour "
                     f"{list(self.color_key)}: a display would replace it by the video"
                 )
         return self

@@ -15,12 +15,13 @@ import numpy as np
 
 from sags_node.clients.overlay.draw import color_key
 from sags_node.clients.overlay.mark import draw_lines
+from sags_node.clients.overlay.proximity import FIELDS
 from sags_node.config.schema import PublishConfig
 from sags_node.messaging import cdr, content
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.sockets import Closes
 from sags_node.messaging.topics import OVERLAY_TOPICS
-from sags_node.types import U8
+from sags_node.types import F32, U8
 
 BLANK_PERIOD = 0.5  # s
 SAID = 5.0  # s
@@ -47,7 +48,7 @@ class OverlayStream(Closes):
         self._blank_due = 0.0
         self._blank_since = 0.0  # for the reason that there is
         self._status_due = 0.0
-        self._state: tuple[str, str | None, tuple[str, ...]] | None = None
+        self._state: tuple[str, str | None, tuple[str, ...], set[tuple[int, str]]] | None = None
         self._epoch = 0
         self.reason: str | None = (
             "waiting for the node"  # why nothing is shown; None: the last picture sent is an overlay
@@ -80,6 +81,12 @@ class OverlayStream(Closes):
             if self.wants(eye):
                 self._send(eye, pictures.get(eye, self._empty()), frame_id, stamp_ns, ahead_ns)
 
+    def tell_proximity(self, rows: F32, frame_id: int, stamp_ns: int, epoch: int) -> None:
+        """Send the rows [N, FIELDS] of the tips that are too near, of the frame captured at `stamp_ns`; none
+        is a message, too."""
+        body = cdr.point_cloud(rows, FIELDS, stamp_ns)
+        self._publisher.publish_content("proximity", body, frame_id, stamp_ns, epoch)
+
     def blank(self, reason: str, size: tuple[int, int] | None = None) -> None:
         """Show nothing, because of `reason`; to be called again and again while that is so.
 
@@ -108,9 +115,11 @@ class OverlayStream(Closes):
         return rgba
 
     def tell(self, facts: dict[str, Any]) -> None:
-        """Send `status` when it is due, and at once when the state or a warning changes."""
+        """Send `status` when it is due, and at once when the state, a warning, or what is too near
+        changes."""
         warned = tuple(facts.get("warning_codes", ()))
-        state = ("running" if self.reason is None else "blank", self.reason, warned)
+        near = {(each["instrument"], each["zone"]) for each in facts.get("proximity", {}).get("near", ())}
+        state = ("running" if self.reason is None else "blank", self.reason, warned, near)
         if state == self._state and time.monotonic() < self._status_due:
             return
         self._state, self._status_due = state, time.monotonic() + STATUS_PERIOD

@@ -30,6 +30,7 @@ class Shape:
         self._scene: Any = RaycastingScene()
         corners = np.ascontiguousarray(triangles.astype(np.uint32))
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(corners))
+        self._is_closed: bool | None = None  # None: nobody asked
 
     def facing(self, eye: Array) -> Shape:
         """Return what of it an eye at [3] sees: triangles whose middles nothing hides. Files wind their
@@ -44,6 +45,16 @@ class Shape:
         return found["points"].numpy().astype(np.float64), found["primitive_normals"].numpy().astype(
             np.float64
         )
+
+    def contains(self, points: Array) -> Bool:
+        """Which points [N, 3] lie inside of it; none, where it is not closed."""
+        if self._is_closed is None:  # each edge of a closed one belongs to two triangles
+            edges = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+            self._is_closed = bool(np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2))
+        if not self._is_closed:
+            return np.zeros(len(points), np.bool_)
+        inside = self._scene.compute_occupancy(self._tensor(points.astype(np.float32)), nsamples=3)
+        return np.asarray(inside.numpy() > 0)
 
     def hides(self, eye: Array, points: Array) -> Bool:
         """Which rays from an eye at [3] through points [N, 3] meet it, before or behind the point."""
