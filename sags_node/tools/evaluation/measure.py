@@ -59,6 +59,8 @@ class MeasureOptions:
     paper_psnr: bool = False
     hidden: bool = False  # a second run, in which boxes of tissue are hidden, see `measure_hidden`
     aside: bool = False  # views of the phantom from places that no eye of it has, see `Aside`
+    second: bool = False  # two more runs for what this one cannot tell, see `measure_second`
+    own_stereo: bool = False  # how far the model's depth is from the frame's own stereo
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.every < 1:
@@ -243,6 +245,8 @@ class Measurer:
             figures[group] = self._predict(before, shown, now, frames)
         if costly and pair.right is not None:
             figures |= self._right_eye(shown, now)
+        if self._options.own_stereo and pair.right is not None and shown.measured_depth.any():
+            figures["stereo"] = _apart(shown)
         flicker = self._flicker(pair.left, shown)
         if flicker is not None:
             figures["flicker"] = flicker
@@ -394,6 +398,17 @@ def _enlarged(shown: ShownFrame, camera: Camera) -> ShownFrame:
         depth=None if shown.depth is None else metrics.resample_nearest(shown.depth, *size),
         tissue=metrics.resample_nearest(shown.tissue, *size),
     )
+
+
+def _apart(shown: MappedFrame) -> Figures:
+    """How far the model's depth is from the frame's own stereo, and the share of the tissue of each."""
+    errors = metrics.depth_errors(shown.depth, shown.measured_depth, shown.tissue)
+    shares = {"coverage": shown.depth, "stereo_coverage": shown.measured_depth}
+    return {
+        "median_mm": errors.median_mm,
+        "p90_mm": errors.p90_mm,
+        **{name: float(np.mean(depth[shown.tissue] > 0)) for name, depth in shares.items()},
+    }
 
 
 def _depth_figures(shown: ShownFrame, depth: F32, known: F32) -> tuple[dict[str, Figures], I64 | None]:
