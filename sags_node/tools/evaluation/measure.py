@@ -388,8 +388,11 @@ class Measurer:
 
 
 def _enlarged(shown: ShownFrame, camera: Camera) -> ShownFrame:
-    """At the size that is compared."""
+    """At the size that is compared. The right view comes at that which is published."""
     size = camera.width, camera.height
+    if isinstance(shown, MappedFrame) and shown.right_rgb is not None:
+        right = cv2.resize(shown.right_rgb, size, interpolation=cv2.INTER_AREA)
+        shown = replace(shown, right_rgb=np.asarray(right, np.uint8))
     if shown.rgb.shape[1::-1] == size:
         return shown
     return replace(

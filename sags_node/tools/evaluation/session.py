@@ -118,7 +118,7 @@ def completed(
     if not options.second:
         return found
     summary = found.summary
-    more = measure_second(session, options, summary["hidden"] is None, progress)
+    more = measure_second(_at_usual_rung(session, summary), options, summary["hidden"] is None, progress)
     missing = {group for group in MEANS if summary[group] is None}
     if summary["settings"]["depth_reference"] is not None:
         missing.discard("stereo")
@@ -130,6 +130,15 @@ def completed(
     told = {"forth_back": more.forth_back, "second_run": {"frames": more.frames}}
     summary |= rounded({**quality(rows, options, session.config.segments), **told})
     return replace(found, rows=rows)
+
+
+def _at_usual_rung(session: Session, summary: dict[str, Any]) -> Session:
+    """The session at the rung that most frames had: the load of the moment changes nothing then."""
+    if not summary["rungs"]:
+        return session
+    rung = max(summary["rungs"], key=summary["rungs"].__getitem__)
+    mapping = session.config.mapping.model_copy(update={"rung": rung})
+    return replace(session, config=session.config.model_copy(update={"mapping": mapping}))
 
 
 def _as_shown(session: Session, run: Run) -> Session:
