@@ -90,9 +90,11 @@ def test_what_did_not_happen_has_no_row_and_what_was_never_shown_has_one() -> No
     quiet = live() | {"dropped": 0, "stage_ms": {"map": 12.0, "publish": 0.004, "render": 0.0}}
     quiet["overlay"] = {**quiet["overlay"], "overlay": 0, "freezes": {"count": 0, "seconds": 0.0}}
     found = groups(quiet)
-    speed, overlay = ({what: values for what, values, _ in found[group]} for group in ("Speed", "Overlay"))
-    assert [what for what in speed if what.startswith("of that")] == ["of that, median of: map"]
-    assert "missed" not in speed and not [what for what in overlay if "stood still" in what]
+    work, camera, overlay = (
+        {what: values for what, values, _ in found[group]} for group in ("Work", "Camera", "Overlay")
+    )
+    assert [what for what in work if what.startswith("of that")] == ["of that, median of: map"]
+    assert "missed" not in camera and not [what for what in overlay if "stood still" in what]
     assert overlay["shown on"] == ["0", ""]
 
 
@@ -119,7 +121,7 @@ def test_figures_stand_in_groups_beside_their_baselines() -> None:
     assert shown["Depth", "error, median"] == ("error, median", ["0.24 mm", ""], "stereo alone: 0.17 mm")
     assert shown["Points", "lost"][1] == ["33 %", ""]
     assert shown["Overlay", "not shown: being pinned"][1] == ["19"]
-    assert ("Speed", "frames on rung: 1") in shown and ("Speed", "frames on rung: 2") not in shown
+    assert ("Model", "frames on rung: 1") in shown and ("Model", "frames on rung: 2") not in shown
     for rows in found.values():
         for what, values, _ in rows:
             assert any(values) and not any("{" in value or "None" in value for value in values), what

@@ -109,7 +109,17 @@ TABLE: dict[str, list[Figure]] = {
         Figure("camera, frame to frame", "pose.rpe_mm", "mm", 2, "a rigid scene", "pose.rigid_rpe_mm"),
         Figure("camera, turn", "pose.rpe_deg", "degrees", 3, "a rigid scene", "pose.rigid_rpe_deg"),
     ],
-    "Speed": [
+    "Right eye and hidden tissue": [
+        _psnr("right eye, from the model", "novel.psnr"),
+        _psnr("right eye, as it was shown", "right.psnr", _WARP, "right.warp_psnr"),
+        _psnr("right eye, the model alone", "right.model_psnr", _COPY, "right.copy_psnr"),
+        Figure("right eye, share that is compared", "right.coverage", "%"),
+        _psnr("hidden tissue", "hidden.psnr", "last seen", "hidden.copy_psnr"),
+        _psnr("hidden tissue, the model alone", "hidden.model_psnr"),
+        *(_psnr(f"from {mm} mm aside", f"view_{mm}.psnr", _WARP, f"view_{mm}.warp_psnr") for mm in AWAY),
+        *(_psnr(f"from {mm} mm aside, the model alone", f"view_{mm}.model_psnr") for mm in AWAY),
+    ],
+    "Camera": [
         Figure("frames of the recording", "frames"),
         Figure("of those played once more, frame by frame", "second_run.frames"),
         Figure("shown", "processed"),
@@ -118,10 +128,14 @@ TABLE: dict[str, list[Figure]] = {
         Figure("rate", "rate_hz", "frames/s", 1),
         Figure("first frame", "first_render_ms", "ms", 1),
         *_times("camera's stamp to sending", "latency_ms"),
+    ],
+    "Work": [
         *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
         Figure("of that, median of", "stage_ms.*", "ms", 2),
         *_times("processor time for a frame", "cpu_ms"),
         Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
+    ],
+    "Model": [
         Figure("Gaussians, mean", "gaussians.mean"),
         Figure("Gaussians, at most", "gaussians.max"),
         Figure("memory at the start", "rss_mb.start", "MB"),
@@ -140,19 +154,11 @@ TABLE: dict[str, list[Figure]] = {
         Figure("left render, LPIPS", "shown.lpips", "", 3),
         *(_psnr(f"predicted {ahead}", f"{key}.psnr", _COPY, f"{key}.copy_psnr") for key, ahead in _AHEAD),
         *(_psnr(f"{ahead}, the model alone", f"{key}.model_psnr") for key, ahead in _AHEAD),
-        _psnr("hidden tissue", "hidden.psnr", "last seen", "hidden.copy_psnr"),
-        _psnr("hidden tissue, the model alone", "hidden.model_psnr"),
-        *(_psnr(f"from {mm} mm aside", f"view_{mm}.psnr", _WARP, f"view_{mm}.warp_psnr") for mm in AWAY),
-        *(_psnr(f"from {mm} mm aside, the model alone", f"view_{mm}.model_psnr") for mm in AWAY),
         _psnr("kept back, drawn from the frame before", "heldout.psnr", _COPY, "heldout.copy_psnr"),
         Figure("kept back, SSIM", "heldout.ssim", "", 3),
         Figure("kept back, LPIPS", "heldout.lpips", "", 3),
         _psnr("kept back, once the next is known", "between.psnr", "mean of both", "between.mean_psnr"),
         _psnr("both carried along the motion", "between.carried_psnr", "mean of both", "between.mean_psnr"),
-        _psnr("right eye, from the model", "novel.psnr"),
-        _psnr("right eye, as it was shown", "right.psnr", _WARP, "right.warp_psnr"),
-        _psnr("right eye, the model alone", "right.model_psnr", _COPY, "right.copy_psnr"),
-        Figure("right eye, share that is compared", "right.coverage", "%"),
         Figure("flicker where nothing moves", "flicker.picture", "grey levels", 2, "input", "flicker.input"),
         Figure("flicker of the right eye", "flicker.right", "grey levels", 2, "input", "flicker.input"),
         Figure("share of the tissue that stands still", "flicker.share", "%"),
@@ -168,7 +174,7 @@ POOLED = ("depth_confidence", "track", "pose", "forth_back")
 
 def _means() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for figure in (*TABLE["Picture"], *TABLE["Depth"]):
+    for figure in (*TABLE["Picture"], *TABLE["Right eye and hidden tissue"], *TABLE["Depth"]):
         for whole in (figure.key, figure.baseline_key):
             group, _, key = whole.partition(".")
             if key and group not in POOLED and key not in found.setdefault(group, []):
@@ -240,7 +246,7 @@ def verdict(figures: Flat) -> list[tuple[str, str]]:
     right = ("right.psnr", "{:.1f} dB PSNR"), ("right.warp_psnr", f" ({_WARP}: {{:.1f}} dB)")
     hidden = ("hidden.psnr", "{:.1f} dB PSNR"), ("hidden.model_psnr", " (the model alone: {:.1f} dB;")
     last = "hidden.copy_psnr", " as it was last seen: {:.1f} dB)"
-    again = "the first {} frames, frame by frame: what a subscriber does not see, or no truth is known of"
+    again = "the first {} frames, frame by frame, for the right eye, hidden tissue and what has no truth"
     warned = below(figures, "warnings").items()
     lines = {
         "overlay": _overlay(figures),

@@ -60,7 +60,7 @@ class MeasureOptions:
     hidden: bool = False  # a second run, in which boxes of tissue are hidden, see `measure_hidden`
     aside: bool = False  # views of the phantom from places that no eye of it has, see `Aside`
     second: bool = False  # two more runs for what this one cannot tell, see `measure_second`
-    own_stereo: bool = False  # how far the model's depth is from the frame's own stereo
+    unseen: bool = False  # of these runs: depth beside the frame's own stereo, and nothing predicted
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.every < 1:
@@ -240,12 +240,12 @@ class Measurer:
 
     def _mapped(self, now: _Recorded, shown: MappedFrame, row: FrameRow, costly: bool) -> FrameRow:
         figures, pair, reference = row.figures, now.pair, now.frame.reference
-        for frames, before in enumerate(self._earlier, 1):
+        for frames, before in () if self._options.unseen else enumerate(self._earlier, 1):
             group = "predict" if frames == 1 else f"predict_{frames}"
             figures[group] = self._predict(before, shown, now, frames)
         if costly and pair.right is not None:
             figures |= self._right_eye(shown, now)
-        if self._options.own_stereo and pair.right is not None and shown.measured_depth.any():
+        if self._options.unseen and pair.right is not None and shown.measured_depth.any():
             figures["stereo"] = _apart(shown)
         flicker = self._flicker(pair.left, shown)
         if flicker is not None:

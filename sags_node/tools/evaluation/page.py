@@ -22,8 +22,8 @@ table { border-collapse: collapse } td, th { padding: 3px 12px 3px 0; text-align
 td { overflow-wrap: anywhere }
 .first { display: flex; align-items: flex-start; flex-wrap: wrap; gap: 12px 24px; margin-top: 16px }
 .first video { flex: 1 1 420px; min-width: 0; max-width: 720px; background: #000 }
-.first .verdict { flex: 1 1 320px }
-.figures { columns: 3 430px; column-gap: 32px } .figures.wide { columns: 2 560px }
+.first .verdict { flex: 1 1 320px } .verdict th { white-space: nowrap }
+.figures { columns: 3 430px; column-gap: 32px } .figures.wide { columns: 2 520px }
 .figures table { width: 100%; break-inside: avoid; margin-bottom: 20px }
 .figures td { border-top: 1px solid #ddd } .figures th { font-size: 17px; color: #222 }
 .figures tr.quiet td { vertical-align: bottom; border-top: 0 }

@@ -148,6 +148,7 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
         line_plot(
             "How near the picture is to the camera's: PSNR, dB; higher is better",
             [
+                series("left render, mostly this picture", BLUE, "shown.psnr"),
                 series("a frame ahead", ORANGE, "predict.psnr"),
                 series("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
                 series("the picture before, again", GREY, "predict.copy_psnr"),

@@ -58,7 +58,7 @@ def measure_second(
     config = alone.model_copy(update={"publish": publish})
     session = replace(session, config=config)
     session = replace(session, source=again(session))
-    asked = MeasureOptions(0, options.every, own_stereo=True)
+    asked = MeasureOptions(0, options.every, unseen=True)
 
     def told(what: str, done: int) -> None:
         progress(f"once more, frame by frame: {what}", done, frames)
@@ -67,7 +67,8 @@ def measure_second(
         pipeline = run_step(session, asked, run, told)
         receipt = Receipt(session.rig, session.working_size, None)
         rectifier = Rectifier(session.rig, *session.working_size, session.published_size)
-        measurer = Measurer(run, rectifier, config, asked, receipt)
+        plain = config.model_copy(update={"publish": publish.model_copy(update={"detail": False})})
+        measurer = Measurer(run, rectifier, plain, asked, receipt)  # it draws the model alone
         with again(session) as recorded:
             measurer.run(recorded, told)
         followed = any(row.track is not None for row in measurer.rows)  # beside true points
