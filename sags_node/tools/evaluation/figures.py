@@ -129,12 +129,6 @@ TABLE: dict[str, list[Figure]] = {
         Figure("first frame", "first_render_ms", "ms", 1),
         *_times("camera's stamp to sending", "latency_ms"),
     ],
-    "Work": [
-        *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
-        Figure("of that, median of", "stage_ms.*", "ms", 2),
-        *_times("processor time for a frame", "cpu_ms"),
-        Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
-    ],
     "Model": [
         Figure("Gaussians, mean", "gaussians.mean"),
         Figure("Gaussians, at most", "gaussians.max"),
@@ -144,6 +138,12 @@ TABLE: dict[str, list[Figure]] = {
         Figure("frames on rung", "rungs.*"),
         Figure("frames that left out", "skipped.*"),
         Figure("frames with the warning", "warnings.*"),
+    ],
+    "Work": [
+        *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
+        Figure("of that, median of", "stage_ms.*", "ms", 2),
+        *_times("processor time for a frame", "cpu_ms"),
+        Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
     ],
     "Picture": [
         _psnr("the model, PSNR over tissue", "online.psnr", _COPY, "predict.copy_psnr"),

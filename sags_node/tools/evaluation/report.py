@@ -201,16 +201,17 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
 
 
 def _figure_groups(summary: Mapping[str, Any]) -> str:
-    """Return a table for each group, side by side where the window is wide."""
-    names = [*headings(summary), "compared with"]
-    head = "".join(f"<td>{escape(name)}</td>" for name in names)
+    """Return a table for each group, side by side where the window is wide; of segments those it has."""
+    names = headings(summary)
     tables = []
     for group, rows in groups(summary).items():
-        lines = [f'<table><tr class="quiet"><th>{group}</th>{head}</tr>']
+        filled = [column for column in range(len(names)) if any(any(row[1][column:]) for row in rows)]
+        head = "".join(f'<td class="quiet">{escape(names[column])}</td>' for column in filled)
+        lines = [f"<table><tr><th>{group}</th>{head}</tr>"]
         for what, values, compared in rows:
-            cells = "".join(f'<td class="number">{escape(value)}</td>' for value in values)
-            cells += "<td></td>" * (len(names) - 1 - len(values))
-            lines.append(f'<tr><td>{escape(what)}</td>{cells}<td class="quiet">{escape(compared)}</td></tr>')
+            cells = "".join(f'<td class="number">{escape(value)}</td>' for value in values[: len(filled)])
+            beside = f'<div class="quiet">{escape(compared)}</div>' if compared else ""
+            lines.append(f"<tr><td>{escape(what)}{beside}</td>{cells}</tr>")
         tables.append("\n".join([*lines, "</table>"]))
-    wide = " wide" if len(names) > 2 else ""
+    wide = " wide" if len(names) > 1 else ""
     return f'<div class="figures{wide}">{"".join(tables)}</div>'
