@@ -22,7 +22,7 @@ from sags_node.tools.evaluation import live
 from sags_node.tools.evaluation.measure import MeasureOptions, Measurer
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.tools.evaluation.run import STATUS, TOPICS, Run
-from sags_node.tools.evaluation.session import again
+from sags_node.tools.evaluation.steps import again
 from sags_node.tools.evaluation.summary import summarise
 from sags_node.vision.rectify import Rectifier
 

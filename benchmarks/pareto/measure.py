@@ -28,7 +28,8 @@ from sags_node.pipeline.warm_up import warm_up
 from sags_node.tools.evaluation.measure import Progress
 from sags_node.tools.evaluation.provenance import machine_name
 from sags_node.tools.evaluation.run import Run
-from sags_node.tools.evaluation.session import measure, run_step
+from sags_node.tools.evaluation.session import measure
+from sags_node.tools.evaluation.steps import run_step
 
 SHORTEST = 3  # frames: the first one, in which the model is made, has times of its own
 KEPT = (

@@ -24,7 +24,8 @@ from sags_node.pipeline.warm_up import warm_up
 from sags_node.quality.metrics import as_float, psnr
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.run import MappedFrame, Run
-from sags_node.tools.evaluation.session import evaluate, measure, run_step
+from sags_node.tools.evaluation.session import evaluate, measure
+from sags_node.tools.evaluation.steps import run_step
 from sags_node.types import U8
 
 METHODS: tuple[MappingMethod, ...] = ("nodes", "sags")

@@ -92,7 +92,9 @@ def evaluate(
     """Measure a recorded session: run time against error.
 
     It is played, then read once more and compared with what was shown. In real time that is what a
-    subscriber gets: rate, latency, pictures and depth. --pace step measures all that a model can tell.
+    subscriber gets: rate, latency, pictures and depth. Then up to 150 frames are played again, frame by
+    frame, for the right eye and hidden tissue; without truth also for depth beside its own stereo, and
+    points that are followed forth and back. --pace step measures all that a model can tell.
 
     \b
     sags eval launch/d4d_pull.yaml --out out.json
@@ -113,7 +115,7 @@ def evaluate(
         hold_out = HOLD_OUT if pace == "step" else 0
     if aside and pace != "step":
         raise click.UsageError("--aside needs --pace step: only there the model is known frame by frame")
-    options = MeasureOptions(hold_out, hidden=hidden, aside=aside, **what)
+    options = MeasureOptions(hold_out, hidden=hidden, aside=aside, second=True, **what)
     if report is not None:
         check_plots()
         check_report(report)

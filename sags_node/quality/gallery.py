@@ -53,12 +53,12 @@ class Gallery:
 
 
 def depth_range(pictures: Sequence[Picture]) -> tuple[float, float]:
-    """Nearest and furthest depth (m) worth a colour: 2nd to 98th percentile over all pictures."""
+    """Nearest and furthest depth (m) worth a colour: all but one in two hundred at either end."""
     known = [picture.depth[picture.tissue & (picture.depth > 0)] for picture in pictures]
     depths = np.concatenate(known) if known else np.zeros(0, np.float32)
     if depths.size == 0:
         return 0.0, 1.0
-    near, far = np.percentile(depths, [2, 98])
+    near, far = np.percentile(depths, [0.5, 99.5])
     return float(near), float(max(far, near + 1e-4))
 
 

@@ -26,14 +26,14 @@ from sags_node.terminal.console import stop_signals
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.report import write_report
 from sags_node.tools.evaluation.run import Run
-from sags_node.tools.evaluation.session import measure
+from sags_node.tools.evaluation.session import completed, measure
 from sags_node.types import U8, FrameResult
 
 VIDEO, LAYERS = "overlay.mp4", "overlay.layers"
 OVERLAY_START = 15.0  # s for the overlay to load its shapes and listen
 OVERLAY_GRACE = 15.0  # s for the overlay to end after the node
 OVERLAY_STOP = 2.0  # s for it when the demo is interrupted
-_OPTIONS = MeasureOptions(hold_out=0)
+_OPTIONS = MeasureOptions(hold_out=0, second=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +87,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
                 session, run, _OPTIONS, (), lambda what, done: progress(done, frames, what), shown.add
             )
             video.finish()
+    outcome = completed(outcome, session, _OPTIONS, lambda what, done, count: progress(done, count, what))
     outcome.summary["overlay"] = consumed | {"saved": str(out / VIDEO)}
     page = write_report(out, outcome.summary, outcome.rows, outcome.pictures, VIDEO)
     return Demo(outcome.summary, page)

@@ -467,6 +467,32 @@ def test_a_session_in_steps_is_measured_and_reproducible(session_folder: Path) -
     assert first["settings"]["depth_reference"] == "exact"
 
 
+def test_a_recording_without_truth_is_measured_against_itself(session_folder: Path) -> None:
+    """The sheet slides by |SPEED| all the time. Played backwards from the last frame it comes back."""
+    launch = (session_folder / "launch.yaml").read_text()
+    start = launch.index(" reference:")
+    own = session_folder / "own.yaml"
+    own.write_text(launch[:start].rstrip(",") + "}" + launch[launch.index("\nrig:") :])
+    options = MeasureOptions(hold_out=0, second=True)
+    outcome = evaluate(own, options=options, iterations=2)
+    found = outcome.summary
+    assert found["depth"] is None and found["track"] is None and found["second_run"] == {"frames": FRAMES}
+    slid_mm = float(np.linalg.norm(SPEED)) * (FRAMES - 1) * PERIOD_NS * 1e-6
+    assert found["forth_back"]["moved_mm"] == pytest.approx(slid_mm, rel=0.1)
+    assert found["forth_back"]["median_mm"] < slid_mm / 10  # the same bounds as beside true points
+    assert found["forth_back"]["median_px"] < 2 and found["forth_back"]["lost"] < 0.5
+    assert found["stereo"]["median_mm"] < 1.5 and found["stereo"]["motion"]["coverage"] > 0.9
+    assert found["stereo"]["stereo_coverage"] < found["stereo"]["coverage"] <= 1
+    assert found["hidden"]["psnr"] > found["hidden"]["copy_psnr"]  # the sheet slides on, the last picture not
+    assert found["right"]["psnr"] > 20 and found["right"]["warp_psnr"] > 20
+    for row in outcome.rows:
+        assert all(figures.keys() <= set(MEANS[group]) for group, figures in row.figures.items())
+    known = evaluate(session_folder, options=options, iterations=2).summary
+    assert known["stereo"] is None and known["forth_back"] is None  # the truth says more
+    assert known["depth"]["median_mm"] < 1.5 and known["track"]["lost"] < 0.05
+    assert known["right"] == found["right"] and known["hidden"] == found["hidden"]
+
+
 def test_a_session_in_real_time_is_seen_as_a_subscriber_sees_it(
     session_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,18 +55,47 @@ def test_a_verdict_has_what_an_overlay_needs_first_with_units_and_baselines() ->
     assert said == {
         "speed": "268 of 300 frames shown at 27.6 frames/s, 32 missed",
         "latency": "39 ms (p50), 97 ms (p99) from the camera's stamp to sending; 314 ms for the first frame",
-        "picture": "36.9 dB PSNR of the next frame"
-        " (the picture before, shown again: 35.8 dB, which has no depth, no other view and no hidden tissue;"
-        " the model alone: 33.6 dB)",
+        "picture": "36.9 dB PSNR of the next frame, the model alone 33.6 dB. The picture before, shown again:"
+        " 35.8 dB; near while tissue rests, but without depth, another view or hidden tissue",
         "points": "0.38 mm off (median), nine of ten within 0.88 mm; 33% given up (no Gaussian near)",
         "overlay": "on 249 of 268 frames (93%), 39 ms (p50), 97 ms (p99) after the camera;"
         " 19 without: being pinned",
         "right eye": "34.1 dB PSNR (left picture, warped: 32.6 dB)",
-        "hidden": "26.1 dB PSNR (as it was last seen: 25.3 dB)",
+        "hidden": "26.1 dB PSNR (the model alone: 22.9 dB; as it was last seen: 25.3 dB)",
         "quality": "rung 3 of 0 to 15 for most frames (1 to 14), 21,510 Gaussians on average, 640x512 px",
         "warnings": "frames_missed (16 frames)",
         "machine": "AMD EPYC, 2 cores; the model on the CPU",
     }
+
+
+def test_without_truth_a_verdict_says_what_a_recording_can_tell_of_itself() -> None:
+    own = {
+        "stereo": {"median_mm": 0.31, "p90_mm": 1.2, "coverage": 0.99, "stereo_coverage": 0.8},
+        "forth_back": {"median_mm": 0.42, "p90_mm": 1.1, "median_px": 2.0, "lost": 0.17, "moved_mm": 12.3},
+        "second_run": {"frames": 150},
+    }
+    figures = flat(live() | dict.fromkeys(("depth", "measured_depth", "track")) | own)
+    said = dict(verdict(figures))
+    apart = "0.31 mm from the frame's own stereo (median), nine of ten within 1.20 mm"
+    assert said["depth"] == f"{apart}; on 99% of the tissue, stereo alone on 80%"
+    back = "0.42 mm off (median), nine of ten within 1.10 mm once back at the first frame, after moving"
+    assert said["points"] == f"{back} 12.30 mm; 17% given up (no Gaussian near)"
+    assert said["played again"].startswith("the first 150 frames, frame by frame")
+    gone = {"forth_back.median_mm": None, "forth_back.p90_mm": None, "forth_back.lost": 1.0}
+    assert dict(verdict(figures | gone))["points"] == "all given up"
+    assert "from the frame's own" not in dict(verdict(flat(live() | own)))["depth"]  # the truth is better
+
+
+def test_what_did_not_happen_has_no_row_and_what_was_never_shown_has_one() -> None:
+    quiet = live() | {"dropped": 0, "stage_ms": {"map": 12.0, "publish": 0.004, "render": 0.0}}
+    quiet["overlay"] = {**quiet["overlay"], "overlay": 0, "freezes": {"count": 0, "seconds": 0.0}}
+    found = groups(quiet)
+    work, camera, overlay = (
+        {what: values for what, values, _ in found[group]} for group in ("Work", "Camera", "Overlay")
+    )
+    assert [what for what in work if what.startswith("of that")] == ["of that, median of: map"]
+    assert "missed" not in camera and not [what for what in overlay if "stood still" in what]
+    assert overlay["shown on"] == ["0", ""]
 
 
 def test_a_run_frame_by_frame_is_not_called_live() -> None:
@@ -92,7 +121,7 @@ def test_figures_stand_in_groups_beside_their_baselines() -> None:
     assert shown["Depth", "error, median"] == ("error, median", ["0.24 mm", ""], "stereo alone: 0.17 mm")
     assert shown["Points", "lost"][1] == ["33 %", ""]
     assert shown["Overlay", "not shown: being pinned"][1] == ["19"]
-    assert ("Speed", "frames on rung: 1") in shown and ("Speed", "frames on rung: 2") not in shown
+    assert ("Model", "frames on rung: 1") in shown and ("Model", "frames on rung: 2") not in shown
     for rows in found.values():
         for what, values, _ in rows:
             assert any(values) and not any("{" in value or "None" in value for value in values), what

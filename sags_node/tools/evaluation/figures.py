@@ -40,6 +40,7 @@ class Figure:
     digits: int = 0
     baseline: str = ""  # what it is compared with
     baseline_key: str = ""
+    nothing: bool = False  # zero says that nothing happened, and has no row
 
 
 def _times(what: str, key: str, baseline: str = "", baseline_key: str = "") -> list[Figure]:
@@ -59,7 +60,7 @@ def _paper(what: str, group: str) -> tuple[Figure, Figure]:
 
 _COPY = "the picture before, shown again"
 _BEFORE = f"{_COPY}: {{:.1f}} dB"
-_WORTH = ", which has no depth, no other view and no hidden tissue"
+_WORTH = "near while tissue rests, but without depth, another view or hidden tissue"
 _STEREO = "stereo alone"
 _WARP = "left picture, warped"
 _AHEAD = (
@@ -67,6 +68,8 @@ _AHEAD = (
     ("predict_2", "two frames ahead"),
     ("predict_3", "three frames ahead"),
 )
+_RETURNED = (("forth_back.moved_mm", " once back at the first frame, after moving {:.2f} mm"),)
+_MOVED = "moved in between", "forth_back.moved_mm"
 AWAY = (2, 5, 10, 20)  # mm to the right of the left eye
 
 TABLE: dict[str, list[Figure]] = {
@@ -76,21 +79,28 @@ TABLE: dict[str, list[Figure]] = {
         Figure("not shown", "overlay.blanked.*"),
         *_times("camera's stamp to sending", "overlay.latency_ms"),
         *_times("drawing", "overlay.draw_ms"),
-        Figure("times it stood still", "overlay.freezes.count"),
-        Figure("seconds it stood still", "overlay.freezes.seconds", "s", 1),
-        Figure("messages lost", "overlay.lost"),
+        Figure("times it stood still", "overlay.freezes.count", nothing=True),
+        Figure("seconds it stood still", "overlay.freezes.seconds", "s", 1, nothing=True),
+        Figure("messages lost", "overlay.lost", nothing=True),
     ],
     "Points": [
         Figure("off, median", "track.median_mm", "mm", 2),
         Figure("off, nine of ten below", "track.p90_mm", "mm", 2),
         Figure("off, median", "track.median_px", "px", 1),
         Figure("lost", "track.lost", "%"),
+        Figure("forth and back: off, median", "forth_back.median_mm", "mm", 2, *_MOVED),
+        Figure("forth and back: off, nine of ten below", "forth_back.p90_mm", "mm", 2),
+        Figure("forth and back: off, median", "forth_back.median_px", "px", 1),
+        Figure("forth and back: lost", "forth_back.lost", "%"),
     ],
     "Depth": [
         Figure("error, median", "depth.median_mm", "mm", 2, _STEREO, "measured_depth.median_mm"),
         Figure("error, nine of ten below", "depth.p90_mm", "mm", 2, _STEREO, "measured_depth.p90_mm"),
         Figure("error, root mean square", "depth.rmse_mm", "mm", 2, _STEREO, "measured_depth.rmse_mm"),
         Figure("share of the tissue", "depth.coverage", "%", 0, _STEREO, "measured_depth.coverage"),
+        Figure("from the frame's own stereo, median", "stereo.median_mm", "mm", 2),
+        Figure("from the frame's own stereo, nine of ten below", "stereo.p90_mm", "mm", 2),
+        Figure("share of the tissue", "stereo.coverage", "%", 0, _STEREO, "stereo.stereo_coverage"),
         Figure("share that calls itself sure", "depth_confidence.sure_share", "%"),
         Figure("error of that, nine of ten below", "depth_confidence.sure_p90_mm", "mm", 2),
         Figure("flicker", "flicker.depth_mm", "mm", 2, _STEREO, "flicker.measured_depth_mm"),
@@ -99,18 +109,27 @@ TABLE: dict[str, list[Figure]] = {
         Figure("camera, frame to frame", "pose.rpe_mm", "mm", 2, "a rigid scene", "pose.rigid_rpe_mm"),
         Figure("camera, turn", "pose.rpe_deg", "degrees", 3, "a rigid scene", "pose.rigid_rpe_deg"),
     ],
-    "Speed": [
+    "Right eye and hidden tissue": [
+        _psnr("right eye, from the model", "novel.psnr"),
+        _psnr("right eye, as it was shown", "right.psnr", _WARP, "right.warp_psnr"),
+        _psnr("right eye, the model alone", "right.model_psnr", _COPY, "right.copy_psnr"),
+        Figure("right eye, share that is compared", "right.coverage", "%"),
+        _psnr("hidden tissue", "hidden.psnr", "last seen", "hidden.copy_psnr"),
+        _psnr("hidden tissue, the model alone", "hidden.model_psnr"),
+        *(_psnr(f"from {mm} mm aside", f"view_{mm}.psnr", _WARP, f"view_{mm}.warp_psnr") for mm in AWAY),
+        *(_psnr(f"from {mm} mm aside, the model alone", f"view_{mm}.model_psnr") for mm in AWAY),
+    ],
+    "Camera": [
         Figure("frames of the recording", "frames"),
+        Figure("of those played once more, frame by frame", "second_run.frames"),
         Figure("shown", "processed"),
-        Figure("missed", "dropped"),
-        Figure("kept back for testing", "held_out"),
+        Figure("missed", "dropped", nothing=True),
+        Figure("kept back for testing", "held_out", nothing=True),
         Figure("rate", "rate_hz", "frames/s", 1),
         Figure("first frame", "first_render_ms", "ms", 1),
         *_times("camera's stamp to sending", "latency_ms"),
-        *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
-        Figure("of that, median of", "stage_ms.*", "ms", 2),
-        *_times("processor time for a frame", "cpu_ms"),
-        Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
+    ],
+    "Model": [
         Figure("Gaussians, mean", "gaussians.mean"),
         Figure("Gaussians, at most", "gaussians.max"),
         Figure("memory at the start", "rss_mb.start", "MB"),
@@ -119,6 +138,12 @@ TABLE: dict[str, list[Figure]] = {
         Figure("frames on rung", "rungs.*"),
         Figure("frames that left out", "skipped.*"),
         Figure("frames with the warning", "warnings.*"),
+    ],
+    "Work": [
+        *_times("work on a frame", "frame_ms", "the time it may take", "budget_ms"),
+        Figure("of that, median of", "stage_ms.*", "ms", 2),
+        *_times("processor time for a frame", "cpu_ms"),
+        Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
     ],
     "Picture": [
         _psnr("the model, PSNR over tissue", "online.psnr", _COPY, "predict.copy_psnr"),
@@ -129,19 +154,11 @@ TABLE: dict[str, list[Figure]] = {
         Figure("left render, LPIPS", "shown.lpips", "", 3),
         *(_psnr(f"predicted {ahead}", f"{key}.psnr", _COPY, f"{key}.copy_psnr") for key, ahead in _AHEAD),
         *(_psnr(f"{ahead}, the model alone", f"{key}.model_psnr") for key, ahead in _AHEAD),
-        _psnr("hidden tissue", "hidden.psnr", "last seen", "hidden.copy_psnr"),
-        _psnr("hidden tissue, the model alone", "hidden.model_psnr"),
-        *(_psnr(f"from {mm} mm aside", f"view_{mm}.psnr", _WARP, f"view_{mm}.warp_psnr") for mm in AWAY),
-        *(_psnr(f"from {mm} mm aside, the model alone", f"view_{mm}.model_psnr") for mm in AWAY),
         _psnr("kept back, drawn from the frame before", "heldout.psnr", _COPY, "heldout.copy_psnr"),
         Figure("kept back, SSIM", "heldout.ssim", "", 3),
         Figure("kept back, LPIPS", "heldout.lpips", "", 3),
         _psnr("kept back, once the next is known", "between.psnr", "mean of both", "between.mean_psnr"),
         _psnr("both carried along the motion", "between.carried_psnr", "mean of both", "between.mean_psnr"),
-        _psnr("right eye, from the model", "novel.psnr"),
-        _psnr("right eye, as it was shown", "right.psnr", _WARP, "right.warp_psnr"),
-        _psnr("right eye, the model alone", "right.model_psnr", _COPY, "right.copy_psnr"),
-        Figure("right eye, share that is compared", "right.coverage", "%"),
         Figure("flicker where nothing moves", "flicker.picture", "grey levels", 2, "input", "flicker.input"),
         Figure("flicker of the right eye", "flicker.right", "grey levels", 2, "input", "flicker.input"),
         Figure("share of the tissue that stands still", "flicker.share", "%"),
@@ -152,12 +169,12 @@ TABLE: dict[str, list[Figure]] = {
 }
 
 # Over points and frames; the other groups are means over frames.
-POOLED = ("depth_confidence", "track", "pose")
+POOLED = ("depth_confidence", "track", "pose", "forth_back")
 
 
 def _means() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for figure in (*TABLE["Picture"], *TABLE["Depth"]):
+    for figure in (*TABLE["Picture"], *TABLE["Right eye and hidden tissue"], *TABLE["Depth"]):
         for whole in (figure.key, figure.baseline_key):
             group, _, key = whole.partition(".")
             if key and group not in POOLED and key not in found.setdefault(group, []):
@@ -178,7 +195,7 @@ def headings(summary: Mapping[str, Any]) -> list[str]:
 
 def groups(summary: Mapping[str, Any]) -> dict[str, list[Row]]:
     """Rows of each group; a row has a value of the whole run and one of each segment. What is not known in
-    any has no row, and a group without rows is left out."""
+    any has no row, nor have counts and times of what did not happen; a group without rows is left out."""
     figures = flat(summary)
     segments = list(summary.get("segments") or {})
     made = {group: _rows(figures, each, segments) for group, each in TABLE.items()}
@@ -186,22 +203,20 @@ def groups(summary: Mapping[str, Any]) -> dict[str, list[Row]]:
 
 
 def _rows(figures: Flat, asked: Sequence[Figure], segments: Sequence[str]) -> list[Row]:
-    rows = []
+    rows: list[Row] = []
     for figure in asked:
-        if figure.key.endswith(".*"):
-            each = below(figures, figure.key[:-2])
-            found = [(f"{figure.what}: {name}", [value], "") for name, value in each.items() if value]
+        each = figure.key.endswith(".*")
+        if each:
+            named = below(figures, figure.key[:-2]).items()
+            found = [(f"{figure.what}: {name}", [_number(value, figure)], "") for name, value in named]
         else:
             group, _, key = figure.key.partition(".")
             values = [figures.get(figure.key), *(figures.get(f"{group}.{name}.{key}") for name in segments)]
             compared = figures.get(figure.baseline_key)
             said = "" if compared is None else f"{figure.baseline}: {_number(compared, figure)}"
-            found = [(figure.what, values, said)]
-        rows += [
-            (what, [_number(value, figure) for value in values], said)
-            for what, values, said in found
-            if any(value is not None for value in values)
-        ]
+            found = [(figure.what, [_number(value, figure) for value in values], said)]
+        shown = set("123456789") if each or figure.nothing else set("0123456789")
+        rows += [row for row in found if shown.intersection("".join(row[1]))]
     return rows
 
 
@@ -228,22 +243,24 @@ def verdict(figures: Flat) -> list[tuple[str, str]]:
         figures: of `summarise`, and of an overlay under `overlay`, made `flat`. What is missing or None is
             left out.
     """
-    followed = _said(figures, *_off("track"), ("track.lost", "; {:.0%} given up (no Gaussian near)"))
     right = ("right.psnr", "{:.1f} dB PSNR"), ("right.warp_psnr", f" ({_WARP}: {{:.1f}} dB)")
-    hidden = ("hidden.psnr", "{:.1f} dB PSNR"), ("hidden.copy_psnr", " (as it was last seen: {:.1f} dB)")
+    hidden = ("hidden.psnr", "{:.1f} dB PSNR"), ("hidden.model_psnr", " (the model alone: {:.1f} dB;")
+    last = "hidden.copy_psnr", " as it was last seen: {:.1f} dB)"
+    again = "the first {} frames, frame by frame, for the right eye, hidden tissue and what has no truth"
     warned = below(figures, "warnings").items()
     lines = {
         "overlay": _overlay(figures),
-        "points": followed or _said(figures, ("track.lost", "all given up")),
+        "points": _points(figures),
         "depth": _depth(figures),
         "right eye": _said(figures, *right),
-        "hidden": _said(figures, *hidden),
+        "hidden": _said(figures, *hidden, last),
         "speed": _speed(figures),
         "latency": _latency(figures),
-        "picture": _picture(figures),
         "unseen": _said(figures, ("heldout.psnr", "{:.1f} dB PSNR on frames kept back"), _copied("heldout")),
+        "picture": _picture(figures),
         "quality": _quality(figures),
         "warnings": ", ".join(f"{code} ({count} frames)" for code, count in warned),
+        "played again": _said(figures, ("second_run.frames", again)),
         "machine": _machine(figures),
     }
     return [(name, said) for name, said in lines.items() if said]
@@ -264,6 +281,16 @@ def _overlay(figures: Flat) -> str:
     age = _said(figures, *_middle("overlay.latency_ms"))
     blanked = (f"; {count} without: {why}" for why, count in below(figures, "overlay.blanked").items())
     return "".join((on, f", {age} after the camera" if on and age else "", *blanked))
+
+
+def _points(figures: Flat) -> str:
+    """Beside true points, else by those that were followed forth and back."""
+    for group, more in (("track", ()), ("forth_back", _RETURNED)):
+        lost = f"{group}.lost"
+        said = _said(figures, *_off(group), *more, (lost, "; {:.0%} given up (no Gaussian near)"))
+        if said or figures.get(lost) is not None:
+            return said or "all given up"
+    return ""
 
 
 def _copied(group: str) -> tuple[str, str]:
@@ -307,24 +334,29 @@ def _picture(figures: Flat) -> str:
     }
     for key, name in shown.items():
         if figures.get(key) is not None:
-            beside = [_said(figures, ("predict.copy_psnr", _BEFORE + _WORTH))]
+            alone = ""
             if key == "predict.psnr" and figures.get("predict.model_psnr") != figures[key]:
-                beside.append(_said(figures, ("predict.model_psnr", "the model alone: {:.1f} dB")))
-            said = "; ".join(filter(None, beside))
-            return f"{figures[key]:.1f} dB PSNR {name}" + (f" ({said})" if said else "")
+                alone = _said(figures, ("predict.model_psnr", ", the model alone {:.1f} dB"))
+            beside = _said(figures, ("predict.copy_psnr", f". {_BEFORE[0].upper()}{_BEFORE[1:]}; {_WORTH}"))
+            return f"{figures[key]:.1f} dB PSNR {name}{alone}{beside}"
     return ""
 
 
 def _depth(figures: Flat) -> str:
+    """Against a reference, else beside the frame's own stereo, from which the model learns."""
     reference = AGAINST.get(str(figures.get("settings.depth_reference")), "the recording's")
     covered = "depth.coverage", ", on {:.0%} of the tissue"
-    said = _said(figures, *_off("depth"), covered)
-    alone = _said(
+    if said := _said(figures, *_off("depth"), covered):
+        shared = "measured_depth.coverage", " on {:.0%}"
+        alone = _said(figures, ("measured_depth.median_mm", "; stereo alone: {:.2f} mm"), shared)
+        return f"{said}, against {reference}{alone}"
+    return _said(
         figures,
-        ("measured_depth.median_mm", "; stereo alone: {:.2f} mm"),
-        ("measured_depth.coverage", " on {:.0%}"),
+        ("stereo.median_mm", "{:.2f} mm from the frame's own stereo (median)"),
+        ("stereo.p90_mm", ", nine of ten within {:.2f} mm"),
+        ("stereo.coverage", "; on {:.0%} of the tissue"),
+        ("stereo.stereo_coverage", ", stereo alone on {:.0%}"),
     )
-    return said and f"{said}, against {reference}{alone}"
 
 
 def _quality(figures: Flat) -> str:

@@ -64,7 +64,7 @@ def measure_hidden(
             truth = metrics.as_float(result.pair.left)
             if curtain.drawn is None:
                 before = truth
-            elif before is not None and not result.held:
+            elif before is not None and not result.held and (curtain.whole & every).any():
                 view = result.views["left"]
                 pictures = {
                     "psnr": metrics.as_float(_small(view)),

@@ -59,6 +59,8 @@ class MeasureOptions:
     paper_psnr: bool = False
     hidden: bool = False  # a second run, in which boxes of tissue are hidden, see `measure_hidden`
     aside: bool = False  # views of the phantom from places that no eye of it has, see `Aside`
+    second: bool = False  # two more runs for what this one cannot tell, see `measure_second`
+    unseen: bool = False  # of these runs: depth beside the frame's own stereo, and nothing predicted
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.every < 1:
@@ -238,11 +240,13 @@ class Measurer:
 
     def _mapped(self, now: _Recorded, shown: MappedFrame, row: FrameRow, costly: bool) -> FrameRow:
         figures, pair, reference = row.figures, now.pair, now.frame.reference
-        for frames, before in enumerate(self._earlier, 1):
+        for frames, before in () if self._options.unseen else enumerate(self._earlier, 1):
             group = "predict" if frames == 1 else f"predict_{frames}"
             figures[group] = self._predict(before, shown, now, frames)
         if costly and pair.right is not None:
             figures |= self._right_eye(shown, now)
+        if self._options.unseen and pair.right is not None and shown.measured_depth.any():
+            figures["stereo"] = _apart(shown)
         flicker = self._flicker(pair.left, shown)
         if flicker is not None:
             figures["flicker"] = flicker
@@ -384,8 +388,11 @@ class Measurer:
 
 
 def _enlarged(shown: ShownFrame, camera: Camera) -> ShownFrame:
-    """At the size that is compared."""
+    """At the size that is compared. The right view comes at that which is published."""
     size = camera.width, camera.height
+    if isinstance(shown, MappedFrame) and shown.right_rgb is not None:
+        right = cv2.resize(shown.right_rgb, size, interpolation=cv2.INTER_AREA)
+        shown = replace(shown, right_rgb=np.asarray(right, np.uint8))
     if shown.rgb.shape[1::-1] == size:
         return shown
     return replace(
@@ -394,6 +401,17 @@ def _enlarged(shown: ShownFrame, camera: Camera) -> ShownFrame:
         depth=None if shown.depth is None else metrics.resample_nearest(shown.depth, *size),
         tissue=metrics.resample_nearest(shown.tissue, *size),
     )
+
+
+def _apart(shown: MappedFrame) -> Figures:
+    """How far the model's depth is from the frame's own stereo, and the share of the tissue of each."""
+    errors = metrics.depth_errors(shown.depth, shown.measured_depth, shown.tissue)
+    shares = {"coverage": shown.depth, "stereo_coverage": shown.measured_depth}
+    return {
+        "median_mm": errors.median_mm,
+        "p90_mm": errors.p90_mm,
+        **{name: float(np.mean(depth[shown.tissue] > 0)) for name, depth in shares.items()},
+    }
 
 
 def _depth_figures(shown: ShownFrame, depth: F32, known: F32) -> tuple[dict[str, Figures], I64 | None]:

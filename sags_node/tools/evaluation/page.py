@@ -22,10 +22,12 @@ table { border-collapse: collapse } td, th { padding: 3px 12px 3px 0; text-align
 td { overflow-wrap: anywhere }
 .first { display: flex; align-items: flex-start; flex-wrap: wrap; gap: 12px 24px; margin-top: 16px }
 .first video { flex: 1 1 420px; min-width: 0; max-width: 720px; background: #000 }
-.first .verdict { flex: 1 1 320px }
-.figures td, .figures th { border-top: 1px solid #ddd } .figures th { padding-top: 18px; color: #222 }
-.figures tr.quiet td { vertical-align: bottom }
-.number { font-variant-numeric: tabular-nums; white-space: nowrap }
+.first .verdict { flex: 1 1 320px } .verdict th { white-space: nowrap }
+.figures { columns: 3 430px; column-gap: 32px } .figures.wide { columns: 2 520px }
+.figures table { width: 100%; break-inside: avoid; margin-bottom: 20px }
+.figures td { border-top: 1px solid #ddd } .figures th { font-size: 17px; color: #222 }
+.figures tr:first-child td { vertical-align: bottom; border-top: 0 }
+.figures td { overflow-wrap: break-word } .number { font-variant-numeric: tabular-nums; white-space: nowrap }
 .pictures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 560px), 1fr)); gap: 8px }
 figure { margin: 0 } figcaption { color: #666; font-size: 13px } img { width: 100%; display: block }

@@ -88,6 +88,7 @@ def line_plot(
     spans: Mapping[str, tuple[int, int]],
     across: str = "frame",
     gaps: Sequence[int] = (),
+    up: str = "",
 ) -> str:
     """An SVG file of several series; empty text when there is nothing to draw.
 
@@ -95,6 +96,7 @@ def line_plot(
         spans: first and last frame of what is shaded and named, unless it is half of all or more.
         across: what lies across; empty: the title says it.
         gaps: frames that are shaded grey.
+        up: what its height is; empty: the title says it.
     """
     series = [each for each in series if any(math.isfinite(value) for _, value in each.points)]
     if not series:
@@ -117,6 +119,7 @@ def line_plot(
             axes.axvspan(frame - 0.5, frame + 0.5, color="#dddddd", linewidth=0, zorder=0)
         axes.set_xlim(first, last)
         axes.set_xlabel(across)
+        axes.set_ylabel(up)
         if len(series) > 1:
             figure.legend(loc="outside lower left", ncols=len(series))
         return as_svg(figure)

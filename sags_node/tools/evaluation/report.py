@@ -72,7 +72,7 @@ def write_report(
             "<h2>Over time</h2>",
             _plots(rows, summary.get("segments") or {}),
             "<h2>Figures</h2>",
-            _figure_table(summary),
+            _figure_groups(summary),
         ],
     )
     report = folder / REPORT
@@ -141,10 +141,14 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
     missed = [row.frame_id for row in rows if row.facts is None]
     tallies = [row.calibration for row in rows if row.calibration is not None]
     sure = calibration.points(tallies, 0.9)
+    off, against = "depth", "off: mm, lower is better"
+    if not any(off in row.figures for row in rows):
+        off, against = "stereo", "from the frame's own stereo: mm"
     plots = [
         line_plot(
             "How near the picture is to the camera's: PSNR, dB; higher is better",
             [
+                series("left render, mostly this picture", BLUE, "shown.psnr"),
                 series("a frame ahead", ORANGE, "predict.psnr"),
                 series("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
                 series("the picture before, again", GREY, "predict.copy_psnr"),
@@ -159,37 +163,55 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
             gaps=missed,
         ),
         line_plot(
-            "How far the depth is off: mm, lower is better",
+            f"How far the depth is {against}",
             [
-                series("nine of ten below", ORANGE, "depth.p90_mm"),
-                series("half below", BLUE, "depth.median_mm"),
+                series("nine of ten below", ORANGE, f"{off}.p90_mm"),
+                series("half below", BLUE, f"{off}.median_mm"),
                 series("half below, stereo alone", GREY, "measured_depth.median_mm"),
             ],
             spans,
         ),
         line_plot(
-            "Whether depth knows its error: real over predicted, mm",
+            "Right eye and hidden tissue: PSNR, dB; higher is better",
+            [
+                series("right eye", ORANGE, "right.psnr"),
+                series("left picture, warped", GREY, "right.warp_psnr"),
+                series("hidden tissue", BLUE, "hidden.psnr", dots=True),
+                series("as it was last seen", GREY, "hidden.copy_psnr", dots=True),
+            ],
+            spans,
+        ),
+        line_plot(
+            "Whether depth knows its error: mm",
             [
                 Series("nine of ten below", ORANGE, sure),
                 Series("half below", BLUE, calibration.points(tallies, 0.5)),
                 Series("as predicted", GREY, [(middle, middle) for middle, _ in sure]),
             ],
             {},
-            across="predicted error, mm",
+            across="predicted",
+            up="real",
         ),
     ]
-    if not tallies:  # no true depth
+    plots = [plot for plot in plots if plot]
+    if len(plots) % 2:  # two stand in a row
         gaussians = series("Gaussians", BLUE, "gaussians")
         plots.append(line_plot("How many Gaussians the model has", [gaussians], spans))
     return plot_grid(plots)
 
 
-def _figure_table(summary: Mapping[str, Any]) -> str:
-    head = "".join(f"<td>{escape(name)}</td>" for name in headings(summary))
-    lines = ['<table class="figures">']
+def _figure_groups(summary: Mapping[str, Any]) -> str:
+    """Return a table for each group, side by side where the window is wide; of segments those it has."""
+    names = headings(summary)
+    tables = []
     for group, rows in groups(summary).items():
-        lines.append(f'<tr class="quiet"><th>{group}</th>{head}<td>compared with</td></tr>')
+        filled = [column for column in range(len(names)) if any(any(row[1][column:]) for row in rows)]
+        head = "".join(f'<td class="quiet">{escape(names[column])}</td>' for column in filled)
+        lines = [f"<table><tr><th>{group}</th>{head}</tr>"]
         for what, values, compared in rows:
-            cells = "".join(f'<td class="number">{escape(value)}</td>' for value in values)
-            lines.append(f'<tr><td>{escape(what)}</td>{cells}<td class="quiet">{escape(compared)}</td></tr>')
-    return "\n".join([*lines, "</table>"])
+            cells = "".join(f'<td class="number">{escape(value)}</td>' for value in values[: len(filled)])
+            beside = f'<div class="quiet">{escape(compared)}</div>' if compared else ""
+            lines.append(f"<tr><td>{escape(what)}{beside}</td>{cells}</tr>")
+        tables.append("\n".join([*lines, "</table>"]))
+    wide = " wide" if len(names) > 1 else ""
+    return f'<div class="figures{wide}">{"".join(tables)}</div>'

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,11 +21,11 @@ from sags_node.messaging import published
 from sags_node.messaging.received import ReceivedImage, ReceivedText, interpret
 from sags_node.messaging.wire import Message, Meta
 from sags_node.processes import resident_mb
-from sags_node.types import F32, U8, Bool, FrameResult, Snapshot
+from sags_node.types import F32, U8, Bool, FrameResult, Snapshot, StereoFrame
 
 IMAGE, DEPTH, MASK, STATUS = "left/render/image", "left/render/depth", "left/tissue_mask", "status"
 TOPICS = (IMAGE, DEPTH, MASK, STATUS)
-_MAPPED = "mapped"
+_MAPPED, _RECORDED = "mapped", "recorded"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +149,19 @@ class Run:
         if name == IMAGE:
             self.frame_ids.append(message.meta.frame_id)
 
+    def keep(self, frame: StereoFrame) -> None:
+        """Keep what was recorded, without its truth.
+
+        Raises:
+            SagsError: the disk is full.
+        """
+        self._keep(frame.frame_id, _RECORDED, replace(frame, reference=None))
+
+    def frame(self, frame_id: int) -> StereoFrame:
+        """What was recorded of a frame that `keep` was given."""
+        frame: StereoFrame = _RECORDS.decode(self._file(frame_id, _RECORDED).read_bytes())
+        return frame
+
     def size(self) -> tuple[int, int]:
         """Width and height of what consumers got, px.
 
@@ -232,4 +245,5 @@ def _array(kind: type, plain: Any) -> Any:
 
 
 _FRAMES = msgspec.msgpack.Decoder(MappedFrame, dec_hook=_array)
+_RECORDS = msgspec.msgpack.Decoder(StereoFrame, dec_hook=_array)
 _MESSAGES = msgspec.msgpack.Decoder(tuple[str, Meta, tuple[bytes, ...]])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,14 +10,11 @@ from typing import Any, Literal
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.kernels.threads import configure_threads
-from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, backend_of, device_of
+from sags_node.mapping.devices import affordable, backend_of, device_of
 from sags_node.messaging.address import NodeAddress
-from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import Session, at_best_scale, open_posed, open_session
+from sags_node.pipeline.session import Session, at_best_scale, open_session
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.quality.gallery import Picture
-from sags_node.sources.source import Source
 from sags_node.tools.evaluation import live
 from sags_node.tools.evaluation.aside import Aside
 from sags_node.tools.evaluation.figures import MEANS
@@ -26,7 +22,9 @@ from sags_node.tools.evaluation.hidden import measure_hidden
 from sags_node.tools.evaluation.measure import FrameRow, MeasureOptions, Measurer, OnPicture, Progress
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.tools.evaluation.run import Run
-from sags_node.tools.evaluation.summary import summarise
+from sags_node.tools.evaluation.second import measure_second
+from sags_node.tools.evaluation.steps import again, run_step
+from sags_node.tools.evaluation.summary import quality, rounded, summarise
 from sags_node.vision.rectify import Rectifier
 
 Pace = Literal["realtime", "step"]
@@ -92,16 +90,55 @@ def evaluate(
     with Run() as run:
         if pace == "step":
             run_step(at_best_scale(session), options, run, told)
-            return measure(session, run, options, overrides, told)
-        # Its own sockets, away from those of a node that may be running on this machine.
-        run_dir = run.folder / "run"
-        sockets = ["publish.data:=[]", "publish.ipc:=true", "publish.control:=null"]
-        arguments = [*overrides, *forced, *sockets, f"publish.run_dir:={run_dir}"]
-        node = NodeAddress(session.config.ns, run_dir=run_dir)
-        account = live.play([*([] if launch is None else [str(launch)]), *arguments], node, run, told)
-        found = measure(_as_shown(session, run), run, options, overrides, told)
-        found.summary.update({key: account[key] for key in ("frame_ms", "stage_ms", "skipped")})
-        return found  # those figures only the node knows
+            found = measure(session, run, options, overrides, told)
+        else:
+            # Its own sockets, away from those of a node that may be running on this machine.
+            run_dir = run.folder / "run"
+            sockets = ["publish.data:=[]", "publish.ipc:=true", "publish.control:=null"]
+            arguments = [*overrides, *forced, *sockets, f"publish.run_dir:={run_dir}"]
+            node = NodeAddress(session.config.ns, run_dir=run_dir)
+            account = live.play([*([] if launch is None else [str(launch)]), *arguments], node, run, told)
+            found = measure(_as_shown(session, run), run, options, overrides, told)
+            # Those figures only the node knows.
+            found.summary.update({key: account[key] for key in ("frame_ms", "stage_ms", "skipped")})
+    return completed(found, at_best_scale(session), options, progress)
+
+
+def completed(
+    found: Evaluation,
+    session: Session,
+    options: MeasureOptions,
+    progress: Callable[[str, int, int | None], None],
+) -> Evaluation:
+    """What was measured, and if asked for (`options.second`) what two more runs tell of what it could not.
+
+    Args:
+        session: as the node plays it, at its size.
+    """
+    if not options.second:
+        return found
+    summary = found.summary
+    more = measure_second(_at_usual_rung(session, summary), options, summary["hidden"] is None, progress)
+    missing = {group for group in MEANS if summary[group] is None}
+    if summary["settings"]["depth_reference"] is not None:
+        missing.discard("stereo")
+    rows = []
+    for row in found.rows:
+        also = more.rows.get(row.frame_id, row)
+        figures = {group: also.figures[group] for group in missing & also.figures.keys()}
+        rows.append(replace(row, figures=row.figures | figures, track=row.track or also.track))
+    told = {"forth_back": more.forth_back, "second_run": {"frames": more.frames}}
+    summary |= rounded({**quality(rows, options, session.config.segments), **told})
+    return replace(found, rows=rows)
+
+
+def _at_usual_rung(session: Session, summary: dict[str, Any]) -> Session:
+    """The session at the rung that most frames had: the load of the moment changes nothing then."""
+    if not summary["rungs"]:
+        return session
+    rung = max(summary["rungs"], key=summary["rungs"].__getitem__)
+    mapping = session.config.mapping.model_copy(update={"rung": rung})
+    return replace(session, config=session.config.model_copy(update={"mapping": mapping}))
 
 
 def _as_shown(session: Session, run: Run) -> Session:
@@ -174,33 +211,6 @@ def _summary(
         "novel_every": options.every,
     }
     return summary
-
-
-def run_step(
-    session: Session, options: MeasureOptions, run: Run, progress: Progress, skips: Skips = ALL_SKIPS
-) -> Pipeline:
-    """Every frame in turn, none lost; only the pipeline's own work is timed. Returns it as it is then."""
-    configure_threads(session.config.engine.threads)
-    pipeline = Pipeline(session.config, session.rig, skips=skips)
-    budget = pipeline.make_budget()
-    with session.source as source:
-        for frame in source:
-            if options.holds_out(frame.frame_id):
-                continue
-            started, before = time.perf_counter(), time.process_time()
-            result = pipeline.process(frame, budget)
-            if frame.warm_up:
-                continue
-            frame_ms, cpu_ms = (time.perf_counter() - started) * 1e3, (time.process_time() - before) * 1e3
-            run.add(result, frame_ms, time.monotonic_ns(), warnings=pipeline.warnings, cpu_ms=cpu_ms)
-            progress("playing", len(run))
-    return pipeline
-
-
-def again(session: Session) -> Source:
-    """The recording once more, every frame, with its truth."""
-    played = session.config.source.model_copy(update={"pace": "step"})
-    return open_posed(session.config.model_copy(update={"source": played}), session.rig)
 
 
 def _check_segments(config: LaunchConfig) -> None:

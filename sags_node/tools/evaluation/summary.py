@@ -46,7 +46,9 @@ def summarise(
         **_timings(facts),
         "budget_ms": budget_ms,
         "iterations_per_frame": _mean([run.counts.get("iterations", 0) for run in facts[1:]]),
-        **_quality(rows, options),
+        **quality(rows, options, segments),
+        "forth_back": None,  # of a second run, see `measure_second`
+        "second_run": None,
         "gaussians": {"mean": float(np.mean(counts)), "max": max(counts)} if counts else None,
         "rss_mb": {"start": memory[0], "end": memory[-1], "max": max(memory)} if memory else None,
         "skipped": dict(Counter(what for run in facts for what in run.skipped)),
@@ -57,13 +59,20 @@ def summarise(
         "segments": {name: list(span) for name, span in segments.items()},
         "machine": machine_name(),
     }
+    return rounded(summary)
+
+
+def quality(
+    rows: Sequence[FrameRow], options: MeasureOptions, segments: Mapping[str, tuple[int, int]]
+) -> dict[str, dict[str, Any] | None]:
+    """Groups of figures of quality, each of all frames and of each segment; None: there is none."""
+    groups = _quality(rows, options)
     for name, (first, last) in segments.items():
         inside = [row for row in rows if first <= row.frame_id <= last]
         for group, figures in _quality(inside, options).items():
-            if summary[group] is not None:
-                summary[group][name] = figures
-    rounded: dict[str, Any] = _rounded(summary)
-    return rounded
+            if (whole := groups[group]) is not None:
+                whole[name] = figures
+    return groups
 
 
 def _timings(facts: Sequence[RunFacts]) -> dict[str, Any]:
@@ -147,10 +156,10 @@ def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """Four decimals: beyond them is noise, and the text stays readable."""
     if isinstance(value, dict):
-        return {key: _rounded(part) for key, part in value.items()}
+        return {key: rounded(part) for key, part in value.items()}
     if isinstance(value, float):
         return round(value, 4)
     return value

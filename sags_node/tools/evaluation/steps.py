@@ -1,0 +1,40 @@
+"""A recording frame by frame: every one in turn, none lost."""
+
+from __future__ import annotations
+
+import time
+
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.devices import ALL_SKIPS, Skips
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.session import Session, open_posed
+from sags_node.sources.source import Source
+from sags_node.tools.evaluation.measure import MeasureOptions, Progress
+from sags_node.tools.evaluation.run import Run
+
+
+def run_step(
+    session: Session, options: MeasureOptions, run: Run, progress: Progress, skips: Skips = ALL_SKIPS
+) -> Pipeline:
+    """Every frame in turn, none lost; only the pipeline's own work is timed. Returns it as it is then."""
+    configure_threads(session.config.engine.threads)
+    pipeline = Pipeline(session.config, session.rig, skips=skips)
+    budget = pipeline.make_budget()
+    with session.source as source:
+        for frame in source:
+            if options.holds_out(frame.frame_id):
+                continue
+            started, before = time.perf_counter(), time.process_time()
+            result = pipeline.process(frame, budget)
+            if frame.warm_up:
+                continue
+            frame_ms, cpu_ms = (time.perf_counter() - started) * 1e3, (time.process_time() - before) * 1e3
+            run.add(result, frame_ms, time.monotonic_ns(), warnings=pipeline.warnings, cpu_ms=cpu_ms)
+            progress("playing", len(run))
+    return pipeline
+
+
+def again(session: Session) -> Source:
+    """The recording once more, every frame, with its truth."""
+    played = session.config.source.model_copy(update={"pace": "step"})
+    return open_posed(session.config.model_copy(update={"source": played}), session.rig)
