@@ -268,16 +268,13 @@ def test_it_leaves_no_anchors_behind(run_dir: Path) -> None:
 
 
 @pytest.mark.usefixtures("node")
-def test_tips_that_are_too_near_are_told_of_the_frame_in_which_they_were_seen(
-    run_dir: Path, tmp_path: Path
-) -> None:
-    """Of every message with one the node has said the same of that very frame."""
+def test_tips_that_are_too_near_are_told_of_their_own_frame(run_dir: Path, tmp_path: Path) -> None:
     scene = tmp_path / "zones.yaml"
     scene.write_text("{tissue_margin: 0.05, objects: [{shape: sphere, label: vessel, margin: 0.05}]}")
     near, tips = TopicName("proximity", ReceivedCloud), TopicName("instruments", ReceivedCloud)
     seen, said = {0: 0, 1: 0}, None
     with (
-        overlay(run_dir, scene=scene) as (_, watcher),
+        overlay(run_dir, scene=scene),
         Subscriber([tips], run_dir=run_dir) as node,
         Subscriber([near], ns="overlay", run_dir=run_dir) as told,
     ):
@@ -291,7 +288,6 @@ def test_tips_that_are_too_near_are_told_of_the_frame_in_which_they_were_seen(
                 assert zone == -1 or row["distance"] == pytest.approx(apart, abs=1e-6)
                 assert zone != 0 or row["distance"] == truth["clearance"] < 0.05
                 seen[zone] = seen.get(zone, 0) + 1
-        assert {each["zone"] for each in watcher.status()["proximity"]["near"]} <= {"vessel", "tissue"}
 
 
 @pytest.mark.fault("process: the node is stopped (SIGSTOP), reset or killed under an overlay")

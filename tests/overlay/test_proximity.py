@@ -28,6 +28,7 @@ TURNED = np.eye(4)
 TURNED[:3, :3], TURNED[:3, 3] = quat_to_matrix(np.array([0.8, 0.4, -0.2, 0.3])), (0.01, -0.02, 0.09)
 FRAME = replace(wall(), stamp_ns=10**9)
 NAN = (np.nan, np.nan, np.nan)
+SURENESS = [(0.9, {}, 1), (0.4, {}, 0), (0.9, {"is_sure": 0}, 0), (0.9, {"depth_confidence": 0.4}, 0)]
 
 
 def cube(is_closed: bool = True) -> Body:
@@ -58,9 +59,6 @@ def looked(near: Proximity, said: ReceivedCloud, put: Placed | None) -> dict[str
     rows = near.look(said, FRAME, [put])
     assert rows is not None
     return dict(zip(FIELDS, rows.T, strict=True))
-
-
-# ---- distances -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -99,17 +97,10 @@ def test_the_speed_and_the_time_to_contact_of_a_steady_approach(speed: float) ->
         row = looked(near, told([(x, 0, 0)], 1 + 0.1 * step), put)
         assert step >= 2 or np.isnan(row["closing"]).all()
     assert row["closing"][0] == pytest.approx(speed, abs=1e-5)
-    contact = 0.004 / speed if speed > 0.002 else np.nan
-    assert row["contact"][0] == pytest.approx(contact, rel=1e-3, nan_ok=True)
+    assert row["contact"][0] == pytest.approx(0.004 / speed if speed > 0.002 else np.nan, 1e-3, nan_ok=True)
 
 
-# ---- what is not sure, not known, or old -----------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("tip", "zone", "sure"),
-    [(0.9, {}, 1), (0.4, {}, 0), (0.9, {"is_sure": 0}, 0), (0.9, {"depth_confidence": 0.4}, 0)],
-)  # fmt: skip
+@pytest.mark.parametrize(("tip", "zone", "sure"), SURENESS)
 def test_what_is_not_sure_is_told_and_drawn_as_unsure(tip: float, zone: Any, sure: int) -> None:
     body, T = cube(), np.eye(4)
     T[2, 3] = 0.03
@@ -131,8 +122,8 @@ def test_what_is_not_known_has_a_row_that_says_so() -> None:
     row = looked(near, told([NAN, (0, 0, 0)], clearance=[np.nan, 0.009]), None)
     assert list(zip(row["zone"], row["id"].view(np.uint32), strict=True)) == [(UNKNOWN, 1), (1, 0)]
     assert np.isnan(row["distance"]).all() and not row["confidence"].any()
-    said = near.status(FRAME.stamp_ns)
-    assert (said["unknown_tips"], said["unplaced_zones"], said["near"]) == ([1], ["artery"], [])
+    told_too = {"reason": None, "near": [], "unknown_tips": [1], "unplaced_zones": ["artery"]}
+    assert near.status(FRAME.stamp_ns) == told_too
 
 
 def test_nothing_old_is_told_or_drawn_as_new() -> None:
@@ -158,9 +149,6 @@ def test_without_a_unit_or_from_an_older_node_nothing_is_told() -> None:
         near = watched(cube())
         assert near.look(said, FRAME, [Placed(cube(), np.eye(4))]) is None
         assert near.status(FRAME.stamp_ns)["reason"] == near.reason is not None
-
-
-# ---- lines -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("margin", "color"), [(0.011, ALARM), (0.009, (255, 255, 255))])
