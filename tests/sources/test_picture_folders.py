@@ -301,3 +301,14 @@ def test_eyes_of_other_names_are_paired_in_order(tmp_path: Path, caplog: pytest.
     frames = played(config)
     assert number_of(frames[5].left) == 6 and number_of(frames[5].right) == 5
     assert "is paired with" in caplog.text and "is a picture missing?" in caplog.text
+
+
+def test_eyes_of_other_depths_are_refused_and_no_levels_advised(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = eyes(tmp_path, [f"{number:02}" for number in range(12)])
+    for number, file in enumerate(sorted(config.left.iterdir())):
+        cv2.imwrite(str(file), picture(number).astype(np.uint16) * 257)
+    with pytest.raises(SagsError, match="holds uint8, others uint16; save all pictures alike"):
+        open_source(config)
+    assert caplog.text == ""
