@@ -29,11 +29,11 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10261,
+    "benchmarks": 10263,
     "sags_lab": 5028,
     "sags_node": 1235,
     "sags_node/bags": 864,
-    "sags_node/cli": 3533,
+    "sags_node/cli": 3535,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2601,
     "sags_node/clients/latency": 431,
@@ -59,14 +59,14 @@ LINES = {
     "sags_node/ros": 332,
     "sags_node/sources": 5717,
     "sags_node/terminal": 359,
-    "sags_node/tools": 479,
+    "sags_node/tools": 480,
     "sags_node/tools/calibration": 1836,
-    "sags_node/tools/evaluation": 2851,
+    "sags_node/tools/evaluation": 3150,
     "sags_node/tools/export": 915,
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1093,
     "sags_node/vision": 5524,
-    "tests": 46933,
+    "tests": 47103,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
