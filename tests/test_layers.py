@@ -61,7 +61,7 @@ LINES = {
     "sags_node/terminal": 359,
     "sags_node/tools": 480,
     "sags_node/tools/calibration": 1838,
-    "sags_node/tools/evaluation": 3156,
+    "sags_node/tools/evaluation": 3150,
     "sags_node/tools/export": 915,
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1092,

@@ -8,7 +8,7 @@ tissue must be as it was.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,26 +30,19 @@ GROUPS = ("right", "novel", "stereo")  # figures of a frame that the first of th
 STEPS = 16  # places of points along each side of the picture
 
 
-@dataclass(frozen=True, slots=True)
-class Second:
-    """What the two runs found."""
-
-    frames: int  # that were played
-    rows: dict[int, FrameRow]  # by frame number; figures of `GROUPS` and `hidden`
-    forth_back: dict[str, Any] | None  # see `_forth_and_back`; None: true points are known, or none is seen
-
-
 def measure_second(
-    session: Session,
-    options: MeasureOptions,
-    hidden: bool,
-    progress: Callable[[str, int, int | None], None],
-) -> Second:
+    session: Session, every: int, hidden: bool, progress: Callable[[str, int, int | None], None]
+) -> tuple[dict[int, FrameRow], dict[str, Any]]:
     """Play the first `MOST` frames of a recording again, at the size of the session.
 
     Args:
+        every: the right eye is measured on every so many frames.
         hidden: also hide tissue, in a run of its own.
         progress: called with what is going on, the frames done and those in all.
+
+    Returns:
+        Rows by frame number, with figures of `GROUPS` and `hidden`; the summary's `second_run` and, where no
+        true points are known, `forth_back` (see `_forth_and_back`).
     """
     frames = min(MOST, session.source.frame_count or MOST)
     source = session.config.source.model_copy(update={"frames": frames})
@@ -58,7 +51,7 @@ def measure_second(
     config = alone.model_copy(update={"publish": publish})
     session = replace(session, config=config)
     session = replace(session, source=again(session))
-    asked = MeasureOptions(0, options.every, unseen=True)
+    asked = MeasureOptions(0, every, unseen=True)
 
     def told(what: str, done: int) -> None:
         progress(f"once more, frame by frame: {what}", done, frames)
@@ -80,7 +73,7 @@ def measure_second(
     of_hidden = measure_hidden(alone, session.rig, again(session), frames, told) if hidden else {}
     for frame_id in of_hidden.keys() & rows.keys():
         rows[frame_id].figures["hidden"] = of_hidden[frame_id]
-    return Second(frames, rows, found)
+    return rows, {"second_run": {"frames": frames}, "forth_back": found}
 
 
 def _forth_and_back(

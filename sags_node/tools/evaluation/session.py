@@ -118,16 +118,16 @@ def completed(
     if not options.second:
         return found
     summary = found.summary
-    more = measure_second(_at_usual_rung(session, summary), options, summary["hidden"] is None, progress)
+    session = _at_usual_rung(session, summary)
+    more, told = measure_second(session, options.every, summary["hidden"] is None, progress)
     missing = {group for group in MEANS if summary[group] is None}
     if summary["settings"]["depth_reference"] is not None:
         missing.discard("stereo")
     rows = []
     for row in found.rows:
-        also = more.rows.get(row.frame_id, row)
+        also = more.get(row.frame_id, row)
         figures = {group: also.figures[group] for group in missing & also.figures.keys()}
         rows.append(replace(row, figures=row.figures | figures, track=row.track or also.track))
-    told = {"forth_back": more.forth_back, "second_run": {"frames": more.frames}}
     summary |= rounded({**quality(rows, options, session.config.segments), **told})
     return replace(found, rows=rows)
 

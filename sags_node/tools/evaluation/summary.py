@@ -59,7 +59,8 @@ def summarise(
         "segments": {name: list(span) for name, span in segments.items()},
         "machine": machine_name(),
     }
-    return rounded(summary)
+    whole: dict[str, Any] = rounded(summary)
+    return whole
 
 
 def quality(
