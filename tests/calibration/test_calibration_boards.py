@@ -17,8 +17,8 @@ from drawn_boards import SIZE, SQUARE, SQUARES, charuco_print, chessboard_print,
 from sags_node.errors import SagsError, UsageError
 from sags_node.rig import load_rig
 from sags_node.tools.calibration.boards import Charuco, Chessboard, StereoView, find_in_both
-from sags_node.tools.calibration.coverage import coverage_hints
 from sags_node.tools.calibration.solve import Solution, calibrate
+from sags_node.tools.calibration.stereo import coverage_hints
 from sags_node.types import F32, U8, StereoRig
 
 

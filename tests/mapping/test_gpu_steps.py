@@ -14,7 +14,7 @@ from sags_node.engine.gpu.rasterizer import DERIVED
 from sags_node.engine.interface import Gradients
 from sags_node.mapping import focus
 from sags_node.mapping.gpu.device_map import DeviceMap
-from sags_node.mapping.gpu.picture import Picture
+from sags_node.mapping.gpu.refiner import Picture
 from sags_node.mapping.optimiser import LearningRates, Optimiser
 from sags_node.model import columns
 from sags_node.model.deformation import NodeDeformation

@@ -21,9 +21,8 @@ from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.types import U8, StereoFrame
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.watch.blocks import is_blocky
 from sags_node.vision.watch.judgement import Judgement
-from sags_node.vision.watch.pair_watch import PairWatch
+from sags_node.vision.watch.pair_watch import PairWatch, is_blocky
 
 STEP_NS = 100_000_000
 NEEDED = 2  # frames, at that rate
