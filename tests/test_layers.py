@@ -29,11 +29,11 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10144,
+    "benchmarks": 10111,
     "sags_lab": 5023,
     "sags_node": 1168,
     "sags_node/bags": 864,
-    "sags_node/cli": 3524,
+    "sags_node/cli": 3539,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2591,
     "sags_node/clients/latency": 431,
@@ -43,13 +43,13 @@ LINES = {
     "sags_node/clients/viewer": 1491,
     "sags_node/config": 1344,
     "sags_node/detail": 932,
-    "sags_node/engine": 4088,
+    "sags_node/engine": 4070,
     "sags_node/instruments": 548,
     "sags_node/field": 1721,
     "sags_node/kernels": 1222,
-    "sags_node/mapping": 5661,
+    "sags_node/mapping": 5651,
     "sags_node/media": 858,
-    "sags_node/messaging": 5317,
+    "sags_node/messaging": 5316,
     "sags_node/model": 961,
     "sags_node/node": 1791,
     "sags_node/phantom": 1591,
@@ -62,11 +62,11 @@ LINES = {
     "sags_node/tools": 536,
     "sags_node/tools/calibration": 1874,
     "sags_node/tools/evaluation": 2851,
-    "sags_node/tools/export": 915,
+    "sags_node/tools/export": 891,
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1093,
     "sags_node/vision": 5438,
-    "tests": 46930,
+    "tests": 46800,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -144,18 +144,17 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool
     \b
     python -m benchmarks alias --out benchmarks/results/alias.json --picture docs/alias.png
     """
-    from benchmarks.quality import alias_report
-    from benchmarks.quality.alias import QUICK, Settings, measure_alias
+    from benchmarks.quality import alias
 
     check_files(out, picture, force=force)
     with progress("measuring") as advance:
-        measured = measure_alias(QUICK if quick else Settings(), advance)
-    for table in [measured.table] if json_out else alias_report.tables(measured.table):
+        measured = alias.measure_alias(alias.QUICK if quick else alias.Settings(), advance)
+    for table in [measured.table] if json_out else alias.tables(measured.table):
         show(table)
     write_json(out, measured.table)
     if picture is not None:
         with whole(picture) as partial:
-            partial.write_bytes(alias_report.picture(measured.truth, measured.models))
+            partial.write_bytes(alias.picture(measured.truth, measured.models))
 
 
 @click.command("methods")

@@ -7,13 +7,14 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 from rich.markup import escape
+from rich.table import Table
 
 from sags_node.cli.launching import (
     STEPWISE,
@@ -31,16 +32,12 @@ from sags_node.cli.launching import (
 from sags_node.cli.node_options import data_options
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.topics import plain_name
+from sags_node.terminal import text
 from sags_node.terminal.console import console, on_stop_signals, progress, show
 
 if TYPE_CHECKING:
     from sags_node.clients.recording.recorder import RecordOptions
     from sags_node.messaging.address import NodeAddress
-from collections.abc import Mapping
-
-from rich.table import Table
-
-from sags_node.terminal import text
 
 DATA_LOST = 3  # exit code
 

@@ -26,7 +26,6 @@ def bridge(run_dir: Path, *command: str) -> Iterator[tuple[subprocess.Popen[str]
     """`sags bridge` and its port."""
     process = start(["bridge", *command, "--json", "--run-dir", run_dir])
     try:
-        assert process.stdout is not None and process.stderr is not None
         line = process.stdout.readline()  # ends with the process
         assert line, process.stderr.read()
         yield process, json.loads(line)["port"]

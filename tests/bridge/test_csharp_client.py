@@ -82,7 +82,6 @@ def running(program: Path, port: int) -> Iterator[subprocess.Popen[str]]:
 
 
 def until_line(process: subprocess.Popen[str], start: str) -> str:
-    assert process.stdout is not None
     while not (line := process.stdout.readline()).startswith(start):
         assert line, "it ended"  # it is killed by the test's own time limit, at the latest
     return line
@@ -94,7 +93,6 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     with sockets(tmp_path) as node, bridged(run_web, options) as port, running(program, port) as process:
         with stream(node, anchored_at):
             found = LINE.fullmatch(until_line(process, "stamp_ns="))
-            assert found is not None
             until_line(process, "stamp_ns=")
         assert "stale: too old" in until_line(process, "stale")
         with stream(node, anchored_at):  # and comes back

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import anchored_at, bridged, senders, sockets
+from bridging import anchored_at, bridged, plane_bridged, senders, sockets
 from places import ROOT
 from ports import free_port, is_free
 from synthetic import HEIGHT, WIDTH, plane_result, stream
@@ -118,23 +118,22 @@ def ros(joined: Client, name: str, number: int = -1) -> Any:
 
 def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None:
     names = [f"/sags/{name}" for name in FRAME_TOPICS]
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
-            joined.subscribe(*names)
-            with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
-                until(
-                    lambda: all(
-                        len(joined.came[name]) > (0 if name in ("/sags/status", "/sags/diagnostics") else 8)
-                        for name in names
-                    )
+    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), client(port) as joined:
+        joined.subscribe(*names)
+        with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
+            until(
+                lambda: all(
+                    len(joined.came[name]) > (0 if name in ("/sags/status", "/sags/diagnostics") else 8)
+                    for name in names
                 )
-                kept = {
-                    (name, m.stamp_ns): m.cdr()
-                    for name in FRAME_TOPICS
-                    for m in [beside.latest(name)]
-                    if m is not None
-                }
-                time.sleep(0.3)  # what was just sent comes there too
+            )
+            kept = {
+                (name, m.stamp_ns): m.cdr()
+                for name in FRAME_TOPICS
+                for m in [beside.latest(name)]
+                if m is not None
+            }
+            time.sleep(0.3)  # what was just sent comes there too
     assert joined.info["name"] == "SAGS sags" and joined.info["capabilities"] == []
     for topic in topics.TOPICS:
         channel = joined.channels[f"/sags/{topic.name}"]
@@ -152,15 +151,14 @@ def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None
 
 
 def test_only_what_is_looked_at_is_asked_of_the_node(tmp_path: Path) -> None:
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port:
-            time.sleep(0.4)
-            assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["status"]
-            with client(port) as joined:
-                joined.subscribe("/sags/anchors")
-                until(lambda: joined.came["/sags/anchors"])
-                assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["anchors", "status"]
-            until(lambda: not running.wanted("anchors"))
+    with plane_bridged(run_foxglove, options(tmp_path)) as (running, port):
+        time.sleep(0.4)
+        assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["status"]
+        with client(port) as joined:
+            joined.subscribe("/sags/anchors")
+            until(lambda: joined.came["/sags/anchors"])
+            assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["anchors", "status"]
+        until(lambda: not running.wanted("anchors"))
 
 
 def test_what_stops_is_empty_and_comes_back(tmp_path: Path) -> None:
@@ -211,33 +209,35 @@ def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) 
 
 def test_a_client_that_does_not_read_holds_nobody_up_and_goes_on_with_what_is_new(tmp_path: Path) -> None:
     name = "/sags/left/render/image"
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as quick, client(port) as slow:
-            for each in (quick, slow):
-                each.subscribe(name)
-                until(lambda each=each: each.came[name])
-            slow.reading.clear()
-            before = len(quick.came[name])
-            until(lambda: len(quick.came[name]) > before + 60)
-            newest = quick.came[name][-1][0]
-            slow.reading.set()
-            until(lambda: slow.came[name][-1][0] > newest)
+    with (
+        plane_bridged(run_foxglove, options(tmp_path)) as (_, port),
+        client(port) as quick,
+        client(port) as slow,
+    ):
+        for each in (quick, slow):
+            each.subscribe(name)
+            until(lambda each=each: each.came[name])
+        slow.reading.clear()
+        before = len(quick.came[name])
+        until(lambda: len(quick.came[name]) > before + 60)
+        newest = quick.came[name][-1][0]
+        slow.reading.set()
+        until(lambda: slow.came[name][-1][0] > newest)
 
 
 def test_pictures_come_as_h264_that_anybody_can_begin_with(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="no H.264 without PyAV")
     name = "/sags/left/image_rect_color/h264"
     truth = plane_result().pair.left
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port:
-            with client(port) as first:
-                first.subscribe(name)
-                until(lambda: len(first.came[name]) > 5)
-                with client(port) as second:
-                    second.subscribe(name)
-                    until(lambda: len(second.came[name]) > KEY_EVERY)
-                    schema = base64.b64decode(second.channels[name]["schema"])
-                    assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo" and schema
+    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port):
+        with client(port) as first:
+            first.subscribe(name)
+            until(lambda: len(first.came[name]) > 5)
+            with client(port) as second:
+                second.subscribe(name)
+                until(lambda: len(second.came[name]) > KEY_EVERY)
+                schema = base64.b64decode(second.channels[name]["schema"])
+                assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo" and schema
     fields = [protobuf_bytes(message) for _, message in second.came[name]]
     assert all(each[4] == b"h264" and each[3].startswith(b"\x00\x00\x00\x01") for each in fields)
     # A picture may go out while the server is still telling that somebody came.
@@ -278,10 +278,9 @@ def protobuf_bytes(message: bytes) -> dict[int, bytes]:
 
 
 def test_status_comes_as_figures_for_plots(tmp_path: Path) -> None:
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
-            joined.subscribe("/sags/figures")
-            until(lambda: joined.came["/sags/figures"])
+    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), client(port) as joined:
+        joined.subscribe("/sags/figures")
+        until(lambda: joined.came["/sags/figures"])
     said = json.loads(joined.came["/sags/figures"][-1][1])
     assert said["rate_hz"] == 30.0 and said["latency_ms"]["p50"] == 40.0 and said["gaussians"] == 384
 

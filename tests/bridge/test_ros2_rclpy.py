@@ -109,7 +109,6 @@ def bridge(run_dir: Path) -> Iterator[subprocess.Popen[str]]:
         text=True,
     )  # fmt: skip
     try:
-        assert process.stdout is not None
         assert json.loads(process.stdout.readline()) == {"domain": DOMAIN, "interface": "lo"}
         yield process
     finally:

@@ -12,11 +12,11 @@ import numpy as np
 import open3d
 import pytest
 from command_line import refused, sags
+from engine_scenes import rasterize
 from running_node import RunningNode
 from splat_files import splats_of
 
 from sags_node.config.schema import PhantomSource
-from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
 from sags_node.messaging.address import NodeAddress

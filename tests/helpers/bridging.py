@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from synthetic import at_frame, plane_result
+from synthetic import at_frame, plane_result, stream
 
 from sags_node.config.schema import PublishConfig
 from sags_node.messaging.address import NodeAddress
@@ -91,3 +91,11 @@ def bridged(
         stop.set()
         thread.join(60)
         assert not thread.is_alive() and not failed, failed
+
+
+@contextmanager
+def plane_bridged(run: Callable[..., None], options: Any) -> Iterator[tuple[Publisher, int]]:
+    """A node that sends the plane with its anchors, and the port of a bridge beside it."""
+    with sockets(options.node.run_dir) as running, stream(running, anchored_at):
+        with bridged(run, options) as port:
+            yield running, port

@@ -40,7 +40,6 @@ class Peer:
         self._thread.start()
 
     def _read(self) -> None:
-        assert self._process.stdout is not None
         for line in self._process.stdout:
             self.came.append(line.split())
 

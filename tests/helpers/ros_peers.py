@@ -107,7 +107,6 @@ class RosNode:
         self._thread.start()
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
         for line in self.process.stdout:
             said = json.loads(line)
             topic = said.pop("topic", None)
@@ -129,7 +128,6 @@ class RosNode:
         self._order(do="publish", type=kind, topic=topic, fields=paths)
 
     def _order(self, **order: object) -> None:
-        assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(order) + "\n")
         self.process.stdin.flush()
 

@@ -38,7 +38,6 @@ class RunningNode:
 
     def said(self) -> str:
         """Everything on stderr, once it has ended."""
-        assert self.process.stderr is not None
         return self.process.stderr.read()
 
     def stop(self) -> int:

@@ -109,7 +109,6 @@ def test_anchors_go_with_the_tissue(phantom_session: Path) -> None:
     budget = StepBudget(4, RUNG)
     first = pipeline.process(taken[0], budget)
     reference = taken[0].reference
-    assert reference is not None and reference.points is not None and reference.points_visible is not None
     pixels, _ = project(first.snapshot.camera, reference.points)
     ids = {}
     for point in np.flatnonzero(reference.points_visible):
@@ -122,7 +121,6 @@ def test_anchors_go_with_the_tissue(phantom_session: Path) -> None:
     off, moved = [], []
     for frame in taken[1:]:
         result = pipeline.process(frame, budget)
-        assert frame.reference is not None and frame.reference.points is not None
         found = dict(zip(result.anchors.ids.tolist(), result.anchors.points, strict=True))
         for point, anchor in ids.items():
             off.append(np.linalg.norm(found[anchor] - frame.reference.points[point]))

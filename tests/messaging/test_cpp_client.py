@@ -114,7 +114,6 @@ def test_it_shows_what_the_python_subscriber_shows(read_depth: Path, node: Runni
 
 def test_it_says_stale_and_shows_nothing_while_no_frames_come(read_depth: Path, node: RunningNode) -> None:
     with ControlClient(run_dir=node.run_dir) as control, running(read_depth, node.data) as process:
-        assert process.stdout is not None
         while not LINE.match(process.stdout.readline()):
             assert process.poll() is None
         control.request("pause")

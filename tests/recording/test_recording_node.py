@@ -159,7 +159,6 @@ def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_pat
         [*command, "--topics", "tf"], env={**os.environ, "XDG_RUNTIME_DIR": str(node)}, stderr=subprocess.PIPE
     )
     try:
-        assert process.stderr is not None
         while b"recording: " not in process.stderr.readline():
             assert process.poll() is None
         process.send_signal(signal.SIGHUP)
