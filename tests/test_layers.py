@@ -29,7 +29,7 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10111,
+    "benchmarks": 10088,
     "sags_lab": 5023,
     "sags_node": 1168,
     "sags_node/bags": 864,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1093,
     "sags_node/vision": 5438,
-    "tests": 46800,
+    "tests": 46621,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -245,9 +245,8 @@ def test_a_running_node_is_exported_as_it_is_now(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Where time is short, a part of the picture is as it was before the frame's step.
-    node = RunningNode(phantom_session, tmp_path, "mapping.iterations:=1")
     depth = TopicName("left/render/depth", ReceivedImage)
-    try:
+    with RunningNode(phantom_session, tmp_path, "mapping.iterations:=1") as node:
         with Subscriber([depth], run_dir=node.run_dir) as subscriber:
             assert subscriber.wait(depth, 60) is not None
             drawn = {}
@@ -271,8 +270,6 @@ def test_a_running_node_is_exported_as_it_is_now(
             control.request("pause")
         with pytest.raises(SagsError, match="nothing fresh came"):
             from_node(NodeAddress(run_dir=node.run_dir))
-    finally:
-        node.stop()
     refused(1, "export", "--mesh", tmp_path / "none.ply", said=("no node runs as 'sags'",))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from browsers import new_page
 from synthetic import plane_result, publisher
-from waiting import until
+from waiting import beside, until
 
 from sags_node.clients.latency.code import NUMBERS, Reader, paint
 from sags_node.clients.latency.ledger import Ledger, Moment
@@ -145,13 +145,8 @@ def measuring(codes: Codes, run_dir: Path, ended: Callable[[], object]) -> Itera
         finally:
             ended()
 
-    thread = threading.Thread(target=measure)
-    thread.start()
-    try:
+    with beside(measure, stop.set):
         yield found
-    finally:
-        stop.set()
-        thread.join()
 
 
 @pytest.mark.live

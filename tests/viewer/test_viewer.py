@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from browsers import new_page
 from click.testing import CliRunner
+from command_line import killed
 
 from sags_node.cli.main import main
 from sags_node.clients.viewer import splats as viewer_splats
@@ -340,14 +341,9 @@ def node(view: RunningView, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]
     write_session(PhantomSource(seconds=2.0, width=160, height=128, seed=1), session, rate=10.0)
     command = [sys.executable, "-m", "sags_node", "run", session, "source.loop:=true"]
     command += ["source.rate:=5", "vision.scale:=1", "publish.data:=[]", "publish.control:=tcp://127.0.0.1:*"]
-    running = subprocess.Popen(
-        list(map(str, command)),
-        env=os.environ | {"XDG_RUNTIME_DIR": str(view.runtime)},
-        stderr=subprocess.DEVNULL,
-    )
-    yield running
-    running.kill()
-    running.wait()
+    words, environment = list(map(str, command)), os.environ | {"XDG_RUNTIME_DIR": str(view.runtime)}
+    with killed(subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL)) as running:
+        yield running
 
 
 def status(page: Any) -> str:
