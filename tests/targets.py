@@ -23,7 +23,7 @@ TESTS = tuple(
     ROOT / "tests" / room / f"test_{name}.py"
     for room, names in {
         "engine": ("rasterizer", "cpu_rasterizer", "projection", "losses", "colours", "adam", "kernels"),
-        "field": ("sampling", "hexplane", "decoder", "deformation"),
+        "field": ("hexplane", "decoder", "deformation"),
         "fitting": ("residuals",),
         "mapping": ("slopes",),
         "detail": ("detail",),

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from sags_node import host
 from sags_node.tools import doctor
 
 
@@ -55,7 +54,7 @@ def made(root: Path, **files: str) -> Path:
     ],
 )
 def test_the_quota_of_control_groups(files: dict[str, str], cores: float | None, tmp_path: Path) -> None:
-    assert host.core_quota(made(tmp_path, **files)) == cores
+    assert doctor.core_quota(made(tmp_path, **files)) == cores
 
 
 def test_a_quota_below_two_cores_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

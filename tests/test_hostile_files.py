@@ -202,7 +202,6 @@ def test_what_is_no_file_is_not_waited_for(make: Maker, tmp_path: Path) -> None:
     (tmp_path / "numbered").mkdir()
     make(tmp_path / "numbered/0.json")
     files = open_numbered(tmp_path / "numbered", ".json", 100)
-    assert files is not None
     with pytest.raises(SagsError, match=r"0\.json: it is a"):
         files.read(0)
 

@@ -19,6 +19,7 @@ from sags_node.cli.launching import (
     launch_argument,
     open_launched,
     positive,
+    shown,
     write_json,
 )
 from sags_node.errors import UsageError
@@ -41,11 +42,10 @@ from sags_node.terminal.console import progress, show
     metavar="FRAME",
     help="Where each begins. Default: the launch file's first segment, else 40 % of the recording.",
 )
-@click.option(
+@shown(
     "--seconds",
     type=positive,
     default=1.0,
-    show_default=True,
     help="That each lasts; dark (0.5 s), flash (2 frames) and cut (10 frames) at most so long.",
 )
 @click.option(

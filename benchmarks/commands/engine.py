@@ -23,6 +23,7 @@ from sags_node.cli.launching import (
     force_option,
     launch_argument,
     lpips_option,
+    shown,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
@@ -42,11 +43,10 @@ from sags_node.tools.evaluation.plots import check_plots
     metavar="FILE.json",
     help="Compare with a table written by --out; fail if a kernel has become slower.",
 )
-@click.option(
+@shown(
     "--tolerance",
     type=click.FloatRange(min=1.0),
     default=1.3,
-    show_default=True,
     help="How many times slower than in --check's table is too slow.",
 )
 @as_json
@@ -144,30 +144,23 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool
     \b
     python -m benchmarks alias --out benchmarks/results/alias.json --picture docs/alias.png
     """
-    from benchmarks.quality import alias_report
-    from benchmarks.quality.alias import QUICK, Settings, measure_alias
+    from benchmarks.quality import alias
 
     check_files(out, picture, force=force)
     with progress("measuring") as advance:
-        measured = measure_alias(QUICK if quick else Settings(), advance)
-    for table in [measured.table] if json_out else alias_report.tables(measured.table):
+        measured = alias.measure_alias(alias.QUICK if quick else alias.Settings(), advance)
+    for table in [measured.table] if json_out else alias.tables(measured.table):
         show(table)
     write_json(out, measured.table)
     if picture is not None:
         with whole(picture) as partial:
-            partial.write_bytes(alias_report.picture(measured.truth, measured.models))
+            partial.write_bytes(alias.picture(measured.truth, measured.models))
 
 
 @click.command("methods")
 @launch_argument
-@click.option(
-    "--iterations",
-    type=click.IntRange(1),
-    default=3,
-    show_default=True,
-    help="Steps per frame, step by step.",
-)
-@click.option("--rung", type=click.IntRange(0), default=7, show_default=True, help="Of the ladder, as well.")
+@shown("--iterations", type=click.IntRange(1), default=3, help="Steps per frame, step by step.")
+@shown("--rung", type=click.IntRange(0), default=7, help="Of the ladder, as well.")
 @measures
 def bench_methods(launch: tuple[str, ...], iterations: int, rung: int) -> Measured:
     """Control nodes or the paper's field: mapping.method nodes and sags on a recording, at two sizes.
@@ -188,16 +181,10 @@ def bench_methods(launch: tuple[str, ...], iterations: int, rung: int) -> Measur
 
 @click.command("ablation")
 @launch_argument
-@click.option(
-    "--warm-up", type=click.IntRange(0), default=300, show_default=True, help="Of the paper's schedule."
-)
-@click.option(
-    "--iterations", type=click.IntRange(1), default=1500, show_default=True, help="With deformation."
-)
-@click.option(
-    "--hold-out", type=click.IntRange(2), default=8, show_default=True, help="Test on every N-th frame."
-)
-@click.option("--seeds", type=click.IntRange(1), default=3, show_default=True, help="Fits of each variant.")
+@shown("--warm-up", type=click.IntRange(0), default=300, help="Of the paper's schedule.")
+@shown("--iterations", type=click.IntRange(1), default=1500, help="With deformation.")
+@shown("--hold-out", type=click.IntRange(2), default=8, help="Test on every N-th frame.")
+@shown("--seeds", type=click.IntRange(1), default=3, help="Fits of each variant.")
 @click.option("--variant", "only", multiple=True, metavar="NAME", help="Only this one; may be given again.")
 @click.option(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="A setting of every variant, as in sags fit."
@@ -239,13 +226,7 @@ def bench_ablation(
 @click.command("gpu")
 @click.option("--small", is_flag=True, help="Tiny sizes and no live runs: does it work, not how fast is it.")
 @click.option("--fit", is_flag=True, help="Also the paper's fit, which takes minutes.")
-@click.option(
-    "--seconds",
-    type=click.FloatRange(min=1),
-    default=420.0,
-    show_default=True,
-    help="After which no part begins.",
-)
+@shown("--seconds", type=click.FloatRange(min=1), default=420.0, help="After which no part begins.")
 @measures
 def bench_gpu(small: bool, fit: bool, seconds: float) -> Measured:
     """All that a GPU should do: parity, times, live runs. `make gpu-check` calls it.

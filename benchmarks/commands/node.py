@@ -23,6 +23,7 @@ from sags_node.cli.launching import (
     launch_argument,
     open_launched,
     positive,
+    shown,
     write_json,
 )
 from sags_node.errors import SagsError, UsageError
@@ -43,11 +44,10 @@ if TYPE_CHECKING:
     help="Some of budgets,resolutions,gaussians,skips (all by default), rungs, hosts.",
 )
 @click.option("--frames", type=click.IntRange(1), help="Of each recording; default: all.")
-@click.option(
+@shown(
     "--repeat",
     type=click.IntRange(1),
     default=1,
-    show_default=True,
     help="Play each setting so often; the run of middle speed counts.",
 )
 @click.option(
@@ -118,18 +118,15 @@ def bench_pareto(
 
 @click.command("endurance")
 @launch_argument
-@click.option("--frames", type=click.IntRange(1), default=10_000, show_default=True, help="To be played.")
-@click.option(
-    "--window", type=click.IntRange(2), default=500, show_default=True, help="Frames of a line of the table."
-)
-@click.option(
+@shown("--frames", type=click.IntRange(1), default=10_000, help="To be played.")
+@shown("--window", type=click.IntRange(2), default=500, help="Frames of a line of the table.")
+@shown(
     "--order",
     type=click.Choice(["there-and-back", "wrap", "walk"]),
     default="there-and-back",
-    show_default=True,
     help="Without a jump; from the start again after the last frame; or a random walk that never repeats.",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the walk and the camera's noise.")
+@shown("--seed", type=int, default=0, help="Of the walk and the camera's noise.")
 @measures
 def bench_endurance(launch: tuple[str, ...], frames: int, window: int, order: Order, seed: int) -> Measured:
     """Whether the node lasts: thousands of frames in a row.
@@ -152,16 +149,13 @@ def bench_endurance(launch: tuple[str, ...], frames: int, window: int, order: Or
 
 @click.command("soak")
 @launch_argument
-@click.option(
+@shown(
     "--frames",
     type=click.IntRange(1),
     default=18_000,
-    show_default=True,
     help="Of the camera, published or left out; 10 minutes.",
 )
-@click.option(
-    "--window", type=click.IntRange(2), default=900, show_default=True, help="Frames of a line of the table."
-)
+@shown("--window", type=click.IntRange(2), default=900, help="Frames of a line of the table.")
 @click.option(
     "--check",
     is_flag=True,
@@ -202,13 +196,7 @@ def bench_soak(
 
 @click.command("tracking")
 @launch_argument
-@click.option(
-    "--frames",
-    "numbers",
-    default="10,20,30,40,50,60,70,80,90",
-    show_default=True,
-    help="After how many frames to measure.",
-)
+@shown("--frames", "numbers", default="10,20,30,40,50,60,70,80,90", help="After how many frames to measure.")
 @measures
 def bench_tracking(launch: tuple[str, ...], numbers: str) -> Measured:
     """How well anchors stay on the tissue.
@@ -233,7 +221,7 @@ def bench_tracking(launch: tuple[str, ...], numbers: str) -> Measured:
 
 @click.command("recall")
 @launch_argument
-@click.option("--seconds", type=positive, default=10.0, show_default=True, help="Out of sight.")
+@shown("--seconds", type=positive, default=10.0, help="Out of sight.")
 @measures
 def bench_recall(launch: tuple[str, ...], seconds: float) -> Measured:
     """Whether anchors come back after a long time out of sight.
@@ -264,7 +252,7 @@ def bench_recall(launch: tuple[str, ...], seconds: float) -> Measured:
     type=click.Choice(["sway", "zoom", "orbit"]),
     help="This one alone; may be given several times. Default: all.",
 )
-@click.option("--seconds", type=positive, default=120.0, show_default=True, help="Of each motion.")
+@shown("--seconds", type=positive, default=120.0, help="Of each motion.")
 @measures
 def bench_scope(launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: float) -> Measured:
     """How true the pose of a moving scope stays.
@@ -290,16 +278,8 @@ def bench_scope(launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: f
 
 @click.command("crowd")
 @launch_argument
-@click.option(
-    "--seconds",
-    type=positive,
-    default=60.0,
-    show_default=True,
-    help="With the crowd; a quarter for each of the others.",
-)
-@click.option(
-    "--many", type=click.IntRange(0, 50), default=20, show_default=True, help="Further subscribers."
-)
+@shown("--seconds", type=positive, default=60.0, help="With the crowd; a quarter for each of the others.")
+@shown("--many", type=click.IntRange(0, 50), default=20, help="Further subscribers.")
 @measures
 def bench_crowd(launch: tuple[str, ...], seconds: float, many: int) -> Measured:
     """Whether subscribers disturb the node.
@@ -323,7 +303,7 @@ def bench_crowd(launch: tuple[str, ...], seconds: float, many: int) -> Measured:
 
 @click.command("bridges")
 @launch_argument
-@click.option("--seconds", type=positive, default=30.0, show_default=True, help="Of each bridge.")
+@shown("--seconds", type=positive, default=30.0, help="Of each bridge.")
 @measures
 def bench_bridges(launch: tuple[str, ...], seconds: float) -> Measured:
     """What each bridge gives and costs.
@@ -345,7 +325,7 @@ def bench_bridges(launch: tuple[str, ...], seconds: float) -> Measured:
 
 
 @click.command("transport")
-@click.option("--frames", type=click.IntRange(1), default=150, show_default=True, help="Of each transport.")
+@shown("--frames", type=click.IntRange(1), default=150, help="Of each transport.")
 @as_json
 def bench_transport(frames: int, json_out: bool) -> None:
     """What sending a picture costs.
@@ -362,7 +342,7 @@ def bench_transport(frames: int, json_out: bool) -> None:
 
 @click.command("thin")
 @launch_argument
-@click.option("--frames", type=click.IntRange(1), default=60, show_default=True, help="To measure.")
+@shown("--frames", type=click.IntRange(1), default=60, help="To measure.")
 @measures
 def bench_thin(launch: tuple[str, ...], frames: int) -> Measured:
     """What thin pictures cost.
@@ -383,7 +363,7 @@ def bench_thin(launch: tuple[str, ...], frames: int) -> Measured:
 
 
 @click.command("inputs")
-@click.option("--seconds", type=positive, default=10.0, show_default=True, help="Of each way.")
+@shown("--seconds", type=positive, default=10.0, help="Of each way.")
 @click.option("--only", metavar="NAME", help="Ways that begin so, e.g. gst; default: all.")
 @measures
 def bench_inputs(seconds: float, only: str | None) -> Measured:

@@ -7,13 +7,25 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
-from benchmarks.kernels.adam import measure_adam
+import numpy as np
+
 from benchmarks.kernels.contention import measure_contention, measure_rhythm
-from benchmarks.kernels.pictures import measure_losses
 from benchmarks.kernels.rasterizing import RasterCase, measure_rasterizer
+from benchmarks.kernels.scenes import surface
+from benchmarks.kernels.timing import median_ms
+from benchmarks.kernels.work import Work, bytes_of, share_of_peak, stage_rows
+from sags_node.engine.adam import AdamState, adam_step
+from sags_node.engine.losses import tissue as losses
+from sags_node.engine.rasterizer import views
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.kernels.peak import Peak, measure_peak, peak_row
 from sags_node.kernels.threads import configure_threads
 from sags_node.tools.evaluation.provenance import machine_name
+
+DEPTH_WEIGHT, DEPTH_SCALE = 2e-3, 1e-3  # as the mapper's
+
+# per value: it and its two momenta are read and written, its gradient is read
+ADAM_FLOATS, ADAM_OPERATIONS = 7, 14
 
 Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
@@ -106,3 +118,57 @@ def raster_cases(settings: Settings, thread_counts: list[int]) -> Iterator[Raste
     yield replace(second, sh_degree=3)
     for share in ACTIVE_SHARES:
         yield replace(second, active_tiles=share)
+
+
+def measure_adam(count: int, of: int, columns: int, threads: int, runs: int, peak: Peak) -> dict[str, Any]:
+    """One row of the table: Adam on `count` rows, spread at random, of a table [of, columns]. The calling
+    thread must be set to `threads`, and `peak` be that of them."""
+    rng = np.random.default_rng(0)
+    values, gradients = (rng.normal(size=(of, columns)).astype(np.float32) for _ in range(2))
+    state, rates = AdamState.new(of, columns), np.full(columns, 1e-3, np.float32)
+    rows = None if count == of else np.sort(rng.permutation(of)[:count])
+    ms = median_ms(lambda: adam_step(values, gradients, state, rates, rows=rows), runs)
+    work = {"step": Work(4 * ADAM_FLOATS * count * columns, ADAM_OPERATIONS * count * columns)}
+    return {
+        "n": count,
+        "of": of,
+        "columns": columns,
+        "threads": threads,
+        "step_ms": ms,
+        "share_of_peak": share_of_peak(ms, work, peak),
+        "stages": stage_rows({"step": ms}, work, peak),
+    }
+
+
+def measure_losses(
+    count: int, width: int, height: int, threads: int, runs: int, peak: Peak
+) -> dict[str, Any]:
+    """One row of the table: of a drawn surface against a darker picture of itself. The calling thread must be
+    set to `threads`, and `peak` be that of them."""
+    gaussians, camera = surface(count, width, height)
+    planes = make_rasterizer("numba", width, height).forward(gaussians, camera)
+    view = views.to_view(planes, camera, 0, 0)
+    image = (0.9 * 255 * views.colours_of(planes)).astype(np.uint8)
+    tissue = np.ones((height, width), np.bool_)
+    v_planes, weight = np.empty_like(planes), np.empty_like(view.depth)
+
+    def tissue_loss() -> None:
+        losses.tissue_loss(planes, image, tissue, view.depth, v_planes, weight, DEPTH_WEIGHT, DEPTH_SCALE)
+
+    times = {
+        "tissue loss": median_ms(tissue_loss, runs),
+        "view": median_ms(lambda: views.to_view(planes, camera, 0, 0), runs),
+    }
+    work = {
+        "tissue loss": Work(bytes_of(planes, image, tissue, view.depth, v_planes, weight)),
+        "view": Work(bytes_of(planes, view.rgb, view.depth, view.alpha)),
+    }
+    return {
+        "width": width,
+        "height": height,
+        "threads": threads,
+        "tissue_loss_ms": times["tissue loss"],
+        "view_ms": times["view"],
+        "share_of_peak": share_of_peak(sum(times.values()), work, peak),
+        "stages": stage_rows(times, work, peak),
+    }

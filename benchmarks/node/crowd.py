@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -20,6 +20,7 @@ import zmq
 from rich.table import Table
 
 from benchmarks.node.neighbours import everything, give_way
+from benchmarks.node.processes import program
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.received import ReceivedText, TopicName
@@ -33,7 +34,7 @@ SMALL = ("tf", "anchors", "status")  # what each of the many listens to
 STATUS = TopicName("status", ReceivedText)
 WARM_UP = 10.0  # s
 STARTING = 60.0  # s for a node to bind its sockets
-STOPPING = 30.0  # s for it, and for each of the crowd, to end
+STOPPING = 30.0  # s for it to end
 SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*", "source.loop:=true"
 
@@ -120,26 +121,17 @@ def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict
     """Subscribers in processes of their own; what is given ends them and returns what they saw."""
     spawn = multiprocessing.get_context("spawn")
     ending = spawn.Event()
-    members: list[tuple[str, Any, Connection]] = []
-    for name, (target, argument) in work.items():
-        here, there = spawn.Pipe()
-        process = spawn.Process(
-            target=_with_what_is_left, args=(target, folder, argument, ending, there), daemon=True
-        )
-        process.start()
-        members.append((name, process, here))
+    members: dict[str, Connection] = {}
 
     def stop() -> dict[str, Any]:
         ending.set()
-        return {name: here.recv() for name, _, here in members if here.poll(10.0)}
+        return {name: here.recv() for name, here in members.items() if here.poll(10.0)}
 
-    try:
+    with ExitStack() as running:
+        for name, (target, argument) in work.items():
+            members[name], there = spawn.Pipe()
+            running.enter_context(program(_with_what_is_left, target, folder, argument, ending, there))
         yield stop
-    finally:
-        for _, process, _ in members:
-            process.terminate()
-            process.join(STOPPING)
-            process.kill()
 
 
 def _with_what_is_left(work: Task, *arguments: Any) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.node.processes import children, cpu_seconds
+from benchmarks.node.processes import children, cpu_seconds, program
 from sags_node.client import FrameSender
 from sags_node.config.schema import GeometryConfig, GstSource, PushSource, Ros2Source, RosGraph
 from sags_node.errors import SagsError, UsageError
@@ -26,7 +26,6 @@ from sags_node.types import U8
 WIDTH, HEIGHT, RATE = 1280, 1024, 30  # of an eye
 WARM_UP_S = 1.0  # from the first pair on
 SILENT_S = 30.0  # a source may give nothing for so long
-STOPPING_S = 5.0
 
 Opener = Callable[[], AbstractContextManager[Source]]  # of a live source of that size and rate
 Send = Callable[[U8, int], object]  # a picture as both eyes', and its stamp (ns)
@@ -58,7 +57,7 @@ def _gst_over_under() -> Source:
 @contextmanager
 def _push() -> Iterator[Source]:
     source = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*", rate=RATE), (WIDTH, HEIGHT))
-    with source, _program(_pushing, source.endpoint):
+    with source, program(_pushing, source.endpoint):
         yield source
 
 
@@ -67,21 +66,8 @@ def _ros2() -> Iterator[Source]:
     domain = 70 + os.getpid() % 30  # away from a robot's own, and from another benchmark
     names = {"left": "/stereo/left/image_raw", "right": "/stereo/right/image_raw"}
     with open_source(Ros2Source(domain=domain, rate=RATE, **names)) as source:
-        with _program(_publishing, domain, *names.values()):
+        with program(_publishing, domain, *names.values()):
             yield source
-
-
-@contextmanager
-def _program(work: Callable[..., None], *arguments: Any) -> Iterator[None]:
-    """Another process, which ends with us."""
-    process = multiprocessing.get_context("spawn").Process(target=work, args=arguments, daemon=True)
-    process.start()
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.join(STOPPING_S)
-        process.kill()
 
 
 def _pushing(endpoint: str) -> None:

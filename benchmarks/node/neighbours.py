@@ -13,13 +13,14 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
 from typing import Any
 
 import zmq
 
+from benchmarks.node.processes import program
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.rundir import connection_path
@@ -96,17 +97,9 @@ def _still_runs(process: Popen[Any], name: str) -> None:
         raise SagsError(f"the {name} ended before its time, exit code {process.returncode}")
 
 
-@contextmanager
-def reader(run_dir: Path) -> Iterator[None]:
+def reader(run_dir: Path) -> AbstractContextManager[None]:
     """Who takes everything, as fast as it comes."""
-    process = multiprocessing.get_context("spawn").Process(target=_read, args=(str(run_dir),), daemon=True)
-    process.start()
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.join(STOPPING)
-        process.kill()
+    return program(_read, str(run_dir))
 
 
 def _read(run_dir: str) -> None:

@@ -1,11 +1,15 @@
-"""What processes cost, and which this one has started."""
+"""What processes cost, which this one has started, and work in one that ends with us."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+STOPPING = 5.0  # s for a process to end
 TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
 
 
@@ -46,3 +50,16 @@ def threads(process: int) -> int:
         OSError: it has ended.
     """
     return len(os.listdir(f"/proc/{process}/task"))
+
+
+@contextmanager
+def program(work: Callable[..., None], *arguments: Any) -> Iterator[None]:
+    """Work in another process, which ends when this is left, and with us."""
+    process = multiprocessing.get_context("spawn").Process(target=work, args=arguments, daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.join(STOPPING)
+        process.kill()

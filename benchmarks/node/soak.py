@@ -30,7 +30,7 @@ from rich.table import Table
 from benchmarks.node import neighbours
 from benchmarks.node.crowd import Advance, node_beside
 from benchmarks.node.endurance import SIGNIFICANT, slope, trends
-from benchmarks.node.processes import descriptors, threads
+from benchmarks.node.processes import descriptors, program, threads
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freezes import Freezes
@@ -253,22 +253,16 @@ def _visitors(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
     spawn = multiprocessing.get_context("spawn")
     ending = spawn.Event()
     here, there = spawn.Pipe()
-    process = spawn.Process(target=_visit, args=(run_dir, ending, there), daemon=True)
-    process.start()
 
     def stop() -> dict[str, int]:
         ending.set()
         return here.recv() if here.poll(neighbours.STARTING) else {"visits": 0, "pictures": 0}
 
-    try:
+    with program(_visit, run_dir, ending, there):
         if not here.poll(neighbours.STARTING):
             raise SagsError("the subscribers did not start")
         here.recv()
         yield stop
-    finally:
-        process.terminate()
-        process.join(neighbours.STOPPING)
-        process.kill()
 
 
 def _visit(run_dir: Path, ending: Event, there: Connection) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import zmq
 
+from benchmarks.node.processes import program
 from sags_node.errors import SagsError
 from sags_node.messaging.address import Address, ClientKeys, connect
 from sags_node.messaging.security import KeyPair
@@ -22,7 +23,7 @@ from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 FRAME_BYTES = 4_000_000
 RATE = 30.0  # frames per second, so that nothing waits in a queue
 WARM_UP = 10  # frames
-STARTING, ARRIVING, STOPPING = 60.0, 10.0, 5.0  # s, at most
+STARTING, ARRIVING = 60.0, 10.0  # s, at most
 
 
 def measure_transport(frames: int) -> list[dict[str, Any]]:
@@ -52,12 +53,11 @@ def _send(
     name: str, endpoint: str, own: KeyPair | None, keys: ClientKeys | None, frames: int
 ) -> Iterator[float]:
     context = zmq.Context()
+    context.linger = 0
     socket = context.socket(zmq.XPUB)
     address = Address(bind(socket, endpoint, "publish.data", own), keys)
     here, there = multiprocessing.Pipe()
-    receiver = multiprocessing.get_context("spawn").Process(target=_receive, args=(address, there))
-    receiver.start()
-    try:
+    with context, program(_receive, address, there):
         if not socket.poll(round(1000 * STARTING)):  # its subscription
             raise SagsError(f"the receiver did not start within {STARTING:g} s")
         socket.recv()
@@ -69,11 +69,6 @@ def _send(
                 raise SagsError(f"{name}: a frame did not arrive within {ARRIVING:g} s")
             yield (here.recv() - sent_ns) * 1e-6
             time.sleep(1 / RATE)
-    finally:
-        receiver.terminate()
-        receiver.join(STOPPING)
-        receiver.kill()
-        context.destroy(linger=0)
 
 
 def _receive(address: Address, there: Connection) -> None:

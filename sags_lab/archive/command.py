@@ -23,6 +23,7 @@ from sags_node.cli.launching import (
     from_zero,
     launch_argument,
     positive,
+    shown,
     split_recording,
     words_of,
     write_json,
@@ -45,10 +46,9 @@ def archive() -> None:
 
 @archive.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option(
+@shown(
     *("-o", "--out"),
     default="archive.csv",
-    show_default=True,
     metavar="FILE",
     help="The manifest, .csv or .parquet; a path, or a URL that fsspec knows.",
 )
@@ -63,11 +63,10 @@ def archive() -> None:
     metavar="SECONDS",
     help="A row for each part of a recording, equally long and no longer than this; default: one for all.",
 )
-@click.option(
+@shown(
     "--warm-up",
     type=from_zero,
     default=2.0,
-    show_default=True,
     metavar="SECONDS",
     help="What is played before a segment, so that the model is there when it begins.",
 )
@@ -137,9 +136,7 @@ def scan(
 @click.option("--local", is_flag=True, help="This machine alone; the default.")
 @click.option("--limit", type=click.IntRange(1), help="Only so many recordings, the first of the list.")
 @click.option("--retry-failed", is_flag=True, help="Also those that are quarantined.")
-@click.option(
-    "--attempts", type=click.IntRange(1), default=3, show_default=True, help="Then one is quarantined."
-)
+@shown("--attempts", type=click.IntRange(1), default=3, help="Then one is quarantined.")
 @click.option(
     "--timeout", type=positive, metavar="S", help="Seconds that one recording may take; default: any."
 )
@@ -149,11 +146,10 @@ def scan(
     metavar="GB",
     help="Memory that one recording may take; Ray starts no more at once than fit.  [default: any]",
 )
-@click.option(
+@shown(
     "--stage-limit",
     type=positive,
     default=50.0,
-    show_default=True,
     metavar="GB",
     help="What may be fetched for one recording whose path is a URL.",
 )
@@ -375,11 +371,10 @@ def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
 @click.option(
     "--job", "jobs", type=click.Choice(sorted(JOBS)), multiple=True, help="May be repeated; default: all."
 )
-@click.option(
+@shown(
     "--frames",
     type=click.IntRange(4),
     default=120,
-    show_default=True,
     help="That are played; and a fourth of them, to tell what a start costs.",
 )
 @figures_option

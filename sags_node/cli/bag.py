@@ -7,15 +7,15 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 from rich.markup import escape
+from rich.table import Table
 
-from sags_node.cli import bag_text as say
 from sags_node.cli.launching import (
     STEPWISE,
     as_json,
@@ -32,6 +32,7 @@ from sags_node.cli.launching import (
 from sags_node.cli.node_options import data_options
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.topics import plain_name
+from sags_node.terminal import text
 from sags_node.terminal.console import console, on_stop_signals, progress, show
 
 if TYPE_CHECKING:
@@ -168,7 +169,7 @@ def record(
         )
         if words is not None:
             summary = _recorded(words, options)
-            show(summary if json_out else say.recorded_table(summary))
+            show(summary if json_out else recorded_table(summary))
             return
         notices = Notices(warn)
 
@@ -195,7 +196,7 @@ def record(
             saved = f"sags bag recover {shlex.quote(str(options.folder))} -o OUT"
             warn(f"broken off: save what is there with: {saved}")
             raise
-    show(summary if json_out else say.recorded_table(summary))
+    show(summary if json_out else recorded_table(summary))
 
 
 def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
@@ -260,7 +261,7 @@ def play(
     options = PlayOptions(
         topics=tuple(plain_name(ns, name) for name in topics),
         exclude=tuple(plain_name(ns, name) for name in exclude),
-        remap=say.remappings(remap, ns),
+        remap=remappings(remap, ns),
         **how,
     )
     player = Player(path, options, PublishConfig(data=(endpoint,), control=None), ns, start_paused)
@@ -282,7 +283,7 @@ def info(path: Path, json_out: bool) -> None:
     from sags_node.clients.recording.info import bag_info
 
     found = bag_info(path)
-    show(found if json_out else say.info_table(found))
+    show(found if json_out else info_table(found))
 
 
 @bag.command()
@@ -297,7 +298,7 @@ def recover(path: Path, out: Path, json_out: bool) -> None:
     from sags_node.clients.recording.recover import recover as save
 
     done = save(path, out)
-    show(done if json_out else say.recovered_text(done))
+    show(done if json_out else recovered_text(done))
     if done["lost"]:
         click.get_current_context().exit(DATA_LOST)
 
@@ -324,3 +325,57 @@ def _on_lines(call: Callable[[], None], at_the_end: Callable[[], None] = lambda:
             at_the_end()
 
     threading.Thread(target=read, name="stdin", daemon=True).start()
+
+
+def remappings(said: Sequence[str], ns: str) -> dict[str, str]:
+    """`old:=new` of `--remap`.
+
+    Raises:
+        UsageError: one is written otherwise.
+    """
+    pairs = [item.partition(":=") for item in said]
+    for old, assigned, new in pairs:
+        if not (old and assigned and new):
+            raise UsageError(f"--remap {old}{assigned}{new}: write old:=new")
+    return {plain_name(ns, old): plain_name(ns, new) for old, _, new in pairs}
+
+
+def recorded_table(summary: Mapping[str, Any]) -> Table:
+    """Return what a recorder wrote and what it could not."""
+    from sags_node.node.recorder_state import SILENT_SECONDS  # brings NumPy along, which --help does not need
+
+    table = text.table("topic", "messages", "dropped", "lost")
+    for name, row in summary["topics"].items():
+        table.add_row(name, str(row["messages"]), str(row["dropped"]), str(row["lost"]))
+    table.add_row("in all", str(summary["messages"]), str(summary["dropped"]), str(summary["lost"]))
+    silent = summary["silent_s"]
+    ended = f"; nothing came in the last {silent:.0f} s" if silent > SILENT_SECONDS else ""
+    size = f"{summary['bytes'] / 1e6:.1f} MB at {summary['mb_per_s']} MB/s"
+    table.caption = f"{summary['folder']}: {size}{ended}"
+    return table
+
+
+def info_table(info: Mapping[str, Any]) -> Table:
+    """Return what a bag holds."""
+    table = text.table("topic", "type", "messages", "Hz", "lost", "longest gap (s)")
+    for row in info["topics"]:
+        cells = (row[key] for key in ("topic", "type", "messages", "rate_hz", "lost", "longest_gap_s"))
+        table.add_row(*("-" if cell is None else str(cell) for cell in cells))
+    files = f" in {len(info['files'])} files" if len(info["files"]) > 1 else ""
+    held = f"{info['duration_s']} s, {info['messages']} messages, {info['size'] / 1e6:.1f} MB{files}"
+    table.caption = f"{info['path']}: {held}"
+    return table
+
+
+def recovered_text(done: Mapping[str, Any]) -> str:
+    """Return what was saved and what was not."""
+    saved = f"{done['messages']} messages saved to {done['folder']}"
+    if not done["lost"]:
+        return f"{saved}; nothing was lost"
+    parts = {
+        "damaged chunks": done["chunks_damaged"],
+        "messages without a topic": done["messages_lost"],
+        "bytes that are no records": done["bytes_skipped"],
+        "files cut off or never closed": done["unclosed_files"],
+    }
+    return f"{saved}; not whole: " + ", ".join(f"{what} {count}" for what, count in parts.items() if count)

@@ -280,12 +280,11 @@ def foxglove(layout: Path | None, ready: Ready, stop: threading.Event, **options
 )
 @shown("--interface", default="lo", help="Network interface; lo: this machine only.")
 @click.option("--insecure", is_flag=True, help="Serve also to other machines: there are no keys.")
-@click.option(
+@shown(
     "--view",
     "views",
     multiple=True,
     default=("ros",),
-    show_default=True,
     metavar="NAME",
     help="A view that peers may open and see; several times.",
 )

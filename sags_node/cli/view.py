@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import click
@@ -17,6 +19,7 @@ from sags_node.terminal.console import console, on_stop_signals, show
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
+    from sags_node.types import Camera, Gaussians
 
 
 @click.command()
@@ -49,7 +52,6 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     if importlib.util.find_spec("viser") is None:
         raise UsageError(f"sags view needs viser; install it with: {install('viewer')}")
     from sags_node.clients.viewer.run import run_viewer
-    from sags_node.tools.export.moment import file_of
 
     os.nice(NICENESS)
 
@@ -61,4 +63,20 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
 
     stop = threading.Event()
     on_stop_signals(stop.set)
-    run_viewer(host, port, insecure, node, ready, export=file_of, stop=stop)
+    run_viewer(host, port, insecure, node, ready, export=_file_of, stop=stop)
+
+
+def _file_of(gaussians: Gaussians, camera: Camera, t_capture_ns: int, kind: str) -> bytes:
+    """Write the model as `sags export` does: a mesh, points or splats, in metres.
+
+    Raises:
+        SagsError: it shows nothing.
+    """
+    from sags_node.tools.export.export import Orbit, export  # torch comes along, which few need
+    from sags_node.tools.export.scene import Scene
+
+    with TemporaryDirectory(prefix="sags-view-") as folder:
+        file = Path(folder, "model.ply")
+        scene = Scene(gaussians, camera, t_capture_ns)
+        export(scene, {kind: file}, Orbit(0.0, 0.0), lambda *progress: None)
+        return file.read_bytes()

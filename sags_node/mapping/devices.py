@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
 from sags_node.config.schema import LaunchConfig
 from sags_node.engine.device import Device, choose_device
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.errors import UsageError
+from sags_node.geometry import unproject
 from sags_node.mapping.budget import Budget, StepBudget, TimeBudget
 from sags_node.mapping.ladder import (
     EVERYTHING,
@@ -22,7 +26,12 @@ from sags_node.mapping.ladder import (
     best_scale,
 )
 from sags_node.mapping.refiner import CpuRefiner, Refiner
-from sags_node.mapping.speed import SAMPLE_SIZE, measured_speed
+from sags_node.types import Camera, Gaussians
+
+SAMPLE_SIZE = 320, 256  # px
+SAMPLE_GAUSSIANS = 8000
+SAMPLE_MS = 1.9  # of one drawing and its gradients, back to back, where live frames take their prices
+TRIES = 21
 
 LEAST_PIXELS = 2  # of the picture for each Gaussian, where time does not count
 FIELD_TIMES = 5.0  # as long as prices say, a frame of the paper's model takes: where its ladder begins
@@ -139,3 +148,34 @@ def _measured_speed(config: LaunchConfig) -> float:
     """`Ladder.speed` before the first frame."""
     times = FIELD_TIMES if config.mapping.method == "sags" else 1.0
     return times * measured_speed(make_rasterizer("numba", *SAMPLE_SIZE))
+
+
+def measured_speed(rasterizer: Rasterizer) -> float:
+    """`Ladder.speed` of this machine: the median of some drawings of made-up Gaussians with their gradients.
+
+    Args:
+        rasterizer: for pictures of `SAMPLE_SIZE`.
+    """
+    width, height = SAMPLE_SIZE
+    rng = np.random.default_rng(0)
+    depths = rng.uniform(0.06, 0.08, SAMPLE_GAUSSIANS).astype(np.float32)
+    pixels = rng.uniform(0, [width, height], (SAMPLE_GAUSSIANS, 2)).astype(np.float32)
+    focal = float(width)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    camera = Camera(width, height, K, np.eye(4))
+    gaussians = Gaussians(
+        means=unproject(camera, pixels, depths),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (SAMPLE_GAUSSIANS, 1)),
+        scales=np.full((SAMPLE_GAUSSIANS, 3), np.float32(3e-4)),
+        opacities=np.full(SAMPLE_GAUSSIANS, np.float32(0.9)),
+        colors=rng.uniform(0, 1, (SAMPLE_GAUSSIANS, 3)).astype(np.float32),
+        ids=np.arange(SAMPLE_GAUSSIANS),
+    )
+    v_planes, weight = np.ones((5, height, width), np.float32), np.ones((height, width), np.float32)
+    times = []
+    for _ in range(TRIES):
+        started = time.perf_counter()
+        rasterizer.forward(gaussians, camera)
+        rasterizer.backward(v_planes, weight)
+        times.append(time.perf_counter() - started)
+    return 1e3 * float(np.median(times)) / SAMPLE_MS

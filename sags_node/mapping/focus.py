@@ -18,25 +18,16 @@ EVERY = 2  # px: a quarter of the pixels tells enough
 REACH = 32  # px: few Gaussians are larger, and those are faint out there
 
 
-def worst_tiles(planes: F32, image: U8, tissue: Bool, share: float) -> Bool:
+def largest(residuals: F32, share: float) -> Bool:
     """The tiles [rows, columns] of a picture with the largest squared colour residuals.
 
     PSNR counts squares, and most of them stand in few tiles: a step on a sixth of the picture gains half of
     what a step on all of it does.
 
     Args:
-        planes: [5, H, W] of the rasteriser.
-        image: [H, W, 3] RGB, what they should show.
-        tissue: [H, W] the pixels that count.
+        residuals: [rows, columns] of `sum_residuals`.
         share: of all tiles, 0..1; at least one is chosen.
     """
-    residuals = np.zeros(tile_grid(tissue).shape, np.float32)
-    sum_residuals(planes, image, tissue, ~tile_grid(tissue), residuals)
-    return largest(residuals, share)
-
-
-def largest(residuals: F32, share: float) -> Bool:
-    """The tiles [rows, columns] of which that is the largest, by share; at least one."""
     chosen = np.zeros(residuals.shape, np.bool_)
     count = max(1, round(share * residuals.size))
     chosen.ravel()[np.argpartition(residuals.ravel(), -count)[-count:]] = True

@@ -148,7 +148,7 @@ class CpuRefiner:
         self._old |= True if tiles is None else tiles
 
     def _worst_tiles(self, share: float) -> Bool:
-        """See `focus.worst_tiles`. Only tiles that were drawn since are looked at again."""
+        """See `focus.largest`. Only tiles that were drawn since are looked at again."""
         if self._old.any():
             seen = self._observation
             sum_residuals(self._planes, seen.image, seen.tissue, self._old, self._sums)

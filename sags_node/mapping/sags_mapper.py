@@ -74,6 +74,7 @@ FIRST_SPEED = 4.0  # times as long, in the first steps of a model
 # model that does not fit yet seems to be darker or brighter by some per cent.
 EXPOSURE_JUMP = 0.05
 EARLIER_RELAXATION = 0.3  # of the step on colours on an earlier frame; what is published is the newest
+SEED = 0  # of the first values of the field and of which frames are learnt again
 LOOK_BACK_NS = SLOT_NS  # the velocity is the field's mean over this time
 
 
@@ -136,12 +137,10 @@ class SagsMapper:
         kept: frames that are learnt again, oldest first; the newest is always there.
     """
 
-    def __init__(self, tissue_map: TissueMap, seed: int = 0) -> None:
-        """`seed`: of the field's first values and of which frames are learnt again."""
+    def __init__(self, tissue_map: TissueMap) -> None:
         torch.set_num_threads(1)  # results do not depend on it then; so few nodes gain little from more
         self.map = tissue_map
         self.step = 0
-        self._seed = seed
         self._field: WindowModel | None = None  # its rows are the map's, by their ids
         self.kept: deque[Kept] = deque()
         self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
@@ -196,7 +195,7 @@ class SagsMapper:
         pixel = float(np.median(depths)) / float(drawn.camera.K[0, 0])  # m
         lengths = [MEAN_PX * pixel] * 3 + [LOG_SCALE] * 3 + [QUAT] * 4 + [0.0] * 3 + [LOGIT]
         self._rates = np.array(lengths, np.float32)
-        self._rng = np.random.default_rng(self._seed)
+        self._rng = np.random.default_rng(SEED)
         steps = self._first_steps = 0
         while steps < FIRST_STEPS and budget.more_at_first(steps):
             self._refine(frame, COLOUR_RELAXATION, deformed=False)
@@ -210,9 +209,9 @@ class SagsMapper:
         low, high = np.quantile(means, [OUTLIERS, 1 - OUTLIERS], axis=0)
         box: F64 = np.array([low, np.maximum(high, low + LEAST_SIDE)])
         slots = WINDOW_NS // SLOT_NS + 2  # the newest slot lies up to one slot after the newest frame
-        hexplane = HexPlane(box, t_ns, SLOT_NS, slots, cells=CELLS, channels=CHANNELS, seed=self._seed)
-        decoder = Decoder(hexplane.features, "nodes", seed=self._seed)
-        decoder.awaken(self._seed)
+        hexplane = HexPlane(box, t_ns, SLOT_NS, slots, cells=CELLS, channels=CHANNELS, seed=SEED)
+        decoder = Decoder(hexplane.features, "nodes", seed=SEED)
+        decoder.awaken(SEED)
         return FrameDeltas(hexplane, decoder)
 
     def _follow(

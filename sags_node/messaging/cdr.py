@@ -191,9 +191,9 @@ def uncalibrated(camera_info: bytes) -> bytes:
     return _serialize(replace(message, **zeros))
 
 
-def eye_info(eye: Eye, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
+def eye_info(eye: Eye, stamp_ns: int) -> Content:
     """`sensor_msgs/CameraInfo` of a calibrated camera that gives raw pictures."""
-    return _camera_info(eye.width, eye.height, eye.distortion, eye.K, eye.R, eye.P, stamp_ns, frame)
+    return _camera_info(eye.width, eye.height, eye.distortion, eye.K, eye.R, eye.P, stamp_ns, LEFT_FRAME)
 
 
 def _camera_info(

@@ -17,11 +17,15 @@ import zmq
 
 from sags_node.errors import SagsError, brief
 from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect, found
-from sags_node.messaging.request_rate import RATE, RequestRate
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, RateLimitedLog
 from sags_node.messaging.sockets import Closes, Took, waiting
 from sags_node.messaging.wire import PROTOCOL
+
+# As many views as there may be, each moved as often as it is drawn, are 480 a second.
+RATE = 500.0  # requests/s
+BURST = 300  # at once: all anchors and views there may be, and some more
+FORGET_ABOVE = 1000  # clients remembered, before those with a full bucket are forgotten
 
 MAX_REQUEST_BYTES = 65536  # per part
 MAX_UNANSWERED_BYTES = 4 << 20  # one peer may have sent; more than its high-water mark can hold
@@ -332,3 +336,31 @@ class ControlClient(Closes):
 
     def close(self) -> None:
         self._context.destroy(linger=0)
+
+
+class RequestRate:
+    """The requests that each client may send: a bucket of tokens that fills again at a steady rate.
+
+    Each is full at first. Of each one number is kept: when it will be full again (GCRA, ITU-T I.371).
+
+    Args:
+        clock: s.
+    """
+
+    def __init__(
+        self, rate: float = RATE, burst: int = BURST, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._rate, self._burst, self._clock = rate, burst, clock
+        self._full: dict[bytes, float] = {}  # by client: when its bucket is full again
+
+    def wait(self, client: bytes) -> float:
+        """Take a token; 0. Where there is none: s until there is one."""
+        now = self._clock()
+        full = max(now, self._full.get(client, now)) + 1 / self._rate
+        wait = full - now - self._burst / self._rate
+        if wait > 1e-9:  # more than rounding
+            return wait
+        if len(self._full) >= FORGET_ABOVE:
+            self._full = {one: when for one, when in self._full.items() if when > now}
+        self._full[client] = full
+        return 0.0

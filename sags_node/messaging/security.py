@@ -210,18 +210,17 @@ def is_loopback(host: str) -> bool:
 
 
 class RateLimitedLog:
-    """Logs at most once in a period, so that no stranger fills the log."""
+    """Logs at most once in `LOG_PERIOD`, so that no stranger fills the log."""
 
-    def __init__(self, period: float = LOG_PERIOD) -> None:
-        self._period = period
+    def __init__(self) -> None:
         self._next = 0.0
 
     def due(self) -> bool:
-        """True at most once per period."""
+        """True at most once in that time."""
         now = time.monotonic()
         if now < self._next:
             return False
-        self._next = now + self._period
+        self._next = now + LOG_PERIOD
         return True
 
 

@@ -18,6 +18,7 @@ JAW_LENGTH = 0.0145  # m, hinge to tip
 BITE = 0.0022  # m, how deep the closed jaws sit in the fold
 SHAFT_END = 0.16  # m
 SHAFT_RADIUS = 0.0034
+SEGMENTS = 32  # of a ring
 
 # Reflectance (RGB, linear) and share of mirror-like reflection.
 _STEEL = (0.66, 0.67, 0.68, 0.85)
@@ -190,22 +191,21 @@ def _tube(
     normal: F64 | list[float] | float,
     plane_normal: F64,
     material: tuple[float, float, float, float],
-    segments: int = 32,
 ) -> Mesh:
     """Elliptic rings along a path [n, 3] in (about) one plane; half axes (m) in it and normal to it."""
     count = len(path)
     tangent = np.gradient(path, axis=0)
     side = _unit(np.cross(plane_normal, tangent))
-    angle = 2 * np.pi * np.arange(segments) / segments
+    angle = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
     half_axes = np.stack([np.broadcast_to(across, count), np.broadcast_to(normal, count)], -1)
     ring = half_axes[:, None, :1] * np.cos(angle)[:, None] * side[:, None]
     ring = ring + half_axes[:, None, 1:] * np.sin(angle)[:, None] * plane_normal
     vertices = (path[:, None] + ring).reshape(-1, 3)
 
-    start = (np.arange(count - 1)[:, None] * segments + np.arange(segments)).ravel()
-    after = (np.arange(count - 1)[:, None] * segments + (np.arange(segments) + 1) % segments).ravel()
-    upper = np.stack([start, after, start + segments], -1)
-    lower = np.stack([after, after + segments, start + segments], -1)
+    start = (np.arange(count - 1)[:, None] * SEGMENTS + np.arange(SEGMENTS)).ravel()
+    after = (np.arange(count - 1)[:, None] * SEGMENTS + (np.arange(SEGMENTS) + 1) % SEGMENTS).ravel()
+    upper = np.stack([start, after, start + SEGMENTS], -1)
+    lower = np.stack([after, after + SEGMENTS, start + SEGMENTS], -1)
     faces = np.concatenate([upper, lower])
 
     corners = vertices[faces]

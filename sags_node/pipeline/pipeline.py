@@ -58,10 +58,9 @@ from sags_node.vision.tissue import TissueMask
 from sags_node.vision.tissue_topic import NearestMask
 from sags_node.vision.watch.color_watch import ColorWatch
 from sags_node.vision.watch.freeze_watch import FreezeWatch
-from sags_node.vision.watch.judgement import Evidence, Judgement, Watcher
+from sags_node.vision.watch.judgement import Evidence, Judgement, PoseWatch, Watcher
 from sags_node.vision.watch.lens_watch import LensWatch
 from sags_node.vision.watch.pair_watch import PairWatch
-from sags_node.vision.watch.pose_watch import PoseWatch
 from sags_node.vision.watch.scene_watch import SceneWatch, enlarged, exposed
 
 if TYPE_CHECKING:

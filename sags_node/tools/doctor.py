@@ -16,7 +16,6 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from sags_node import host
 from sags_node.checks import Finding, Level, parted
 from sags_node.config.schema import (
     GstSource,
@@ -46,6 +45,8 @@ from sags_node.sources.pictures import size_text
 from sags_node.sources.robot import hand_eye_file
 from sags_node.tools.importing.check import played
 from sags_node.vision.onnx_session import OnnxSession
+
+ROOT = Path("/")  # of the small files that are read; tests have another folder
 
 Look = tuple[str, Finding]  # what was looked at, and what was found
 REQUIRED = (
@@ -186,8 +187,8 @@ def _library(name: str, package: str) -> Finding:
     return Finding("warning", "missing", f"Open3D needs it: sudo apt-get install {package}")
 
 
-def check_cores(root: Path = host.ROOT) -> Finding:
-    cores, there, quota = len(os.sched_getaffinity(0)), os.cpu_count() or 1, host.core_quota(root)
+def check_cores(root: Path = ROOT) -> Finding:
+    cores, there, quota = len(os.sched_getaffinity(0)), os.cpu_count() or 1, core_quota(root)
     found = f"{cores} core{'s' * (cores != 1)}, {platform.machine()}"
     if cores < there:
         found += f"; the machine has {there}"
@@ -203,8 +204,8 @@ def check_cores(root: Path = host.ROOT) -> Finding:
     return Finding("ok", found)
 
 
-def check_governor(root: Path = host.ROOT) -> Finding:
-    found = host.governors(root)
+def check_governor(root: Path = ROOT) -> Finding:
+    found = governors(root)
     if not found:
         return Finding("ok", "not known")
     said = ", ".join(sorted(found))
@@ -214,8 +215,8 @@ def check_governor(root: Path = host.ROOT) -> Finding:
     return Finding(level, said, "for even times: sudo cpupower frequency-set -g performance")
 
 
-def check_memory(root: Path = host.ROOT) -> Finding:
-    amounts = host.memory(root)
+def check_memory(root: Path = ROOT) -> Finding:
+    amounts = memory(root)
     free = amounts.get("MemAvailable", 0)
     swap, used = amounts.get("SwapTotal", 0), amounts.get("SwapTotal", 0) - amounts.get("SwapFree", 0)
     swapped = f"{used / 1e9:.1f} of {swap / 1e9:.1f} GB swap used" if swap else "no swap"
@@ -336,3 +337,59 @@ def _recordings() -> Finding:
         return Finding("ok", folder)
     fix = "set it to the folder of your recordings; without any, sags run plays the phantom"
     return Finding("warning", f"{folder} is no folder", fix)
+
+
+def core_quota(root: Path = ROOT) -> float | None:
+    """The cores whose time control groups grant, of this one and those above it; None: no limit is known.
+
+    Versions 2 and 1 (https://docs.kernel.org/admin-guide/cgroup-v2.html).
+    """
+    granted = []
+    for line in _read(root / "proc/self/cgroup").splitlines():
+        _, controllers, path = line.split(":", 2)
+        mount = root / "sys/fs/cgroup" / ("cpu" if controllers else "")
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        # A container may see its own group as the root, whatever it is called outside.
+        for group in (mount / path.lstrip("/"), *(mount / path.lstrip("/")).parents):
+            said = _read(group / "cpu.max").split()
+            if controllers:
+                said = [_read(group / "cpu.cfs_quota_us").strip(), _read(group / "cpu.cfs_period_us").strip()]
+            with suppress(ValueError, ZeroDivisionError):  # "max", -1 and nothing: no limit
+                if float(said[0] if said else "") > 0:
+                    granted.append(float(said[0]) / float(said[1]))
+            if group == mount:
+                break
+    return min(granted, default=None)
+
+
+def governors(root: Path = ROOT) -> set[str]:
+    """Return what decides the clock rates of the cores; empty where the machine does not tell, as in most
+    guests.
+
+    `powersave` of a processor that chooses its rate itself (`intel_pstate`, `amd-pstate-epp`) is not the
+    lowest rate, and is called `balanced` here.
+    """
+    found = set()
+    for file in (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"):
+        name = _read(file).strip()
+        chooses_itself = _read(file.with_name("scaling_driver")).strip() in ("intel_pstate", "amd-pstate-epp")
+        found.add("balanced" if chooses_itself and name == "powersave" else name)
+    return found - {""}
+
+
+def memory(root: Path = ROOT) -> dict[str, int]:
+    """`MemAvailable`, `SwapTotal`, `SwapFree` and the others of /proc/meminfo, bytes."""
+    found = {}
+    for line in _read(root / "proc/meminfo").splitlines():
+        name, _, said = line.partition(":")
+        number, _, unit = said.strip().partition(" ")
+        found[name] = int(number) * (1024 if unit == "kB" else 1)
+    return found
+
+
+def _read(file: Path) -> str:
+    try:
+        return file.read_text()
+    except OSError:
+        return ""

@@ -14,15 +14,14 @@ from numba import prange
 
 from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.kernels.threads import thread_count
-from sags_node.kernels.vectors import load_anywhere, select, store_anywhere
+from sags_node.kernels.vectors import larger, load_anywhere, select, spread, store_anywhere
 from sags_node.types import F32, Bool
 from sags_node.vision import agreement
 from sags_node.vision.agreement import correlate, drop_wrong
 from sags_node.vision.inverse_search import spread_patches
 from sags_node.vision.matchers import Patches
 from sags_node.vision.pyramid import BORDER
-from sags_node.vision.smoothing import guided
-from sags_node.vision.windows import chunk, chunks, inside
+from sags_node.vision.windows import chunk, chunks, inside, repeat_ends, window_row
 
 FEWEST_ROWS = 32  # of a band
 EDGE = np.float32(0.01)  # px: so far from the last pixel, that there is one beyond
@@ -230,3 +229,58 @@ def _zip(even: F32, odd: F32, row: F32) -> None:
         x = np.uint64(i)
         row[two * x] = even[x]
         row[two * x + one] = odd[x]
+
+
+@kernel
+def guided(field: F32, radius: int, variance: Any, smooth: F32) -> None:
+    """The guided filter (He et al., PAMI 2013) of a field [h, w] with the field as its own guide.
+
+    Planes and steps larger than the noise stay as they are.
+
+    Args:
+        field: contiguous, at least 16 px wide; its edge is repeated.
+        radius: px, of the windows.
+        variance: float32; where the field varies less around, it is noise.
+        smooth: [h, w] result.
+    """
+    height, width = field.shape
+    line = width + 2 * radius
+    # The share that a pixel keeps of itself, and the part that is the mean's.
+    kept, rest = np.empty((2, height, width), np.float32)
+    sums = np.empty(2 * line, np.float32)
+    zero = spread(np.float32(0))
+    share = np.float32(1) / np.float32((2 * radius + 1) ** 2)
+    for y in range(height):
+        for i in range(chunks(width)):
+            x = chunk(i, width)
+            total, squares = zero, zero
+            for j in range(y - radius, y + radius + 1):
+                value = load_anywhere(field, inside(j, height) * width + x)
+                total, squares = total + value, squares + value * value
+            store_anywhere(sums, radius + x, total)
+            store_anywhere(sums, line + radius + x, squares)
+        repeat_ends(sums, 0, width, radius)
+        repeat_ends(sums, line, width, radius)
+        for i in range(chunks(width)):
+            x = chunk(i, width)
+            mean = window_row(sums, x, radius) * share
+            varies = larger(window_row(sums, line + x, radius) * share - mean * mean, zero)
+            own = varies / (varies + variance)
+            store_anywhere(kept, y * width + x, own)
+            store_anywhere(rest, y * width + x, mean - mean * own)
+    for y in range(height):
+        for i in range(chunks(width)):
+            x = chunk(i, width)
+            total, means = zero, zero
+            for j in range(y - radius, y + radius + 1):
+                at = inside(j, height) * width + x
+                total, means = total + load_anywhere(kept, at), means + load_anywhere(rest, at)
+            store_anywhere(sums, radius + x, total)
+            store_anywhere(sums, line + radius + x, means)
+        repeat_ends(sums, 0, width, radius)
+        repeat_ends(sums, line, width, radius)
+        for i in range(chunks(width)):
+            x = chunk(i, width)
+            own = load_anywhere(field, y * width + x)
+            found = window_row(sums, x, radius) * own + window_row(sums, line + x, radius)
+            store_anywhere(smooth, y * width + x, found * share)

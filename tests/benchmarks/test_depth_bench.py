@@ -14,6 +14,7 @@ from benchmarks.quality.depth import (
     by_confidence,
     error_figures,
     measure_faults,
+    regions_of,
 )
 from benchmarks.quality.depth_ct import (
     CTPair,
@@ -21,7 +22,6 @@ from benchmarks.quality.depth_ct import (
     errors_along_z,
     read_ct_pair,
 )
-from benchmarks.quality.depth_regions import regions_of
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError

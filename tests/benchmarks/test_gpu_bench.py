@@ -6,8 +6,7 @@ import pytest
 import warp as wp
 from warp_on_cpu import use_warp_on_cpu
 
-from benchmarks.gpu import refining
-from benchmarks.gpu.check import GpuCheck, gpu_check
+from benchmarks.gpu.check import GpuCheck, gpu_check, measure_case
 from sags_node.engine.gpu.rasterizer import DeviceRasterizer
 from sags_node.errors import SagsError
 
@@ -18,7 +17,7 @@ def test_a_wrong_drawing_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         DeviceRasterizer, "backward", lambda self, v, w: backward(self, wp.array(2 * v.numpy()), w)
     )
-    assert refining.measure_case(8, 32, 16, 1)["colors_apart"] > 0.5
+    assert measure_case(8, 32, 16, 1)["colors_apart"] > 0.5
 
 
 def test_a_gpu_that_fails_gives_no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,7 +29,7 @@ def test_a_gpu_that_fails_gives_no_figures(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(DeviceRasterizer, "backward", fails)
     with pytest.raises(SagsError, match="CUDA error"):
-        refining.measure_case(8, 32, 16, 1)
+        measure_case(8, 32, 16, 1)
 
 
 def test_the_check_tries_everything_and_goes_on_after_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:

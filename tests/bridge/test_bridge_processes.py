@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from command_line import refused, sags, start
-from igtl_peer import PEER, Peer, built, peer
+from command_line import killed, refused, sags, start
+from igtl_peer import PEER, Peer, built
 from places import SESSION
 from running_node import RunningNode
 from waiting import until
@@ -24,15 +24,10 @@ pytestmark = pytest.mark.live
 @contextmanager
 def bridge(run_dir: Path, *command: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """`sags bridge` and its port."""
-    process = start(["bridge", *command, "--json", "--run-dir", run_dir])
-    try:
-        assert process.stdout is not None and process.stderr is not None
+    with killed(start(["bridge", *command, "--json", "--run-dir", run_dir])) as process:
         line = process.stdout.readline()  # ends with the process
         assert line, process.stderr.read()
         yield process, json.loads(line)["port"]
-    finally:
-        process.kill()
-        process.wait(10)
 
 
 def state(joined: Peer) -> str:
@@ -45,18 +40,17 @@ def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(tm
     program = built(PEER, tmp_path)
     run_dir = tmp_path / "run"
     with bridge(run_dir, "openigtlink", "--port", "0") as (first, port):
-        with peer(program, port, "say", "SagsRequest", "pin 150 120") as early:
+        with Peer(program, port, "say", "SagsRequest", "pin 150 120") as early:
             until(lambda: "no node" in " ".join(early.newest("SagsAnswer") or []).lower())
-        node = RunningNode(SESSION, tmp_path, "source.pace:=realtime")
-        try:
-            with peer(program, port) as joined:
+        with RunningNode(SESSION, tmp_path, "source.pace:=realtime") as node:
+            with Peer(program, port) as joined:
                 until(lambda: state(joined) == "1")
-                with peer(program, port, "say", "SagsRequest", "pin 150 120"):
+                with Peer(program, port, "say", "SagsRequest", "pin 150 120"):
                     until(lambda: "anchor" in " ".join(joined.newest("SagsAnchors") or []))
                 first.send_signal(signal.SIGKILL)  # the node goes on
             with (
                 bridge(run_dir, "openigtlink", "--port", str(port)) as (second, _),
-                peer(program, port) as joined,
+                Peer(program, port) as joined,
             ):
                 until(lambda: "anchor" in " ".join(joined.newest("SagsAnchors") or []))
                 until(lambda: state(joined) == "1")
@@ -66,9 +60,6 @@ def test_a_pinned_anchor_comes_back_and_a_killed_node_leaves_nothing_standing(tm
                 second.send_signal(signal.SIGINT)
                 assert second.wait(60) == 0
                 assert second.stderr is not None and "Traceback" not in second.stderr.read()
-        finally:
-            node.process.kill()
-            node.process.wait(10)
 
 
 @pytest.mark.parametrize(

@@ -7,17 +7,17 @@ import re
 import shutil
 import struct
 import subprocess
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bridging import SEEN, anchored, anchored_at, bridged, sockets
+from command_line import killed
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, stream
+from waiting import beside
 
 pytest.importorskip("websockets", reason="no gateway without: pip install '.[bridges]'")
 
@@ -66,23 +66,12 @@ def compiled(*arguments: Path | str) -> None:
     assert told.returncode == 0, told.stdout + told.stderr
 
 
-@contextmanager
-def running(program: Path, port: int) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        ["mono", program, f"ws://127.0.0.1:{port}/ws"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+def running(program: Path, port: int) -> AbstractContextManager[subprocess.Popen[str]]:
+    command = ["mono", program, f"ws://127.0.0.1:{port}/ws"]
+    return killed(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
 
 
 def until_line(process: subprocess.Popen[str], start: str) -> str:
-    assert process.stdout is not None
     while not (line := process.stdout.readline()).startswith(start):
         assert line, "it ended"  # it is killed by the test's own time limit, at the latest
     return line
@@ -94,7 +83,6 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     with sockets(tmp_path) as node, bridged(run_web, options) as port, running(program, port) as process:
         with stream(node, anchored_at):
             found = LINE.fullmatch(until_line(process, "stamp_ns="))
-            assert found is not None
             until_line(process, "stamp_ns=")
         assert "stale: too old" in until_line(process, "stale")
         with stream(node, anchored_at):  # and comes back
@@ -159,13 +147,8 @@ def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
                 connection.send(message("sags/anchors", "x,y,z,id", [0, 4], b""))
 
     with serve(attend, "127.0.0.1", 0) as server:
-        serving = threading.Thread(target=server.serve_forever)
-        serving.start()
-        try:
+        with beside(server.serve_forever, server.shutdown):
             with running(program, server.socket.getsockname()[1]) as process:
                 found = LINE.fullmatch(until_line(process, "stamp_ns="))
-        finally:
-            server.shutdown()
-            serving.join(60)
     assert found is not None and found[4] == "70" and found[5] == "9,9,9,9" and found[6] == ""
     assert len(attempts) > len(broken)

@@ -9,17 +9,18 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bridging import anchored_at, bridged, senders, sockets
+from bridging import anchored_at, bridged, plane_bridged, senders, sockets
 from places import ROOT
 from ports import free_port, is_free
 from synthetic import HEIGHT, WIDTH, plane_result, stream
 from waiting import until
+
+from sags_node.messaging.sockets import Closes
 
 pytest.importorskip("foxglove", reason="no Foxglove without: pip install '.[bridges]'")
 pytest.importorskip("websockets", reason="no peer without the package websockets")
@@ -41,7 +42,7 @@ KEY_EVERY = 30  # pictures
 FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
 
 
-class Client:
+class Client(Closes):
     """Speaks the protocol from its description alone: channel -> messages (log time ns, bytes)."""
 
     def __init__(self, port: int) -> None:
@@ -97,15 +98,6 @@ class Client:
         self._thread.join(60)
 
 
-@contextmanager
-def client(port: int) -> Iterator[Client]:
-    joined = Client(port)
-    try:
-        yield joined
-    finally:
-        joined.close()
-
-
 def options(run_dir: Path, **changes: Any) -> FoxgloveOptions:
     settings = {**senders(run_dir), "port": 0}
     return FoxgloveOptions(**{**settings, **changes})
@@ -118,23 +110,22 @@ def ros(joined: Client, name: str, number: int = -1) -> Any:
 
 def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None:
     names = [f"/sags/{name}" for name in FRAME_TOPICS]
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
-            joined.subscribe(*names)
-            with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
-                until(
-                    lambda: all(
-                        len(joined.came[name]) > (0 if name in ("/sags/status", "/sags/diagnostics") else 8)
-                        for name in names
-                    )
+    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), Client(port) as joined:
+        joined.subscribe(*names)
+        with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
+            until(
+                lambda: all(
+                    len(joined.came[name]) > (0 if name in ("/sags/status", "/sags/diagnostics") else 8)
+                    for name in names
                 )
-                kept = {
-                    (name, m.stamp_ns): m.cdr()
-                    for name in FRAME_TOPICS
-                    for m in [beside.latest(name)]
-                    if m is not None
-                }
-                time.sleep(0.3)  # what was just sent comes there too
+            )
+            kept = {
+                (name, m.stamp_ns): m.cdr()
+                for name in FRAME_TOPICS
+                for m in [beside.latest(name)]
+                if m is not None
+            }
+            time.sleep(0.3)  # what was just sent comes there too
     assert joined.info["name"] == "SAGS sags" and joined.info["capabilities"] == []
     for topic in topics.TOPICS:
         channel = joined.channels[f"/sags/{topic.name}"]
@@ -152,20 +143,19 @@ def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None
 
 
 def test_only_what_is_looked_at_is_asked_of_the_node(tmp_path: Path) -> None:
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port:
-            time.sleep(0.4)
-            assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["status"]
-            with client(port) as joined:
-                joined.subscribe("/sags/anchors")
-                until(lambda: joined.came["/sags/anchors"])
-                assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["anchors", "status"]
-            until(lambda: not running.wanted("anchors"))
+    with plane_bridged(run_foxglove, options(tmp_path)) as (running, port):
+        time.sleep(0.4)
+        assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["status"]
+        with Client(port) as joined:
+            joined.subscribe("/sags/anchors")
+            until(lambda: joined.came["/sags/anchors"])
+            assert [name for name in FRAME_TOPICS if running.wanted(name)] == ["anchors", "status"]
+        until(lambda: not running.wanted("anchors"))
 
 
 def test_what_stops_is_empty_and_comes_back(tmp_path: Path) -> None:
     image, depth, anchors = "/sags/left/render/image", "/sags/left/render/depth", "/sags/anchors"
-    with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+    with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as joined:
         joined.subscribe(image, depth, anchors)
         until(lambda: any("no node" in said.get("message", "").lower() for said in joined.said))
         with sockets(tmp_path) as running:
@@ -184,10 +174,10 @@ def test_what_stops_is_empty_and_comes_back(tmp_path: Path) -> None:
 
 
 def test_who_comes_later_is_told_what_is_missing_too(tmp_path: Path) -> None:
-    with bridged(run_foxglove, options(tmp_path)) as port, client(port) as first:
+    with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as first:
         first.subscribe("/sags/tf")
         until(lambda: first.said)
-        with client(port) as second:
+        with Client(port) as second:
             second.subscribe("/sags/tf")
             until(lambda: any("no node" in said.get("message", "").lower() for said in second.said))
 
@@ -203,7 +193,7 @@ def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) 
     with sockets(tmp_path) as running, stream(running, anchored_at):
         port = free_port()
         for _ in range(2):
-            with bridged(run_foxglove, options(tmp_path, port=port)), client(port) as joined:
+            with bridged(run_foxglove, options(tmp_path, port=port)), Client(port) as joined:
                 joined.subscribe("/sags/tf")
                 until(lambda: joined.came["/sags/tf"])
             until(lambda: is_free(port))  # a server of the SDK ends a moment after it was stopped
@@ -211,33 +201,35 @@ def test_a_bridge_that_is_started_anew_goes_on_on_the_same_port(tmp_path: Path) 
 
 def test_a_client_that_does_not_read_holds_nobody_up_and_goes_on_with_what_is_new(tmp_path: Path) -> None:
     name = "/sags/left/render/image"
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as quick, client(port) as slow:
-            for each in (quick, slow):
-                each.subscribe(name)
-                until(lambda each=each: each.came[name])
-            slow.reading.clear()
-            before = len(quick.came[name])
-            until(lambda: len(quick.came[name]) > before + 60)
-            newest = quick.came[name][-1][0]
-            slow.reading.set()
-            until(lambda: slow.came[name][-1][0] > newest)
+    with (
+        plane_bridged(run_foxglove, options(tmp_path)) as (_, port),
+        Client(port) as quick,
+        Client(port) as slow,
+    ):
+        for each in (quick, slow):
+            each.subscribe(name)
+            until(lambda each=each: each.came[name])
+        slow.reading.clear()
+        before = len(quick.came[name])
+        until(lambda: len(quick.came[name]) > before + 60)
+        newest = quick.came[name][-1][0]
+        slow.reading.set()
+        until(lambda: slow.came[name][-1][0] > newest)
 
 
 def test_pictures_come_as_h264_that_anybody_can_begin_with(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="no H.264 without PyAV")
     name = "/sags/left/image_rect_color/h264"
     truth = plane_result().pair.left
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port:
-            with client(port) as first:
-                first.subscribe(name)
-                until(lambda: len(first.came[name]) > 5)
-                with client(port) as second:
-                    second.subscribe(name)
-                    until(lambda: len(second.came[name]) > KEY_EVERY)
-                    schema = base64.b64decode(second.channels[name]["schema"])
-                    assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo" and schema
+    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port):
+        with Client(port) as first:
+            first.subscribe(name)
+            until(lambda: len(first.came[name]) > 5)
+            with Client(port) as second:
+                second.subscribe(name)
+                until(lambda: len(second.came[name]) > KEY_EVERY)
+                schema = base64.b64decode(second.channels[name]["schema"])
+                assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo" and schema
     fields = [protobuf_bytes(message) for _, message in second.came[name]]
     assert all(each[4] == b"h264" and each[3].startswith(b"\x00\x00\x00\x01") for each in fields)
     # A picture may go out while the server is still telling that somebody came.
@@ -278,10 +270,9 @@ def protobuf_bytes(message: bytes) -> dict[int, bytes]:
 
 
 def test_status_comes_as_figures_for_plots(tmp_path: Path) -> None:
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
-            joined.subscribe("/sags/figures")
-            until(lambda: joined.came["/sags/figures"])
+    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), Client(port) as joined:
+        joined.subscribe("/sags/figures")
+        until(lambda: joined.came["/sags/figures"])
     said = json.loads(joined.came["/sags/figures"][-1][1])
     assert said["rate_hz"] == 30.0 and said["latency_ms"]["p50"] == 40.0 and said["gaussians"] == 384
 
@@ -310,7 +301,7 @@ def pinning(run_dir: Path, pinned: list[dict[str, Any]]) -> Any:
 def test_a_click_pins_an_anchor_where_that_is_allowed(tmp_path: Path) -> None:
     pinned: list[dict[str, Any]] = []
     with pinning(tmp_path, pinned) as running, stream(running):
-        with bridged(run_foxglove, options(tmp_path, pin=True)) as port, client(port) as joined:
+        with bridged(run_foxglove, options(tmp_path, pin=True)) as port, Client(port) as joined:
             until(lambda: joined.info)
             assert joined.info["capabilities"] == ["clientPublish"]
             click(joined, frame="left_optical_frame")
@@ -319,7 +310,7 @@ def test_a_click_pins_an_anchor_where_that_is_allowed(tmp_path: Path) -> None:
             until(lambda: pinned)
             until(lambda: any("depth_confidence" in said.get("message", "") for said in joined.said))
         assert pinned == [{"x": 0.01, "y": 0.02, "z": 0.07}]
-        with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+        with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as joined:
             click(joined)
             joined.subscribe("/sags/tf")
             until(lambda: len(joined.came["/sags/tf"]) > 10)
@@ -347,7 +338,7 @@ def test_the_layout_that_is_kept_names_the_channels_there_are(tmp_path: Path) ->
         for part in _strings(json.loads(text))
         if part.startswith(("/sags/", "/overlay/"))
     }
-    with bridged(run_foxglove, options(tmp_path)) as port, client(port) as joined:
+    with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as joined:
         until(lambda: joined.channels)
         until(lambda: named <= joined.channels.keys())
     shown = {

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command_line import refused
 from gstreamer import need_gstreamer
-from waiting import repeating, until
+from waiting import beside, repeating, until
 
 from sags_node.clients.bridge.gst import GstOptions, run_gst
 from sags_node.clients.overlay.draw import color_key
@@ -52,22 +52,9 @@ def drawing(stream: OverlayStream, paused: threading.Event) -> AbstractContextMa
 
 @contextmanager
 def displays(run_dir: Path, **launches: str) -> Iterator[None]:
-    stop, failed = threading.Event(), []
-
-    def work() -> None:
-        try:
-            run_gst(GstOptions(NodeAddress("overlay", run_dir=run_dir), **launches), lambda: None, stop)
-        except SagsError as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    try:
+    options, stop = GstOptions(NodeAddress("overlay", run_dir=run_dir), **launches), threading.Event()
+    with beside(lambda: run_gst(options, lambda: None, stop), stop.set):
         yield
-    finally:
-        stop.set()
-        thread.join(60)
-    assert not thread.is_alive() and not failed, failed
 
 
 def shown(file: Path) -> np.ndarray:

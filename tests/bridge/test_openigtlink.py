@@ -12,8 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import HIDDEN, LOST, SEEN, UNSURE, anchored, anchored_at, bridged, senders, sockets
-from igtl_peer import PEER, built, peer
+from bridging import (
+    HIDDEN,
+    LOST,
+    SEEN,
+    UNSURE,
+    anchored,
+    anchored_at,
+    bridged,
+    plane_bridged,
+    senders,
+    sockets,
+)
+from igtl_peer import PEER, Peer, built
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
 
@@ -67,7 +78,7 @@ def test_every_device_says_in_millimetres_what_the_node_says(tmp_path: Path, pro
     with sockets(tmp_path) as running, stream(running, anchored_at):
         with (
             bridged(run_openigtlink, options(tmp_path, surface_step=8)) as port,
-            peer(program, port) as joined,
+            Peer(program, port) as joined,
         ):
             devices = ("SagsPicture", "SagsRender", "SagsSurface", "SagsAnchors", "SagsLeftCamera")
             until(lambda: all(joined.newest(device) for device in devices))
@@ -114,30 +125,28 @@ def test_debians_own_example_receives_it_unchanged(tmp_path: Path) -> None:
     if not RECEIVE_CLIENT.exists():
         pytest.skip("no example without the Debian package openigtlink-examples")
     client = built(RECEIVE_CLIENT, tmp_path)
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_openigtlink, options(tmp_path)) as port:
-            said = tmp_path / "said"
-            with (
-                said.open("w") as file,
-                subprocess.Popen([client, "127.0.0.1", str(port)], stderr=file) as shown,
-            ):
-                try:
-                    until(lambda: all(words in said.read_text() for words in EXAMPLE_SAYS))
-                finally:
-                    shown.kill()
+    with plane_bridged(run_openigtlink, options(tmp_path)) as (_, port):
+        said = tmp_path / "said"
+        with (
+            said.open("w") as file,
+            subprocess.Popen([client, "127.0.0.1", str(port)], stderr=file) as shown,
+        ):
+            try:
+                until(lambda: all(words in said.read_text() for words in EXAMPLE_SAYS))
+            finally:
+                shown.kill()
 
 
 def test_a_surface_has_holes_where_the_depth_is_not_sure_or_jumps(tmp_path: Path, program: Path) -> None:
     plane = plane_result()
     view = plane.views["left"]
-    assert view.confidence is not None
     depth, confidence = view.depth.copy(), view.confidence.copy()
     depth[:, : WIDTH // 3] += 0.05  # a step of 50 mm between two neighbours, 8 px or 5 mm apart
     confidence[:, 2 * WIDTH // 3 :] = 0.49
     torn = replace(plane, views=plane.views | {"left": replace(view, depth=depth, confidence=confidence)})
     with sockets(tmp_path) as running, stream(running, lambda i: at_frame(torn, i, time.time_ns())):
         with bridged(run_openigtlink, options(tmp_path, send=("surface",), surface_step=8)) as port:
-            with peer(program, port) as joined:
+            with Peer(program, port) as joined:
                 until(lambda: joined.newest("SagsSurface"))
                 surface = joined.newest("SagsSurface") or []
     corners = int(surface[0])
@@ -173,7 +182,7 @@ def test_the_overlay_comes_over_its_picture(tmp_path: Path, program: Path) -> No
         sockets(tmp_path) as running,
         stream(running, frame),
         bridged(run_openigtlink, options(tmp_path, send=("overlay",))) as port,
-        peer(program, port) as joined,
+        Peer(program, port) as joined,
     ):
         until(drawn)
         assert int((joined.newest("SagsOverlay") or [])[4]) == weighted(expected)
@@ -183,7 +192,7 @@ def test_the_overlay_comes_over_its_picture(tmp_path: Path, program: Path) -> No
 
 
 def test_what_stops_is_dark_and_empty_and_comes_back(tmp_path: Path, program: Path) -> None:
-    with bridged(run_openigtlink, options(tmp_path)) as port, peer(program, port) as joined:
+    with bridged(run_openigtlink, options(tmp_path)) as port, Peer(program, port) as joined:
         until(lambda: "no node" in " ".join(joined.newest("SagsState") or []).lower())
         assert {fields[3] for fields in joined.came if fields[1] == "SagsState"} == {"13"}
         with sockets(tmp_path) as running:
@@ -205,35 +214,35 @@ def test_what_stops_is_dark_and_empty_and_comes_back(tmp_path: Path, program: Pa
 
 
 def test_a_slow_peer_holds_nobody_up(tmp_path: Path, program: Path) -> None:
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_openigtlink, options(tmp_path, send=("camera",), rate=30.0)) as port:
-            with peer(program, port, "slow", 1000) as slow, peer(program, port) as quick:
-                until(lambda: len(slow.came) > 4)
-                assert len(quick.came) > 3 * len(slow.came), "it is not slowed down by the other"
+    with plane_bridged(run_openigtlink, options(tmp_path, send=("camera",), rate=30.0)) as (_, port):
+        with Peer(program, port, "slow", 1000) as slow, Peer(program, port) as quick:
+            until(lambda: len(slow.came) > 4)
+            assert len(quick.came) > 3 * len(slow.came), "it is not slowed down by the other"
 
 
 def test_nothing_is_asked_of_the_node_while_nobody_is_connected(tmp_path: Path, program: Path) -> None:
     asked = ("left/image_rect_color", "left/render/image", "left/render/depth", "anchors", "tf")
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_openigtlink, options(tmp_path, send=("picture", "anchors"))) as port:
-            time.sleep(0.5)
-            assert not any(running.wanted(name) for name in asked)
-            with peer(program, port) as joined:
-                until(lambda: joined.newest("SagsPicture"))
-                assert [name for name in asked if running.wanted(name)] == [
-                    "left/image_rect_color",
-                    "anchors",
-                ]
-            until(lambda: not any(running.wanted(name) for name in asked))
+    with plane_bridged(run_openigtlink, options(tmp_path, send=("picture", "anchors"))) as (running, port):
+        time.sleep(0.5)
+        assert not any(running.wanted(name) for name in asked)
+        with Peer(program, port) as joined:
+            until(lambda: joined.newest("SagsPicture"))
+            assert [name for name in asked if running.wanted(name)] == [
+                "left/image_rect_color",
+                "anchors",
+            ]
+        until(lambda: not any(running.wanted(name) for name in asked))
 
 
 def test_depth_is_asked_for_only_when_a_surface_is_due(tmp_path: Path, program: Path) -> None:
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_openigtlink, options(tmp_path, send=("surface",), surface_rate=0.5)) as port:
-            with peer(program, port) as joined:
-                until(lambda: joined.newest("SagsSurface"))
-                until(lambda: not running.wanted("left/render/depth"))
-                assert running.wanted("tf"), "it tells that the node goes on"
+    with plane_bridged(run_openigtlink, options(tmp_path, send=("surface",), surface_rate=0.5)) as (
+        running,
+        port,
+    ):
+        with Peer(program, port) as joined:
+            until(lambda: joined.newest("SagsSurface"))
+            until(lambda: not running.wanted("left/render/depth"))
+            assert running.wanted("tf"), "it tells that the node goes on"
 
 
 # ---- requests --------------------------------------------------------------------------------------------
@@ -261,18 +270,18 @@ def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path
         stream(running),
     ):
         with bridged(run_openigtlink, options(tmp_path)) as port:
-            with peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
+            with Peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
                 until(lambda: node.pinned)
                 assert np.allclose([node.pinned[0][axis] for axis in "xyz"], [0.01, 0.02, 0.07])
                 until(lambda: joined.newest("SagsAnswer"))
                 assert "depth_confidence" in " ".join(joined.newest("SagsAnswer") or [])
-            with peer(program, port, "point", "SagsPin", -10, -20, 70):  # the same list again: nothing new
+            with Peer(program, port, "point", "SagsPin", -10, -20, 70):  # the same list again: nothing new
                 time.sleep(1.0)
-            with peer(program, port, "point", "SagsPin", -10, -20, 71):  # moved
+            with Peer(program, port, "point", "SagsPin", -10, -20, 71):  # moved
                 until(lambda: len(node.pinned) == 2 and node.removed == [1])
-            with peer(program, port, "say", "SagsRequest", "pin 320 256.5"):
+            with Peer(program, port, "say", "SagsRequest", "pin 320 256.5"):
                 until(lambda: len(node.pinned) == 3)
-            with peer(program, port, "say", "SagsRequest", "dance"):
+            with Peer(program, port, "say", "SagsRequest", "dance"):
                 pass
     assert node.pinned[2] == {"u": 320.0, "v": 256.5}
 
@@ -305,29 +314,28 @@ def test_strangers_are_cut_off_and_disturb_nobody(tmp_path: Path, program: Path)
     large = (1).to_bytes(2, "big") + b"STRING".ljust(12, b"\0") + b"x".ljust(20, b"\0") + bytes(8)
     large += (MAX_BODY_BYTES + 1).to_bytes(8, "big") + bytes(8)
     damaged = large[:42] + (40).to_bytes(8, "big") + bytes(8) + b"\xff" * 40  # its CRC is wrong
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_openigtlink, options(tmp_path)) as port, peer(program, port) as joined:
-            until(lambda: joined.came)  # it has its place
-            for attack in (
-                b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://evil.example\r\n\r\n",
-                large,
-                b"\xff" * 4096,
-            ):
-                with socket.create_connection(("127.0.0.1", port), timeout=60) as stranger:
-                    stranger.sendall(attack)
-                    stranger.settimeout(60)
-                    with pytest.raises((ConnectionError, EOFError)):
-                        while stranger.recv(1 << 16):
-                            pass
-                        raise EOFError
+    with plane_bridged(run_openigtlink, options(tmp_path)) as (_, port), Peer(program, port) as joined:
+        until(lambda: joined.came)  # it has its place
+        for attack in (
+            b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://evil.example\r\n\r\n",
+            large,
+            b"\xff" * 4096,
+        ):
             with socket.create_connection(("127.0.0.1", port), timeout=60) as stranger:
-                stranger.sendall(damaged)  # passed over
-                assert stranger.recv(10)
-            crowd = [socket.create_connection(("127.0.0.1", port), timeout=60) for _ in range(20)]
-            before = len(joined.came)
-            until(lambda: len(joined.came) > before + 20)
-            for stranger in crowd:
-                stranger.close()
+                stranger.sendall(attack)
+                stranger.settimeout(60)
+                with pytest.raises((ConnectionError, EOFError)):
+                    while stranger.recv(1 << 16):
+                        pass
+                    raise EOFError
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as stranger:
+            stranger.sendall(damaged)  # passed over
+            assert stranger.recv(10)
+        crowd = [socket.create_connection(("127.0.0.1", port), timeout=60) for _ in range(20)]
+        before = len(joined.came)
+        until(lambda: len(joined.came) > before + 20)
+        for stranger in crowd:
+            stranger.close()
 
 
 def test_an_answer_that_comes_after_the_end_goes_nowhere() -> None:

@@ -11,9 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from bridging import anchored, anchored_at, bridged, senders, sockets
+from bridging import anchored, anchored_at, bridged, plane_bridged, senders, sockets
 from made_messages import message_of
-from ros_peers import DOMAIN, KEPT, Listener, listener
+from ros_peers import DOMAIN, KEPT, Listener
 from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
 from waiting import until
 
@@ -64,15 +64,13 @@ def test_every_topic_comes_byte_for_byte(tmp_path: Path) -> None:
         arrays = [cdr.decode(data, ARRAY).status for data in joined.came["/diagnostics"]]
         return {status.name for array in arrays for status in array}
 
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_ros2, options(tmp_path)), listener(*wanted) as joined:
-            until(lambda: {"sags: node", "sags: map", "sags: bridge"} <= stages())  # the last once a second
-            until(lambda: all(len(joined.came[name]) > (0 if kind == TEXT else 1) for name, kind in wanted))
-            with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
-                until(lambda: all(beside.latest(name) for name in FRAME_TOPICS))
-                sent = {name: beside.latest(name) for name in FRAME_TOPICS if name not in RARE}
+    with plane_bridged(run_ros2, options(tmp_path)) as (_, _), Listener(*wanted) as joined:
+        until(lambda: {"sags: node", "sags: map", "sags: bridge"} <= stages())  # the last once a second
+        until(lambda: all(len(joined.came[name]) > (0 if kind == TEXT else 1) for name, kind in wanted))
+        with Subscriber(FRAME_TOPICS, run_dir=tmp_path) as beside:
+            until(lambda: all(beside.latest(name) for name in FRAME_TOPICS))
+            sent = {name: beside.latest(name) for name in FRAME_TOPICS if name not in RARE}
     for name, message in sent.items():
-        assert message is not None
         expected = timeless(message.cdr(), message.stamp_ns)
         for data in joined.came[named(name)]:
             at = 8 if name == "tf" else 4
@@ -91,7 +89,7 @@ def test_a_namesake_in_the_graph_is_said_until_it_goes(
         newest = joined.came["/diagnostics"][-1:]
         return " ".join(status.message for data in newest for status in cdr.decode(data, ARRAY).status)
 
-    with bridged(run_ros2, options(tmp_path)), listener(("/diagnostics", ARRAY)) as joined:
+    with bridged(run_ros2, options(tmp_path)), Listener(("/diagnostics", ARRAY)) as joined:
         until(lambda: "no node" in said().lower())
         shared = joined.graph.writer("/diagnostics", ARRAY)
         time.sleep(0.6)  # three beats
@@ -105,14 +103,13 @@ def test_a_namesake_in_the_graph_is_said_until_it_goes(
 
 
 def test_only_what_is_read_is_asked_of_the_node(tmp_path: Path) -> None:
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_ros2, options(tmp_path)):
-            time.sleep(0.4)
-            assert {name for name in FRAME_TOPICS if running.wanted(name)} == {"status"}
-            with listener(("/sags/anchors", topics.POINT_CLOUD)) as joined:
-                until(lambda: joined.came["/sags/anchors"])
-                assert {name for name in FRAME_TOPICS if running.wanted(name)} == {"anchors", "status"}
-            until(lambda: not running.wanted("anchors"))
+    with plane_bridged(run_ros2, options(tmp_path)) as (running, _):
+        time.sleep(0.4)
+        assert {name for name in FRAME_TOPICS if running.wanted(name)} == {"status"}
+        with Listener(("/sags/anchors", topics.POINT_CLOUD)) as joined:
+            until(lambda: joined.came["/sags/anchors"])
+            assert {name for name in FRAME_TOPICS if running.wanted(name)} == {"anchors", "status"}
+        until(lambda: not running.wanted("anchors"))
 
 
 def stale(joined: Listener) -> list[str]:
@@ -133,7 +130,7 @@ def test_what_stops_is_not_sent_again_and_is_called_stale(
 ) -> None:
     monkeypatch.setattr(ros2, "BEAT", 0.2)
     wanted = [("/tf", TF), ("/sags/left/camera_info", topics.CAMERA_INFO), ("/diagnostics", ARRAY)]
-    with bridged(run_ros2, options(tmp_path)), listener(*wanted, ("/sags/status", TEXT, KEPT)) as joined:
+    with bridged(run_ros2, options(tmp_path)), Listener(*wanted, ("/sags/status", TEXT, KEPT)) as joined:
         until(lambda: any("sags: node: " in line and "no node" in line.lower() for line in stale(joined)))
         with sockets(tmp_path) as running:
             with stream(running, anchored_at):
@@ -147,7 +144,7 @@ def test_what_stops_is_not_sent_again_and_is_called_stale(
             until(
                 lambda: json.loads(cdr.decode(joined.newest("/sags/status"), TEXT).data)["state"] == "silent"
             )
-            with listener(
+            with Listener(
                 ("/sags/status", TEXT, KEPT), ("/sags/left/camera_info", topics.CAMERA_INFO, KEPT)
             ) as late:
                 until(lambda: late.came["/sags/status"])
@@ -168,9 +165,8 @@ def test_points_are_thinned_and_pictures_are_small_files(tmp_path: Path) -> None
         ("/sags/left/tissue_mask/compressed", cdr.COMPRESSED),
         ("/sags/left/depth/compressedDepth", cdr.COMPRESSED),
     ]  # fmt: skip
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_ros2, options(tmp_path, points=100)), listener(*wanted) as joined:
-            until(lambda: all(len(joined.came[name]) > 1 for name, _ in wanted))
+    with plane_bridged(run_ros2, options(tmp_path, points=100)) as (_, _), Listener(*wanted) as joined:
+        until(lambda: all(len(joined.came[name]) > 1 for name, _ in wanted))
     few, every = (
         cdr.decode(joined.newest(name), topics.POINT_CLOUD) for name in ("/sags/points", "/sags/points/all")
     )
@@ -212,7 +208,6 @@ def as_ros_decodes(data: np.ndarray) -> np.ndarray:
 def test_what_compresses_badly_is_made_coarser_until_it_fits(name: str) -> None:
     """Noise of 1280x1024 px, which no codec makes small without loss."""
     topic = topics.find(name)
-    assert topic is not None
     rng = np.random.default_rng(0)
     if topic.content.startswith("32FC1"):
         smooth = 0.1 * np.ones((256, 320), np.float32)
@@ -254,7 +249,7 @@ def test_requests_are_passed_on_and_answered(tmp_path: Path) -> None:
         sockets(tmp_path, {name: note(name) for name in operations}) as running,
         stream(running, anchored_at),
     ):
-        with bridged(run_ros2, options(tmp_path)), listener(("/sags/answer", TEXT)) as joined:
+        with bridged(run_ros2, options(tmp_path)), Listener(("/sags/answer", TEXT)) as joined:
 
             def ask(name: str, content: bytes) -> dict[str, Any]:
                 kind = asks(["ros"])[name].kind
@@ -307,7 +302,7 @@ def test_who_asks_for_more_than_a_topic_gives_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with bridged(run_ros2, options(tmp_path)):
-        with listener(("/sags/left/depth", topics.IMAGE, KEPT)):  # reliable, and kept
+        with Listener(("/sags/left/depth", topics.IMAGE, KEPT)):  # reliable, and kept
             until(lambda: "/sags/left/depth: somebody reads it with stricter settings" in caplog.text)
     assert "net.core.rmem_default" in caplog.text or kernel_buffer("default") >= 4 << 20
 

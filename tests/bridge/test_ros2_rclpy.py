@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 import zlib
 from collections.abc import Iterator
@@ -17,8 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bridging import anchored, bridged, senders, sockets
+from command_line import killed, start
 from places import ROOT, SESSION
-from ros_peers import DOMAIN, LARGE_BUFFERS, RosNode, listener, rclpy_python, ros_node
+from ros_peers import DOMAIN, LARGE_BUFFERS, Listener, RosNode, rclpy_python, ros_node
 from running_node import RunningNode
 from synthetic import at_frame, stream
 from waiting import until
@@ -100,21 +100,9 @@ def test_ros_reads_all_topics_bit_by_bit_and_a_slow_node_holds_nobody_up(tmp_pat
 
 @contextmanager
 def bridge(run_dir: Path) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [
-            sys.executable, "-m", "sags_node", "bridge", "ros2", "--json",
-            "--run-dir", str(run_dir), "--domain", str(DOMAIN),
-        ],
-        stdout=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
-    try:
-        assert process.stdout is not None
+    with killed(start(["bridge", "ros2", "--json", "--run-dir", run_dir, "--domain", DOMAIN])) as process:
         assert json.loads(process.stdout.readline()) == {"domain": DOMAIN, "interface": "lo"}
         yield process
-    finally:
-        process.kill()
-        process.wait(10)
 
 
 def placed(node: RosNode) -> dict[int, tuple[float, ...]]:
@@ -139,9 +127,8 @@ def test_ros_pins_an_anchor_and_outlives_a_killed_bridge_and_a_killed_node(tmp_p
         "std_msgs/msg/String:/sags/answer:reliable",
         "sensor_msgs/msg/CompressedImage:/sags/view/ros/image/compressed",
     )
-    running = RunningNode(SESSION, tmp_path, "source.pace:=realtime")
-    try:
-        with ros_node(*heard) as node, listener(array) as joined:
+    with RunningNode(SESSION, tmp_path, "source.pace:=realtime") as running:
+        with ros_node(*heard) as node, Listener(array) as joined:
             with bridge(run_dir) as first, Subscriber([ANCHORS, "splats"], run_dir=run_dir) as beside:
                 until(lambda: node.came["/sags/anchors"])
                 until(lambda: beside.latest("splats"))
@@ -177,28 +164,19 @@ def test_ros_pins_an_anchor_and_outlives_a_killed_bridge_and_a_killed_node(tmp_p
                 until(lambda: stale(joined.newest("/diagnostics")))
                 second.send_signal(signal.SIGINT)
                 assert second.wait(30) == 0
-    finally:
-        running.process.kill()
-        running.process.wait(10)
 
 
 def test_the_example_publishes_where_the_tissue_is(tmp_path: Path) -> None:
     """examples/ros2/follow_tissue.py, as its first lines say."""
     where = "geometry_msgs/msg/PointStamped:/tissue_point:reliable"
-    running = RunningNode(SESSION, tmp_path, "source.pace:=realtime")
-    words = ["--ros-args", "-p", "u:=150.0", "-p", "v:=120.0"]
-    try:
+    command = [rclpy_python(), ROOT / "examples/ros2/follow_tissue.py"]
+    command += ["--ros-args", "-p", "u:=150.0", "-p", "v:=120.0"]
+    with RunningNode(SESSION, tmp_path, "source.pace:=realtime"):
         with ros_node(where) as node, bridge(tmp_path / "run"):
-            example = subprocess.Popen(
-                [rclpy_python(), ROOT / "examples/ros2/follow_tissue.py", *words],
-                env=os.environ | {"ROS_DOMAIN_ID": str(DOMAIN)} | LARGE_BUFFERS,
-            )
-            try:
+            environment = os.environ | {"ROS_DOMAIN_ID": str(DOMAIN)} | LARGE_BUFFERS
+            with killed(subprocess.Popen(command, env=environment)) as example:
                 until(lambda: len(node.came["/tissue_point"]) > 3)
-            finally:
                 example.send_signal(signal.SIGINT)
                 assert example.wait(60) == 0
-    finally:
-        running.stop()
     depths = [np.frombuffer(bytes.fromhex(each.data)[-8:], "<f8")[0] for each in node.came["/tissue_point"]]
     assert 0.03 < np.median(depths) < 0.2, "metres, of tissue"

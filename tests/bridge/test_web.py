@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import anchored, anchored_at, bridged, senders, sockets
+from bridging import anchored, anchored_at, bridged, plane_bridged, senders, sockets
+from browsers import new_page
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
 from thin_sender import making, node_sockets
@@ -37,7 +38,6 @@ from sags_node.messaging import content
 
 pytestmark = pytest.mark.live
 
-CHROMIUM = shutil.which("chromium")
 DEPTH, IMAGE = "sags/left/render/depth", "sags/left/render/image"
 
 
@@ -202,9 +202,8 @@ def test_who_reads_slowly_misses_some_and_nobody_waits_for_him(
 @pytest.fixture
 def web(tmp_path: Path) -> Iterator[int]:
     """The port of a gateway to a node that sends the plane."""
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with bridged(run_web, options(tmp_path)) as port:
-            yield port
+    with plane_bridged(run_web, options(tmp_path)) as (_, port):
+        yield port
 
 
 # ---- the page ----------------------------------------------------------------------------------------------
@@ -237,17 +236,9 @@ AT_AGES = """([first, second]) => {
 
 @pytest.fixture
 def page() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
-    if CHROMIUM is None:
-        pytest.skip("there is no chromium on this machine (Debian: chromium)")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        try:
-            page = browser.new_page()
-            page.set_default_timeout(60_000)
-            yield page
-        finally:
-            browser.close()
+    with new_page() as page:
+        page.set_default_timeout(60_000)
+        yield page
 
 
 def pixels(page: Any, canvas: str) -> np.ndarray:

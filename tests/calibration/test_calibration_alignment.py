@@ -18,12 +18,12 @@ from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig
 from sags_node.sources.pictures import read_picture
+from sags_node.tools.calibration.check import measure_rows
 from sags_node.types import F32, U8, Bool, StereoFrame, StereoRig
 from sags_node.vision.alignment import FEWEST_FIELDS, WINDOW, RowMonitor
 from sags_node.vision.matchers import InverseSearch
 from sags_node.vision.pyramid import gray_pyramid
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.row_error import measure_rows
 
 SIZE = 640, 512
 DISPARITIES = 8.0, 60.0  # px at the matching size

@@ -33,7 +33,6 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 @pytest.mark.parametrize("bridge", ["web", "foxglove", "openigtlink"])
 def test_a_bridge_says_that_it_waits_for_a_node(bridge: str, run_dir: Path) -> None:
     process = start(["bridge", bridge, "--port", "0", "--ns", "other", "--json"])
-    assert process.stderr is not None
     assert "waiting: no node runs as 'other'" in process.stderr.readline()
     process.terminate()
     assert process.wait(60) == 0
@@ -262,7 +261,6 @@ def test_ctrl_c_ends_the_overlay_with_its_figures(beside_node: dict[str, Any], t
 
 def test_ctrl_c_ends_a_topic_tool(beside_node: dict[str, Any]) -> None:
     process = start(["topic", "echo", "tf"])
-    assert process.stdout is not None
     assert process.stdout.readline() == "topic: sags/tf\n"
     stopped(process)
     assert process.returncode == 130

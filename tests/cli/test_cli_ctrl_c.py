@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -97,51 +97,45 @@ def test_a_ctrl_c_while_modules_are_loaded_is_one_word(
     assert process.returncode == 130 and (stdout, stderr) == ("", "stopped\n")
 
 
-def test_a_ctrl_c_that_c_code_loses_comes_through_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As calls of ZeroMQ may: what is raised in them is told as ignored."""
+@ctypes.CFUNCTYPE(None)
+def _called() -> None:
+    signal.raise_signal(signal.SIGINT)
 
-    @ctypes.CFUNCTYPE(None)
-    def called() -> None:
+
+class _Finalised:
+    def __del__(self) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(sys, "unraisablehook", interrupt.unraisable)
-    before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            called()
-            time.sleep(10)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
-
-def test_a_ctrl_c_in_a_finaliser_comes_through_after_it() -> None:
-    class Binding:
-        def __del__(self) -> None:
-            signal.raise_signal(signal.SIGINT)
-
-    before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            Binding()
-            time.sleep(10)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def test_a_ctrl_c_while_a_kernel_is_compiled_comes_through_after_it() -> None:
-    """LLVM calls back with what it has compiled, and there an exception is printed and forgotten."""
+def _compile() -> None:
     machine = llvm.Target.from_default_triple().create_target_machine()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly("define void @kernel() { ret void }"), machine)
     engine.set_object_cache(lambda module, code: signal.raise_signal(signal.SIGINT))
+    engine.finalize_object()
+
+
+@pytest.fixture
+def interrupting() -> Iterator[None]:
+    """Ctrl-C does what it does in a command."""
     before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            engine.finalize_object()
-            time.sleep(10)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.usefixtures("interrupting")
+@pytest.mark.parametrize("lose", [_called, _Finalised, _compile], ids=["c code", "finaliser", "compiler"])
+def test_a_ctrl_c_that_is_lost_comes_through_after_it(
+    lose: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What calls of ZeroMQ raise is told as ignored; LLVM calls back with what it has compiled, and there an
+    exception is printed and forgotten."""
+    monkeypatch.setattr(sys, "unraisablehook", interrupt.unraisable)
+    with pytest.raises(KeyboardInterrupt):
+        lose()
+        time.sleep(10)
+
+
+@pytest.mark.usefixtures("interrupting")
 def test_an_import_that_hangs_is_broken_off_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,12 +144,8 @@ def test_an_import_that_hangs_is_broken_off_in_the_end(
     )
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(terminal, "LONGEST_WAIT", 0.1)
-    before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            importlib.import_module("hanging")
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(KeyboardInterrupt):
+        importlib.import_module("hanging")
 
 
 @pytest.mark.fault("process: Ctrl-C or SIGTERM between two steps of a node's start or end")
@@ -240,12 +230,7 @@ def stop() -> Iterator[threading.Event]:
 
 def test_a_ctrl_c_that_meets_a_finaliser_is_not_lost(stop: threading.Event) -> None:
     """An exception there is printed and forgotten; a socket that is closed is such a place."""
-
-    class Socket:
-        def __del__(self) -> None:
-            signal.raise_signal(signal.SIGINT)
-
-    Socket()
+    _Finalised()
     assert stop.is_set()
 
 

@@ -35,9 +35,8 @@ def two_videos(user_files: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def node(two_videos: Path, tmp_path: Path) -> Iterator[RunningNode]:
-    running = RunningNode(two_videos, tmp_path)
-    yield running
-    running.stop()
+    with RunningNode(two_videos, tmp_path) as running:
+        yield running
 
 
 def test_every_message_says_that_lengths_have_no_unit_and_none_is_sure(

@@ -21,6 +21,7 @@ from engine_scenes import (
     draw_and_differentiate,
     on_one_thread,
     random_gaussians,
+    rasterize,
     truth,
     with_filter,
     with_view_dependence,
@@ -41,13 +42,7 @@ from sags_node.engine.rasterizer import (
     smoothing,
 )
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
-from sags_node.engine.rasterizer.rasterize import (
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    make_rasterizer,
-    rasterize,
-    to_view,
-)
+from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.kernels.jit import parallel_kernel, take
 from sags_node.kernels.threads import configure_threads

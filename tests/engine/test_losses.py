@@ -53,7 +53,7 @@ def on_cpu(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
 
 def in_warp(inputs: dict[str, Any]) -> tuple[float, F32, F32]:
     from sags_node.engine.gpu import runtime
-    from sags_node.mapping.gpu.picture import Picture
+    from sags_node.mapping.gpu.refiner import Picture
 
     height, width = inputs["tissue"].shape
     picture = Picture(width, height, runtime.device_named("cpu"))

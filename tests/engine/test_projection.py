@@ -15,6 +15,7 @@ from engine_scenes import (
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
+    rasterize,
     relative_error,
     truth,
     with_filter,
@@ -26,7 +27,7 @@ from rounding import after
 from sags_node import geometry
 from sags_node.engine.rasterizer import smoothing
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.types import F64, Camera
 
 VIEW = camera(moved=True)

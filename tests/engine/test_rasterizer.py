@@ -18,6 +18,7 @@ from engine_scenes import (
     draw_and_differentiate,
     one_gaussian,
     random_gaussians,
+    rasterize,
     rows,
     truth,
     with_filter,
@@ -36,7 +37,6 @@ from sags_node.engine.rasterizer.rasterize import (
     Gradients,
     Rasterizer,
     make_rasterizer,
-    rasterize,
 )
 from sags_node.errors import SagsError
 from sags_node.types import F32, Bool, Camera, Gaussians

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from engine_scenes import round_gaussians
+from engine_scenes import rasterize, round_gaussians
 from golden import Golden, Tolerance, compare, read_golden, write_golden
 from places import ROOT
 
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.rig import save_rig

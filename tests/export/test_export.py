@@ -12,11 +12,11 @@ import numpy as np
 import open3d
 import pytest
 from command_line import refused, sags
+from engine_scenes import rasterize
 from running_node import RunningNode
 from splat_files import splats_of
 
 from sags_node.config.schema import PhantomSource
-from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
 from sags_node.messaging.address import NodeAddress
@@ -245,9 +245,8 @@ def test_a_running_node_is_exported_as_it_is_now(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Where time is short, a part of the picture is as it was before the frame's step.
-    node = RunningNode(phantom_session, tmp_path, "mapping.iterations:=1")
     depth = TopicName("left/render/depth", ReceivedImage)
-    try:
+    with RunningNode(phantom_session, tmp_path, "mapping.iterations:=1") as node:
         with Subscriber([depth], run_dir=node.run_dir) as subscriber:
             assert subscriber.wait(depth, 60) is not None
             drawn = {}
@@ -271,8 +270,6 @@ def test_a_running_node_is_exported_as_it_is_now(
             control.request("pause")
         with pytest.raises(SagsError, match="nothing fresh came"):
             from_node(NodeAddress(run_dir=node.run_dir))
-    finally:
-        node.stop()
     refused(1, "export", "--mesh", tmp_path / "none.ply", said=("no node runs as 'sags'",))
 
 

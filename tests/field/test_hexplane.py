@@ -1,4 +1,4 @@
-"""The HexPlane against its formula, and the window that slides."""
+"""The HexPlane against its formula, the window that slides, and sums of rows against torch's own."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from engine_scenes import on_one_thread
 
 from sags_node.errors import SagsError, UsageError
 from sags_node.field import hexplane as module
+from sags_node.field.gather import filled, gather
 from sags_node.field.hexplane import PAIRS, HexPlane, for_clip
 from sags_node.types import F32
 
@@ -249,3 +251,111 @@ def test_the_memory_of_the_planes_has_a_limit(monkeypatch: pytest.MonkeyPatch) -
     for cells in (1000, 10**12):  # the second is out of the range of integers
         with pytest.raises(SagsError, match="MB, the limit is 1 MB"):
             HexPlane(BOX, T0, SECOND, cells=cells)
+
+
+# ---- The HexPlane's kernels against its formula in torch, in double precision. ----
+
+
+AROUND = np.array([[-0.02, -0.01, 0.05], [0.03, 0.02, 0.09]])
+SLOTS = 3
+
+
+def window(channels: int) -> HexPlane:
+    """A window that has slid: its newest slot lies before the older ones in the table."""
+    field = HexPlane(AROUND, 0, SECOND, SLOTS, cells=(5, 4, 3), channels=channels)
+    field.advance((2 * SLOTS - 2) * SECOND, lambda t_ns: None)
+    values = np.random.default_rng(channels).normal(size=tuple(field.cells.shape))
+    field.cells = torch.from_numpy(values.astype(np.float32)).requires_grad_()
+    return field
+
+
+def some_points(count: int) -> torch.Tensor:
+    """Within the box and around it."""
+    size = AROUND[1] - AROUND[0]
+    points = np.random.default_rng(count).uniform(AROUND[0] - size / 4, AROUND[1] + size / 4, (count, 3))
+    return torch.from_numpy(points.astype(np.float32))
+
+
+def sampled(field: HexPlane, points: torch.Tensor, t_ns: int, double: bool) -> list[torch.Tensor]:
+    """Features, and gradients by cells and points."""
+    kind = torch.float64 if double else torch.float32
+    single, leaves = field.cells, [each.detach().to(kind).requires_grad_() for each in (field.cells, points)]
+    field.cells = leaves[0]
+    features = field.sample(leaves[1], t_ns)
+    field.cells = single
+    generator = torch.Generator().manual_seed(1)
+    v = torch.randn(features.shape, generator=generator).to(kind)
+    return [features.detach(), *torch.autograd.grad(features, leaves, v)]
+
+
+@pytest.mark.parametrize("channels", [16, 48])
+@pytest.mark.parametrize("slot", [1.0, 2.0, 2.75, 3.5, 4.0, 9.0])
+def test_kernels_equal_the_formula(channels: int, slot: float) -> None:
+    field, points, t_ns = window(channels), some_points(700), int(slot * SECOND)
+    wanted = sampled(field, points, t_ns, double=True)
+    # products of six sums of four float32, and places that are rounded by 1e-6 of a cell
+    for got, want in zip(sampled(field, points, t_ns, double=False), wanted, strict=True):
+        assert (got - want).norm() <= 1e-5 * want.norm()
+
+
+def test_no_points_have_no_features() -> None:
+    features, v_cells, v_points = sampled(window(16), torch.zeros(0, 3), SECOND, double=False)
+    assert features.shape == (0, 32) and v_points.shape == (0, 3) and not v_cells.any()
+
+
+def test_same_bits_on_one_thread_and_on_all() -> None:
+    field, points = window(32), some_points(2000)
+    alone = on_one_thread(lambda: sampled(field, points, 3 * SECOND, double=False))
+    for got, want in zip(sampled(field, points, 3 * SECOND, double=False), alone, strict=True):
+        assert torch.equal(got, want)
+
+
+# ---- sums of rows ----------------------------------------------------------------------------------------
+
+
+def inputs(bags: int, columns: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A table, rows of it, their weights and a cotangent."""
+    generator = torch.Generator().manual_seed(bags + columns)
+    table = torch.randn(50, columns, generator=generator)
+    index = torch.randint(0, 40, (bags, 4), generator=generator)  # the last ten rows are never taken
+    weight = torch.randn(bags, 4, generator=generator)
+    return table, index, weight, torch.randn(bags, columns, generator=generator)
+
+
+def run(
+    table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, v: torch.Tensor
+) -> list[torch.Tensor]:
+    leaves = [table.clone().requires_grad_(), weight.clone().requires_grad_()]
+    sums = gather(leaves[0], index, leaves[1])
+    return [sums.detach(), *torch.autograd.grad(sums, leaves, v)]
+
+
+@pytest.mark.parametrize("columns", [1, 16, 23, 32])
+@pytest.mark.parametrize("bags", [0, 1, 700])
+def test_kernels_equal_torch_in_double_precision(bags: int, columns: int) -> None:
+    table, index, weight, v = inputs(bags, columns)
+    expected = run(table.double(), index, weight.double(), v.double())
+    for found, wanted in zip(run(table, index, weight, v), expected, strict=True):
+        # a row of the table takes part in at most 4 bags sums of float32
+        assert (found - wanted).norm() <= 1e-6 * max(1.0, float(wanted.norm()))
+
+
+def test_sums_have_the_same_bits_on_one_thread_and_on_all() -> None:
+    arrays = inputs(2000, 23)
+    alone = on_one_thread(lambda: run(*arrays))
+    for found, wanted in zip(run(*arrays), alone, strict=True):
+        assert torch.equal(found, wanted)
+
+
+def test_only_what_is_learnt_gets_a_gradient() -> None:
+    table, index, weight, _ = inputs(30, 8)
+    gather(table.requires_grad_(), index, weight).sum().backward()
+    assert table.grad is not None and weight.grad is None
+    np.testing.assert_array_equal(np.flatnonzero(filled(table.grad)), np.unique(index.numpy()))
+
+
+def test_rows_that_hold_something() -> None:
+    table = torch.zeros(1300, 5)
+    table[[0, 7, 512, 1299], [0, 4, 2, 3]] = torch.tensor([1e-30, -1, torch.nan, torch.inf])
+    for kind in (table, table.double()):  # by the kernel, and in torch
+        assert np.flatnonzero(filled(kind)).tolist() == [0, 7, 512, 1299]

@@ -104,27 +104,24 @@ def write_rosbag2(path: Path, rows: list[Row], plugin: str = "MCAP", compression
     writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
     if compression is not None:
         writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
-    with writer:
-        known: dict[str, Any] = {}
-        for topic, message, stamp in rows:
-            kind = message.__msgtype__
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=ROS2)
-            writer.write(known[topic], stamp + 5 * MS, ROS2.serialize_cdr(message, kind))
-    return path
+    return _written(path, writer, rows, ROS2, ROS2.serialize_cdr)
 
 
 def write_rosbag1(path: Path, rows: list[Row], compression: str | None = None) -> Path:
     writer = rosbag1.Writer(path)
     if compression is not None:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    return _written(path, writer, rows, ROS1, ROS1.serialize_ros1)
+
+
+def _written(path: Path, writer: Any, rows: list[Row], store: Any, serialize: Callable[..., Any]) -> Path:
     with writer:
         known: dict[str, Any] = {}
         for topic, message, stamp in rows:
             kind = message.__msgtype__
             if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=ROS1)
-            writer.write(known[topic], stamp + 5 * MS, ROS1.serialize_ros1(message, kind))
+                known[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(known[topic], stamp + 5 * MS, serialize(message, kind))
     return path
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from synthetic import at_frame, plane_result
+from synthetic import at_frame, plane_result, stream
+from waiting import beside, until
 
 from sags_node.config.schema import PublishConfig
 from sags_node.messaging.address import NodeAddress
@@ -19,7 +20,6 @@ from sags_node.messaging.publisher import Publisher
 from sags_node.types import AnchorStates, FrameResult
 
 SEEN, HIDDEN, LOST, UNSURE = 3, 5, 8, 9  # numbers of the anchors in `anchored`
-STARTING = 60.0  # s
 
 
 @contextmanager
@@ -70,24 +70,16 @@ def bridged(
     run: Callable[[Any, Callable[[str, int], None], threading.Event], None], options: Any
 ) -> Iterator[int]:
     """A bridge on a thread; gives its port."""
-    stop, ports, failed = threading.Event(), [], []
-
-    def work() -> None:
-        try:
-            run(options, lambda _, port: ports.append(port), stop)
-        except BaseException as error:  # told to the test below
-            failed.append(error)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    deadline = time.monotonic() + STARTING
-    while not ports:
+    stop, ports = threading.Event(), []
+    with beside(lambda: run(options, lambda _, port: ports.append(port), stop), stop.set) as failed:
+        until(lambda: ports or failed)
         assert not failed, failed
-        assert time.monotonic() < deadline, "the bridge did not start"
-        time.sleep(0.01)
-    try:
         yield ports[0]
-    finally:
-        stop.set()
-        thread.join(60)
-        assert not thread.is_alive() and not failed, failed
+
+
+@contextmanager
+def plane_bridged(run: Callable[..., None], options: Any) -> Iterator[tuple[Publisher, int]]:
+    """A node that sends the plane with its anchors, and the port of a bridge beside it."""
+    with sockets(options.node.run_dir) as running, stream(running, anchored_at):
+        with bridged(run, options) as port:
+            yield running, port

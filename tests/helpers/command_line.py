@@ -8,15 +8,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 import pytest
 from click.testing import CliRunner, Result
 
 from sags_node.cli.main import main
+
+S = TypeVar("S", str, bytes)
 
 START_SECONDS = 120  # the first start on a machine compiles kernels
 # For a node that a test starts: ports that are free, and pictures of one size, however busy the machine is.
@@ -80,6 +83,16 @@ def start(arguments: list[Any], **environment: str | Path) -> subprocess.Popen[s
         start_new_session=True,
         env=os.environ | {key: str(value) for key, value in environment.items()},
     )
+
+
+@contextmanager
+def killed(process: subprocess.Popen[S]) -> Iterator[subprocess.Popen[S]]:
+    """A process that has ended when this is left, whatever comes of the test."""
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def wait_for(process: subprocess.Popen[str], ready: Callable[[], bool]) -> None:

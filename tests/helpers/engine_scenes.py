@@ -14,8 +14,9 @@ from rounding import U, after, moved, roughly
 
 from benchmarks.kernels.reference import ReferenceRasterizer
 from sags_node.engine.interface import MAX_OPACITY
-from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer, make_rasterizer
-from sags_node.types import F32, F64, U8, Camera, Gaussians
+from sags_node.engine.rasterizer.rasterize import Gradients, Rasterizer, make_rasterizer, to_view
+from sags_node.mapping.focus import largest, sum_residuals, tile_grid
+from sags_node.types import F32, F64, U8, Bool, Camera, Gaussians, RenderedView
 
 T = TypeVar("T")
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "slopes")
@@ -214,3 +215,16 @@ def on_one_thread(run: Callable[[], T]) -> T:
         return run()
     finally:
         numba.set_num_threads(cores)
+
+
+def rasterize(gaussians: Gaussians, view: Camera, backend: str = "numba") -> RenderedView:
+    """Drawn by a rasteriser of its own."""
+    rasterizer = make_rasterizer(backend, view.width, view.height)
+    return to_view(rasterizer.forward(gaussians, view), view, 0, 0)
+
+
+def worst_tiles(planes: F32, image: U8, tissue: Bool, share: float) -> Bool:
+    """The tiles of `focus.largest`, of all residuals."""
+    residuals = np.zeros(tile_grid(tissue).shape, np.float32)
+    sum_residuals(planes, image, tissue, ~tile_grid(tissue), residuals)
+    return largest(residuals, share)

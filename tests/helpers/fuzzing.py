@@ -374,7 +374,6 @@ def numbered_archives(_: Path) -> list[bytes]:
 def read_numbered(data: bytes, folder: Path) -> None:
     (folder / "frames.tar.gz").write_bytes(gzip.compress(data, 1) if data[-1:] == b"\0" else data)
     files = open_numbered(folder / "frames", ".json", 1000)
-    assert files is not None
     for number in (1, 0, 2, 9):
         files.read(number)
     files.close()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from places import ROOT
+
+from sags_node.messaging.sockets import Closes
 
 PEER = ROOT / "tests/bridge/igtl_peer.cxx"
 
@@ -28,7 +28,7 @@ def built(source: Path, folder: Path) -> Path:
     return program
 
 
-class Peer:
+class Peer(Closes):
     """The program; what it prints is taken in as it comes: the fields of each line."""
 
     def __init__(self, program: Path, port: int, *order: object) -> None:
@@ -40,7 +40,6 @@ class Peer:
         self._thread.start()
 
     def _read(self) -> None:
-        assert self._process.stdout is not None
         for line in self._process.stdout:
             self.came.append(line.split())
 
@@ -52,12 +51,3 @@ class Peer:
         self._process.kill()
         self._process.wait(10)
         self._thread.join(60)
-
-
-@contextmanager
-def peer(program: Path, port: int, *order: object) -> Iterator[Peer]:
-    joined = Peer(program, port, *order)
-    try:
-        yield joined
-    finally:
-        joined.close()

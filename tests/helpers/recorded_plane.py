@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from synthetic import at_frame, plane_result, publisher, stream
-from waiting import until
+from waiting import beside, until
 
 from sags_node.bags.bag import BagMessage, read_messages
 from sags_node.clients.recording.recorder import Recorder, RecordOptions
-from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.types import FrameResult
 
@@ -25,24 +23,9 @@ RATE = 30.0  # Hz
 def recording(options: RecordOptions) -> Iterator[tuple[Recorder, list[dict[str, Any]]]]:
     """A recorder on a thread, ready; the summary is the last thing that it says."""
     recorder, said = Recorder(options), []
-    failed: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            said.append(recorder.run(said.append))
-        except SagsError as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    until(lambda: said or failed)
-    try:
+    with beside(lambda: said.append(recorder.run(said.append)), recorder.stop) as failed:
+        until(lambda: said or failed)
         yield recorder, said
-    finally:
-        recorder.stop()
-        thread.join(60)
-    if failed:
-        raise failed[0]
 
 
 def record_plane(tmp_path: Path, seconds: float = 1.0, **options: Any) -> tuple[Path, dict[str, Any]]:

@@ -18,6 +18,7 @@ from places import ROOT
 from waiting import until
 
 from sags_node.config.schema import RosGraph
+from sags_node.messaging.sockets import Closes
 from sags_node.ros.endpoints import Delivery
 from sags_node.ros.graph import Graph
 
@@ -44,7 +45,7 @@ def rclpy_python() -> Path:
     return python
 
 
-class Listener:
+class Listener(Closes):
     """Reads topics by DDS alone: name, type, and how if not with best effort."""
 
     def __init__(self, *topics: Wanted) -> None:
@@ -71,15 +72,6 @@ class Listener:
         del self.graph, self._readers
 
 
-@contextmanager
-def listener(*topics: Wanted) -> Iterator[Listener]:
-    joined = Listener(*topics)
-    try:
-        yield joined
-    finally:
-        joined.close()
-
-
 @dataclass(frozen=True)
 class Came:
     """A message that reached rclpy; see tests/ros2/peer.py."""
@@ -90,7 +82,7 @@ class Came:
     data: str = ""
 
 
-class RosNode:
+class RosNode(Closes):
     """tests/ros2/peer.py with these subscriptions."""
 
     def __init__(self, words: tuple[str, ...], variables: Mapping[str, str]) -> None:
@@ -107,7 +99,6 @@ class RosNode:
         self._thread.start()
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
         for line in self.process.stdout:
             said = json.loads(line)
             topic = said.pop("topic", None)
@@ -129,7 +120,6 @@ class RosNode:
         self._order(do="publish", type=kind, topic=topic, fields=paths)
 
     def _order(self, **order: object) -> None:
-        assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(order) + "\n")
         self.process.stdin.flush()
 
@@ -141,9 +131,6 @@ class RosNode:
 
 @contextmanager
 def ros_node(*words: str, **variables: str) -> Iterator[RosNode]:
-    joined = RosNode(words, variables)
-    try:
+    with RosNode(words, variables) as joined:
         until(lambda: joined.said)  # importing rclpy takes seconds
         yield joined
-    finally:
-        joined.close()

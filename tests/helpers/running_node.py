@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Self
 
 from command_line import RUN_HERE
 
@@ -38,8 +39,13 @@ class RunningNode:
 
     def said(self) -> str:
         """Everything on stderr, once it has ended."""
-        assert self.process.stderr is not None
         return self.process.stderr.read()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     def stop(self) -> int:
         if self.process.poll() is None:

@@ -9,21 +9,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from command_line import killed
 from places import HELPERS
 
 
 @contextmanager
 def sending(command: Sequence[object], **variables: str) -> Iterator[subprocess.Popen[bytes]]:
     """A process that sends; has begun when this returns, since imports take seconds."""
-    process = subprocess.Popen(
-        [str(word) for word in command], env={**os.environ, **variables}, stdout=subprocess.PIPE
-    )
-    try:
+    words, environment = [str(word) for word in command], {**os.environ, **variables}
+    with killed(subprocess.Popen(words, env=environment, stdout=subprocess.PIPE)) as process:
         assert process.stdout is not None and process.stdout.readline() == b"sending\n"
         yield process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def stereo_sender(way: str, where: object, session: Path, seconds: float, *settings: str) -> list[object]:

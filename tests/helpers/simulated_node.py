@@ -380,7 +380,6 @@ class Run:
         """What is shown as new is no older than the limit says, by the clock that nobody sets."""
         for name, fresh in self.fresh.items():
             if fresh.problem(self.world.time_ns()) is None:
-                assert fresh.last is not None
                 self.shown[name] += 1
                 taken, wall_ahead = self.source.filmed[fresh.last.stamp_ns]
                 age, set_back = self.world.now - taken, wall_ahead - self.world.wall_ahead

@@ -23,14 +23,32 @@ def until(done: Callable[[], T], seconds: float = 60.0) -> T:
 
 
 @contextmanager
+def beside(work: Callable[[], object], end: Callable[[], object] = lambda: None) -> Iterator[list[Exception]]:
+    """Does this in a thread that has ended when it is left. Gives what it failed with, and raises it then."""
+    failed: list[Exception] = []
+
+    def do() -> None:
+        try:
+            work()
+        except Exception as error:  # told to the test below
+            failed.append(error)
+
+    thread = threading.Thread(target=do)
+    thread.start()
+    try:
+        yield failed
+    finally:
+        end()
+        thread.join(60)
+        assert not thread.is_alive()
+        if failed:
+            raise failed[0]
+
+
+@contextmanager
 def repeating(step: Callable[[int], object]) -> Iterator[None]:
     """Calls `step` with 0, 1, 2 and so on, from a thread of its own."""
     stop = threading.Event()
     calls = itertools.takewhile(lambda _: not stop.is_set(), itertools.count())
-    thread = threading.Thread(target=lambda: [step(number) for number in calls])
-    thread.start()
-    try:
+    with beside(lambda: [step(number) for number in calls], stop.set):
         yield
-    finally:
-        stop.set()
-        thread.join()

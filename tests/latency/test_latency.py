@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 import threading
 import time
 import urllib.error
@@ -17,8 +16,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from browsers import new_page
 from synthetic import plane_result, publisher
-from waiting import until
+from waiting import beside, until
 
 from sags_node.clients.latency.code import NUMBERS, Reader, paint
 from sags_node.clients.latency.ledger import Ledger, Moment
@@ -31,7 +31,6 @@ from sags_node.types import U8, Camera, FrameResult
 
 MS = 1_000_000
 HELD = 0.2  # s, by which a chain is known to hold pictures
-CHROMIUM = shutil.which("chromium")
 
 
 def numbered(number: int) -> U8:
@@ -146,13 +145,8 @@ def measuring(codes: Codes, run_dir: Path, ended: Callable[[], object]) -> Itera
         finally:
             ended()
 
-    thread = threading.Thread(target=measure)
-    thread.start()
-    try:
+    with beside(measure, stop.set):
         yield found
-    finally:
-        stop.set()
-        thread.join()
 
 
 @pytest.mark.live
@@ -179,26 +173,16 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
     assert found["total_ms"]["max"] >= found["parts_ms"]["published"]["max"]
 
 
-@pytest.fixture
-def display() -> Iterator[Any]:
-    """A browser with a page of 400x400 px."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
-    if CHROMIUM is None:
-        pytest.skip("there is no chromium on this machine (Debian: chromium)")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        try:
-            yield browser.new_page(viewport={"width": 400, "height": 400})
-        finally:
-            browser.close()
-
-
 @pytest.mark.live
 @pytest.mark.alone
-def test_a_camera_that_films_the_page_closes_the_circle(display: Any, tmp_path: Path) -> None:
+def test_a_camera_that_films_the_page_closes_the_circle(tmp_path: Path) -> None:
     """Screenshots are what the camera sees; they are published `HELD` later."""
-    codes, ended = Page(0), threading.Event()
-    with publisher(tmp_path / "run") as node, measuring(codes, tmp_path / "run", ended.set) as found:
+    codes, ended, run_dir = Page(0), threading.Event(), tmp_path / "run"
+    with (
+        new_page(viewport={"width": 400, "height": 400}) as display,
+        publisher(run_dir) as node,
+        measuring(codes, run_dir, ended.set) as found,
+    ):
         display.goto(codes.address)
         for number in itertools.count():
             if ended.is_set():

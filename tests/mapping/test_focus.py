@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from engine_scenes import worst_tiles
 from places import SESSION
 
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
 from sags_node.mapping import focus, refiner
 from sags_node.mapping.budget import StepBudget
-from sags_node.mapping.focus import EVERY, largest, with_neighbours, worst_tiles
+from sags_node.mapping.focus import EVERY, largest, with_neighbours
 from sags_node.mapping.ladder import Rung
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.pipeline.pipeline import Pipeline

@@ -250,7 +250,6 @@ def test_damage_is_healed(where: str) -> None:
     played = on_device()
     played.take(frame(0))
     deformation = played.mapper.map.deformation
-    assert deformation is not None
     count = played.mapper.model.count
     if where in {"adam_m", "momentum"}:
         assert isinstance(played.refiner, GpuRefiner)
@@ -287,7 +286,6 @@ def test_tissue_that_comes_into_view_gets_nodes_on_the_device_too() -> None:
             observation.tissue[hidden] = False
             observation.depth[hidden] = 0
             played.take(observation, steps=2)
-            assert played.mapper.map.deformation is not None
             counts.append(len(played.mapper.map.deformation.nodes))
     assert counts[1] > counts[0] and counts[2:] == counts[:2]
     assert played.mapper.model.node_index.max() >= counts[0]

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from engine_scenes import camera, relative_error
+from engine_scenes import camera, relative_error, worst_tiles
 
 from sags_node.engine.gpu import runtime
 from sags_node.engine.gpu.rasterizer import DERIVED
 from sags_node.engine.interface import Gradients
 from sags_node.mapping import focus
 from sags_node.mapping.gpu.device_map import DeviceMap
-from sags_node.mapping.gpu.picture import Picture
+from sags_node.mapping.gpu.refiner import Picture
 from sags_node.mapping.optimiser import LearningRates, Optimiser
 from sags_node.model import columns
 from sags_node.model.deformation import NodeDeformation
@@ -188,7 +188,7 @@ def test_the_worst_tiles_are_the_cpus(share: float) -> None:
     planes = rng.uniform(0, 1, (5, height, width)).astype(np.float32)
     image = rng.integers(0, 256, (height, width, 3), np.uint8)
     tissue = rng.uniform(size=(height, width)) < 0.8
-    expected = focus.worst_tiles(planes, image, tissue, share)
+    expected = worst_tiles(planes, image, tissue, share)
     picture = Picture(width, height, runtime.device_named("cpu"))
     picture.rasterizer.planes.assign(planes)
     picture.show(image, tissue, planes[3])

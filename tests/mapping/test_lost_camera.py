@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from engine_scenes import rasterize
 
-from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.geometry import invert
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential

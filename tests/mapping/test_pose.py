@@ -8,10 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from engine_scenes import rasterize
 from places import SESSION
 from recorded_session import both, psnr
 
-from sags_node.engine.rasterizer.rasterize import rasterize
 from sags_node.findings import by_code
 from sags_node.geometry import invert, project
 from sags_node.mapping.budget import StepBudget
@@ -218,7 +218,6 @@ def test_instruments_in_nearly_half_of_the_picture_do_not_pull_the_pose(still: P
 
     def covered(k: int, frame: StereoFrame) -> StereoFrame:
         """The left 40 % are a textured instrument that slides by 4 px a frame, beside those there."""
-        assert frame.right is not None and frame.tissue is not None
         left, right, tissue = frame.left.copy(), frame.right.copy(), frame.tissue.copy()
         left[:, :128] = right[:, :128] = sliding[:, 4 * k : 4 * k + 128]
         tissue[:, :128] = False
@@ -337,7 +336,6 @@ def test_places_at_rest_that_lost_their_shape_do_not_move_the_camera(still: Path
     session, frames = opened(still)
     pipeline, results = play(session, frames[:7])
     deformation = pipeline.map.deformation
-    assert deformation is not None
     rest = deformation.rest
     rest += np.float32(0.02) * (rest - rest.mean(0))  # as a camera sees it that is 1.5 mm nearer
     budget = StepBudget(1)
@@ -361,5 +359,4 @@ def test_without_an_estimate_asked_for_the_pose_is_the_sessions(still: Path) -> 
     session, frames = opened(still, "session")
     _, results = play(session, frames[:4])
     for result, frame in zip(results, frames, strict=False):
-        assert frame.T_world_cam is not None
         assert np.array_equal(result.pair.camera.T_world_cam, frame.T_world_cam)

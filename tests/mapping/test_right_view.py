@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from engine_scenes import rasterize
 from places import SESSION
 
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.right_eye import right_eye_mask

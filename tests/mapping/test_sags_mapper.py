@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -31,15 +31,10 @@ RUNG = Rung(12_000)
 SAGS = "mapping.method:=sags"
 
 
-def pipeline_of(folder: Path, *overrides: str) -> tuple[Pipeline, Iterator[StereoFrame]]:
+def pipeline_of(folder: Path, *overrides: str) -> tuple[Pipeline, list[StereoFrame]]:
     session = open_session(folder, ["source.pace:=step", SAGS, *overrides])
-    pipeline = Pipeline(session.config, session.rig)
-
-    def frames() -> Iterator[StereoFrame]:
-        with open_posed(session.config, session.rig) as source:
-            yield from source
-
-    return pipeline, frames()
+    with open_posed(session.config, session.rig) as source:
+        return Pipeline(session.config, session.rig), list(source)
 
 
 def mapper_of(pipeline: Pipeline) -> SagsMapper:
@@ -65,8 +60,7 @@ def quality(picture: F32, result: FrameResult) -> float:
 def lift(phantom_session: Path) -> tuple[Pipeline, list[StereoFrame], list[FrameResult]]:
     """Two seconds of the phantom."""
     configure_threads(None)
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=20")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=20")
     return pipeline, taken, played(pipeline, taken)
 
 
@@ -104,12 +98,10 @@ def test_both_eyes_velocities_and_depth_are_published(lift: Lift) -> None:
 
 def test_anchors_go_with_the_tissue(phantom_session: Path) -> None:
     """They are off by less than half of how far it moved."""
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=20")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=20")
     budget = StepBudget(4, RUNG)
     first = pipeline.process(taken[0], budget)
     reference = taken[0].reference
-    assert reference is not None and reference.points is not None and reference.points_visible is not None
     pixels, _ = project(first.snapshot.camera, reference.points)
     ids = {}
     for point in np.flatnonzero(reference.points_visible):
@@ -122,7 +114,6 @@ def test_anchors_go_with_the_tissue(phantom_session: Path) -> None:
     off, moved = [], []
     for frame in taken[1:]:
         result = pipeline.process(frame, budget)
-        assert frame.reference is not None and frame.reference.points is not None
         found = dict(zip(result.anchors.ids.tolist(), result.anchors.points, strict=True))
         for point, anchor in ids.items():
             off.append(np.linalg.norm(found[anchor] - frame.reference.points[point]))
@@ -137,7 +128,7 @@ def test_two_runs_give_the_same_bits_whatever_the_number_of_threads() -> None:
     for count in (None, 1):
         configure_threads(count)
         pipeline, frames = pipeline_of(SESSION, "source.frames:=6")
-        runs.append(played(pipeline, list(frames), steps=2))
+        runs.append(played(pipeline, frames, steps=2))
     configure_threads(threads)
     for a, b in zip(*runs, strict=True):
         for name in ("means", "quats", "scales", "opacities", "colors", "ids"):
@@ -163,8 +154,7 @@ def test_over_eight_windows_nothing_grows(phantom_session: Path) -> None:
 
 
 def test_a_reset_and_another_place_make_a_new_model_in_a_new_epoch(phantom_session: Path) -> None:
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=9")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=9")
     before = played(pipeline, taken[:3])[-1]
     pipeline.reset()
     after = played(pipeline, taken[3:6])[-1]
@@ -180,8 +170,7 @@ def test_a_reset_and_another_place_make_a_new_model_in_a_new_epoch(phantom_sessi
 
 
 def test_a_damaged_model_is_made_anew(phantom_session: Path) -> None:
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=6")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=6")
     before = played(pipeline, taken[:3])[-1]
     mapper_of(pipeline).field.table[:] = np.nan
     after = played(pipeline, taken[3:])[-1]
@@ -193,8 +182,7 @@ def test_a_model_that_shows_less_than_one_colour_would_is_made_anew_before_it_is
     phantom_session: Path,
 ) -> None:
     """Beside it every later picture would seem too dark, too bright or of another scene, and be held."""
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=8")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=8")
     before = played(pipeline, taken[:6])[-1]
     mapper_of(pipeline).field.table[:, columns.COLOR] = 10  # one step takes nine tenths off: it stays white
     after, later = played(pipeline, taken[6:], steps=1)
@@ -206,8 +194,7 @@ def test_a_model_that_shows_less_than_one_colour_would_is_made_anew_before_it_is
 @pytest.mark.filterwarnings("error")
 def test_what_walked_away_in_a_long_session_is_brought_back(phantom_session: Path) -> None:
     """A scale of exp(-200) m is 0 in float32, one of exp(50) m infinite."""
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=8")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=8")
     played(pipeline, taken[:6])
     mapper = mapper_of(pipeline)
     mapper.field.table[::9, columns.LOG_SCALE] = -200
@@ -224,7 +211,7 @@ def test_what_the_field_forgets_moves_nothing(phantom_session: Path) -> None:
     """After three times `FORGOTTEN_NS` the twentieth part is left of what it learnt. Before, the window has
     to be full, and then full of what it learnt last: that takes two windows."""
     pipeline, frames = pipeline_of(phantom_session, "source.frames:=7")
-    last = played(pipeline, list(frames))[-1].observation
+    last = played(pipeline, frames)[-1].observation
     mapper, budget = mapper_of(pipeline), StepBudget(0, RUNG)
     cells, before = mapper.field.field.deltas.hexplane.cells, mapper.model.means.copy()
 
@@ -241,8 +228,7 @@ def test_what_the_field_forgets_moves_nothing(phantom_session: Path) -> None:
 
 
 def test_a_veiled_picture_moves_nothing_and_a_dark_one_begins_nothing(phantom_session: Path) -> None:
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=5")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=5")
     dark = replace(taken[0], left=np.zeros_like(taken[0].left), right=np.zeros_like(taken[0].left))
     assert played(pipeline, [dark])[-1].snapshot.counts["inserted"] == 0
     last = played(pipeline, taken[1:4])[-1].observation
@@ -255,8 +241,7 @@ def test_a_veiled_picture_moves_nothing_and_a_dark_one_begins_nothing(phantom_se
 
 
 def test_a_clock_that_goes_back_stops_nothing(phantom_session: Path) -> None:
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=12")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=12")
     played(pipeline, taken[:6])
     earlier = [replace(each, t_capture_ns=each.t_capture_ns - 10 * WINDOW_NS) for each in taken[6:]]
     last = played(pipeline, earlier)[-1]
@@ -264,8 +249,7 @@ def test_a_clock_that_goes_back_stops_nothing(phantom_session: Path) -> None:
 
 
 def test_the_colours_follow_a_jump_of_the_exposure(phantom_session: Path) -> None:
-    pipeline, frames = pipeline_of(phantom_session, "source.frames:=7")
-    taken = list(frames)
+    pipeline, taken = pipeline_of(phantom_session, "source.frames:=7")
     played(pipeline, taken[:6])
     darker = replace(
         taken[6], left=(0.8 * taken[6].left).astype(np.uint8), right=(0.8 * taken[6].right).astype(np.uint8)

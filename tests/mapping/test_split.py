@@ -87,11 +87,9 @@ def test_a_slope_goes_on_through_the_parts(scene: Scene, smoothing: float) -> No
     model.smoothing[LARGE] = smoothing
     model.slopes[LARGE] = 0, 0.1, 0
     whole, middle = bake_filter(model.gaussians()), model.means[LARGE].copy()
-    assert whole.slopes is not None
     per_metre = whole.slopes[LARGE, 1] / whole.scales[LARGE, 1]
     scene.split()
     parts = bake_filter(model.gaussians())
-    assert parts.slopes is not None
     rows = np.flatnonzero(np.abs(parts.slopes[:, 1]) > 0)
     assert len(rows) == 3 and LARGE in rows
     along = (parts.means[rows] - middle) @ np.array([-np.sin(np.pi / 4), np.cos(np.pi / 4), 0])

@@ -170,7 +170,6 @@ def undamaged(session: Session, measured_frames: list[StereoFrame]) -> float:
 
 
 def with_damaged_depth(frame: StereoFrame, value: float, every: int) -> StereoFrame:
-    assert frame.depth is not None
     depth = frame.depth.copy()
     depth.ravel()[::every] = value
     return replace(frame, depth=depth)

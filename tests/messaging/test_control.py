@@ -15,7 +15,7 @@ import msgpack
 import pytest
 import zmq
 from ports import free_port
-from waiting import repeating, until
+from waiting import beside, repeating, until
 
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
@@ -87,13 +87,11 @@ def test_a_future_is_answered_when_it_is_done_and_others_meanwhile(tmp_path: Pat
     with node(tmp_path / "run", {"later": later}) as endpoint:
         with ControlClient(endpoint) as slow, ControlClient(endpoint) as quick:
             answers: list[Any] = []
-            thread = threading.Thread(target=lambda: answers.append(slow.request("later", timeout=30)))
-            thread.start()
-            until(lambda: waiting)
-            assert quick.request("ping") == "pong"
-            assert answers == []
-            waiting[0].set_result({"done": True})
-            thread.join()
+            with beside(lambda: answers.append(slow.request("later", timeout=30))):
+                until(lambda: waiting)
+                assert quick.request("ping") == "pong"
+                assert answers == []
+                waiting[0].set_result({"done": True})
             assert answers == [{"done": True}]
             waiting.clear()
             with pytest.raises(SagsError, match="no answer"):

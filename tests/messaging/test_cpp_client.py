@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -17,6 +17,7 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
+from command_line import killed
 from independent_client import zmq_socket
 from made_messages import message_of
 from places import ROOT
@@ -67,21 +68,14 @@ def read_depth(examples: Path) -> Path:
     return examples / "read_depth"
 
 
-@contextmanager
-def running(*command: str | Path) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+def running(*command: str | Path) -> AbstractContextManager[subprocess.Popen[str]]:
+    return killed(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
 
 
 @pytest.fixture(scope="module")
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
-    one = RunningNode(phantom_session, tmp_path_factory.mktemp("node"))
-    yield one
-    one.stop()
+    with RunningNode(phantom_session, tmp_path_factory.mktemp("node")) as one:
+        yield one
 
 
 def test_it_shows_what_the_python_subscriber_shows(read_depth: Path, node: RunningNode) -> None:
@@ -114,7 +108,6 @@ def test_it_shows_what_the_python_subscriber_shows(read_depth: Path, node: Runni
 
 def test_it_says_stale_and_shows_nothing_while_no_frames_come(read_depth: Path, node: RunningNode) -> None:
     with ControlClient(run_dir=node.run_dir) as control, running(read_depth, node.data) as process:
-        assert process.stdout is not None
         while not LINE.match(process.stdout.readline()):
             assert process.poll() is None
         control.request("pause")

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import signal
 import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Self
 
 import msgspec
 import pytest
+from command_line import killed
 from keyed_node import make_keys, node
 from places import HELPERS
 from ports import free_port
@@ -28,8 +27,9 @@ from sags_node.messaging.subscriber import Subscriber
 pytestmark = pytest.mark.live
 
 
-@contextmanager
-def _node(run_dir: Path, session: str, port: int, ipc: bool = False) -> Iterator[subprocess.Popen[bytes]]:
+def _node(
+    run_dir: Path, session: str, port: int, ipc: bool = False
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
     """A publisher in its own process, which ends with SIGKILL and so leaves its files behind."""
     program = (
         "import time; from pathlib import Path; from synthetic import publisher, stream\n"
@@ -39,12 +39,7 @@ def _node(run_dir: Path, session: str, port: int, ipc: bool = False) -> Iterator
         "    with stream(running):\n"
         "        time.sleep(60)\n"
     )
-    process = subprocess.Popen([sys.executable, "-c", program], cwd=HELPERS)
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    return killed(subprocess.Popen([sys.executable, "-c", program], cwd=HELPERS))
 
 
 @pytest.mark.fault("process: the node is killed, another begins in its place")

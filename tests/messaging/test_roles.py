@@ -17,8 +17,7 @@ from waiting import repeating, until
 
 from sags_node.errors import SagsError
 from sags_node.mapping.anchors import MAX_ANCHORS
-from sags_node.messaging.control import MAX_PENDING_OF_ONE
-from sags_node.messaging.request_rate import BURST, FORGET_ABOVE, RATE, RequestRate
+from sags_node.messaging.control import BURST, FORGET_ABOVE, MAX_PENDING_OF_ONE, RATE, RequestRate
 from sags_node.messaging.requests import MAX_VIEW_HZ
 from sags_node.messaging.roles import ROLES, Client, needed
 from sags_node.messaging.security import read_allow_list, write_key_pair

@@ -7,7 +7,6 @@ import logging
 import os
 import socket
 import stat
-import threading
 from pathlib import Path
 
 import hostile
@@ -20,7 +19,7 @@ from independent_client import zmq_socket
 from keyed_node import TOPIC, error_of, make_keys, node, of
 from running_node import RunningNode
 from synthetic import publisher
-from waiting import until
+from waiting import beside, until
 from zmq.auth import load_certificate
 
 from sags_node.cli.main import main
@@ -378,10 +377,8 @@ def test_a_flood_is_cut_off(tmp_path: Path, which: str, kind: bytes, block: byte
         with attacked.serves_on():
             before = _resident_mb()
             sent: list[int] = []
-            attack = threading.Thread(target=lambda: sent.append(hostile.flood(endpoint, kind, block, 2.0)))
-            attack.start()
-            until(lambda: running.connections[which]["flooding"])
-            attack.join()
+            with beside(lambda: sent.append(hostile.flood(endpoint, kind, block, 2.0))):
+                until(lambda: running.connections[which]["flooding"])
             assert sent[0] > len(block)
             assert _resident_mb() - before < 100
 
@@ -392,12 +389,9 @@ def test_a_reply_too_large_for_the_client_is_not_taken() -> None:
         router.send_multipart([identity, bytes(8 << 20)])
 
     with zmq_socket(zmq.ROUTER, "tcp://127.0.0.1:*", bind=True) as router:
-        thread = threading.Thread(target=answer)
-        thread.start()
-        with ControlClient(router.getsockopt_string(zmq.LAST_ENDPOINT)) as asker:
+        with beside(answer), ControlClient(router.getsockopt_string(zmq.LAST_ENDPOINT)) as asker:
             with pytest.raises(SagsError, match="no answer"):
                 asker.request("ping", timeout=0.5)
-        thread.join()
 
 
 # ---- the whole, with a process ---------------------------------------------------------------------------
@@ -407,8 +401,7 @@ def test_a_secured_node_as_a_process_and_its_clients(
     phantom_session: Path, keys: Path, tmp_path: Path
 ) -> None:
     secured = (f"publish.key:={keys}/node.key", f"publish.allow:={keys}/clients", "publish.data:=[tcp://*:*]")
-    process = RunningNode(phantom_session, tmp_path, *secured)
-    try:
+    with RunningNode(phantom_session, tmp_path, *secured) as process:
         port = process.data.rpartition(":")[2]
         where = ["--endpoint", f"tcp://127.0.0.1:{port}"]
         good = tf_rate(*where, "--key", f"{keys}/clients/viewer.key", "--server-key", f"{keys}/node.pub")
@@ -421,8 +414,6 @@ def test_a_secured_node_as_a_process_and_its_clients(
         with ControlClient(run_dir=process.run_dir, keys=viewer) as asker:
             connections = asker.request("get_status")["connections"]
         assert connections["data"]["unlisted_key"] == 1 and connections["data"]["refused"] >= 2
-    finally:
-        process.stop()
     said = process.said()
     assert "Traceback" not in said
     assert read_key_pair(keys / "stranger.key").public.decode() in said.replace("\n", "").replace(" ", "")

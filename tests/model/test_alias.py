@@ -15,6 +15,7 @@ from engine_scenes import (
     camera,
     draw_and_differentiate,
     random_gaussians,
+    rasterize,
     relative_error,
 )
 from following import Following
@@ -22,7 +23,7 @@ from splat_files import splats_of
 
 from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
 from benchmarks.quality.alias_truth import moved, resized
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget

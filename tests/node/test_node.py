@@ -28,9 +28,8 @@ pytestmark = pytest.mark.live
 @pytest.fixture(scope="module")
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
     # No frame is left out, so what is shown does not depend on how busy the machine is.
-    running = RunningNode(phantom_session, tmp_path_factory.mktemp("node"), "source.pace:=fast")
-    yield running
-    running.stop()
+    with RunningNode(phantom_session, tmp_path_factory.mktemp("node"), "source.pace:=fast") as running:
+        yield running
 
 
 def test_each_operation_has_its_role(node: RunningNode) -> None:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from synthetic import plane_result
+from waiting import beside
 
 from sags_node.confidence import SURE
 from sags_node.config.schema import FoldersSource, LaunchConfig
@@ -53,22 +54,18 @@ def test_close_delivers_what_is_left_then_ends() -> None:
 def test_close_wakes_a_waiter() -> None:
     slot: Latest[int] = Latest()
     got: list[int | None] = []
-    waiter = threading.Thread(target=lambda: got.append(slot.get()))
-    waiter.start()
-    slot.close()
-    waiter.join(timeout=60)
+    with beside(lambda: got.append(slot.get())):
+        slot.close()
     assert got == [None]
 
 
 def test_hand_over_drops_nothing() -> None:
     slot: Latest[int] = Latest()
-    sender = threading.Thread(target=lambda: [slot.hand_over(i) for i in range(50)] and slot.close())
-    sender.start()
     got = []
-    while (value := slot.get(timeout=60)) is not None:
-        time.sleep(0.001)
-        got.append(value)
-    sender.join(timeout=60)
+    with beside(lambda: [slot.hand_over(i) for i in range(50)] and slot.close()):
+        while (value := slot.get(timeout=60)) is not None:
+            time.sleep(0.001)
+            got.append(value)
     assert got == list(range(50))
     assert slot.dropped == 0
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from command_line import RUN_HERE, START_SECONDS, sags, start
+from command_line import RUN_HERE, START_SECONDS, killed, sags, start
 from places import SESSION
 
 from sags_node.node import service_manager
@@ -136,10 +136,8 @@ def test_pings_end_when_the_mapping_hangs(
 
 @pytest.mark.live
 def test_a_service_is_told_and_tells(manager: Manager, phantom_session: Path, run_dir: Path) -> None:
-    process = start(
-        ["--log", "json", "run", phantom_session, "source.loop:=true", *RUN_HERE], **manager.environment()
-    )
-    try:
+    command = ["--log", "json", "run", phantom_session, "source.loop:=true", *RUN_HERE]
+    with killed(start(command, **manager.environment())) as process:
         manager.listen(START_SECONDS, until="READY=1")
         manager.listen(60, until="STATUS=running")
         for _ in range(3):
@@ -149,8 +147,6 @@ def test_a_service_is_told_and_tells(manager: Manager, phantom_session: Path, ru
         os.killpg(process.pid, signal.SIGTERM)
         manager.listen(60, until="STOPPING=1")
         _, stderr = process.communicate(timeout=60)
-    finally:
-        process.kill()
     assert process.returncode == 0
     assert all(isinstance(json.loads(line)["message"], str) for line in stderr.splitlines())
     gone = sags("health")

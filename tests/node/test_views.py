@@ -14,6 +14,7 @@ import independent_client as client
 import msgpack
 import numpy as np
 import pytest
+from engine_scenes import rasterize
 from running_node import START_SECONDS, RunningNode
 from synthetic import at_frame, plane_result
 from waiting import until
@@ -21,7 +22,7 @@ from warp_on_cpu import use_warp_on_cpu
 
 from sags_node.engine.gpu.rasterizer import DeviceRasterizer
 from sags_node.engine.interface import Rasterizer
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, rasterize
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError
 from sags_node.mapping.ladder import RUNGS
 from sags_node.messaging.control import ControlClient

@@ -42,7 +42,6 @@ def assert_frames(frames: list[StereoFrame], numbers: list[int], tolerance: int 
     for frame, number in zip(frames, numbers, strict=True):
         assert frame.t_capture_right_ns - frame.t_capture_ns == 2 * MS
         for eye, seen in enumerate((frame.left, frame.right)):
-            assert seen is not None
             assert np.abs(seen.astype(int) - picture(number, eye)).max() <= tolerance
 
 

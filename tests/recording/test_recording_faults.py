@@ -19,7 +19,7 @@ from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher, stream
 from waiting import until
 
-from sags_node.cli.bag_text import recorded_table
+from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
 from sags_node.clients.recording.backlog import Arrived, Backlog
 from sags_node.clients.recording.bag_writer import BagWriter

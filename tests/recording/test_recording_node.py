@@ -15,7 +15,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from command_line import RUN_HERE, START_SECONDS, pure_json, refused, sags, start, stopped, wait_for
+from command_line import RUN_HERE, START_SECONDS, killed, pure_json, refused, sags, start, stopped, wait_for
 from mcap.reader import make_reader
 from recorded_plane import by_topic
 from rosbags.highlevel import AnyReader
@@ -133,7 +133,7 @@ def test_ctrl_c_closes_the_file_and_a_signal_takes_a_snapshot(node: Path, tmp_pa
 def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> None:
     """As `ssh` that is cut off leaves it: the kernel sends SIGHUP, and nothing can be printed any more."""
     ours, theirs = pty.openpty()
-    process = subprocess.Popen(
+    program = subprocess.Popen(
         [
             *("setsid", "--ctty", "--wait", sys.executable, "-m", "sags_node"),
             *("bag", "record", "-o", str(tmp_path / "bag"), "--topics", "tf"),
@@ -141,25 +141,21 @@ def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> 
         env={**os.environ, "XDG_RUNTIME_DIR": str(node)},
         stdin=theirs, stdout=theirs, stderr=theirs,
     )  # fmt: skip
-    try:
+    with killed(program) as process:
         os.close(theirs)
         until(lambda: b"recording: " in os.read(ours, 1000), START_SECONDS)
         time.sleep(1)
         os.close(ours)
         process.wait(30)
-    finally:
-        process.kill()
     assert (tmp_path / "bag/metadata.yaml").exists()
     assert bag_info(tmp_path / "bag")["messages"] > 0
 
 
 def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_path: Path) -> None:
     command = ["nohup", sys.executable, "-m", "sags_node", "bag", "record", "-o", str(tmp_path / "bag")]
-    process = subprocess.Popen(
-        [*command, "--topics", "tf"], env={**os.environ, "XDG_RUNTIME_DIR": str(node)}, stderr=subprocess.PIPE
-    )
-    try:
-        assert process.stderr is not None
+    command += ["--topics", "tf"]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(node)}
+    with killed(subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)) as process:
         while b"recording: " not in process.stderr.readline():
             assert process.poll() is None
         process.send_signal(signal.SIGHUP)
@@ -167,8 +163,6 @@ def test_a_recorder_that_nohup_started_outlives_its_terminal(node: Path, tmp_pat
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
-    finally:
-        process.kill()
 
 
 def test_recording_on_the_control_socket(node: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import pytest
 from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer, pipelines, raw_file
+from numbered_pictures import write_video
 from places import HELPERS, ROOT
 from pydantic import ValidationError
 from sending import sending
@@ -417,11 +418,8 @@ def test_what_sdi_and_decoders_give_keeps_its_depth(tmp_path: Path, bits: int, t
 def test_encoded_files_are_decoded(tmp_path: Path) -> None:
     """As launch/gst_file.yaml does."""
     smooth = cv2.resize(pictures(1, 6, 8)[0], (320, 240), interpolation=cv2.INTER_CUBIC)
-    writer = cv2.VideoWriter(str(tmp_path / "eye.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (320, 240))
-    for _ in range(5):
-        writer.write(smooth[..., ::-1])
-    writer.release()
-    file = f"filesrc location={tmp_path / 'eye.avi'} ! decodebin"
+    film = write_video(tmp_path / "eye.avi", [smooth] * 5, 30)
+    file = f"filesrc location={film} ! decodebin"
     frames, _ = take(GstSource(left=file, right=file), 99)
     assert len(frames) == 5
     assert np.abs(frames[0].left.astype(int) - smooth).mean() < 4  # JPEG's loss; exchanged colours: 80

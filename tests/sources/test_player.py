@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ import pytest
 from command_line import sags, start, stopped, wait_for
 from recorded_plane import by_topic, record_plane
 from synthetic import HEIGHT, WIDTH, plane_result
-from waiting import until
+from waiting import beside, until
 
 from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 from sags_node.clients.recording.info import bag_info
@@ -42,14 +41,9 @@ def playing(path: Path, run_dir: Path, paused: bool = True, **options: Any) -> I
     config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir)
     player = Player(path, PlayOptions(**options), config, "sags", paused)
     outcome: list[Any] = []
-    thread = threading.Thread(target=lambda: outcome.append(player.play()))
-    thread.start()
-    until((run_dir / "sags.json").exists)
-    try:
+    with beside(lambda: outcome.append(player.play()), player.stop):
+        until((run_dir / "sags.json").exists)
         yield player
-    finally:
-        player.stop()
-        thread.join(60)
     assert outcome
 
 

@@ -15,6 +15,7 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
+from command_line import killed
 from independent_client import zmq_socket
 from live_taking import Taker
 from made_messages import MS, meta
@@ -181,12 +182,10 @@ def test_the_sender_of_the_phantom_ends_with_ctrl_c_and_explains_itself(tmp_path
     said = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True, timeout=60).stdout
     assert "\n    python examples/send_phantom.py push\n" in said
     command += ["push", "--size", "160", "128", "--endpoint", f"ipc://{tmp_path}/in"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with killed(program) as process:
         assert process.stdout is not None
         while process.stdout.readline() != "sending\n":
             assert process.poll() is None
         process.send_signal(signal.SIGINT)
         assert process.communicate(timeout=30)[1] == "" and process.returncode == 130
-    finally:
-        process.kill()

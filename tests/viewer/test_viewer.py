@@ -6,7 +6,6 @@ import base64
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -21,7 +20,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from browsers import new_page
 from click.testing import CliRunner
+from command_line import killed
 
 from sags_node.cli.main import main
 from sags_node.clients.viewer import splats as viewer_splats
@@ -40,14 +41,13 @@ from sags_node.types import SH_DEGREE_0, Camera
 pytestmark = [pytest.mark.live, pytest.mark.alone]
 
 START_SECONDS = 90  # the first start on a machine compiles kernels
-CHROMIUM = shutil.which("chromium")
 # Keeps what the page reports as an error.
 KEEP_ERRORS = """
     window.errors = [];
     const report = console.error;
     console.error = (...said) => { window.errors.push(said.join(" ")); report(...said); };
 """
-SOFTWARE_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 needs_viser = pytest.mark.skipif(
     subprocess.run([sys.executable, "-c", "import viser"], capture_output=True, check=False).returncode != 0,
@@ -264,7 +264,6 @@ class RunningView:
             stderr=subprocess.PIPE,
             text=True,
         )
-        assert self.process.stdout is not None
         self.where: dict[str, Any] = json.loads(self.process.stdout.readline())
 
     def upgrade(self, origin: str) -> int:
@@ -325,12 +324,7 @@ def test_an_anchor_that_is_seen_and_not_recognised_has_a_colour_of_its_own() -> 
 @pytest.fixture(scope="module")
 def page(view: RunningView) -> Iterator[Any]:
     """The viewer's page in a headless browser; `page.requests` are the addresses it asked for."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
-    if CHROMIUM is None:
-        pytest.skip("there is no chromium on this machine (Debian: chromium)")
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_GL)
-        page = browser.new_page(viewport={"width": 1050, "height": 400})
+    with new_page(SOFTWARE_GL, viewport={"width": 1050, "height": 400}) as page:
         page.set_default_timeout(30_000)
         page.requests = []
         page.add_init_script(KEEP_ERRORS)
@@ -338,7 +332,6 @@ def page(view: RunningView) -> Iterator[Any]:
         page.goto(view.where["url"])
         page.wait_for_selector("canvas")
         yield page
-        browser.close()
 
 
 @pytest.fixture
@@ -348,14 +341,9 @@ def node(view: RunningView, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]
     write_session(PhantomSource(seconds=2.0, width=160, height=128, seed=1), session, rate=10.0)
     command = [sys.executable, "-m", "sags_node", "run", session, "source.loop:=true"]
     command += ["source.rate:=5", "vision.scale:=1", "publish.data:=[]", "publish.control:=tcp://127.0.0.1:*"]
-    running = subprocess.Popen(
-        list(map(str, command)),
-        env=os.environ | {"XDG_RUNTIME_DIR": str(view.runtime)},
-        stderr=subprocess.DEVNULL,
-    )
-    yield running
-    running.kill()
-    running.wait()
+    words, environment = list(map(str, command)), os.environ | {"XDG_RUNTIME_DIR": str(view.runtime)}
+    with killed(subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL)) as running:
+        yield running
 
 
 def status(page: Any) -> str:

@@ -44,7 +44,6 @@ def of_pixels(cells: np.ndarray, side: float) -> np.ndarray:
 
 def fogged(pair: RectifiedPair) -> RectifiedPair:
     """The right eye sees its middle third through dense fog, and the camera's noise."""
-    assert pair.right is not None
     veiled = pair.right.copy()
     part = slice(WIDTH // 3, 2 * WIDTH // 3)
     blurred = cv2.GaussianBlur(pair.right, (0, 0), 2)[:, part].astype(np.float32)
@@ -191,7 +190,6 @@ def test_the_drawn_depth_says_how_sure_it_is_and_keeps_silent_where_it_is_a_gues
     drawn = np.full(SHAPE, DEPTH, np.float32)
     view = RenderedView(0, 0, CAMERA, BLACK, drawn, np.ones(SHAPE, np.float32))
     shown = with_confidence(view, model.gaussians())
-    assert shown.confidence is not None
     assert np.allclose(shown.confidence[:, :140], confidence_of(np.float32(1e-3)), atol=1e-3)
     assert np.allclose(shown.depth[:, :140], DEPTH)
     assert not shown.depth[:, 180:].any() and not shown.confidence[:, 180:].any()
@@ -207,7 +205,6 @@ def test_a_drawn_depth_is_no_surer_than_it_agrees_with_what_is_measured() -> Non
     drawn = np.full(SHAPE, DEPTH, np.float32)
     view = RenderedView(0, 0, CAMERA, BLACK, drawn, np.ones(SHAPE, np.float32))
     shown = with_confidence(view, wall(1e-3).gaussians(), grid)
-    assert shown.confidence is not None
     its_error = float((grid.error * np.square(DEPTH - apart))[:, :30].max())
     assert its_error < apart - HALVING  # or the two need not contradict each other
     assert shown.confidence[:, :120].max() <= confidence_of(np.float32(apart - its_error)) + 1e-3 < SURE

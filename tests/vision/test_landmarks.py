@@ -49,7 +49,6 @@ def test_pulled_tissue_is_found_where_it_went(tissue: U8) -> None:
     after, origin = pulled(tissue, WIDTH / 10)
     first, second = gray_pyramid(tissue), gray_pyramid(after)
     found = find_again(first, second, everywhere(first))
-    assert found is not None
     columns, rows = np.rint(found.after).astype(int).T
     errors = np.linalg.norm(origin[rows, columns] - found.before, axis=1)
     assert np.percentile(errors, 90) < 2 * 1.2**7  # px: one of ORB's smallest picture, of half the size

@@ -41,7 +41,6 @@ def _disc(shape: tuple[int, ...], radius: float) -> Bool:
 
 def _wet(picture: U8 | None) -> U8:
     """Blurred, and turned upside down, as through a drop."""
-    assert picture is not None
     blurred = cv2.GaussianBlur(picture[::-1, ::-1], (0, 0), 5).astype(np.float32)
     inside: F32 = cv2.GaussianBlur(_disc(picture.shape, RADIUS).astype(np.float32), (0, 0), 2)
     return np.asarray(np.rint(picture + inside[..., None] * (blurred - picture)), np.uint8)

@@ -9,11 +9,11 @@ import pytest
 from sags_node.types import F32
 from sags_node.vision import agreement
 from sags_node.vision.coarse_stereo import coarse_disparity
+from sags_node.vision.dense_depth import guided
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.inverse_search import PATCH, at_pixels, centres, grid_shape, search, start
 from sags_node.vision.margin import clear_of_instruments
 from sags_node.vision.pyramid import BORDER, gray_pyramid, inner, level, level_count, with_border
-from sags_node.vision.smoothing import guided
 
 WIDTH, HEIGHT = 90, 70  # no multiple of the patches' distance, nor of a vector
 PX = np.float64

@@ -61,7 +61,6 @@ def test_near_tissue_gets_its_own_depth() -> None:
     errors, coverage = {}, {}
     for scale in (1.0, NEAR):
         (pair, truth), *_ = shown(PHANTOM, scale, 1)
-        assert truth is not None
         depth, _ = StereoDepth(StereoConfig(), pair.camera, pair.baseline)(pair, everywhere(pair))
         known = (depth > 0) & (truth > 0)
         errors[scale] = float(np.percentile(np.abs(depth - truth)[known] / truth[known], 90))
@@ -154,7 +153,6 @@ def test_the_limit_comes_at_once_and_goes_slowly(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.parametrize("source", [PHANTOM, ROOT / "launch/d4d_pull.yaml"])
 def test_pictures_that_do_not_belong_together_move_nothing(source: Path) -> None:
     for pair, _ in shown(source, 1.0, 3):
-        assert pair.right is not None
         other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]), gray=None)
         exchanged = replace(pair, left=pair.right, right=pair.left, gray=None)
         for wrong in (other, exchanged):

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from numbered_pictures import write_video
 from onnx_networks import save_matcher, save_odd, save_table
 
 from sags_node.config.launch_file import load_launch
@@ -279,7 +280,6 @@ def depth_error(result: FrameResult, frame: StereoFrame) -> tuple[float, float]:
 
 def dark(frame: StereoFrame) -> StereoFrame:
     """Where a network of these tests fails; see `unwatched`."""
-    assert frame.right is not None
     return replace(frame, left=frame.left // 8, right=frame.right // 8)
 
 
@@ -382,7 +382,6 @@ def test_scale_and_shift_are_found_among_outliers() -> None:
     relative[50, 50] = np.nan
     everywhere = np.ones(depth.shape, bool)
     found = fit_scale_shift(relative, depth, everywhere)
-    assert found is not None
     assert found.scale == pytest.approx(1 / 0.03, rel=0.02)
     assert found.shift == pytest.approx(0.2 / 0.03, abs=0.3)
     assert fit_scale_shift(-relative, depth, everywhere) is None
@@ -486,12 +485,8 @@ def test_a_recording_of_one_camera_is_played(
 ) -> None:
     left = phantom_session / "left"
     if kind == "videos":
-        film = tmp_path / "film.avi"
-        video = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (WIDTH, HEIGHT))
-        for file in sorted(left.iterdir())[:3]:
-            video.write(cv2.imread(str(file)))
-        video.release()
-        left = film
+        pictures = [cv2.imread(str(file))[..., ::-1] for file in sorted(left.iterdir())[:3]]
+        left = write_video(tmp_path / "film.avi", pictures, 10.0)
     launch = one_camera_launch(phantom_session, knowing, tmp_path, {"kind": kind, "left": str(left)})
     monkeypatch.chdir("/")
     session = open_session(launch, ["source.frames:=2"])

@@ -105,7 +105,6 @@ def test_bands_leave_no_seams(workers: int, monkeypatch: pytest.MonkeyPatch) -> 
     """Each worker takes a band of rows; how many there are changes nothing, in the last digit of confidence
     either. With steps in depth and noise everything depends on what is around."""
     pair, _ = plane_pair(28.0, 0.02, -0.01)
-    assert pair.right is not None
     right = np.where(np.arange(HEIGHT)[:, None, None] // 40 % 2, pair.right, np.roll(pair.right, 6, axis=1))
     noise = np.random.default_rng(1).normal(0, 4, right.shape)
     pair = make_pair(pair.left, np.clip(right + noise, 0, 255).astype(np.uint8))

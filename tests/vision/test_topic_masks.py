@@ -107,7 +107,6 @@ def test_masks_come_and_go_and_the_frames_go_on(home: Path) -> None:
         assert "older than the picture" in until(lambda: warning(client))
         assert fits(subscriber, frames=10) < 5  # found without: other pixels
         last = subscriber.wait(MASK, 60)
-        assert first is not None and last is not None
         # None waits for its mask: that would take `TOLERANCE` each time, over two periods of the phantom.
         assert last.meta.seq - first.meta.seq > 0.5 * (last.meta.frame_id - first.meta.frame_id)
         with masker(home):
@@ -121,9 +120,7 @@ def fits(subscriber: Subscriber, frames: int) -> int:
     last, count = None, 0
     for _ in range(frames):
         last = subscriber.wait(MASK, 60, after=last)
-        assert last is not None
         picture = subscriber.latest(PICTURE)
-        assert picture is not None
         pictures = [*pictures, picture.array][-4:]
         made = [segment(shown) > 0 for shown in pictures]
         count += any(np.array_equal(mask, last.array > 0) for mask in made)

@@ -10,6 +10,7 @@ from av.video.frame import PictureType
 
 from sags_node.types import U8
 
+RATE = 30.0  # Hz of the pictures, for what it may send
 KEY_EVERY = 30  # pictures: who comes, or has lost one, sees something within a second
 BITS_PER_PIXEL = 0.2  # of a picture: 2 Mbit/s at 640x512 and 30 Hz, with tissue still sharp
 
@@ -20,8 +21,7 @@ class Encoder:
     No picture refers to a later one, and each key picture says all that a decoder must know.
     """
 
-    def __init__(self, rate: float = 30.0) -> None:
-        self._rate = rate
+    def __init__(self) -> None:
         self._codec: av.VideoCodecContext | None = None
         self._number = 0
 
@@ -44,9 +44,9 @@ class Encoder:
         codec = av.CodecContext.create("libx264", "w")
         assert isinstance(codec, av.VideoCodecContext)
         codec.width, codec.height, codec.pix_fmt = width, height, "yuv420p"
-        codec.time_base = Fraction(1, round(self._rate))
+        codec.time_base = Fraction(1, round(RATE))
         codec.thread_count = 1
-        bits = round(BITS_PER_PIXEL * width * height * self._rate)
+        bits = round(BITS_PER_PIXEL * width * height * RATE)
         codec.options = {
             "preset": "ultrafast",
             "tune": "zerolatency",

@@ -7,10 +7,9 @@ from sags_node.engine.interface import Gradients, Rasterizer
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.engine.rasterizer.views import to_view
 from sags_node.errors import UsageError
-from sags_node.types import Camera, Gaussians, RenderedView
 
 __all__ = [
-    "TILE_HEIGHT", "TILE_WIDTH", "Gradients", "Rasterizer", "make_rasterizer", "rasterize", "to_view",
+    "TILE_HEIGHT", "TILE_WIDTH", "Gradients", "Rasterizer", "make_rasterizer", "to_view",
 ]  # fmt: skip
 
 
@@ -37,20 +36,3 @@ def make_rasterizer(backend: str, width: int, height: int, antialias: bool = Tru
 
         return WarpRasterizer(width, height, antialias, device.gpu())
     raise UsageError(f"unknown engine backend '{backend}'; choose numba or warp")
-
-
-def rasterize(
-    gaussians: Gaussians,
-    camera: Camera,
-    frame_id: int = 0,
-    t_capture_ns: int = 0,
-    backend: str = "numba",
-) -> RenderedView:
-    """Draw Gaussians for a camera of any size and pose. Makes its own rasteriser each time: keep one from
-    `make_rasterizer` to draw often.
-
-    Raises:
-        UsageError: an array or the camera has the wrong shape or size.
-    """
-    rasterizer = make_rasterizer(backend, camera.width, camera.height)
-    return to_view(rasterizer.forward(gaussians, camera), camera, frame_id, t_capture_ns)

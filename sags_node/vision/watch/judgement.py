@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 from sags_node.types import F32, Bool, Finding, FrameResult, RectifiedPair, StereoFrame
@@ -44,3 +44,21 @@ class Watcher(Protocol):
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
         """Return what may be used of a frame: `judged`, which those that were asked before say, or less."""
+
+
+class PoseWatch:
+    """Looks at what the robot says of every frame.
+
+    Attributes:
+        findings: why the newest frame's pose is not known. May be read from any thread.
+    """
+
+    def __init__(self, needed: bool) -> None:
+        self.findings: tuple[Finding, ...] = ()
+        self._needed = needed
+
+    def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
+        """Without its pose a frame is held: nobody knows where it shows the tissue."""
+        problem = evidence.frame.pose_problem if self._needed else None
+        self.findings = () if problem is None else (problem,)
+        return judged if problem is None else replace(judged, hold=problem.text, stage="pose")

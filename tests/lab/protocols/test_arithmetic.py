@@ -121,7 +121,6 @@ def test_scared_takes_the_mean_where_truth_is_known_and_leaves_sparse_frames_out
     depth[0, :5] = 0.099
     depth[1, :4] = 0
     error = arithmetic.mean_depth_error(depth, truth)
-    assert error is not None
     assert error[0] == pytest.approx((5 * 1 + 11 * 3) / 16, abs=1e-3) and error[1] == pytest.approx(16 / 20)
     truth[:] = 0
     truth[0, :9] = 0.1  # 9 %
@@ -149,7 +148,6 @@ def test_depth_errors_have_a_sign() -> None:
     truth.flat[:10] = 0.1
     depth.flat[:10] = [0.099] * 5 + [0.102, 0.102, 0.106, 0, 0]
     figures = arithmetic.depth_figures(depth, truth, np.ones((4, 4), bool))
-    assert figures is not None
     assert figures["mae_mm"] == pytest.approx((5 + 4 + 6) / 8, abs=1e-4)
     assert figures["median_mm"] == pytest.approx(1, abs=1e-4)
     assert figures["bias_mm"] == pytest.approx(-1, abs=1e-4)

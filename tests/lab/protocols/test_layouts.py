@@ -89,7 +89,6 @@ def stir(recorded: tuple[StereoRig, list[StereoFrame]], tmp_path_factory: pytest
         there = folder / f"1/{side}01/seq00"
         (there / "segmentation").mkdir()
         for when, frame in zip(("start", "end"), (frames[0], frames[-1]), strict=True):
-            assert frame.reference is not None and frame.reference.points is not None
             pixels, _ = project(camera.moved_right(shift), frame.reference.points[chosen])
             marked = np.zeros((eye.height, eye.width, 3), np.uint8)
             for x, y in np.rint(to_raw(eye, camera, pixels)).astype(int):

@@ -42,7 +42,6 @@ def stir(tmp_path_factory: pytest.TempPathFactory, rig: StereoRig, played: list[
     truth = {}
     for number in KNOWN:
         reference, camera = played[number].reference, rectifier.camera
-        assert reference is not None and reference.points is not None and reference.points_visible is not None
         left, right = (
             project(eye, reference.points)[0] for eye in (camera, camera.moved_right(rig.baseline))
         )

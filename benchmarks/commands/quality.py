@@ -1,0 +1,220 @@
+"""How right depth and masks are, and how exactly is measured, registered and placed by them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from benchmarks.commands.measuring import (
+    STEP,
+    Measured,
+    each_recording,
+    measures,
+    step_by_step,
+)
+from sags_node.cli.launching import (
+    as_json,
+    check_files,
+    figures_option,
+    file_option,
+    folder_option,
+    force_option,
+    launch_argument,
+    open_launched,
+    shown,
+    write_json,
+)
+from sags_node.errors import UsageError
+from sags_node.files import whole
+from sags_node.terminal.console import progress, show
+
+FAULT_SIZE = (640, 512)  # px
+FAULT_FRAMES = 4
+
+
+@click.command("depth")
+@launch_argument
+@click.option(
+    "--ct",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
+    help="One pair of the Open-CAS set against its CT surface, instead of a recording.",
+)
+@click.option("--faults", is_flag=True, help="The phantom with noise, blur, smoke and highlights rising.")
+@click.option(
+    "--network",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    metavar="FILE.onnx",
+    help="A depth network to compare as well.",
+)
+@figures_option
+@file_option(
+    "--picture", metavar="FILE.jpg", help="With --ct: draw the left picture, the depth and its error."
+)
+@force_option
+@as_json
+def bench_depth(
+    launch: tuple[str, ...],
+    ct: Path | None,
+    faults: bool,
+    network: Path | None,
+    out: Path | None,
+    picture: Path | None,
+    force: bool,
+    json_out: bool,
+) -> None:
+    """How right the depth is, and how much there is of it.
+
+    The stereo stage at every scale, beside OpenCV's SGBM in its place and as its own sample sets it up, and a
+    network where one is given.
+    Median, 90th percentile and median signed error (below 0: too near), the share of the tissue that has a
+    depth, the time of one pair, and whether the confidence orders the errors.
+
+    A recording, by default the built-in phantom, is played with one step of the mapper a frame; at
+    most every tenth frame is compared with its reference depth, and so is the depth of the drawn model, also
+    by region: near and far, at edges, beside instruments, where the right eye does not see.
+
+    \b
+    python -m benchmarks depth launch/d4d_pull.yaml --out benchmarks/results/depth_d4d.json
+    python -m benchmarks depth --ct $SAGS_DATA/tmi_ct_pair --out benchmarks/results/depth_tmi.json
+    python -m benchmarks depth --faults --out benchmarks/results/depth_phantom.json
+    python -m benchmarks depth launch/d4d_pull.yaml --network stereo.onnx
+    """
+    from benchmarks.quality import depth, depth_ct, depth_report
+
+    if (ct is not None) + faults + bool(launch) > 1:
+        raise UsageError("a recording, --ct or --faults: give one of them")
+    if picture is not None and ct is None:
+        raise UsageError("--picture draws what --ct measures; add --ct FOLDER")
+    check_files(out, picture, force=force)
+    if ct is not None:
+        pair = depth_ct.read_ct_pair(ct)
+        with progress("measuring") as advance:
+            measured = depth_ct.measure_ct(pair, advance, network)
+        if picture is not None:
+            with whole(picture) as partial:
+                partial.write_bytes(depth_ct.picture(pair))
+    elif faults:
+        with progress("measuring") as advance:
+            measured = depth.measure_faults(FAULT_SIZE, FAULT_FRAMES, depth.FAULTS, advance, network)
+    else:
+        session = step_by_step(launch, "depth")
+        with progress("playing") as advance:
+            measured = depth.measure_recording(session, advance, network=network)
+    for table in [measured] if json_out else depth_report.tables(measured):
+        show(table)
+    write_json(out, measured)
+
+
+@click.command("masks")
+@click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
+@measures
+def bench_masks(launch: tuple[str, ...]) -> Measured:
+    """How right masks are that were found, and what they bring.
+
+    Plays recordings that have masks of their own, by default the built-in phantom, once with these, once with
+    those found without them (classical), once with none, and with a network's where vision.tissue.path is
+    given; one step of the mapper a frame. Intersection over union of the instruments, the share of them that
+    is missed, the share of tissue taken for them, what flickers; PSNR and depth error of the model, always
+    under the recording's own mask.
+
+    \b
+    python -m benchmarks masks launch/d4d_pull.yaml launch/phantom.yaml --out benchmarks/results/masks.json
+    """
+    from benchmarks.quality import masks
+
+    paths, overrides = each_recording(launch, "masks")
+    methods = ["session", "classical", "none"]
+    if any(override.startswith("vision.tissue.path:=") for override in overrides):
+        methods.append("onnx")
+    rows = []
+    for path in paths:
+        for method in methods:
+            session = open_launched(path, [*overrides, *STEP, f"vision.tissue.method:={method}"])
+            with progress("playing") as advance:
+                rows.append(masks.measure_masks(session, advance))
+    return rows, [masks.table(rows)]
+
+
+@click.command("lengths")
+@launch_argument
+@measures
+def bench_lengths(launch: tuple[str, ...]) -> Measured:
+    """How exactly lengths and areas between anchors are measured, and whether the errors told are true.
+
+    Anchors are pinned at points of the phantom that its first frame shows. Every fifth frame distances, paths
+    of four and triangles between them are compared with the true ones; beside it the first frame's value,
+    unchanged.
+
+    \b
+    python -m benchmarks lengths source.seconds:=8 --out benchmarks/results/lengths.json
+    """
+    from benchmarks.quality import measuring
+
+    with progress("measuring") as advance:
+        measured = measuring.measure_lengths(step_by_step(launch, "lengths"), advance)
+    return measured, measuring.tables(measured)
+
+
+@click.command("registration")
+@folder_option("--ct", help="The pair of the Open-CAS set with its CT surface, too.")
+@shown("--seeds", type=click.IntRange(1), default=20, help="Phantoms, and errors of the picked points.")
+@measures
+def bench_registration(ct: Path | None, seeds: int) -> Measured:
+    """How exactly a model is placed on tissue, and whether the errors told are true.
+
+    A part of the phantom's surface, moved, is registered to what the node measures of it in a second, from
+    five pairs of points that are 1 mm off along each axis. Errors of five targets 20 mm below the surface:
+    by the pairs alone, after the fit to the surface, by Open3D's ICP from the same start; and how many are
+    within what was told. What must be refused is counted with its remedy.
+
+    \b
+    python -m benchmarks registration --ct $SAGS_DATA/tmi_ct_pair --out benchmarks/results/registration.json
+    """
+    from benchmarks.quality import registration
+
+    with progress("registering") as advance:
+        measured = registration.measure_registration(ct, seeds, advance)
+    return measured, registration.tables(measured)
+
+
+@click.command("deform")
+@shown("--seeds", type=click.IntRange(1), default=5, help="Phantoms.")
+@measures
+def bench_deform(seeds: int) -> Measured:
+    """How well a registered model follows tissue that is pulled.
+
+    A part of the phantom's surface, and the same 5, 10 and 20 mm below it, is held by anchors while the
+    surface is pulled by 10 mm and more: rigid, and bent with it (`deform: true`). Errors of its vertices to
+    the truth; below the surface that is an elastic half space, by definition. What the check of the residual
+    says of both.
+
+    \b
+    python -m benchmarks deform --out benchmarks/results/deform.json
+    """
+    from benchmarks.quality import deform
+
+    with progress("pulling") as advance:
+        measured = deform.measure_deform(seeds, advance)
+    return measured, deform.tables(measured)
+
+
+@click.command("instruments")
+@shown("--seeds", type=click.IntRange(1), default=4, help="Phantoms, each with other instruments before it.")
+@measures
+def bench_instruments(seeds: int) -> Measured:
+    """How exactly the topic `instruments` tells tips, axes and distances, and whether its confidence is true.
+
+    Instruments are put before the phantom, 5 to 40 mm from the tissue: one, two, crossing, and leaving the
+    picture. Beside them is the far end of the mask, at the depth of the tissue there, and at the depth that
+    the node's stereo finds on the instrument.
+
+    \b
+    python -m benchmarks instruments --out benchmarks/results/instruments.json
+    """
+    from benchmarks.quality import instruments
+
+    with progress("placing") as advance:
+        measured = instruments.measure_instruments(seeds, advance)
+    return measured, instruments.tables(measured)
