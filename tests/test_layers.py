@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1092,
     "sags_node/vision": 5530,
-    "tests": 47053,
+    "tests": 47034,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
