@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1093,
     "sags_node/vision": 5524,
-    "tests": 47103,
+    "tests": 47101,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
