@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1092,
     "sags_node/vision": 5444,
-    "tests": 47187,
+    "tests": 47185,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
