@@ -47,7 +47,7 @@ LINES = {
     "sags_node/instruments": 650,
     "sags_node/field": 1721,
     "sags_node/kernels": 1222,
-    "sags_node/mapping": 5651,
+    "sags_node/mapping": 5669,
     "sags_node/media": 864,
     "sags_node/messaging": 5341,
     "sags_node/model": 961,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1523,
     "sags_node/tools/importing": 1092,
     "sags_node/vision": 5444,
-    "tests": 47185,
+    "tests": 47210,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -12,6 +12,7 @@ from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.engine.losses.pieces import LEVEL
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.mapping.initialise import insert
+from sags_node.mapping.surface import surface_at
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, U8, Bool, Observation
@@ -57,8 +58,9 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
 
 def prune(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> int:
     """Remove what `prune_mask` says and `prune_to_budget`; returns how many."""
-    removed = model.remove(prune_mask(model, surface, depth_is_new, limit))
-    return removed + prune_to_budget(model, limit)
+    remove = prune_mask(model, surface, depth_is_new, limit)
+    removed = model.remove(remove)
+    return removed + prune_to_budget(model, shown(model, surface[~remove]), limit)
 
 
 def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> Bool:
@@ -80,15 +82,31 @@ def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: in
     return remove
 
 
-def prune_to_budget(model: GaussianModel, limit: int) -> int:
+def shown(model: GaussianModel, surface: F32) -> F32:
+    """How much each Gaussian shows, [N] px; infinite where nobody knows yet.
+
+    Of one that an instrument or other tissue hides it is the mean of all: it is seen again, and missed then.
+
+    Args:
+        surface: [N, 3] of `surface_at`.
+    """
+    z, measured = surface[:, 0], surface[:, 1]
+    behind = z > (1 + FRONT_TOLERANCE) * measured  # also where nothing is measured
+    hidden = (z > 0) & behind & (model.contribution < IDLE)
+    return np.where(hidden, np.float32(mean_contribution(model.contribution[~hidden])), model.contribution)
+
+
+def prune_to_budget(model: GaussianModel, contribution: F32, limit: int) -> int:
     """While there are more than `limit`, give up some of those that show least; returns how many.
 
     The others grow by the area that is given up, so that the tissue stays covered.
+
+    Args:
+        contribution: [N] of `shown`.
     """
     excess = min(model.count - limit, int(SHED * model.count))
     if excess <= 0:
         return 0
-    contribution = model.contribution
     least = np.argpartition(contribution, excess)[:excess]
     known = contribution[contribution < np.inf].sum()
     given_up = contribution[least]
@@ -125,24 +143,23 @@ def fill(
     return pixels, rows.stop - rows.start, given_up
 
 
-def give_up(model: GaussianModel, count: int) -> int:
+def give_up(model: GaussianModel, observation: Observation, count: int) -> int:
     """Remove `least_shown`; returns how many."""
-    return model.remove(least_shown(model, count))
+    return model.remove(least_shown(shown(model, surface_at(model.means, observation)), count))
 
 
-def least_shown(model: GaussianModel, count: int) -> Bool:
-    """[N] those up to `count` that show least, and little."""
-    remove = np.zeros(model.count, np.bool_)
-    contribution = model.contribution
-    little = LITTLE * mean_contribution(model)
+def least_shown(contribution: F32, count: int) -> Bool:
+    """[N] those up to `count` that show least, and little, by the `contribution` of `shown`."""
+    remove = np.zeros(len(contribution), np.bool_)
+    little = LITTLE * mean_contribution(contribution)
     least = np.argpartition(contribution, count)[:count]
     remove[least] = contribution[least] < little
     return remove
 
 
-def mean_contribution(model: GaussianModel) -> float:
-    """px, of those whose contribution is known; 0: of none."""
-    known = model.contribution[model.contribution < np.inf]
+def mean_contribution(contribution: F32) -> float:
+    """px, of those [N] whose contribution is known; 0: of none."""
+    known = contribution[contribution < np.inf]
     return float(known.mean()) if len(known) else 0.0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from enum import Enum, auto
+from functools import partial
 
 import numpy as np
 
@@ -193,7 +194,7 @@ class Mapper:
         # 5. Densify: new Gaussians in the holes. A full model gives up what shows least for them.
         pixels, inserted, given_up = densify.fill(
             self.model, self._deformation, planes, drawn, 7 * self._frames, limit, self._smoothing,
-            self._give_up,
+            partial(self._give_up, drawn),
         )  # fmt: skip
         self._refiner.take(slice(self.model.count - inserted, self.model.count))
         tiles = tiles_of(pixels, drawn.tissue)
@@ -208,10 +209,10 @@ class Mapper:
         self.step += iterations
         return {"inserted": inserted, "removed": removed + given_up, "iterations": iterations}
 
-    def _give_up(self, count: int) -> int:
+    def _give_up(self, observation: Observation, count: int) -> int:
         """`densify.give_up`, in the middle of a frame."""
         self._refiner.download()
-        removed = densify.give_up(self.model, count)
+        removed = densify.give_up(self.model, observation, count)
         self._refiner.take(self._all_rows)
         return removed
 

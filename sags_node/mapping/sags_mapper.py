@@ -240,7 +240,7 @@ class SagsMapper:
                 split_where_room(model, observation, as_view(planes, model, observation), limit)
                 _, inserted, given_up = densify.fill(
                     model, self._nodes, planes, frame.drawn, 7 * self._frames, limit, smoothing=True,
-                    give_up=partial(densify.give_up, model),
+                    give_up=partial(densify.give_up, model, frame.drawn),
                 )  # fmt: skip
                 removed += given_up
             self._take_over(frame.t_ns)

@@ -42,7 +42,7 @@ def split_worst(model: GaussianModel, observation: Observation, view: RenderedVi
         How many were split.
     """
     contribution = model.contribution
-    mean = mean_contribution(model)
+    mean = mean_contribution(contribution)
     score = np.zeros(model.count, np.float32)
     spare = np.zeros(model.count, np.bool_)
     _look(

@@ -1,5 +1,7 @@
 """The mapper's parts against known truth, and the mapper on pictures it must reproduce."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from recorded_session import both, frames_of, opened, psnr
@@ -194,8 +196,8 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
     model.contribution[:] = np.random.default_rng(0).uniform(2, 20, old)
     model.append(points, size, grey, 0.9)
     ids, shown, area = model.ids.copy(), model.contribution.copy(), shown_area(model)
-    assert densify.prune_to_budget(model, len(ids)) == 0
-    removed = densify.prune_to_budget(model, old // 2)
+    assert densify.prune_to_budget(model, model.contribution, len(ids)) == 0
+    removed = densify.prune_to_budget(model, model.contribution, old // 2)
     assert removed == len(ids) - model.count == int(densify.SHED * len(ids))
     gone = ~np.isin(ids, model.ids)
     assert not gone[old:].any()
@@ -203,7 +205,30 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
     # What is left covers as much as all did, in the share that each one shows of its area.
     assert shown_area(model) == pytest.approx(area, rel=1e-3)
     np.testing.assert_allclose(model.log_scales, np.log(model.scales), atol=1e-5)
-    assert densify.prune_to_budget(model, model.count - 1) == 1
+    assert densify.prune_to_budget(model, model.contribution, model.count - 1) == 1
+
+
+def test_where_the_machine_affords_fewer_hidden_tissue_stays_as_likely_as_what_is_seen() -> None:
+    """A third of the picture lies under an instrument: none of it shows, and each is as good as the mean."""
+    points = grid_points()
+    size, grey = np.full((len(points), 3), 2e-4, np.float32), np.full((len(points), 3), 0.5, np.float32)
+    model = GaussianModel(len(points))
+    model.append(points, size, grey, 0.9)
+    seen = observation()
+    tissue = seen.tissue.copy()
+    tissue[:, : tissue.shape[1] // 3] = False
+    now = replace(seen, tissue=tissue, depth=np.where(tissue, seen.depth, np.float32(0)))
+    surface = surface_at(model.means, now)
+    hidden = (surface[:, 0] > 0) & (surface[:, 1] == 0)
+    assert 0.2 < hidden.mean() < 0.5
+    model.contribution[:] = np.where(hidden, 0, np.random.default_rng(0).uniform(2, 20, model.count))
+    ids = model.ids.copy()
+    densify.prune(model, surface, False, model.count // 2)
+    gone = ~np.isin(ids, model.ids)
+    assert gone.any() and not gone[hidden].any()
+    assert not densify.least_shown(densify.shown(model, surface_at(model.means, now)), 10)[
+        np.isin(model.ids, ids[hidden])
+    ].any()
 
 
 def shown_area(model: GaussianModel) -> float:
@@ -218,10 +243,10 @@ def test_a_full_model_gives_up_what_shows_least_and_nothing_that_shows_much() ->
     model = GaussianModel(len(points))
     model.append(points, size, grey, 0.9)
     model.contribution[:] = np.linspace(10, 1, len(points))
-    prune_mask = densify.least_shown(model, 10)
+    prune_mask = densify.least_shown(model.contribution, 10)
     assert np.flatnonzero(prune_mask).tolist() == list(range(len(points) - 10, len(points)))
     model.contribution[:] = np.linspace(10, 5, len(points))
-    assert not densify.least_shown(model, 10).any()
+    assert not densify.least_shown(model.contribution, 10).any()
 
 
 def test_first_pixels_respect_the_limit_and_the_mask_and_fill_gaps() -> None:
