@@ -21,6 +21,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
 from sags_node.terminal import text
+from sags_node.terminal.console import tell, time_text
 from sags_node.tools.evaluation.lpips import BACKBONE, Lpips
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.provenance import machine_name
@@ -173,13 +174,15 @@ def fit_session(
 
 def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
     """All iterations that are left. Ctrl-C leaves a checkpoint, too."""
+    tell(f"{fit.total - fit.iteration} iterations take about {time_text(fit.seconds_left())}")
     saved = time.monotonic()
     try:
         while not fit.done:
             fit.iterate()
+            stage = "warming up" if fit.iteration < fit.warm_up else "fitting"
             if fit.iteration % SHOWN_EVERY == 0 or fit.done:
-                what = f"fitting, colours differ by {fit.residual:.4f}, {len(fit.model)} Gaussians"
-                advance(fit.iteration, fit.total, what)
+                what = f"{stage}, colours differ by {fit.residual:.4f}, {len(fit.model)} Gaussians"
+                advance(*fit.stage, what)
             if time.monotonic() - saved > CHECKPOINT_PERIOD:
                 checkpoint.save(fit, stored)
                 saved = time.monotonic()

@@ -21,13 +21,15 @@ from sags_node.types import F32, I64, Bool, Camera, Gaussians
 
 LOOK_BACK_NS = 200_000_000  # a prediction's velocity is the mean over this time
 FADE_NS = 150_000_000  # in which it falls to 1/e
+COLOR_DAMPING = 0.3  # px: a barely seen Gaussian changes its colour slowly
 
 
 class Rates(NamedTuple):
-    """Lengths of a step of Adam."""
+    """Lengths of a step: of Adam, and beside it of the closed-form one on colours and slopes."""
 
     rows: F32  # [14] of the canonical rows
     field: FieldRates
+    colors: float = 0.0  # relaxation over the loss's second derivative by a pixel's colour; 0: no such step
 
 
 class DeformableModel:
@@ -132,10 +134,33 @@ class DeformableModel:
         Gaussians that none of them saw stay as they are."""
         seen = torch.stack([drawing.contribution > 0 for drawing in drawings]).any(0)
         assert self.rows.grad is not None
+        if rates.colors:
+            self._solve_colors(drawings, rates.colors)
         row_rates = torch.from_numpy(rates.rows).to(self.device, non_blocking=True)
         self.adam.step(self.rows, self.rows.grad, row_rates, seen)
-        self.rows.grad = None
         self.field.deltas.step(rates.field)
+        self.forget()
+
+    def forget(self) -> None:
+        """Clear all gradients."""
+        deltas = self.field.deltas
+        for leaf in (self.rows, self.slopes, deltas.hexplane.cells, *deltas.decoder.parameters()):
+            if leaf is not None:
+                leaf.grad = None
+
+    @torch.no_grad()
+    def _solve_colors(self, drawings: Sequence[Drawing], length: float) -> None:
+        """A SIRT step on colours and slopes, whose bounds `mapping.optimiser.Optimiser` derives."""
+        assert self.rows.grad is not None
+        weight = torch.stack([drawing.contribution for drawing in drawings]).sum(0) + COLOR_DAMPING
+        step = (length / weight)[:, None]
+        color = columns.COLOR
+        self.rows[:, color] -= (step * self.rows.grad[:, color]).nan_to_num(0, 0, 0)
+        if self.slopes is not None:
+            assert self.slopes.grad is not None
+            spread = torch.stack([drawing.spread for drawing in drawings]).sum(0)
+            wide = (spread / weight - 1).clamp(min=1)[:, None]
+            self.slopes -= (step / (6 * wide) * self.slopes.grad).nan_to_num(0, 0, 0)
 
     def keep(self, kept: Bool) -> None:
         """Remove the Gaussians where `kept` [N] is False."""
@@ -146,11 +171,12 @@ class DeformableModel:
         self._take(np.arange(len(self)), rows, parents)
 
     def _take(self, kept: I64, rows: F32, parents: I64) -> None:
-        """The Gaussians in `kept`, then new ones."""
-        assert self.slopes is None  # only an online start has them, whose Gaussians are the mapper's
+        """The Gaussians in `kept`, then new ones, which have the slopes of their parents."""
         ids = np.arange(self.next_id, self.next_id + len(rows))
         self.ids, self.next_id = np.concatenate([self.ids[kept], ids]), self.next_id + len(rows)
         self.rows = self._leaf(np.concatenate([self.table[kept], rows]))
+        if self.slopes is not None:
+            self.slopes = self._leaf(self.slopes.detach().cpu().numpy()[np.concatenate([kept, parents])])
         known = torch.from_numpy(kept).to(self.device)
         self.adam = self.adam.rows(known).grown(len(rows))
         self.field.follow(self.means)

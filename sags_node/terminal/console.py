@@ -87,16 +87,29 @@ def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[C
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None, visible=False)
-        said = now()
+        said = began = now()
+        first, count = 0, 0  # where the count that runs began, and of how many it is
 
         def advance(done: int, total: int | None = None, description: str | None = None) -> None:
-            nonlocal said
+            nonlocal said, began, first, count
             bar.update(task, completed=done, total=total, description=description or what, visible=True)
-            if not console.is_terminal and now() - said >= SAY_EVERY:
-                said = now()
-                _print(f"{description or what}: {done}" + ("" if total is None else f" of {total}"))
+            if console.is_terminal:
+                return
+            moment, of = now(), total or 0
+            if of != count or done < first:
+                began, first, count = moment, done, of
+            if moment - said >= SAY_EVERY:
+                said = moment
+                left = (moment - began) / (done - first) * (of - done) if done > first and of else None
+                rest = "" if left is None else f", about {time_text(left)} left"
+                _print(f"{description or what}: {done}" + ("" if total is None else f" of {total}{rest}"))
 
         yield advance
+
+
+def time_text(seconds: float) -> str:
+    """How long something takes, as far as anybody can say beforehand."""
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
 def show(result: Table | str | dict[str, Any] | list[dict[str, Any]]) -> None:

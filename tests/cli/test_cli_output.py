@@ -330,13 +330,20 @@ def test_a_table_for_another_program_is_not_cut(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_where_no_terminal_is_progress_is_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
-    times = iter([0.0, 9.9, 10.0, 10.0, 19.9, 20.0, 20.0])
+    """With the time that is left, by what was done since the count began: another count is another work."""
+    times = iter([0.0, 5.0, 10.0, 19.9, 20.0, 21.0, 31.0])
     with terminal.progress("fitting", lambda: next(times)) as advance:
         for done in (1, 2, 3):
             advance(done, 9)
         advance(4, None, "drawing")
+        for done in (5, 10):
+            advance(done, 100, "measuring")
     said = [line.split(" ", 2)[2] for line in capsys.readouterr().err.splitlines()]
-    assert said == ["fitting: 2 of 9", "drawing: 4"]
+    assert said == [
+        "fitting: 2 of 9, about 35 s left",
+        "drawing: 4",
+        "measuring: 10 of 100, about 3 min left",
+    ]
 
 
 def every_command(group: click.Group, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

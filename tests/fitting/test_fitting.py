@@ -19,7 +19,7 @@ from command_line import figures_of
 from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.field.decoder import Decoder
-from sags_node.field.losses import compare
+from sags_node.field.losses import LossWeights, compare
 from sags_node.field.model import FADE_NS, LOOK_BACK_NS
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
@@ -30,7 +30,7 @@ from sags_node.tools.fitting.clip import Clip, read_clip
 from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.refined import RefinedModel
 from sags_node.tools.fitting.score import score, score_between, score_depth, score_tracks
-from sags_node.tools.fitting.settings import FieldShape, FitSettings, Units
+from sags_node.tools.fitting.settings import FieldShape, FitSettings, Growth, RowRates, Units
 from sags_node.tools.fitting.start import follow_online
 from sags_node.types import F32
 
@@ -38,6 +38,9 @@ SMALL = FitSettings(
     iterations=120, max_gaussians=3000, shape=FieldShape(cells=16, channels=16, frames_per_slot=12 / 7)
 )
 PAPER = dataclasses.replace(SMALL, schedule="paper", warm_up=60)
+STEEP = dataclasses.replace(
+    PAPER, slopes=True, color_softness=0.15, growth=Growth(first=2500, every=4, until=0.7)
+)
 QUICK_PATHS = 300  # steps of the regression: twelve frames are learnt sooner than a clip
 FRAMES = ["source.pace:=step", "source.loop:=false", "source.frames:=12"]
 
@@ -239,6 +242,25 @@ def test_an_iteration_of_several_frames_descends_on_all_of_them(clip: Clip) -> N
     assert (np.sign(moved) != -np.sign(slopes[0]))[clear].any()  # not those of one frame
 
 
+def test_the_step_on_colours_and_slopes_makes_no_picture_worse(clip: Clip) -> None:
+    """By its bound (`mapping.optimiser.Optimiser`), without a rate that somebody chose; slopes show more."""
+    still, alone = RowRates(0, 0, 0, 0, 0), LossWeights(inverse_depth=0, smoothness=0, depth_smoothness=0)
+    settings = dataclasses.replace(
+        PAPER, warm_up=40, iterations=0, rates=still, weights=alone, color_softness=0.15, slopes=True,
+        max_gaussians=800,
+    )  # fmt: skip
+    fit, residuals = fitted(clip, settings, iterations=0), []
+    while not fit.done:
+        fit.iterate()
+        residuals.append(fit.residual)
+    assert (np.diff(residuals) < 1e-6).all() and residuals[-1] < residuals[0]
+    frame, model = clip.train[0], fit.model
+    learnt = score(fit, [frame], {})["psnr"]
+    assert model.slopes is not None
+    model.slopes.detach()[:] = 0
+    assert score(fit, [frame], {})["psnr"] < learnt
+
+
 def test_the_number_of_gaussians_stays_under_its_cap(clip: Clip) -> None:
     often = dataclasses.replace(PAPER.growth, every=10)
     settings = dataclasses.replace(PAPER, max_gaussians=2000, warm_up=10, iterations=100, growth=often)
@@ -262,14 +284,17 @@ def _restarted(fit: Fit) -> Fit:
 
 
 @pytest.mark.parametrize(
-    "settings", [SMALL, dataclasses.replace(PAPER, tokens="nodes")], ids=["self", "nodes"]
+    "settings", [SMALL, dataclasses.replace(PAPER, tokens="nodes"), STEEP], ids=["self", "nodes", "slopes"]
 )
 def test_a_resumed_fit_gives_the_same_bits(clip: Clip, settings: FitSettings, tmp_path: Path) -> None:
+    """Also where Gaussians were split, and where somebody asked how long the rest takes."""
     settings = dataclasses.replace(settings, iterations=20, warm_up=5)
     whole = fitted(clip, settings, iterations=9)
     checkpoint.save(whole, tmp_path / "checkpoint.npz")
     resumed = Fit(clip, settings)
     checkpoint.load(resumed, tmp_path / "checkpoint.npz")
+    assert resumed.seconds_left() > 0
+    assert not settings.slopes or whole.split > 0
     for fit in (whole, resumed):
         while not fit.done:
             fit.iterate()

@@ -37,7 +37,7 @@ def test_the_released_preset_has_the_numbers_of_the_released_code() -> None:
     assert rates.mean_px * pixel == pytest.approx(1.6e-6, rel=0.02)
     assert rates.color == pytest.approx(2.5e-3 * SH_0, rel=1e-3)
     assert (rates.logit, rates.log_scale, rates.quat) == (0.05, 5e-3, 1e-3)
-    assert rates.decaying == ("means",)
+    assert rates.decaying == ("means",) and not RELEASED.slopes
     assert RELEASED.decay ** (RELEASED.iterations / 4000) == pytest.approx(0.0316, rel=1e-2)
     assert RELEASED.decay_over == 4000
     assert (growth.first, growth.every, growth.share) == (30_000, 300, 1.0)
@@ -83,6 +83,7 @@ def test_rates_fall_by_a_factor_all_along_or_in_a_line_at_the_end() -> None:
         ("stable=1.0", "below 1"),
         ("batch_size=0", "at least 1"),
         ("block=big", "adaptive"),
+        ("slopes=true", "color_softness"),
     ],
 )
 def test_a_change_that_cannot_be_says_why(change: str, said: str) -> None:

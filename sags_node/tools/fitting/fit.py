@@ -24,6 +24,7 @@ from sags_node.field.adam import RowAdam
 from sags_node.field.canvas import Canvas
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, Field, NodeField
+from sags_node.field.drawing import Drawing
 from sags_node.field.hexplane import for_clip
 from sags_node.field.losses import compare
 from sags_node.field.model import DeformableModel, Rates
@@ -44,6 +45,8 @@ REFINE_RATES = LearningRates()  # the mapper's, gentle: the start is good
 REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
 REFINE_RELAXATION = 1.6  # of the colour step: a frame is seen again after many others
 REFINE_DECAY = 0.1
+REST_RELAXATION = 0.9  # of the colour step of the paper's schedule in its warm-up, as the mapper's
+RELAXATION = 0.1  # of the same afterwards: colours are those of all frames, not of the last ones
 
 
 class Fit:
@@ -82,6 +85,8 @@ class Fit:
         self._rates = row_rates(settings.rates, pixel)
         self._decays = marked(settings.rates.decaying)
         self._refine_rates = self._rates.copy()
+        if settings.slopes:
+            self._rates[columns.COLOR] = 0  # which has its closed form
         self._refine_rates[columns.QUAT] = REFINE_RATES.quat
         self._refine_rates[columns.COLOR] = 0  # which has its closed form
         self._refine_rates[columns.LOGIT] = REFINE_RATES.opacity_logit
@@ -98,7 +103,8 @@ class Fit:
             on_device = self._device if isinstance(self._learning, Canvas) else None
             rows = pooled_rows(self.clip, exposure, settings, on_device)
             field = self._make_field(rows[:, columns.MEAN])
-            self.model = DeformableModel(rows, field, exposure, settings.antialias)
+            slopes = np.zeros((len(rows), 3), np.float32) if settings.slopes else None
+            self.model = DeformableModel(rows, field, exposure, settings.antialias, slopes)
         else:
             rows, slopes, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
             field = self._make_field(rows[:, columns.MEAN])
@@ -137,42 +143,69 @@ class Fit:
             self._descend()
         self.seconds += time.perf_counter() - started
 
+    def seconds_left(self) -> float:
+        """About how long the iterations that are left take here: one of each kind is begun, and not ended."""
+        rest = min(self.total - self.iteration, self.settings.iterations)
+        seconds = 0.0
+        for deformed, count in ((False, self.total - self.iteration - rest), (True, rest * self._batch)):
+            for _ in range(2 if count else 0):  # the first may have to compile kernels
+                started = time.perf_counter()
+                self._differentiated(self.clip.train[0], deformed)
+                float(self._residual)  # waits for the device
+                took = time.perf_counter() - started
+            seconds += count * took if count else 0.0
+        self.model.forget()
+        return seconds
+
+    def _differentiated(self, frame: ClipFrame, deformed: bool) -> Drawing:
+        """A training frame, drawn and compared; all that is learnt has the gradients of that."""
+        if isinstance(self.model, RefinedModel):
+            drawing = self.model.draw_to_refine(self.rasterizer, frame.t_capture_ns, frame.camera)
+            self._residual = tissue_loss(
+                drawing.planes.detach().numpy(), frame.image, frame.tissue, frame.depth, self._v_planes,
+                self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
+            )  # fmt: skip
+            drawing.differentiate(self._v_planes, self._weight)
+            return drawing
+        drawing = self.model.draw(self._learning, frame.t_capture_ns, frame.camera, deformed)
+        image, tissue, depth = self._tensors(frame)
+        found = compare(
+            drawing.planes, image, tissue, depth, self._unseen, self.settings.weights,
+            self.settings.color_softness,
+        )  # fmt: skip
+        gain = float(self.model.exposure.at(frame.t_capture_ns).mean())
+        drawing.differentiate(found.loss, found.weight * gain**2)  # of a colour before exposure
+        self._residual = found.terms["color"].detach()
+        return drawing
+
     def _descend(self) -> None:
         """A step of the paper's schedule."""
-        deformed = self.iteration >= self.warm_up
+        settings, deformed = self.settings, self.iteration >= self.warm_up
+        frames = [self._next_frame() for _ in range(self._batch)] if deformed else self.clip.train[:1]
         drawings = []
-        for _ in range(self.settings.batch_size if deformed else 1):
-            frame = self._next_frame() if deformed else self.clip.train[0]
-            drawing = self.model.draw(self._learning, frame.t_capture_ns, frame.camera, deformed)
-            image, tissue, depth = self._tensors(frame)
-            found = compare(
-                drawing.planes, image, tissue, depth, self._unseen, self.settings.weights,
-                self.settings.color_softness,
-            )  # fmt: skip
-            drawing.differentiate(found.loss, found.weight)
-            self._density.observe(drawing.v_means, drawing.contribution)
-            drawings.append(drawing)
-        self._residual = found.terms["color"].detach()
-        share = self.settings.rate_share(*self._stage)
+        for frame in frames:
+            drawings.append(self._differentiated(frame, deformed))
+            self._density.observe(drawings[-1].v_means, drawings[-1].contribution)
+        share = settings.rate_share(*self.stage)
+        colors = 0.0
+        if settings.slopes:
+            relaxation = share * (RELAXATION if deformed else REST_RELAXATION)
+            pixels = float(np.mean([np.count_nonzero(frame.tissue) for frame in frames]))
+            colors = relaxation * 3 * pixels * settings.color_softness / settings.weights.color
         rates = Rates(
-            self._rates * np.float32(share) ** self._decays, self.settings.field_rates.scaled(share)
+            self._rates * np.float32(share) ** self._decays, settings.field_rates.scaled(share), colors
         )
         self.model.descend(drawings, rates)
         self.iteration += 1
-        growth = self.settings.growth
+        growth = settings.growth
         if self.iteration % growth.every == 0 and self._progress() < growth.until:
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
 
     def _refine(self, model: RefinedModel) -> None:
         """A step of the joint refinement after the online pass."""
-        share, frame = REFINE_DECAY ** self._progress(), self._next_frame()
-        drawing = model.draw_to_refine(self.rasterizer, frame.t_capture_ns, frame.camera)
-        self._residual = tissue_loss(
-            drawing.planes.detach().numpy(), frame.image, frame.tissue, frame.depth, self._v_planes,
-            self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
-        )  # fmt: skip
-        drawing.differentiate(self._v_planes, self._weight)
+        share = REFINE_DECAY ** self._progress()
+        drawing = self._differentiated(self._next_frame(), deformed=True)
         model.refine(
             drawing,
             self._refine_rates * np.float32(share),
@@ -208,10 +241,11 @@ class Fit:
         remembered = {"rows": [model.adam], "cells": [deltas.hexplane.adam]}
         if isinstance(model.field, NodeField):
             found |= {"index": _array(model.field.index), "weight": _array(model.field.weight)}
-        if isinstance(model, RefinedModel) and model.slopes is not None:
+        if model.slopes is not None:
+            found["slopes"] = _array(model.slopes)
+        if isinstance(model, RefinedModel):
             residuals = model.residuals
             found |= {"residuals": residuals.values, "residuals.times": residuals.times_ns}
-            found["slopes"] = model.slopes.detach().numpy()
             remembered["residuals"] = residuals.adam
         for name, states in remembered.items():
             found[f"{name}.moments"] = np.stack([_array(adam.moments) for adam in states])
@@ -249,7 +283,7 @@ class Fit:
             residuals.adam = [AdamState(*each) for each in remembered]
             self.model = RefinedModel(rows, field, exposure, smooth, arrays["slopes"], residuals)
         else:
-            self.model = DeformableModel(rows, field, exposure, smooth)
+            self.model = DeformableModel(rows, field, exposure, smooth, arrays.get("slopes"))
         model, deltas = self.model, field.deltas
         if isinstance(field, NodeField):
             field.attach(torch.from_numpy(arrays["index"]), torch.from_numpy(arrays["weight"]))
@@ -279,11 +313,15 @@ class Fit:
 
     def _progress(self) -> float:
         """How far the stage is, 0..1; each stage has its own schedule."""
-        done, of = self._stage
+        done, of = self.stage
         return done / max(1, of)
 
     @property
-    def _stage(self) -> tuple[int, int]:
+    def _batch(self) -> int:
+        return self.settings.batch_size if self.settings.schedule == "paper" else 1
+
+    @property
+    def stage(self) -> tuple[int, int]:
         """Iterations of the stage that are done, and all it has."""
         if self.iteration < self.warm_up:
             return self.iteration, self.warm_up

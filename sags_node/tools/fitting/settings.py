@@ -65,7 +65,7 @@ class RowRates:
     mean_px: float = 0.08  # in px at the tissue's median depth
     log_scale: float = 5e-3
     quat: float = 1e-3
-    color: float = 2.5e-3  # of RGB 0..1
+    color: float = 2.5e-3  # of RGB 0..1; without slopes, beside which colours have a closed form
     logit: float = 0.05
     decaying: tuple[Part, ...] = PARTS  # those that fall with the field's; the others stay
 
@@ -106,13 +106,16 @@ class FitSettings:
     batch_size: int = 1  # frames of an iteration, whose losses are added; only with schedule = paper
     weights: LossWeights = STEREO  # only with schedule = paper
     color_softness: float = 0.0  # of RGB 0..1, see `field.losses.compare`; only with schedule = paper
+    # Whether Gaussians have slopes of luminance (`types.Gaussians`), which are learnt with canonical colours
+    # in closed form; only with schedule = paper. An online start always has them.
+    slopes: bool = False
     smooth_everywhere: bool = False  # False: the two kinds of smoothness are for what no frame shows
 
     def __post_init__(self) -> None:
         """
         Raises:
             UsageError: the block is an MLP, but its tokens attend to each other; `stable` is no share;
-                `batch_size` is below 1.
+                `batch_size` is below 1; slopes without a soft loss, which alone has a second derivative.
         """
         if self.block == "mlp" and self.tokens != "self":
             raise UsageError(
@@ -122,6 +125,8 @@ class FitSettings:
             raise UsageError(f"stable is a share of a stage from 0 to below 1, not {self.stable}")
         if self.batch_size < 1:
             raise UsageError(f"batch_size is at least 1 frame, not {self.batch_size}")
+        if self.slopes and not (self.color_softness > 0 and self.weights.color > 0):
+            raise UsageError("slopes need a color_softness and a weights.color above 0, or set slopes=false")
 
     def rate_share(self, done: int, of: int) -> float:
         """The rate share of rates that decay: the share that is left after `done` of a stage's iterations."""
@@ -138,13 +143,14 @@ PAPER = FitSettings(
     tokens="self",
     iterations=3000,
     shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
-    rates=RowRates(mean_px=0.16, log_scale=1e-2, color=5e-3),
+    rates=RowRates(mean_px=0.16, log_scale=1e-2, quat=5e-3, color=5e-3, logit=0.015),
     field_rates=FieldRates(cells=2.5e-2, decoder=5e-4, lines=5e-2),
     decay=0.03,
     stable=0.7,
     growth=Growth(first=60_000, opacity=0.9, scale=0.6, share=0.15),
     batch_size=2,
     color_softness=0.15,  # more than most differences
+    slopes=True,
 )
 # Each number as in the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).
 # Their SH degree is 3: with one camera that stands still this is a second rate for the same colours, and is
