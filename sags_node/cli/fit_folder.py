@@ -208,7 +208,7 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
     if depth is not None:
         lines["depth"] = f"{depth['median_mm']:.2f} mm off (median), on {depth['frames']} frames"
     if track is not None:
-        lines["points"] = f"{track['median_mm']:.2f} mm off (median); {track['lost']:.0%} lost"
+        lines["points"] = f"{track['median_mm']:.2f} mm off (median); {track['lost']:,} times given up"
     size = f"{found['gaussians']:,} Gaussians (at most {found['cap']:,})"
     where = "" if found["device"] == "cpu" else f" on {found['device']}"
     lines["model"] = f"{size}, fitted in {found['seconds']:.0f} s{where}"
