@@ -393,10 +393,12 @@ def test_the_cpu_is_ready_to_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
             made.append(config.device)
 
         def process(self, given: StereoFrame, *_: Any) -> Any:
-            return SimpleNamespace(views={"left": given.left})
+            observation = SimpleNamespace(gray=given.left)
+            return SimpleNamespace(views={"left": SimpleNamespace(camera=None)}, observation=observation)
 
     monkeypatch.setattr(warm_up, "Pipeline", Noted)
     monkeypatch.setattr(warm_up, "InstrumentFinder", lambda: lambda left, view: None)
+    monkeypatch.setattr(warm_up.Instruments, "update", lambda *_: None)
     warm_up.warm_up(LaunchConfig(device="cuda"))
     assert made == ["cpu", "cuda"]
 

@@ -255,6 +255,6 @@ def test_clocks_that_differ_are_told_and_can_be_set(ahead_ms: int, tmp_path: Pat
 def test_eyes_that_are_not_of_one_moment_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, skew_ms=16.4))
     said = "right pictures were taken 16.4 ms after the left ones"
-    assert any(said in finding.what and finding.level == "warning" for finding in check_folder(path))
-    open_session(path)
+    open_session(path)  # says it once in a process; a check says it in its own way
     assert said in caplog.text
+    assert any(said in finding.what and finding.level == "warning" for finding in check_folder(path))
