@@ -123,11 +123,13 @@ def completed(
     missing = {group for group in MEANS if summary[group] is None}
     if summary["settings"]["depth_reference"] is not None:
         missing.discard("stereo")
+    followed = any(row.track is not None for row in found.rows)
     rows = []
     for row in found.rows:
         also = more.get(row.frame_id, row)
         figures = {group: also.figures[group] for group in missing & also.figures.keys()}
-        rows.append(replace(row, figures=row.figures | figures, track=row.track or also.track))
+        track = row.track if followed else also.track
+        rows.append(replace(row, figures=row.figures | figures, track=track))
     summary |= rounded({**quality(rows, options, session.config.segments), **told})
     return replace(found, rows=rows)
 
