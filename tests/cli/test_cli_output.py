@@ -242,7 +242,7 @@ NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says what is 
     "a video cut short": (
         ("VIDEOS", "source.right:=FILES/short.mp4"),
         "source",
-        "short.mp4 ends after 6 frames",
+        "short.mp4 has 6 pictures",
     ),
     "a calibration": (("VIDEOS", "rig:=FILES/gone"), "calibration", "gone/left.yaml"),
     "a calibration of another size": (("VIDEOS", "rig:=FILES/double"), "calibration", "640x512"),

@@ -39,7 +39,7 @@ def test_each_operation_has_its_role(node: RunningNode) -> None:
     names = str(refused.value).split("this node knows: ")[1].split(", ")
     assert len(names) > 15
     for name in names:
-        reads = name == "ping" or name.startswith("get_")
+        reads = name in ("ping", "measure") or name.startswith("get_")
         writes = "recording" in name or "save" in name or "snapshot" in name
         assert needed(name) == ("listen" if reads else "files" if writes else "control"), name
 
