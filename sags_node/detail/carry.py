@@ -34,7 +34,7 @@ NOWHERE = -1e6  # px
 FINDINGS = 3  # of a ray's place in the source, each from where the last one met its surface
 CLOSE = 1e-3  # of the depth: nearer to that surface it is found
 LITTLE = 3.0  # px of motion from one frame to the next: depths at edges differ by more than SAME all the same
-BAND = 16  # places, one below the other
+BAND = 32  # places, one below the other
 _STILL = np.zeros((4, 1, 1), np.float32)
 f4 = np.float32
 u8 = np.uint64
@@ -52,7 +52,7 @@ class Trace:
     """Where a view's tissue was in a source's picture: for the pixels of `coarse_camera`, and one more
     on each side."""
 
-    places: F32  # [m + 2, n + 2, 2] u and v, px of the picture; `NOWHERE`: not in it
+    places: F32  # [m + 2, n + 2, 2] u and v, px of `SeenFrame.lent`; `NOWHERE`: not in it
     share: U8  # [m + 2, n + 2] 0..255 of the picture in the view
 
 
@@ -80,7 +80,7 @@ def trace(
     Args:
         depth: [m, n] m of the view, as `every_fourth` has it; 0 unknown.
         small: the coarse camera of the view.
-        lent: [H', W', 4] of `SeenFrame.lent`.
+        lent: of `SeenFrame.lent`.
         motion: [4, m, n] of `SmallDrawings.motion`; None: nothing has moved.
         tiles: [rows, columns] 0..1 over the source's picture: the share that it deserves.
         unsure: of each pixel that the tissue has moved, so many are doubtful: the share falls with them.
@@ -89,7 +89,7 @@ def trace(
         wanted: [m, n] 0 where nothing is to be carried, nor beside it.
     """
     T = source.camera.viewmat @ small.T_world_cam
-    size = lent.shape[1::-1]
+    size = lent.shape[1] - 2, lent.shape[0] - 2
     K = scale_intrinsics(source.camera.K, (source.camera.width, source.camera.height), size)
     rays = np.array([1 / small.K[0, 0], small.K[0, 2], 1 / small.K[1, 1], small.K[1, 2]], f4)
     eye = np.array([K[0, 0], K[0, 2], K[1, 1], K[1, 2], *size], f4)
@@ -129,7 +129,7 @@ def _trace_row(
         j = min(max(x - 1, 0), depth.shape[1] - 1)
         ray_x, z = (f4(x - 1) - rays[1]) * rays[0], depth[i, j]
         if wanted[min(j, np.int64(len(wanted) - 1))] == np.uint8(0):
-            places[x, 0], places[x, 1] = eye[0] * ray_x + eye[1], eye[2] * ray_y + eye[3]
+            places[x, 0], places[x, 1] = eye[0] * ray_x + eye[1] + f4(1), eye[2] * ray_y + eye[3] + f4(1)
             share[x] = np.uint8(0)
             continue
         part, lag, told, near = f4(0), f4(0), True, False
@@ -165,7 +165,7 @@ def _trace_row(
         elif (unmoved and lag < f4(LITTLE)) or was == f4(0) or abs(was - c) < f4(SAME) * c:
             doubt = unsure * lag
             part = _between(tiles, across, down) / (f4(1) + doubt * doubt)
-        places[x, 0], places[x, 1] = u, v
+        places[x, 0], places[x, 1] = u + f4(1), v + f4(1)
         share[x] = np.uint8(np.int64(f4(255) * part + f4(0.5)))
 
 
@@ -190,7 +190,7 @@ def carry(
     Args:
         shown: [H, W, 3] RGB of the view; written.
         taken: [H, W] the share that each pixel got, 0..255; written. Pixels that have one already stay.
-        lent: [H', W', 4] of `SeenFrame.lent`.
+        lent: of `SeenFrame.lent`.
         gain: [3] factor that brings the source's light to that of the view.
         tint: [m, n, 3] for the coarse camera: added to the picture, in the place of colours 0..1.
     """
@@ -203,13 +203,10 @@ def carry(
         top, left = max(EVERY * (begin + row - 2), 0), max(EVERY * (column - 2), 0)  # px that they reach
         free = taken[top : EVERY * (begin + row + rows), left : EVERY * (column + columns)]
         by_pixel = partial(_by_pixel, top=top, left=left, size=free.shape)
-        places = by_pixel(traced.places)
-        found = cv2.remap(lent, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        found = cv2.remap(lent, by_pixel(traced.places), None, cv2.INTER_LINEAR)
         if more is not None:
             found = cv2.add(found, by_pixel(more), dtype=cv2.CV_8U)
         tissue = cv2.compare(cv2.extractChannel(found, 3), 127, cv2.CMP_GT)
-        inside = cv2.inRange(places, (-0.5, -0.5), (lent.shape[1] - 0.5, lent.shape[0] - 0.5))
-        tissue = cv2.bitwise_and(tissue, inside)
         share = cv2.bitwise_and(by_pixel(traced.share), cv2.compare(free, 0, cv2.CMP_EQ), mask=tissue)
         paste(cv2.cvtColor(found, cv2.COLOR_RGBA2RGB), share, shown[top:], left, gain)
         cv2.max(free, share, dst=free)

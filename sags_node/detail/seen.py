@@ -74,7 +74,8 @@ class SeenFrame:
         return found
 
     def lent(self, focal_px: float, sure: bool = False) -> U8:
-        """Its picture with what it shows tissue in, [H, W, 4]: red, green, blue, and 255: tissue.
+        """Its picture with the tissue that it shows, [1 + H + 1, 1 + W + 1, 4]: RGB, and 255: tissue.
+        Around it the colours of its edge are repeated, and there is no tissue.
 
         Args:
             focal_px: of a view: no finer than that shows is the picture.
@@ -94,6 +95,8 @@ class SeenFrame:
                 picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
                 tissue = cv2.resize(tissue, size, interpolation=cv2.INTER_NEAREST)
             packed = cv2.cvtColor(picture, cv2.COLOR_RGB2RGBA)
+            packed = cv2.copyMakeBorder(packed, 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+            tissue = cv2.copyMakeBorder(tissue, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=(0.0,))
             self._lent[key] = np.asarray(cv2.insertChannel(tissue, packed, 3))
         return self._lent[key]
 
