@@ -60,7 +60,9 @@ def prune(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) ->
     """Remove what `prune_mask` says and `prune_to_budget`; returns how many."""
     remove = prune_mask(model, surface, depth_is_new, limit)
     removed = model.remove(remove)
-    return removed + prune_to_budget(model, shown(model, surface[~remove]), limit)
+    if model.count > limit:
+        removed += prune_to_budget(model, shown(model, surface[~remove]), limit)
+    return removed
 
 
 def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> Bool:

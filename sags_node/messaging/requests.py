@@ -18,6 +18,7 @@ MAX_VIEW_SIDE = 1920  # px
 MAX_VIEW_PIXELS = 1920 * 1200  # of each eye
 MAX_VIEW_HZ = 60.0
 MAX_AHEAD_MS = 1000.0
+MAX_MEASURED = 256  # anchors: the mapping thread does it
 MAX_DISTANCE = 10.0  # m from the world's origin or the left camera
 
 Row = tuple[float, ...]
@@ -56,7 +57,7 @@ class AnchorName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MeasureRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`measure`: the anchors along a way, or around an area."""
 
-    anchors: tuple[int, ...]
+    anchors: Annotated[tuple[int, ...], msgspec.Meta(max_length=MAX_MEASURED)]
     area: bool = False
 
 
