@@ -287,7 +287,7 @@ def _points(figures: Flat) -> str:
     """Beside true points, else by those that were followed forth and back."""
     for group, more in (("track", ()), ("forth_back", _RETURNED)):
         lost = f"{group}.lost"
-        said = _said(figures, *_off(group), *more, (lost, "; {:.0%} given up (no Gaussian near)"))
+        said = _said(figures, *_off(group), *more, (lost, "; {:.0%} given up (the Gaussians near them are gone)"))
         if said or figures.get(lost) is not None:
             return said or "all given up"
     return ""
