@@ -34,7 +34,7 @@ NOWHERE = -1e6  # px
 FINDINGS = 3  # of a ray's place in the source, each from where the last one met its surface
 CLOSE = 1e-3  # of the depth: nearer to that surface it is found
 LITTLE = 3.0  # px of motion from one frame to the next: depths at edges differ by more than SAME all the same
-BAND = 32  # places, one below the other
+MIDDLE = 128  # of the levels of a picture: for tints
 _STILL = np.zeros((4, 1, 1), np.float32)
 f4 = np.float32
 u8 = np.uint64
@@ -194,22 +194,21 @@ def carry(
         gain: [3] factor that brings the source's light to that of the view.
         tint: [m, n, 3] for the coarse camera: added to the picture, in the place of colours 0..1.
     """
-    more = None if tint is None else np.pad(tint * f4(255), ((1, 1), (1, 1), (0, 1)), mode="edge")
-    # The boxes around what is to be carried, band by band: one around all of it would hold much that is not.
-    for begin in range(0, len(traced.share), BAND):
-        column, row, columns, rows = cv2.boundingRect(traced.share[begin : begin + BAND])
-        if not columns:
-            continue
-        top, left = max(EVERY * (begin + row - 2), 0), max(EVERY * (column - 2), 0)  # px that they reach
-        free = taken[top : EVERY * (begin + row + rows), left : EVERY * (column + columns)]
-        by_pixel = partial(_by_pixel, top=top, left=left, size=free.shape)
-        found = cv2.remap(lent, by_pixel(traced.places), None, cv2.INTER_LINEAR)
-        if more is not None:
-            found = cv2.add(found, by_pixel(more), dtype=cv2.CV_8U)
-        tissue = cv2.compare(cv2.extractChannel(found, 3), 127, cv2.CMP_GT)
-        share = cv2.bitwise_and(by_pixel(traced.share), cv2.compare(free, 0, cv2.CMP_EQ), mask=tissue)
-        paste(cv2.cvtColor(found, cv2.COLOR_RGBA2RGB), share, shown[top:], left, gain)
-        cv2.max(free, share, dst=free)
+    column, row, columns, rows = cv2.boundingRect(traced.share)
+    if not columns:
+        return
+    top, left = max(EVERY * (row - 2), 0), max(EVERY * (column - 2), 0)  # px that they reach
+    free = taken[top : EVERY * (row + rows), left : EVERY * (column + columns)]
+    by_pixel = partial(_by_pixel, top=top, left=left, size=free.shape)
+    found = cv2.remap(lent, by_pixel(traced.places), None, cv2.INTER_LINEAR)
+    if tint is not None:
+        levels = np.rint(np.pad(tint, ((0, 0), (0, 0), (0, 1))) * f4(255)) + f4(MIDDLE)
+        more = cv2.copyMakeBorder(np.clip(levels, 0, 255).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+        found = cv2.addWeighted(found, 1, by_pixel(more), 1, -MIDDLE)
+    tissue = cv2.compare(cv2.extractChannel(found, 3), 127, cv2.CMP_GT)
+    share = cv2.bitwise_and(by_pixel(traced.share), cv2.compare(free, 0, cv2.CMP_EQ), mask=tissue)
+    paste(cv2.cvtColor(found, cv2.COLOR_RGBA2RGB), share, shown[top:], left, gain)
+    cv2.max(free, share, dst=free)
 
 
 def _by_pixel(coarse: Any, top: int, left: int, size: tuple[int, int]) -> Any:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sags_node.detail.seen import SeenFrame
+from sags_node.detail.seen import MatchedDepth, SeenFrame
 from sags_node.types import F32, Gaussians
 
 EVERY = 0.2  # s between frames that are kept
@@ -52,17 +52,17 @@ class Matched:
     """Keeps what stereo measured last, beside what the model had there: not every frame is matched."""
 
     def __init__(self) -> None:
-        self._last: tuple[F32, F32] | None = None
+        self._last: MatchedDepth | None = None
         self._when_ns = 0
 
-    def __call__(self, now_ns: int, drawn: F32, measured: F32) -> tuple[F32, F32] | None:
-        """The newest pair of both, for `SeenFrame.matched`; None: there is none of a moment ago.
+    def __call__(self, now_ns: int, drawn: F32, measured: F32) -> MatchedDepth | None:
+        """The newest of both, for `SeenFrame.matched`; None: there is none of a moment ago.
 
         Args:
             drawn, measured: [h, w] m of this frame, 0 unknown.
         """
         if measured.any():
-            self._last, self._when_ns = (drawn, measured), now_ns
+            self._last, self._when_ns = MatchedDepth(drawn, measured), now_ns
         return self._last if 0 <= now_ns - self._when_ns <= MATCHED * 1e9 else None
 
 

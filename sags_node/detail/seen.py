@@ -14,7 +14,30 @@ from sags_node.types import F32, I64, U8, Bool, Camera, Gaussians, Shown
 
 MARGIN = np.ones((5, 5), np.uint8)  # px of the working size: nearer to a mask's edge an instrument may shine
 SAME = 0.04  # of the depth: nearer to each other, two depths are of one surface
-AROUND = (9, 9)  # px of the working size, over which the model's error of depth is averaged
+FINER = 2  # px of the working size: of every so many along both axes the model's error of depth is known,
+AROUND = (5, 5)  # and averaged over so many of these
+
+
+@dataclass(frozen=True)
+class MatchedDepth:
+    """What stereo measured in a frame, and what the model had there."""
+
+    drawn: F32  # [h, w] m, 0 unknown
+    measured: F32  # [h, w] m, 0 unknown
+
+    @cached_property
+    def finer(self) -> F32:
+        """[h / FINER, w / FINER] the factors that bring the one to the other, averaged."""
+        height, width = self.drawn.shape
+        size = -(-width // FINER), -(-height // FINER)
+        drawn, measured = (
+            cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST) for depth in (self.drawn, self.measured)
+        )
+        error = measured - drawn
+        known = ((drawn > 0) & (measured > 0) & (np.abs(error) < np.float32(SAME) * drawn)).astype(np.float32)
+        part = np.divide(error * known, drawn, out=np.zeros_like(drawn), where=drawn > 0)
+        part, around = cv2.blur(part, AROUND), cv2.blur(known, AROUND)
+        return np.asarray(1 + np.divide(part, around, out=np.zeros_like(part), where=around > 0))
 
 
 @dataclass(frozen=True)
@@ -27,7 +50,7 @@ class SeenFrame:
     picture: Callable[[], U8]  # [H, W, 3] RGB of the left eye as it is published; made when it is asked for
     mask: Bool  # [h, w] tissue
     depth: F32  # [h, w] m, of the model drawn for it; 0 unknown
-    matched: tuple[F32, F32] | None = None  # that depth, and the measured one, of a moment ago
+    matched: MatchedDepth | None = None  # of a moment ago
     whole: Shown | None = None  # its left view: lends what is hidden, too
     _lent: dict[tuple[int, bool], U8] = field(default_factory=dict, init=False, repr=False)
 
@@ -49,12 +72,7 @@ class SeenFrame:
         if self.matched is None:
             return self.depth
         size = self.depth.shape[::-1]
-        drawn, measured = (cv2.resize(d, size, interpolation=cv2.INTER_NEAREST) for d in self.matched)
-        error = measured - drawn
-        known = ((drawn > 0) & (measured > 0) & (np.abs(error) < np.float32(SAME) * drawn)).astype(np.float32)
-        part = np.divide(error * known, drawn, out=np.zeros_like(drawn), where=drawn > 0)
-        part, around = cv2.blur(part, AROUND), cv2.blur(known, AROUND)
-        finer: F32 = self.depth * (1 + np.divide(part, around, out=np.zeros_like(part), where=around > 0))
+        finer: F32 = self.depth * cv2.resize(self.matched.finer, size, interpolation=cv2.INTER_LINEAR)
         return finer
 
     @cached_property

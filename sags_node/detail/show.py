@@ -14,11 +14,12 @@ from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.share import Share
 from sags_node.engine.rasterizer.views import to_view
-from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.mapping.right_eye import coarse_right_eye_mask
 from sags_node.model.gaussians import for_right_eye
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 
 LESSON_EVERY = 4  # frames: what lessons teach changes slowly, and each costs a small view
+ASIDE_EVERY = 12  # frames: the same of what another eye teaches
 LOOKED_AT = 4  # px: every so many along both axes tell how well pictures are carried
 COMPARED = 8  # px, how sharp a picture is beside the model
 AROUND = np.ones((5, 5), np.uint8)  # px of the working size: what is seen there is made as if hidden, too
@@ -162,8 +163,7 @@ class Detail:
             right: [H, W, 3] the right picture, as it is published.
             baseline: m.
         """
-        known = now.depth[now.mask & (now.depth > 0)]
-        where = right_eye_mask(now.mask, known, float(now.camera.K[0, 0]), baseline)
+        where = coarse_right_eye_mask(now.mask, now.depth, float(now.camera.K[0, 0]), baseline)
         camera, truth, where = _sampled(now.camera.moved_right(baseline), right, where)
         drawn, depth = self._drawn(for_right_eye(now.gaussians, snapshot), camera)
         carried = _carried(drawn, depth, camera, now, None, tint=self.tint(snapshot, now.gaussians, camera))
@@ -226,10 +226,10 @@ def _loss_by_pixel(frame: SeenFrame, drawn: U8) -> float:
 
 def _in_light_of(drawn: U8, picture: U8, where: Bool) -> U8:
     """A picture with mean and contrast of the drawn one, channel by channel: eyes differ in both."""
-    if not where.any():
-        return picture
-    seen, shown = picture[where].astype(f4), drawn[where].astype(f4)
-    spread = seen - seen.mean(0)
-    gain = (spread * (shown - shown.mean(0))).sum(0) / np.maximum((spread * spread).sum(0), f4(1))
-    alike = (picture - seen.mean(0)) * gain + shown.mean(0) + f4(0.5)
-    return np.asarray(np.clip(alike, 0, 255).astype(np.uint8))
+    mask = where.view(np.uint8)
+    mean, shown_mean = np.array(cv2.mean(picture, mask)[:3]), np.array(cv2.mean(drawn, mask)[:3])
+    spread = (picture - mean.astype(f4)) * where[..., None]
+    squares = np.einsum("ijk,ijk->k", spread, spread)
+    gain = np.einsum("ijk,ijk->k", spread, drawn - shown_mean.astype(f4)) / np.maximum(squares, 1)
+    offset = shown_mean - gain * mean
+    return np.asarray(cv2.transform(picture, np.column_stack([np.diag(gain), offset])))

@@ -7,6 +7,7 @@ import numpy as np
 from sags_node.types import F32, Bool
 
 FAR_MARGIN = 0.1  # of the disparity, below the furthest tissue drawn
+COARSE = 4  # px: a mask this coarse keeps within the margins
 NEAR_MARGIN = 0.5  # of the disparity, above the nearest: instruments come in between tissue and camera
 
 
@@ -38,3 +39,14 @@ def right_eye_mask(tissue: Bool, depths: F32, focal_px: float, baseline: float) 
     np.cumsum(~tissue, axis=1, out=others[:, 1:])
     mask[:, :columns] = others[:, highest + 1 : highest + 1 + columns] == others[:, lowest : lowest + columns]
     return mask
+
+
+def coarse_right_eye_mask(tissue: Bool, depth: F32, focal_px: float, baseline: float) -> Bool:
+    """`right_eye_mask` of every `COARSE` th pixel along both axes, [h, w].
+
+    Args:
+        depth: [H, W] m, as it is drawn for the left eye; 0 unknown.
+    """
+    tissue = tissue[::COARSE, ::COARSE]
+    known = depth[:: 2 * COARSE, :: 2 * COARSE][tissue[::2, ::2]]
+    return right_eye_mask(tissue, known[known > 0], focal_px / COARSE, baseline)

@@ -21,14 +21,14 @@ from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.engine.rasterizer.views import to_view
 from sags_node.kernels.jit import PIECE, kernel, parallel_kernel
 from sags_node.mapping.mapped import Mapped
-from sags_node.mapping.right_eye import right_eye_mask
+from sags_node.mapping.right_eye import COARSE, coarse_right_eye_mask
 from sags_node.model.gaussians import GaussianModel, for_right_eye
 from sags_node.types import F32, U8, Bool, Camera, Colours, Gaussians, RenderedView
 
-LEARNING = 0.5  # of what a Gaussian lacks in the right eye, taken in from every other frame
-FADING = 0.94  # in two frames, of what was not seen again: a highlight of a second ago lies elsewhere by now
+LEARN_EVERY = 2  # frames
+LEARNING = 0.5  # of what a Gaussian lacks in the right eye, taken in from such a frame
+FADING = 0.94  # from one to the next, of what was not seen again: a highlight lies elsewhere after a second
 SAME = 0.03  # of the depth: nearer to each other, two depths are of one surface
-EVERY = 4  # px: a mask this coarse keeps within the margin that masks have
 f4 = np.float32
 u8 = np.uint64
 
@@ -37,7 +37,6 @@ class RightView:
     """Draws the right eye, and learns from what it really saw."""
 
     def __init__(self) -> None:
-        self._turn = 0  # which half of the Gaussians learns next
         self._missed = 0  # frames in which nobody looked
 
     def miss(self) -> None:
@@ -47,7 +46,7 @@ class RightView:
     def wake(self, model: GaussianModel) -> None:
         """Somebody looks at this frame: what was learnt is older by the frames that were missed."""
         if self._missed:
-            model.right_colors[:] *= f4(FADING ** (self._missed / 2))
+            model.right_colors[:] *= f4(FADING ** (self._missed / LEARN_EVERY))
             self._missed = 0
 
     def draw(self, mapped: Mapped, baseline: float, show: Callable[[Gaussians, Camera], F32]) -> RenderedView:
@@ -67,7 +66,7 @@ class RightView:
         self, view: RenderedView, shown: U8, mapped: Mapped, model: GaussianModel, picture: U8, tissue: Bool,
         baseline: float,
     ) -> None:  # fmt: skip
-        """Take in what the right eye saw of a frame, for the frames after it.
+        """Take in what the right eye saw of a frame, for the frames after it; of every `LEARN_EVERY` th.
 
         Args:
             view: as it was drawn for that frame.
@@ -78,30 +77,21 @@ class RightView:
             baseline: m.
         """
         snapshot = mapped.snapshot
-        sure = _sure_tissue(tissue, mapped.view.depth, float(view.camera.K[0, 0]), baseline)
+        sure = coarse_right_eye_mask(tissue, mapped.view.depth, float(view.camera.K[0, 0]), baseline)
         rows = min(len(snapshot.gaussians), model.count)
         same = model.ids[:rows] == snapshot.gaussians.ids[:rows]
         _learn(
             snapshot.gaussians.means[:rows], same, pack(view.camera), picture, shown, view.depth, sure,
-            model.right_colors[:rows], self._turn,
+            model.right_colors[:rows],
         )  # fmt: skip
-        self._turn = 1 - self._turn
-
-
-def _sure_tissue(tissue: Bool, depth: F32, focal_px: float, baseline: float) -> Bool:
-    """`right_eye_mask` of every fourth pixel, [h, w]."""
-    tissue = tissue[::EVERY, ::EVERY]
-    known = depth[:: 2 * EVERY, :: 2 * EVERY][tissue[::2, ::2]]
-    return right_eye_mask(tissue, known[known > 0], focal_px / EVERY, baseline)
 
 
 @parallel_kernel
 def _learn(
-    means: F32, same: Bool, cam: F32, picture: U8, right: U8, right_depth: F32, sure: Bool, colors: F32,
-    turn: Any,
-) -> None:  # fmt: skip
-    for pair in prange(-(-len(means) // (2 * PIECE))):
-        first = (2 * np.int64(pair) + turn) * PIECE
+    means: F32, same: Bool, cam: F32, picture: U8, right: U8, right_depth: F32, sure: Bool, colors: F32
+) -> None:
+    for piece in prange(-(-len(means) // PIECE)):
+        first = np.int64(piece) * PIECE
         _learn_rows(
             means, same, cam, picture, right, right_depth, sure, colors,
             first, min(first + PIECE, len(means)),
@@ -126,7 +116,7 @@ def _learn_rows(
             shows = u >= f4(1) and v >= f4(1) and u < f4(width - 2) and v < f4(height - 2)
         if shows:
             px, py = u8(np.int32(u + f4(0.5))), u8(np.int32(v + f4(0.5)))
-            seen = sure[py // u8(EVERY), px // u8(EVERY)]
+            seen = sure[py // u8(COARSE), px // u8(COARSE)]
             shows = seen and abs(right_depth[py, px] - z) < f4(SAME) * z
         if not shows:
             for c in range(3):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sags_node.detail.seen import SeenFrame
-from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
+from sags_node.detail.show import ASIDE_EVERY, LESSON_EVERY, Detail, Lessons
 from sags_node.messaging import published
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.types import FrameResult, Gaussians, RenderedView, Shown, Snapshot
@@ -46,7 +46,7 @@ class Teacher:
     def _learn_aside(self, scene: FrameResult, now: SeenFrame) -> None:
         self._aside += 1
         pair = scene.pair
-        if pair.right is not None and self._aside % LESSON_EVERY == 1:
+        if pair.right is not None and self._aside % ASIDE_EVERY == 1:
             self._detail.learn_aside(now, scene.snapshot, published.picture(pair, "right"), pair.baseline)
 
     def detail(

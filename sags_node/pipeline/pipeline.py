@@ -18,7 +18,7 @@ from sags_node.confidence import HALVING, confidence_of
 from sags_node.config.schema import LaunchConfig
 from sags_node.detail.memory import Matched, Memory
 from sags_node.detail.seen import SeenFrame
-from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
+from sags_node.detail.show import ASIDE_EVERY, Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.findings import Findings, by_stage
 from sags_node.instruments.instruments import Instruments
@@ -32,7 +32,7 @@ from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
 from sags_node.mapping.pose_refiner import PoseRefiner
-from sags_node.mapping.right_view import RightView
+from sags_node.mapping.right_view import LEARN_EVERY, RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging import published
 from sags_node.pipeline.repeats import doubted, repeated, unseen
@@ -424,21 +424,23 @@ class Pipeline:
         if last is not None and "right" in last.views and last.views["left"].colours is mapped.view.colours:
             return replace(last.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
         view, baseline = self._right.draw(mapped, observation.baseline, self._refiner.show), pair.baseline
-        rgb = view.rgb
+        self._right_views += 1
         if self._detail is not None and self.seen:
             now, gaussians = self.seen[0], mapped.snapshot.gaussians
+            if self._right_views % ASIDE_EVERY == 1:
+                self._detail.learn_aside(now, mapped.snapshot, published.picture(pair, "right"), baseline)
             camera = replace(published.camera_of(pair), T_world_cam=view.camera.T_world_cam)
             drawn = view.colours.at(camera.width, camera.height)
             tint = self._detail.tint(mapped.snapshot, gaussians, camera)
             shown = self._detail.view(drawn, view.depth, camera, gaussians, now, baseline, tint=tint)
             view = replace(view, shown=shown)
-            rgb = cv2.resize(shown.rgb, rgb.shape[1::-1], interpolation=cv2.INTER_AREA)
-            self._right_views += 1
-            if self._right_views % LESSON_EVERY == 0:
-                self._detail.learn_aside(now, mapped.snapshot, published.picture(pair, "right"), baseline)
-        assert seen.right is not None  # else nothing is drawn for it
-        sure = by_both if judged.learn and not judged.no_stereo else np.zeros_like(by_both)
-        self._right.learn(view, rgb, mapped, self.map.model, seen.right, sure, baseline)
+        if self._right_views % LEARN_EVERY == 0:
+            assert seen.right is not None  # else nothing is drawn for it
+            rgb = view.rgb
+            if view.shown is not None:
+                rgb = cv2.resize(view.shown.rgb, rgb.shape[1::-1], interpolation=cv2.INTER_AREA)
+            sure = by_both if judged.learn and not judged.no_stereo else np.zeros_like(by_both)
+            self._right.learn(view, rgb, mapped, self.map.model, seen.right, sure, baseline)
         return view
 
     def _located_instruments(

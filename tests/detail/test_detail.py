@@ -12,7 +12,7 @@ from places import SESSION
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import EVERY, MATCHED, MOST, OLDEST, Matched, Memory, hidden_source
 from sags_node.detail.motion import SmallDrawings, gaussians_at
-from sags_node.detail.seen import SAME, SeenFrame
+from sags_node.detail.seen import SAME, MatchedDepth, SeenFrame
 from sags_node.detail.share import Share
 from sags_node.detail.show import Detail
 from sags_node.geometry import project
@@ -140,7 +140,10 @@ def test_from_aside_the_surface_is_where_stereo_saw_it() -> None:
     """The model has the tissue at 100 mm, stereo at 102, but for a column of which it says nothing."""
     drawn, measured = np.full((HEIGHT, WIDTH), 0.1, np.float32), np.full((HEIGHT, WIDTH), 0.102, np.float32)
     measured[:, 30] = 0
-    source, camera = replace(seen(), matched=(drawn, measured)), CAMERA.moved_right(10 * 0.102 / FOCAL)
+    source, camera = (
+        replace(seen(), matched=MatchedDepth(drawn, measured)),
+        CAMERA.moved_right(10 * 0.102 / FOCAL),
+    )
     shown, taken = carried(drawn, camera, source)
     assert np.abs(shown[:, :-14].astype(int) - source.picture()[:, 10:-4]).max() <= 1
     assert (taken[:, :-14] == 255).all()
@@ -151,7 +154,7 @@ def test_what_stereo_saw_counts_for_a_moment() -> None:
     assert matched(0, drawn, 0 * drawn) is None
     for later_ns in (0, int(0.9e9 * MATCHED)):
         found = matched(later_ns, drawn * (1 + later_ns), 1.01 * drawn * (later_ns == 0))
-        assert found is not None and (found[0] == 1).all() and (found[1] > 1).all()
+        assert found is not None and (found.drawn == 1).all() and (found.measured > 1).all()
     assert matched(int(1.1e9 * MATCHED), drawn, 0 * drawn) is None
     assert matched(-1, drawn, 0 * drawn) is None  # clocks are set back
 

@@ -57,7 +57,8 @@ def test_a_verdict_has_what_an_overlay_needs_first_with_units_and_baselines() ->
         "latency": "39 ms (p50), 97 ms (p99) from the camera's stamp to sending; 314 ms for the first frame",
         "picture": "36.9 dB PSNR of the next frame, the model alone 33.6 dB. The picture before, shown again:"
         " 35.8 dB; near while tissue rests, but without depth, another view or hidden tissue",
-        "points": "0.38 mm off (median), nine of ten within 0.88 mm; 33% given up (the Gaussians near them are gone)",
+        "points": "0.38 mm off (median), nine of ten within 0.88 mm;"
+        " 33% given up (the Gaussians near them are gone)",
         "overlay": "on 249 of 268 frames (93%), 39 ms (p50), 97 ms (p99) after the camera;"
         " 19 without: being pinned",
         "right eye": "34.1 dB PSNR (left picture, warped: 32.6 dB)",

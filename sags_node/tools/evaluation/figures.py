@@ -287,7 +287,8 @@ def _points(figures: Flat) -> str:
     """Beside true points, else by those that were followed forth and back."""
     for group, more in (("track", ()), ("forth_back", _RETURNED)):
         lost = f"{group}.lost"
-        said = _said(figures, *_off(group), *more, (lost, "; {:.0%} given up (the Gaussians near them are gone)"))
+        given_up = lost, "; {:.0%} given up (the Gaussians near them are gone)"
+        said = _said(figures, *_off(group), *more, given_up)
         if said or figures.get(lost) is not None:
             return said or "all given up"
     return ""
