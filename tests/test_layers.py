@@ -32,7 +32,7 @@ LINES = {
     "benchmarks": 10090,
     "sags_lab": 5023,
     "sags_node": 1172,
-    "sags_node/bags": 870,
+    "sags_node/bags": 873,
     "sags_node/cli": 3546,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2591,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1567,
     "sags_node/tools/importing": 1098,
     "sags_node/vision": 5452,
-    "tests": 47338,
+    "tests": 47340,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

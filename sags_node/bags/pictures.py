@@ -80,12 +80,15 @@ def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
     """
     message = decode_message(data, kind, where)
     if kind == cdr.COMPRESSED:
-        if (stream := _STREAM.search(message.format)) is not None:
+        try:
+            decoded = decode_file(np.asarray(message.data, np.uint8), where)
+        except SagsError:
+            if (stream := _STREAM.search(message.format)) is None:
+                raise
             raise SagsError(
                 f"{where}: {stream[0]!r} is a stream of pictures, and single ones are read (JPEG, PNG); make "
                 "a video of each eye's messages, or record single pictures"
-            )
-        decoded = decode_file(np.asarray(message.data, np.uint8), where)
+            ) from None
         channels = 1 if decoded.ndim == 2 else decoded.shape[2]
         mosaic = _mosaic(message.format) if channels == 1 else None
         of_file: U8 = cv2.cvtColor(decoded, _FILE_TO_RGB[channels] if mosaic is None else mosaic)

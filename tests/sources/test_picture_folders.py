@@ -15,6 +15,7 @@ from PIL import Image
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import section_of
 from sags_node.errors import SagsError, UsageError
+from sags_node.sources.pictures import say
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
 
@@ -214,6 +215,7 @@ def test_grey_pictures_that_are_a_mosaic_are_told(
     pattern: str, is_told: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Colours of tissue under a camera's noise; grey pictures whose rows or columns differ are none."""
+    say.cache_clear()  # as a new session does
     rng = np.random.default_rng(0)
     cells = TISSUE[["RGB".index(name) for name in pattern]].reshape(2, 2)
     for side in ("left", "right"):
