@@ -138,7 +138,7 @@ def pages(data: memoryview) -> int:
     try:
         if not _is_tiff(data):
             with closing(_opened(data)) as picture:
-                return getattr(picture, "n_frames", 1)
+                return int(getattr(picture, "n_frames", 1))
         first, read = _tiff_tags(data), set[int]()
         count, tags = 1, first
         while tags.next and tags.next not in read:

@@ -94,7 +94,7 @@ class Replay:
         self._count = -(-self.pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
         self.assumed = "" if "rate" in config.model_fields_set or self.pairs.rate else ASSUMED
-        for finding in () if quiet else self.pairs.findings:
+        for finding in [] if quiet else self.pairs.findings:
             say(f"{finding.what}; {finding.fix}")
         stamps = None if self.pairs.stamps is None else self.pairs.stamps[:: config.stride]
         self._stamps = stamps if config.rate is None else None  # [turns, 2] ns, of both eyes' pictures
