@@ -23,6 +23,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -95,6 +96,8 @@ class StereoRig:
     name: str
     left: Eye
     right: Eye
+    # Where it was read, for what people are told to do with it.
+    path: Path | str = field(default="PATH", kw_only=True)
     # False: guessed, so that lengths are right up to a factor that nobody knows.
     metric: bool = field(default=True, kw_only=True)
 

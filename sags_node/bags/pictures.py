@@ -19,6 +19,7 @@ from sags_node.types import U8
 
 IMAGE_TYPES = (IMAGE, cdr.COMPRESSED)
 LARGEST_SIDE = 16384  # px
+_STREAM = re.compile("h.?26[45]|hevc|avc|av1|vp[89]|theora|mpeg", re.IGNORECASE)
 _BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)")
 _STAMP = struct.Struct("<iI")
 _BIG_STAMP = struct.Struct(">iI")
@@ -79,7 +80,15 @@ def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
     """
     message = decode_message(data, kind, where)
     if kind == cdr.COMPRESSED:
-        decoded = decode_file(np.asarray(message.data, np.uint8), where)
+        try:
+            decoded = decode_file(np.asarray(message.data, np.uint8), where)
+        except SagsError:
+            if (stream := _STREAM.search(message.format)) is None:
+                raise
+            raise SagsError(
+                f"{where}: {stream[0]!r} is a stream of pictures, and single ones are read (JPEG, PNG); make "
+                "a video of each eye's messages, or record single pictures"
+            ) from None
         channels = 1 if decoded.ndim == 2 else decoded.shape[2]
         mosaic = _mosaic(message.format) if channels == 1 else None
         of_file: U8 = cv2.cvtColor(decoded, _FILE_TO_RGB[channels] if mosaic is None else mosaic)

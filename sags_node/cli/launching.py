@@ -182,6 +182,7 @@ def _pictures_text(session: Session) -> str:
     """Size, rate and calibration of what is played."""
     from sags_node.rig import GUESSED_FOV
     from sags_node.sources.rectified import come_rectified
+    from sags_node.sources.replay import Replay
 
     eye, source, config = session.rig.left, session.source, session.config
     count = source.frame_count
@@ -191,7 +192,8 @@ def _pictures_text(session: Session) -> str:
         rig += ", the pictures are rectified already"
     if not session.rig.metric:
         rig = f"no calibration: {GUESSED_FOV:g} degrees across are guessed, depth has no unit (sags calib)"
-    return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{length}; {rig}"
+    assumed = source.assumed if isinstance(source, Replay) else ""
+    return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{assumed}{length}; {rig}"
 
 
 def _runs_on(device: Device) -> str:

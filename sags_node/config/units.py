@@ -1,5 +1,8 @@
 """Units of length in which calibrations are kept."""
 
+import shlex
+from pathlib import Path
+
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254, "um": 1e-6}  # metres
 NAMES = {"m": "metres", "mm": "millimetres", "cm": "centimetres", "inch": "inches", "um": "micrometres"}
 
@@ -9,11 +12,8 @@ def fitting_units(length: float, least: float, most: float) -> list[str]:
     return [unit for unit, metres in UNITS.items() if unit != "m" and least <= length * metres <= most]
 
 
-def in_metres(units: list[str]) -> str:
-    """How to fix lengths that are in one of these units."""
-    ways = [
-        f"of {NAMES[unit]} divide it by {1 / UNITS[unit]:.5g}, or sags calib convert PATH -o FOLDER "
-        f"--unit {unit}"
-        for unit in units
-    ]
+def in_metres(units: list[str], path: Path | str) -> str:
+    """How to fix lengths of the calibration at `path` that are in one of these units."""
+    convert = f"sags calib convert {shlex.quote(str(path))} -o FOLDER --unit"
+    ways = [f"of {NAMES[unit]} divide it by {1 / UNITS[unit]:.5g}, or {convert} {unit}" for unit in units]
     return f"projection_matrix[3] in right.yaml (or T) is in metres: {'; '.join(ways)}"

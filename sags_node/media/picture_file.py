@@ -132,6 +132,24 @@ def claimed_size(data: memoryview) -> tuple[int, int] | None:
         return None
 
 
+def pages(data: memoryview) -> int:
+    """How many pictures as large as the first a file holds, such as a stack of ImageJ; its thumbnails are
+    smaller. 1 where it does not say it."""
+    try:
+        if not _is_tiff(data):
+            with closing(_opened(data)) as picture:
+                return int(getattr(picture, "n_frames", 1))
+        first, read = _tiff_tags(data), set[int]()
+        count, tags = 1, first
+        while tags.next and tags.next not in read:
+            read.add(tags.next)
+            tags = _tiff_tags(data, tags.next)
+            count += all(tags[side] == first[side] for side in (Tiff.IMAGEWIDTH, Tiff.IMAGELENGTH))
+    except Exception:  # as above
+        return 1
+    return count
+
+
 def is_whole(data: memoryview) -> bool:
     """Tell whether the end of a picture is there: its mark, or, where a kind has none, all of its pixels."""
     begin = next((begin for begin in _ENDS if bytes(data[: len(begin)]) == begin), None)
@@ -163,12 +181,12 @@ def _is_tiff(data: memoryview) -> bool:
     return bytes(data[:4]) in (b"II*\0", b"MM\0*")
 
 
-def _tiff_tags(data: memoryview) -> Tiff.ImageFileDirectory_v2:
-    """The tiff tags of the first picture. Pillow has no mode for some that OpenCV reads, such as three floats
-    a pixel."""
+def _tiff_tags(data: memoryview, at: int | None = None) -> Tiff.ImageFileDirectory_v2:
+    """The tiff tags of the first picture, or of the one at that byte. Pillow has no mode for some that OpenCV
+    reads, such as three floats a pixel."""
     tags = Tiff.ImageFileDirectory_v2(bytes(data[:8]))
     file = BytesIO(data)
-    file.seek(tags.next)
+    file.seek(tags.next if at is None else at)
     tags.load(file)
     return tags
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -52,7 +53,6 @@ _MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
 DEEP = 16  # bits of a sample
 NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg
 HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ISO/IEC 23091-2
-SPLIT = "if each is an eye: ffmpeg -i OLD -map 0:v:0 -c copy left.mkv -map 0:v:1 -c copy right.mkv"
 
 
 class LostPictureError(SagsError):
@@ -128,7 +128,9 @@ class Video:
         self.tracks = len(_tracks(self._container))
         self.oddities = [f"{path}: {index.unused}"] if index.unused else []
         if self.tracks > 1:
-            self.oddities.append(f"{path} holds {self.tracks} video tracks, and the first is shown; {SPLIT}")
+            self.oddities.append(
+                f"{path} holds {self.tracks} video tracks, and the first is shown; {self.split}"
+            )
         if self._container.format.flags & NO_TIMES:
             self.oddities.append(
                 f"{path} is a stream without a container, which holds no times: nobody can tell its rate, or "
@@ -148,8 +150,19 @@ class Video:
         if (bits := _bits_used(first)) is not None:
             self.oddities.append(
                 f"{path} has samples of {DEEP} bits, of which its first picture uses {bits}: it may be "
-                "played too dark; play its pictures as a folder, which finds the bits (ffmpeg -i OLD %d.png)"
+                "played too dark; play its pictures as a folder, which finds the bits "
+                f"(ffmpeg -i {self._name} %d.png)"
             )
+
+    @property
+    def split(self) -> str:
+        """How two tracks become two files."""
+        tracks = " ".join(f"-map 0:v:{eye} -c copy {side}.mkv" for eye, side in enumerate(("left", "right")))
+        return f"if each is an eye: ffmpeg -i {self._name} {tracks}"
+
+    @property
+    def _name(self) -> str:
+        return shlex.quote(str(self.path))
 
     @property
     def gaps(self) -> list[tuple[int, int]]:
@@ -349,7 +362,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         # AVI knows no order but that of decoding: FFmpeg guesses, and some codecs hold pictures back.
         is_guessed = container.format.name == "avi" and stream.codec_context.has_b_frames
         are_few = 2 * len(known) <= len(shown) or (is_guessed and (np.diff(known) > 0).all())
-        unused = "" if are_few else _why_unused(known, base)
+        unused = "" if are_few else _why_unused(path, known, base)
         is_used = not are_few and not unused
         pts = np.unique(known) if is_used else None
         ends = 0.0 if not ticks else float((latest + np.diff(ticks).max(initial=0)) * base)
@@ -368,13 +381,14 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         return _Index(len(shown), pts, np.array(sorted(keys), np.int64).reshape(-1, 3), unused, cut_off)
 
 
-def _why_unused(pts: I64, base: Fraction) -> str:
+def _why_unused(path: Path, pts: I64, base: Fraction) -> str:
     """Return what is wrong with the stamps of pictures in the order in which they are decoded; nothing:
     ""."""
     order = np.argsort(pts, kind="stable")
     moved = np.abs(order - np.arange(len(pts)))
     steps = np.diff(pts[order]) * float(base)
-    remedy = "it is played by number, at its rate; ffmpeg -fflags +genpts -i OLD NEW writes new stamps"
+    again = f"ffmpeg -fflags +genpts -i {shlex.quote(str(path))} NEW"
+    remedy = f"it is played by number, at its rate; {again} writes new stamps"
     if len(pts) and moved.max() > REORDERED:
         return f"its stamps begin anew near picture {int(np.argmax(moved > REORDERED))}; {remedy}"
     if np.count_nonzero(steps == 0) > 0.1 * len(pts):

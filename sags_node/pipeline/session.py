@@ -22,6 +22,7 @@ from sags_node.errors import UsageError
 from sags_node.mapping.devices import with_scale
 from sags_node.rig import load_camera, load_rig
 from sags_node.sources.endonerf import baseline_of
+from sags_node.sources.pictures import say
 from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.robot import Posed
 from sags_node.sources.source import Source, open_source, recorded_rig
@@ -66,6 +67,7 @@ def open_session(
         UsageError: a wrong key, value or path.
         SagsError: the recording or the calibration cannot be used.
     """
+    say.cache_clear()
     config = load_launch(launch, overrides)
     one_eyed = isinstance(config.source, EndoNerfSource) and baseline_of(config.source) is None
     if config.one_camera or one_eyed:

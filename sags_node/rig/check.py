@@ -221,9 +221,10 @@ def _check_order(rig: StereoRig) -> list[Finding]:
 def _check_baseline(rig: StereoRig) -> list[Finding]:
     baseline = rig.baseline
     units = fitting_units(baseline, *ENDOSCOPE_BASELINE)
+    in_unit = in_metres(units, rig.path) if units else ""
     if baseline > LARGEST_BASELINE:
         looks = f"looks like {' or '.join(NAMES[unit] for unit in units)}" if units else "is too large"
-        fix = in_metres(units) if units else f"is the side of the board's squares right? {RECALIBRATE}"
+        fix = in_unit or f"is the side of the board's squares right? {RECALIBRATE}"
         return [Finding("error", f"the baseline of {baseline:g} m {looks}", fix)]
     if baseline < SMALLEST_BASELINE:
         what = f"a baseline of {baseline * 1e3:.3g} mm is too small: projection_matrix[3] is -fx * baseline"
@@ -231,7 +232,7 @@ def _check_baseline(rig: StereoRig) -> list[Finding]:
         return [Finding("error", what, fix)]
     if not ENDOSCOPE_BASELINE[0] <= baseline <= ENDOSCOPE_BASELINE[1]:
         what = f"a baseline of {baseline * 1e3:.3g} mm is unusual for a stereo endoscope (3 to 10 mm)"
-        fix = in_metres(units) if units else "check projection_matrix[3] in right.yaml: it is -fx * metres"
+        fix = in_unit or "check projection_matrix[3] in right.yaml: it is -fx * metres"
         return [Finding("warning", what, fix)]
     return [Finding("ok", f"baseline {baseline * 1e3:.3g} mm")]
 

@@ -87,7 +87,7 @@ def load_camera(file: Path) -> StereoRig:
     Raises:
         UsageError: it cannot be read, or `check_rig` finds an error.
     """
-    return accept_rig(ros.read_one(Path(file), NOMINAL_BASELINE), file)
+    return accept_rig(replace(ros.read_one(Path(file), NOMINAL_BASELINE), path=file), file)
 
 
 def guessed_rig(width: int, height: int, pixel_aspect: float = 1.0) -> StereoRig:
@@ -113,7 +113,10 @@ def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | No
     Raises:
         UsageError: nothing known is there, or a file is missing or malformed.
     """
-    path = Path(path)
+    return replace(_read(Path(path), size, metres), path=path)
+
+
+def _read(path: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
     form = find_form(path)
     folder = path if path.is_dir() else path.parent
     if form is Form.ROS_FOLDER:
@@ -133,7 +136,7 @@ def with_unit(rig: StereoRig, metres: float | None) -> StereoRig:
     """The rig whose lengths were read in another unit than metres."""
     factors = np.array([1.0, 1.0, 1.0, metres or 1.0])
     left, right = (replace(eye, P=eye.P * factors) for eye in (rig.left, rig.right))
-    return StereoRig(rig.name, left, right)
+    return replace(rig, left=left, right=right)
 
 
 def find_form(path: Path) -> Form | None:

@@ -140,7 +140,7 @@ def fit_distortion(coefficients: F64, where: str) -> F64:
 
 def resized_rig(rig: StereoRig, factor: float) -> StereoRig:
     """The same rig for pictures that were resized by `factor`."""
-    return StereoRig(rig.name, _resized(rig.left, factor), _resized(rig.right, factor))
+    return replace(rig, left=_resized(rig.left, factor), right=_resized(rig.right, factor))
 
 
 def _resized(eye: Eye, factor: float) -> Eye:

@@ -281,7 +281,7 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
     if left is None or right is None:
         side = "left" if left is None else "right"
         raise UsageError(f"{config.path} calibrates one eye only, the {side} one is missing; set rig")
-    rig = StereoRig(config.path.stem, left, right)
+    rig = StereoRig(config.path.stem, left, right, path=config.path)
     return accept_rig(rig, config.path) if judged else rig
 
 

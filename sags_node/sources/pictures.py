@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,7 +16,7 @@ from sags_node.checks import Finding, parted
 from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import SHOWN, read_file
-from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole
+from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole, pages
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
 from sags_node.sources.names import gaps_in, in_order, numbers, times_in, together
@@ -30,6 +31,12 @@ LOOKED_AT = 9  # pictures, spread over a recording, that tell which value is whi
 STORED = cv2.IMREAD_UNCHANGED
 
 F = TypeVar("F")
+
+
+@lru_cache(maxsize=256)
+def say(oddity: str) -> None:
+    """Once for each session, however often its recording is opened (`open_session` begins anew)."""
+    log.warning(oddity)
 
 
 class RawPair(NamedTuple):
@@ -210,7 +217,7 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
     OpenCV fills what is missing of a cut-off picture with grey and says nothing, so its end is checked first.
 
     Raises:
-        SagsError: the file is missing, no plain file, cut off, damaged or too large.
+        SagsError: the file is missing, no plain file, cut off, damaged or too large, or holds several.
     """
     if flags == cv2.IMREAD_COLOR:
         samples = read_samples(file)
@@ -221,6 +228,11 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
         raise SagsError(f"cannot read picture {file}: {error.strerror}") from None
     if not is_whole(memoryview(data)):
         raise SagsError(f"picture {file} is damaged or cut off ({len(data)} bytes); {MEND}")
+    if (count := pages(memoryview(data))) > 1:
+        raise SagsError(
+            f"{file} holds {count} pictures, of which one would be shown; save each as a file of its own (in "
+            "ImageJ: Save As, Image Sequence)"
+        )
     return decode(data, flags, f"picture {file}", MEND)
 
 

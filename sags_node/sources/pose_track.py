@@ -108,8 +108,8 @@ class _Edge:
         if jump and self._jumps[jump - 1] > t_ns - JUMP_HELD_NS:
             raise NoPoseError(
                 "pose_jumped",
-                "the robot's pose jumps faster than a scope can move: check its joints' sensors and its "
-                "base frame",
+                "the robot's pose jumps faster than a scope can move: are its lengths in metres? Check its "
+                "joints' sensors and its base frame",
             )
         share = 0.0 if gap == 0 else (t_ns - self._stamps[before]) / gap
         return between(self._samples[before], self._samples[after], share)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import lru_cache
 from typing import Self
 
 import cv2
@@ -19,13 +17,11 @@ from sags_node.sources.bags import BagPairs
 from sags_node.sources.dvrk import DvrkPairs
 from sags_node.sources.endonerf import EndoNerfPairs
 from sags_node.sources.layout import Layout
-from sags_node.sources.pictures import FolderPairs, Pairs
+from sags_node.sources.pictures import FolderPairs, Pairs, say
 from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
 from sags_node.sources.videos import OneVideoPairs, VideoPairs
 from sags_node.types import U8, StereoFrame
-
-log = logging.getLogger(__name__)
 
 Recording = (
     cfg.FoldersSource
@@ -36,10 +32,17 @@ Recording = (
     | cfg.DvrkSource
 )
 DEFAULT_RATE = 30.0  # of folders, which do not know theirs
+ASSUMED = " (assumed: the files do not say it; set source.rate)"
 # Two eyes that are one: compared in pictures so small that noise and compression are averaged away.
 WIDTH = 80  # px
 SURELY = 0.25  # of what a shift by one of their pixels changes; the eyes of a scope differ by 1 to 5 of it
 LEAST = 1.0  # grey levels, of such a shift: less is a picture of nothing, which tells nothing
+# Colours of a mosaic, shares of the sum of its four pixels.
+GREENS, RED_BLUE = 0.005, 0.03
+MOSAIC = (
+    "the pictures are grey, and a Bayer mosaic: each pixel holds one colour; take it apart (OpenCV's "
+    "cvtColor with COLOR_BayerRG2BGR or another pattern), and save pictures in colour"
+)
 
 
 class Replay:
@@ -55,6 +58,7 @@ class Replay:
     Attributes:
         first: number of the first frame.
         pairs: what is read.
+        assumed: what is to be said behind the rate, where nobody told it.
 
     Args:
         config: which recording, and how to play it.
@@ -62,6 +66,7 @@ class Replay:
         clock: monotonic seconds.
         wall_ns: wall clock, nanoseconds.
         sleep: waits for seconds; the default is cut short by `stop`.
+        quiet: it is looked at before it is played: then its oddities are said.
 
     Raises:
         UsageError: files are missing or do not fit each other, pairs are missing before `frames`, or `start`
@@ -76,8 +81,9 @@ class Replay:
         clock: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
         sleep: Callable[[float], object] | None = None,
+        quiet: bool = False,
     ) -> None:
-        self._config = config
+        self._config, self._quiet = config, quiet
         self._stopped = threading.Event()
         self._clock = clock
         self._wall_ns = wall_ns
@@ -87,8 +93,9 @@ class Replay:
         self.pairs = open_pairs(config, references)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
-        for finding in self.pairs.findings:
-            _say(f"{finding.what}; {finding.fix}")
+        self.assumed = "" if "rate" in config.model_fields_set or self.pairs.rate else ASSUMED
+        for finding in [] if quiet else self.pairs.findings:
+            say(f"{finding.what}; {finding.fix}")
         stamps = None if self.pairs.stamps is None else self.pairs.stamps[:: config.stride]
         self._stamps = stamps if config.rate is None else None  # [turns, 2] ns, of both eyes' pictures
         # Those of the left pictures, ns: by them poses of the same recording are found.
@@ -163,7 +170,7 @@ class Replay:
                     pair = self.pairs.read()
                     ended = pair is None
                 except LostPictureError as lost:
-                    _say(str(lost))
+                    say(str(lost))
                     ended = False
             if ended:
                 if not self._config.loop or index == self.first:
@@ -185,6 +192,8 @@ class Replay:
                     return
                 if frame_id == self.first and pair.depth is None:
                     refuse_one_eye_twice(pair.left, pair.right)
+                if frame_id == self.first and not self._quiet and is_mosaic(pair.left):
+                    say(MOSAIC)
                 yield StereoFrame(
                     frame_id,
                     t_capture_ns=stamp,
@@ -249,12 +258,6 @@ class Replay:
         return self._began[1] + self._elapsed(frame_id)
 
 
-@lru_cache(maxsize=256)
-def _say(oddity: str) -> None:
-    """Once, however often a recording is opened."""
-    log.warning(oddity)
-
-
 def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, one return per kind
     """The reader that fits the kind of recording; `references`: of the recording's truth, too."""
     match config:
@@ -279,6 +282,17 @@ def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, 
             return BagPairs(config)
         case cfg.DvrkSource():
             return DvrkPairs(config)
+
+
+def is_mosaic(picture: U8) -> bool:
+    """Tell whether a grey picture [H, W, 3] holds a Bayer mosaic of tissue: of four pixels two on one
+    diagonal are alike, since green, and red and blue on the other one are not."""
+    grey = picture[..., 1]
+    if not all(np.array_equal(grey, picture[..., channel]) for channel in (0, 2)):
+        return False
+    (a, b), (c, d) = ([float(grey[y::2, x::2].mean()) for x in (0, 1)] for y in (0, 1))
+    alike, apart = sorted((abs(a - d), abs(b - c)))
+    return alike < GREENS * (a + b + c + d) and apart > RED_BLUE * (a + b + c + d)
 
 
 def refuse_one_eye_twice(left: U8, right: U8 | None) -> None:

@@ -150,7 +150,7 @@ def read_rig(folder: Path) -> StereoRig:
     eyes = [
         Eye(width, height, *parts) for parts in zip(found.K, found.distortion, found.R, found.P, strict=True)
     ]
-    return StereoRig(name, *eyes)
+    return StereoRig(name, *eyes, path=folder)
 
 
 def read_rectification(folder: Path, size: tuple[int, int]) -> Rectification:

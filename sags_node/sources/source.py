@@ -60,6 +60,7 @@ def open_source(
     progress: Callable[[int, int], None] | None = None,
     size: tuple[int, int] | None = None,
     rig: StereoRig | None = None,
+    quiet: bool = False,
 ) -> Source:
     """Open the source a launch file describes.
 
@@ -69,6 +70,7 @@ def open_source(
         progress: called with (done, total) while a phantom session is rendered.
         size: width and height that an eye's live pictures must have, px; None: those of the first.
         rig: the calibration that live cameras gave, if they did: it must stay the same.
+        quiet: a recording's oddities are said by who plays it.
 
     Raises:
         UsageError: a file, folder or device is missing or does not fit the rest.
@@ -95,7 +97,7 @@ def open_source(
 
     if isinstance(config, cfg.PhantomSource):
         config = _phantom_recording(config, progress)
-    return Replay(config, references=references)
+    return Replay(config, references=references, quiet=quiet)
 
 
 def recorded_rig(config: cfg.Source, judged: bool = True) -> StereoRig | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -108,8 +109,8 @@ class VideoPairs(Pairs):
             if apart > (0.01 if is_even else UNEVEN_RATES):
                 raise UsageError(
                     f"{left.path} has {left.rate} frames/s but {right.path} has {right.rate}; they are not "
-                    f"one stereo pair: record both at one rate, or bring one to it (ffmpeg -i OLD -r "
-                    f"{left.rate:g} NEW)"
+                    "one stereo pair: record both at one rate, or bring one to it (ffmpeg -i "
+                    f"{shlex.quote(str(right.path))} -r {left.rate:g} NEW)"
                 )
         if left.stamps is None or right.stamps is None or left.rate is None:
             return None

@@ -60,7 +60,7 @@ class DepthChoice:
     def __init__(self, config: VisionConfig, rectifier: Rectifier) -> None:
         camera, baseline = rectifier.camera, rectifier.baseline
         self._rectifier = rectifier
-        self.stereo = StereoDepth(config.stereo, camera, baseline)
+        self.stereo = StereoDepth(config.stereo, camera, baseline, rectifier.path)
         self._network: NetworkDepth | None = None
         if config.onnx.path is not None:
             self._network = NetworkDepth(config, self.stereo, camera, baseline)

@@ -73,6 +73,7 @@ class Rectifier:
     Attributes:
         camera: the left rectified camera at the working size, at the world's origin.
         baseline: metres.
+        path: of the calibration.
         raw_size: width and height of the pictures it takes, px.
     """
 
@@ -81,7 +82,7 @@ class Rectifier:
     ) -> None:
         """`published`: width and height in which frames are published; default: those they are worked in."""
         self.camera = rectified_camera(rig, width, height)
-        self.baseline = rig.baseline
+        self.baseline, self.path = rig.baseline, rig.path
         self._size = width, height
         self.raw_size = rig.left.width, rig.left.height
         K_rectified = rig.left.P[:, :3]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 
@@ -31,11 +33,16 @@ class StereoDepth:
     neighbourhood agrees with the place in the right picture that it was matched to: the confidence is 0 at a
     zero-mean normalised cross-correlation (ZNCC) of 0.57 and below, where the depth is unknown, and 1 at 1.
 
+    Args:
+        path: of the calibration.
+
     Raises:
         UsageError: the pictures are too small to match, or the eyes too far apart for the depth range.
     """
 
-    def __init__(self, config: StereoConfig, camera: Camera, baseline: float) -> None:
+    def __init__(
+        self, config: StereoConfig, camera: Camera, baseline: float, path: Path | str = "PATH"
+    ) -> None:
         scale = config.scale or (2 if camera.width >= FULL_SIZE_BELOW else 1)
         width, height = camera.width // scale, camera.height // scale
         if min(width, height) < SMALLEST_SIDE:
@@ -51,7 +58,7 @@ class StereoDepth:
         self._end_at(self._near.limit)
         if self._smallest >= self._largest or baseline > WIDEST * config.max_depth:
             units = fitting_units(baseline, *ENDOSCOPE_BASELINE)
-            unit = f"{in_metres(units)}; " if units else ""
+            unit = f"{in_metres(units, path)}; " if units else ""
             raise UsageError(
                 f"eyes that stand {baseline * 1e3:.3g} mm apart see nothing alike within "
                 f"vision.stereo.max_depth, {config.max_depth:g} m; {unit}if that baseline is right, set "

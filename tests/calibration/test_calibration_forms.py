@@ -414,6 +414,7 @@ def test_convert(tmp_path: Path) -> None:
     assert_same(load_rig(tmp_path / "out"), make_rig())
     code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", *size)
     assert code == 2 and "looks like millimetres" in said and not (tmp_path / "no").exists()
+    assert f"sags calib convert {folder} -o FOLDER --unit mm" in said
     code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640")
     assert code == 2 and "'640' is not like 720x576" in said
     code, _, _ = ran("calib", "convert", tmp_path / "out", "-o", tmp_path / "double", "--scale", "2")

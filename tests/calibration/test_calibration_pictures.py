@@ -223,7 +223,11 @@ def test_another_picture_size(subject: tuple[StereoRig, Pairs]) -> None:
         (cv2.resize(left, None, fx=2, fy=2), cv2.resize(right, None, fx=2, fy=2)) for left, right in pairs
     ]
     (finding,) = check_pictures(rig, double)
-    assert finding.level == "error" and "2 times as large" in finding.what and "--scale 2" in finding.fix
+    assert (
+        finding.level == "error"
+        and "2 times as large" in finding.what
+        and f"{rig.path} -o FOLDER --scale 2" in finding.fix
+    )
     (finding,) = check_pictures(rig, [(left[:-20], right[:-20]) for left, right in pairs])
     assert "cropped" in finding.fix
 

@@ -203,6 +203,33 @@ def test_check_says_what_run_says(kind: str, tmp_path: Path, caplog: pytest.LogC
     assert len(said) == 2 + len(once) == (3 if kind == "videos" else 2) and said - checked == once
 
 
+@pytest.mark.parametrize("has_rig", [True, False])  # else a camera is guessed from some pictures
+def test_a_run_says_all_again_after_a_check_and_after_a_run(
+    has_rig: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gap(made(tmp_path))
+    if has_rig:
+        shutil.copytree(SESSION / "calib", tmp_path / "calib")
+    for _ in range(2):
+        check_folder(tmp_path)
+        caplog.clear()
+        assert not is_refused(tmp_path)
+        assert [record.getMessage().count("gaps in the numbers") for record in caplog.records].count(1) == 1
+
+
+def test_a_rate_that_nobody_told_is_called_assumed(tmp_path: Path) -> None:
+    """Names that are times tell it; so does who sets it."""
+    made(tmp_path)
+    told = [["source.rate:=30"], []]
+    said = [next(each.what for each in check_folder(tmp_path, each) if " Hz" in each.what) for each in told]
+    size = f"{FRAMES} frames of {WIDTH}x{HEIGHT} px at 30 Hz"
+    assert said == [size, f"{size} (assumed: the files do not say it; set source.rate)"]
+    for folder in ("left", "right", "masks", "depth"):
+        for file in (tmp_path / folder).iterdir():
+            file.rename(file.with_stem(f"{1_700_000_000 + int(file.stem)}"))
+    assert next(each.what for each in check_folder(tmp_path) if " Hz" in each.what).endswith("at 1 Hz")
+
+
 def is_refused(folder: Path) -> bool:
     """By `sags run`."""
     try:
@@ -327,7 +354,9 @@ def test_a_video_says_how_it_shows_both_eyes(name: str, tmp_path: Path) -> None:
             assert " ".join(overrides_of(played)).endswith(play)
     assert found[1].what.startswith("case.avi: 3 frames of ") and "px at 25 Hz, 0.1 s" in found[1].what
     assert ("one eye" in found[2].what) == (name == "one eye")
-    assert ("exchanged" in str(found)) == (name == "exchanged")
+    assert ("taken for the left eye's" in str(found)) == (name == "exchanged") and "exchange " not in str(
+        found
+    )
 
 
 @pytest.mark.parametrize("height", [1470, 1471, 1469])
@@ -421,6 +450,7 @@ def test_folders_that_are_not_played_yet_are_named(tmp_path: Path) -> None:
     for name in ("groundtruth.txt", "StereoCalibration.ini"):
         (tmp_path / "P2" / name).touch()
     assert "StereoMIS" in check_folder(tmp_path / "P2")[0].what
+    assert f"stereomis {tmp_path / 'P2'} measures it" in check_folder(tmp_path / "P2")[0].fix
     (tmp_path / "stir/01/left01/seq00/segmentation").mkdir(parents=True)
     assert "STIR" in check_folder(tmp_path / "stir")[0].what
     (tmp_path / "d4d/specimen_1/s/clips/Clip_1/left_images_rect").mkdir(parents=True)

@@ -135,6 +135,14 @@ def test_compressed_mosaics_are_taken_apart(pattern: str, kind: str) -> None:
         assert (np.ptp(shown.mean((0, 1))) < 1) == (not taken_apart)
 
 
+@pytest.mark.parametrize("said", ["h264", "hevc", "H.265", "av1"])
+def test_a_stream_in_compressed_messages_is_named(said: str) -> None:
+    body = np.frombuffer(b"\0\0\0\1\x67" + bytes(99), np.uint8)
+    message = ROS2.types[files.COMPRESSED](files.header(ROS2, START), said, body)
+    with pytest.raises(SagsError, match=rf"left: '{said}' is a stream of pictures.*; make a video"):
+        decode_picture(bytes(ROS2.serialize_cdr(message, files.COMPRESSED)), files.COMPRESSED, "left")
+
+
 def test_playing_from_anywhere_again_and_again(tmp_path: Path) -> None:
     path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, 60, infos=False))
     numbers = list(range(60))

@@ -10,10 +10,12 @@ import cv2
 import numpy as np
 import pytest
 from numbered_pictures import HEIGHT, WIDTH, number_of, numbers, picture, write_png
+from PIL import Image
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import section_of
 from sags_node.errors import SagsError, UsageError
+from sags_node.sources.pictures import say
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
 
@@ -192,6 +194,53 @@ def test_levels_of_folders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> 
     left = played(config.model_copy(update={"levels": (0.0, 0.5)}))[0].left
     assert np.abs(left / 255 - np.clip(2 * RAMP[..., ::-1], 0, 1)).max() < 2 / 255
     assert caplog.text == ""
+
+
+TISSUE = np.array([140, 84, 81])  # RGB
+
+
+@pytest.mark.parametrize(
+    ("pattern", "is_told"),
+    [
+        ("RGGB", True),
+        ("BGGR", True),
+        ("GRBG", True),
+        ("GBRG", True),
+        ("GGGG", False),
+        ("RRGG", False),
+        ("RGRG", False),
+    ],
+)
+def test_grey_pictures_that_are_a_mosaic_are_told(
+    pattern: str, is_told: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Colours of tissue under a camera's noise; grey pictures whose rows or columns differ are none."""
+    say.cache_clear()  # as a new session does
+    rng = np.random.default_rng(0)
+    cells = TISSUE[["RGB".index(name) for name in pattern]].reshape(2, 2)
+    for side in ("left", "right"):
+        shown = np.tile(cells, (48, 64)) + rng.normal(0, 6, (96, 128))
+        write_png(tmp_path / f"{side}/0.png", np.clip(shown, 0, 255).astype(np.uint8)[..., None].repeat(3, 2))
+    played(cfg.FoldersSource(left=tmp_path / "left", right=tmp_path / "right", pace="step"))
+    assert ("a Bayer mosaic" in caplog.text) is is_told
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png", "webp"])
+def test_a_stack_is_refused_and_a_thumbnail_behind_a_picture_is_passed_over(
+    suffix: str, tmp_path: Path
+) -> None:
+    config = cfg.FoldersSource(left=tmp_path / "left", right=tmp_path / "right", pace="step")
+    for behind in (2, suffix == "tif"):
+        for eye, side in enumerate(("left", "right")):
+            pages = [Image.fromarray(picture(number, eye=eye)) for number in range(1 + behind)]
+            more = pages[1:] if behind == 2 else [page.resize((16, 12)) for page in pages[1:]]
+            (tmp_path / side).mkdir(exist_ok=True)
+            file = tmp_path / f"{side}/0.{suffix}"
+            pages[0].save(file, save_all=bool(more), append_images=more, lossless=True)
+        if behind == 2:
+            with pytest.raises(SagsError, match=r"left/0.\w+ holds 3 pictures, .*of its own"):
+                open_source(config)
+    assert numbers(played(config)) == [0]
 
 
 def test_a_picture_brighter_than_white_is_no_white_one(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def test_depth_ends_at_the_tissue_edge_and_at_the_range() -> None:
             StereoConfig(),
             CAMERA,
             BASELINE / 0.0254,
-            "169 mm apart .* --unit inch; if that baseline is right, set vision",
+            "169 mm apart .* convert 'my rig' -o FOLDER --unit inch; if that baseline is right, set vision",
         ),
     ],
 )
@@ -178,7 +178,7 @@ def test_what_cannot_be_matched_is_refused(
     config: StereoConfig, camera: Camera, baseline: float, words: str
 ) -> None:
     with pytest.raises(UsageError, match=words):
-        StereoDepth(config, camera, baseline)
+        StereoDepth(config, camera, baseline, "my rig")
 
 
 @pytest.mark.parametrize(("baseline", "max_depth"), [(0.012, 0.3), (0.063, 0.3), (0.12, 1.0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -177,7 +178,7 @@ def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:
         return Finding("error", what, fix)
     fix = (
         f"calibrate at {size_text(*size)}, or if the pictures are only resized, not cropped: "
-        f"sags calib convert PATH -o FOLDER --scale {ratio:g}"
+        f"sags calib convert {shlex.quote(str(rig.path))} -o FOLDER --scale {ratio:g}"
     )
     return Finding("error", f"{what}, {ratio:.3g} times as large", fix, {"scale": ratio})
 

@@ -65,7 +65,7 @@ def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int]
     if isinstance(source, RecordedSource):
         source = source.model_copy(update={"pace": "step", "loop": False, "warm_up": 0})
     size, pairs = None, list[Pair]()
-    with open_source(source, references=False) as opened:
+    with open_source(source, references=False, quiet=True) as opened:
         pixel_aspect = opened.pairs.pixel_aspect if isinstance(opened, Replay) else 1.0
         for index, frame in enumerate(opened):
             size = size or (frame.left.shape[1], frame.left.shape[0])

@@ -128,7 +128,7 @@ def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
 def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
     """As it is, then all that users get wrong; of two that fit alike the first is meant."""
     rows = rectified_rows(rig, matches)
-    exchanged = rectified_rows(StereoRig(rig.name, rig.right, rig.left), matches)
+    exchanged = rectified_rows(replace(rig, left=rig.right, right=rig.left), matches)
     exchanged_files = Reading(
         exchanged,
         "the eyes are exchanged in the calibration: left.yaml is of the camera that took the right pictures",
@@ -201,7 +201,7 @@ def _exchanged_or_shifted(rows: Rows) -> Finding:
 def _other_size(rig: StereoRig, factor: float) -> StereoRig:
     scale = np.diag([factor, factor, 1.0])
     left, right = (replace(eye, K=scale @ eye.K, P=scale @ eye.P) for eye in (rig.left, rig.right))
-    return StereoRig(rig.name, left, right)
+    return replace(rig, left=left, right=right)
 
 
 def _undistorted(eye: Eye, pixels: F64) -> F64:
@@ -309,7 +309,7 @@ def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
     if not PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]:
         what = f"points would lie at {depth:.3g} m (median); an endoscope sees 0.005 to 1 m"
         units = fitting_units(_signed_baseline(rig), *ENDOSCOPE_BASELINE)
-        fix = in_metres(units) if units else RECALIBRATE
+        fix = in_metres(units, rig.path) if units else RECALIBRATE
         return [Finding("error", what, fix, figures)]
     per_pixel = depth**2 / (rig.left.P[0, 0] * _signed_baseline(rig))
     what = (

@@ -25,7 +25,7 @@ from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play
 from sags_node.rig import read_rig
 from sags_node.rig.check import RECALIBRATE
 from sags_node.sources.endonerf import is_published
-from sags_node.sources.pictures import list_pictures, size_text
+from sags_node.sources.pictures import list_pictures, say, size_text
 from sags_node.sources.rectified import as_pictures_come
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source, recorded_rig
@@ -55,6 +55,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
     Raises:
         UsageError: it is no folder.
     """
+    say.cache_clear()
     contents = recognise(folder)
     fix = "" if contents.level == "ok" else contents.instead
     found = [Finding(contents.level, f"{folder.name or folder} is {contents.what}", fix)]
@@ -174,13 +175,13 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
     """The first frame, and those in the middle: do masks mark something, are the eyes of one time?"""
     with open_source(source, references=False) as opened:
         count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
-        said, stamped = list[Finding](), False
+        said, stamped, assumed = list[Finding](), False, ""
         if isinstance(opened, Replay):
-            said, stamped = opened.pairs.findings, bool(opened.pairs.judged)
+            said, stamped, assumed = opened.pairs.findings, bool(opened.pairs.judged), opened.assumed
     if first is None:
         return [Finding("error", "not one frame can be read", "check the files")]
-    found = [Finding("ok", f"{count} frames of {size_text(*first.left.shape[1::-1])} px at {rate:g} Hz")]
-    found += said
+    size = size_text(*first.left.shape[1::-1])
+    found = [Finding("ok", f"{count} frames of {size} px at {rate:g} Hz{assumed}"), *said]
     timing, shares, blue = Timing(), [], []
     middle = source.start + max(0, (count - LOOKED_AT) // 2) / rate
     with open_source(source.model_copy(update={"start": middle}), references=False) as opened:

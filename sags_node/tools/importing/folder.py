@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -70,7 +71,7 @@ def recognise(folder: Path) -> Contents:
         return _playable(folder, config)
     for needed, what, instead in _KNOWN:
         if all(any(any(folder.glob(pattern)) for pattern in one_of) for one_of in needed):
-            return Contents(what, instead, "error")
+            return Contents(what, instead.format(folder=shlex.quote(str(folder))), "error")
     return _plain(folder)
 
 
@@ -194,24 +195,24 @@ _KNOWN: tuple[tuple[tuple[tuple[str, ...], ...], str, str], ...] = (
     (
         (("track_pts.*",),),
         "a sequence of StereoMIS-Tracking",
-        "sags eval --protocol stereomis FOLDER follows its points (docs/evaluation.md)",
+        "sags eval --protocol stereomis {folder} follows its points (docs/evaluation.md)",
     ),
     (
         (("left_images_rect", *(f"{depth}clips/*/left_images_rect" for depth in ("", "*/", "*/*/"))),),
         "clips of D4D",
-        "sags eval --protocol d4d FOLDER measures them; to play one, give its left_images_rect and "
+        "sags eval --protocol d4d {folder} measures them; to play one, give its left_images_rect and "
         "right_images_rect as source.kind folders (docs/evaluation.md)",
     ),
     (
         (("groundtruth.txt",), ("StereoCalibration.ini",)),
         "a sequence of StereoMIS",
-        "sags eval --protocol stereomis FOLDER measures it; to play it, write a launch file with "
+        "sags eval --protocol stereomis {folder} measures it; to play it, write a launch file with "
         "source.geometry.layout over_under (docs/evaluation.md)",
     ),
     (
         (("left*/seq*/segmentation", "*/left*/seq*/segmentation"),),
         "sequences of STIR",
-        "sags eval --protocol stir FOLDER measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
+        "sags eval --protocol stir {folder} measures them; each leftNN/seqNN/frames/*.mp4 and its rightNN "
         "are source.kind videos (docs/evaluation.md)",
     ),
 )

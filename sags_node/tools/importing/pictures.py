@@ -20,7 +20,7 @@ COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direct
 DARK = 12  # grey level of a border
 NARROWEST_BORDER = 4  # px
 ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median
-DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0)  # m per count, the usual ones first
+DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0, 1e-3 / 256)  # m per count, the usual ones first; SERV-CT's last
 FEWEST_MATCHES = 30
 RIGHT_FIRST = "source.geometry.first:=right"
 
@@ -143,7 +143,7 @@ def check_depth(
     if not fitting:
         what = f"depth: a median of {median:g} counts is no distance in an endoscope's view in any usual unit"
         return [Finding("error", what, "is it a disparity, or inverse depth? Convert it to depth")]
-    distance = f"{median * fitting[0] * 1e3:.0f} mm with {fitting[0]:g} m per count"
+    distance = " or ".join(f"{median * one * 1e3:.0f} mm with {one:g} m per count" for one in fitting)
     found = [
         Finding(
             "ok" if unit is None else "warning",

@@ -13,7 +13,7 @@ import numpy as np
 from sags_node.checks import Finding, parted
 from sags_node.config.schema import GeometryConfig
 from sags_node.errors import UsageError
-from sags_node.media.video import SPLIT, LostPictureError, Video
+from sags_node.media.video import LostPictureError, Video
 from sags_node.sources.layout import Layout
 from sags_node.sources.names import EYE
 from sags_node.sources.pictures import size_text
@@ -202,13 +202,17 @@ def _one(file: Path, shown: list[U8]) -> list[Finding]:
     looked = pictures.check_both(*zip(*map(way.eyes, shown), strict=True))
     if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
+    if way.right is None:  # then `layout_of` exchanges them
+        said = "points lie farther to the right in the second picture, which is taken for the left eye's"
+        turned = Finding("ok", said)
+        looked = [turned if pictures.RIGHT_FIRST in each.launch else each for each in looked]
     return [Finding("ok", f"{size} px show both eyes: {way.what}"), *looked]
 
 
 def _both_needed(file: Path) -> str:
     with closing(Video(file)) as video:
         if video.tracks > 1:
-            return f"it holds {video.tracks} video tracks; {SPLIT}"
+            return f"it holds {video.tracks} video tracks; {video.split}"
     return (
         "two videos or one of both eyes are needed; sags calib live "
         f"{shlex.quote(override('source.left', file))} source.kind:=videos {LAYOUT}side_by_side shows what "
