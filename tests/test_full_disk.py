@@ -147,6 +147,7 @@ def test_a_writer_without_a_command_does_the_same(disk: Path, name: str) -> None
     assert there(disk) <= {"rig", "all"}
 
 
+@pytest.mark.fault("disk: full while recording")
 @pytest.mark.usefixtures("run_dir")
 def test_a_recording_keeps_what_it_has(disk: Path, tiny: Path) -> None:
     """It cannot be made again: `sags bag recover` reads it, and finds no metadata.yaml that is cut off."""

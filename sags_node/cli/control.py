@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -145,26 +145,18 @@ def load(file: Path, json_out: bool, node: NodeAddress) -> None:
 
     All of it or, if one of the keys cannot change, nothing: see sags param set.
     """
+    from sags_node.config.launch_file import leaves
     from sags_node.config.yaml_reader import read_yaml
 
     wanted = read_yaml(file, "parameters")
     if not isinstance(wanted, dict):
         raise UsageError(f"{file} has no parameters: write key: value, as sags param dump does")
-    now = dict(_leaves(ask(node, "get_parameters")))
-    said = {key: value for key, value in _leaves(wanted) if key not in now or now[key] != value}
+    now = dict(leaves(ask(node, "get_parameters")))
+    said = {key: value for key, value in leaves(wanted) if key not in now or now[key] != value}
     if said:
         ask(node, "set_parameters", said)
     changed = ", ".join(f"{key} is {value}" for key, value in said.items())
     show(said if json_out else changed or "all of it is so already")
-
-
-def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Each value of nested keys, by its whole key."""
-    for key, value in tree.items():
-        if isinstance(value, dict) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 @param.command("set")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any, TypeVar, get_args
@@ -107,6 +107,15 @@ def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
     for override in overrides:
         _apply_override(tree, override)
     return tree
+
+
+def leaves(tree: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    """Each value of nested keys, by its whole key."""
+    for key, value in tree.items():
+        if isinstance(value, dict) and value:
+            yield from leaves(value, f"{within}{key}.")
+        else:
+            yield f"{within}{key}", value
 
 
 def written_in(folder: Path, tree: Mapping[str, Any]) -> dict[str, Any]:

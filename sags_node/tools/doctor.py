@@ -10,6 +10,7 @@ import importlib.metadata
 import os
 import platform
 import socket
+import struct
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -56,6 +57,7 @@ REQUIRED = (
 CORES = 2  # for the rate of a camera
 ENOUGH_MEMORY = 2e9  # bytes: about twice what a node takes
 TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
+MAX_ERROR = struct.Struct("@I3l")  # modes, offset, frequency and largest error (us) of its `timex`
 TIME_KEEPERS = {"chronyd", "ntpd", "phc2sys", "ptp4l", "systemd-timesyn"}  # as far as /proc tells names
 OPEN3D_LIBRARIES = {
     "usb-1.0": "libusb-1.0-0",
@@ -277,29 +279,16 @@ def _keys(key: Path, allow: Sequence[Path]) -> Finding:
     return Finding("ok", f"{key}; may connect: {', '.join(map(str, allowed.values()))}")
 
 
-class _Timex(ctypes.Structure):
-    """The head of what adjtimex(2) tells; the kernel writes 208 bytes."""
-
-    _fields_ = (
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),  # us
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("rest", ctypes.c_char * 256),
-    )
-
-
 def _clock() -> Finding:
     """Tell whether anything sets this machine's clock right. Clients on other machines ask the node for its
     clock, so one that nobody keeps is no fault."""
     by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
-    timex = _Timex()
-    if ctypes.CDLL(None).adjtimex(ctypes.byref(timex)) in (-1, TIME_ERROR):
+    timex = ctypes.create_string_buffer(256)  # of which the kernel writes 208 bytes
+    if ctypes.CDLL(None).adjtimex(timex) in (-1, TIME_ERROR):
         fix = "to compare stamps with other machines': sudo apt-get install chrony"
         return Finding("ok", f"kept by {by}; not synchronised", fix)
-    return Finding("ok", f"kept by {by}; synchronised to within {timex.maxerror * 1e-3:.0f} ms")
+    error_us = MAX_ERROR.unpack_from(timex)[3]
+    return Finding("ok", f"kept by {by}; synchronised to within {error_us * 1e-3:.0f} ms")
 
 
 def _running() -> set[str]:

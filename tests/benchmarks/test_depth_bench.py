@@ -64,9 +64,6 @@ def slanted() -> F32:
     return (16.0 + 0.010 * columns - 0.012 * rows).astype(np.float32)
 
 
-# ---- the smoothing of the stereo stage -------------------------------------------------------------------
-
-
 # ---- figures ---------------------------------------------------------------------------------------------
 
 
@@ -157,9 +154,6 @@ def test_faults_make_depth_worse(tmp_path: Path) -> None:
     assert blocks["coverage"] > 0.5
     assert 0 < blocks["median_mm"] < 3.3  # half a px of disparity at 80 mm, 230 px and 4.3 mm
     assert [made.row_count for made in depth_report.tables(measured)] == [1 + len(clean["settings"])] * 2
-
-
-# ---- both eyes against each other ------------------------------------------------------------------------
 
 
 # ---- a CT surface ----------------------------------------------------------------------------------------

@@ -31,10 +31,6 @@ def opened(*overrides: str) -> Session:
     )
 
 
-def ignore(done: int, total: int, what: str) -> None:
-    pass
-
-
 # ---- the order of frames ---------------------------------------------------------------------------------
 
 
@@ -42,13 +38,17 @@ def visits(count: int, order: Any, length: int, seed: int = 0) -> list[int]:
     return list(itertools.islice(endurance.visits(count, order, seed), length))
 
 
-def test_there_and_back_never_jumps_and_shows_no_frame_twice_in_a_row() -> None:
-    assert visits(4, "there-and-back", 13) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
-    assert visits(2, "there-and-back", 4) == [0, 1, 0, 1]
-
-
-def test_wrap_begins_again() -> None:
-    assert visits(3, "wrap", 7) == [0, 1, 2, 0, 1, 2, 0]
+@pytest.mark.parametrize(
+    ("order", "count", "numbers"),
+    [
+        ("there-and-back", 4, [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0]),  # none twice in a row, no jump
+        ("there-and-back", 2, [0, 1, 0, 1]),
+        ("wrap", 3, [0, 1, 2, 0, 1, 2, 0]),
+        *((order, 1, [0] * 5) for order in ("there-and-back", "wrap", "walk")),  # a single one is enough
+    ],
+)
+def test_frames_come_in_the_order_that_was_asked_for(order: Any, count: int, numbers: list[int]) -> None:
+    assert visits(count, order, len(numbers)) == numbers
 
 
 def test_a_walk_goes_by_single_frames_to_all_of_them_and_never_the_same_way_again() -> None:
@@ -57,11 +57,6 @@ def test_a_walk_goes_by_single_frames_to_all_of_them_and_never_the_same_way_agai
     assert walk == visits(40, "walk", 4000) != visits(40, "walk", 4000, seed=1)
     stretches = {tuple(walk[i : i + 200]) for i in range(0, 4000, 200)}
     assert len(stretches) == 20
-
-
-@pytest.mark.parametrize("order", ["there-and-back", "wrap", "walk"])
-def test_a_single_frame_is_enough(order: Any) -> None:
-    assert visits(1, order, 5) == [0] * 5
 
 
 # ---- slopes ----------------------------------------------------------------------------------------------

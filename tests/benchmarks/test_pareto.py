@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from benchmarks.pareto import settings as pareto_settings
 from benchmarks.pareto.measure import non_dominated, why_default
@@ -108,13 +107,3 @@ def test_warp_by_the_exact_depth_is_the_right_picture(phantom_session: Path) -> 
             focal_baseline, focal_baseline / np.maximum(depth, np.float32(1e-3)) + np.float32(shift)
         )
         assert exact > warped(shifted * (depth > 0))[0] + 0.4
-
-
-# ---- the command -----------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pareto_settings, "BUDGETS_MS", (33.0, 20.0))
-    monkeypatch.setattr(pareto_settings, "SIZES", (0.5,))
-    monkeypatch.setattr(pareto_settings, "COUNTS", (1000,))

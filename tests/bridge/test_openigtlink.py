@@ -17,7 +17,6 @@ from bridging import (
     LOST,
     SEEN,
     UNSURE,
-    anchored,
     anchored_at,
     bridged,
     plane_bridged,
@@ -355,7 +354,3 @@ def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:
             run_openigtlink(options(tmp_path, port=port), lambda *_: None, threading.Event())
     with pytest.raises(UsageError, match="--send depth: there is picture"):
         run_openigtlink(options(tmp_path, send=("depth",)), lambda *_: None, threading.Event())
-
-
-def test_the_plane_with_anchors_is_what_it_says() -> None:
-    assert len(anchored().anchors) == 4

@@ -558,14 +558,6 @@ def test_a_video_that_is_cut_off_is_refused_by_check_and_run_alike(
         assert len(list(source)) == int(remedy.removeprefix("source.frames:="))
 
 
-def test_videos_say_rate_length_and_number(tmp_path: Path) -> None:
-    found = check_folder(write_eyes(tmp_path / "case", moving(50), moving(50, -DISPARITY)))
-    said = [each.what for each in found]
-    assert f"left.avi: 50 frames of {WIDTH}x{HEIGHT} px at 25 Hz, 2.0 s" in said
-    assert f"right.avi: 50 frames of {WIDTH}x{HEIGHT} px at 25 Hz, 2.0 s" in said
-    assert "error" not in {each.level for each in found} and "no calibration" in str(odd_of(found))
-
-
 def odd_of(found: list[Finding]) -> list[Finding]:
     return [each for each in found if each.level != "ok"]
 

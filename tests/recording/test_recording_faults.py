@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from contextlib import nullcontext
@@ -16,7 +15,7 @@ import zmq
 from independent_client import zmq_socket
 from made_messages import message_of
 from recorded_plane import by_topic, recording
-from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher, stream
+from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher
 from waiting import until
 
 from sags_node.cli.bag import recorded_table
@@ -214,25 +213,3 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     ):
         pass
     assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.fault("disk: full while recording")
-def test_a_full_disk_ends_with_one_message(tmp_path: Path) -> None:
-    with publisher(tmp_path / "run") as running, stream(running):
-        file = Path("/dev/full")
-        recorder_folder = tmp_path / "bag"
-        recorder_folder.mkdir()
-        with pytest.raises(SagsError, match=r"cannot write .*: No space left on device; save what is there"):
-            with recording(RecordOptions(recorder_folder, node=NodeAddress(run_dir=tmp_path / "run"))) as (
-                _,
-                _,
-            ):
-                # The file that is being written becomes a full disk.
-                (written,) = recorder_folder.glob("*.mcap")
-                descriptors = Path("/proc/self/fd")
-                number = next(
-                    int(d.name) for d in descriptors.iterdir() if os.path.realpath(d) == str(written)
-                )
-                with file.open("wb") as full:
-                    os.dup2(full.fileno(), number)
-                time.sleep(2)

@@ -21,7 +21,7 @@ from sags_node.tools.evaluation.measure import FrameRow, MeasureOptions, Measure
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.tools.evaluation.run import MappedFrame, Run
 from sags_node.tools.evaluation.steps import again, run_step
-from sags_node.tools.evaluation.tracking import REACH, PointTracks, TrackErrors
+from sags_node.tools.evaluation.tracking import REACH, PointTracks, TrackErrors, pooled
 from sags_node.types import F64, FrameResult, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
@@ -108,14 +108,7 @@ def _forth_and_back(
         told("backwards", done)
     assert result is not None
     end = _errors(tracks, points, result)
-    known = len(end.errors_mm) > 0
-    return {
-        "median_mm": float(np.median(end.errors_mm)) if known else None,
-        "p90_mm": float(np.percentile(end.errors_mm, 90)) if known else None,
-        "median_px": float(np.median(end.errors_px)) if known else None,
-        "lost": end.lost / len(points),
-        "moved_mm": moved,
-    }
+    return {**pooled([end]), "lost": end.lost / len(points), "moved_mm": moved}
 
 
 def _mirrored(frame: StereoFrame, last: StereoFrame) -> StereoFrame:

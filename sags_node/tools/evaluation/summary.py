@@ -16,6 +16,7 @@ from sags_node.tools.evaluation.lpips import BACKBONE
 from sags_node.tools.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.tools.evaluation.provenance import machine_name
 from sags_node.tools.evaluation.run import RunFacts
+from sags_node.tools.evaluation.tracking import pooled
 from sags_node.tools.evaluation.trajectory import trajectory_errors
 
 STAGES = ("rectify", "mask", "depth", "map", "render", "publish")
@@ -139,16 +140,7 @@ def _track(rows: Sequence[FrameRow]) -> dict[str, Any] | None:
     followed = sum(len(track.errors_mm) for track in tracks)
     if followed + lost == 0:
         return None
-    if followed == 0:
-        return {"median_mm": None, "p90_mm": None, "median_px": None, "lost": 1.0}
-    errors_mm = np.concatenate([track.errors_mm for track in tracks])
-    errors_px = np.concatenate([track.errors_px for track in tracks])
-    return {
-        "median_mm": float(np.median(errors_mm)),
-        "p90_mm": float(np.percentile(errors_mm, 90)),
-        "median_px": float(np.median(errors_px)),
-        "lost": lost / (lost + followed),
-    }
+    return {**pooled(tracks), "lost": lost / (lost + followed)}
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,20 @@ class TrackErrors:
     errors_mm: F64  # [F] of the points that were followed
     errors_px: F64  # [F] the same, in the left picture
     lost: int  # visible, but no neighbour is left, or none was ever near enough
+
+
+def pooled(tracks: Sequence[TrackErrors]) -> dict[str, float | None]:
+    """The errors over points and frames; None where no point was followed."""
+    mm, px = (
+        np.concatenate([np.empty(0), *errors])
+        for errors in ([each.errors_mm for each in tracks], [each.errors_px for each in tracks])
+    )
+    known = len(mm) > 0
+    return {
+        "median_mm": float(np.median(mm)) if known else None,
+        "p90_mm": float(np.percentile(mm, 90)) if known else None,
+        "median_px": float(np.median(px)) if known else None,
+    }
 
 
 class PointTracks:

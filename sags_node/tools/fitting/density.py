@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from sags_node.field.model import DeformableModel
+from sags_node.geometry import quat_to_matrix
 from sags_node.model import columns
 from sags_node.types import F32
 
@@ -60,7 +61,7 @@ def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
     """Return what becomes of rows [M, 14]: smaller ones, shifted along their longest axis to either side."""
     every = np.arange(len(parents))
     longest = parents[:, columns.LOG_SCALE].argmax(1)
-    along = _axes(parents[:, columns.QUAT])[every, :, longest]
+    along = quat_to_matrix(parents[:, columns.QUAT])[every, :, longest]
     reach = np.exp(parents[:, columns.LOG_SCALE][every, longest])
     shift = along * (reach * rng.uniform(0.5, 1.0, len(parents)))[:, None].astype(np.float32)
     there: F32 = parents.copy()
@@ -69,17 +70,3 @@ def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
     there[:, columns.MEAN] += shift
     here[:, columns.MEAN] -= shift
     return there, here
-
-
-def _axes(quats: F32) -> F32:
-    """Rotation matrices [M, 3, 3]; column k is the k-th axis."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    matrix = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    axes: F32 = np.moveaxis(matrix, 2, 0)
-    return axes

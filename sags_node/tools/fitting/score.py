@@ -15,10 +15,10 @@ from sags_node.files import whole
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.lpips import Lpips
 from sags_node.tools.evaluation.moments import Seen, carried
-from sags_node.tools.evaluation.tracking import PointTracks
+from sags_node.tools.evaluation.tracking import PointTracks, TrackErrors, pooled
 from sags_node.tools.fitting.clip import ClipFrame
 from sags_node.tools.fitting.fit import Fit
-from sags_node.types import F32, F64
+from sags_node.types import F32
 
 Segments = dict[str, tuple[int, int]]  # first and last frame
 
@@ -144,28 +144,18 @@ def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None
         frames; None if no frame knows such points.
     """
     tracks: PointTracks | None = None
-    errors_mm: list[F64] = []
-    errors_px: list[F64] = []
-    lost = 0
+    found: list[TrackErrors] = []
     for frame in frames:
         reference = frame.reference
         if reference is None or reference.points is None or reference.points_visible is None:
             continue
         if tracks is None:
             tracks = PointTracks(len(reference.points))
-        found = tracks.update(fit.gaussians(frame), reference.points, reference.points_visible, frame.camera)
-        errors_mm.append(found.errors_mm)
-        errors_px.append(found.errors_px)
-        lost += found.lost
-    if not errors_mm or sum(map(len, errors_mm)) == 0:
-        return None
-    mm, px = np.concatenate(errors_mm), np.concatenate(errors_px)
-    return {
-        "median_mm": round(float(np.median(mm)), 4),
-        "p90_mm": round(float(np.quantile(mm, 0.9)), 4),
-        "median_px": round(float(np.median(px)), 4),
-        "lost": lost,
-    }
+        found.append(
+            tracks.update(fit.gaussians(frame), reference.points, reference.points_visible, frame.camera)
+        )
+    figures = {name: round(value, 4) for name, value in pooled(found).items() if value is not None}
+    return {**figures, "lost": sum(errors.lost for errors in found)} if figures else None
 
 
 def _figures(shown: F32, frame: ClipFrame, lpips: Lpips | None) -> dict[str, float]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sags_node.checks import Finding, is_wrong
-from sags_node.config.launch_file import known_recording, load_launch
+from sags_node.config.launch_file import known_recording, leaves, load_launch
 from sags_node.config.schema import EndoNerfSource, FoldersSource, LaunchConfig, LiveSource
 from sags_node.errors import UsageError
 from sags_node.sources.pictures import size_text
@@ -77,18 +76,10 @@ def _launch_of(named: Sequence[Path], overrides: Sequence[str]) -> list[str]:
                 return [f"source.kind:={kind}", left, right]
         raise UsageError(f"{named[0]} and {named[1]} are neither two videos nor two folders of pictures")
     known = known_recording(named[0])
-    launch = overrides_of(named[0]) if known is None else list(_flat(known))
+    launch = overrides_of(named[0]) if known is None else [override(*each) for each in leaves(known)]
     if not launch:
         raise UsageError(f"{named[0]} has a launch file already: copy it, and change what should differ")
     return launch
-
-
-def _flat(tree: Mapping[str, Any], within: str = "") -> Iterator[str]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{within}{key}.")
-        else:
-            yield override(f"{within}{key}", value)
 
 
 def _of_cameras(devices: Sequence[Path], overrides: Sequence[str]) -> list[str]:
