@@ -29,16 +29,16 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10090,
+    "benchmarks": 10281,
     "sags_lab": 5023,
     "sags_node": 1169,
-    "sags_node/bags": 864,
+    "sags_node/bags": 894,
     "sags_node/cli": 3544,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2591,
     "sags_node/clients/latency": 431,
     "sags_node/clients/overlay": 3059,
-    "sags_node/clients/recording": 1383,
+    "sags_node/clients/recording": 1403,
     "sags_node/clients/registration": 483,
     "sags_node/clients/viewer": 1491,
     "sags_node/config": 1345,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1567,
     "sags_node/tools/importing": 1092,
     "sags_node/vision": 5444,
-    "tests": 47245,
+    "tests": 47074,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

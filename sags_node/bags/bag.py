@@ -68,7 +68,7 @@ def read_messages(
 
 def recorded_namespace(path: Path) -> str | None:
     """The namespace of the node that was recorded; None where the bag does not say it: it is of another
-    recorder, or neither MCAP.
+    recorder, or no MCAP.
 
     Raises:
         UsageError, SagsError: as `read_messages`.
@@ -81,7 +81,8 @@ def recorded_namespace(path: Path) -> str | None:
                 if head.opcode == Opcode.METADATA and head.length <= MAX_METADATA_BYTES:
                     said = mcap_file.read_metadata(mcap_file.read_content(opened, head))
                     if said is not None and said.name == RECORDED:
-                        return said.metadata.get("ns")
+                        ns: str | None = said.metadata.get("ns")
+                        return ns
     return None
 
 
