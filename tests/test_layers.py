@@ -29,16 +29,16 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10090,
+    "benchmarks": 10281,
     "sags_lab": 5023,
     "sags_node": 1172,
-    "sags_node/bags": 873,
+    "sags_node/bags": 902,
     "sags_node/cli": 3538,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2591,
     "sags_node/clients/latency": 431,
     "sags_node/clients/overlay": 3059,
-    "sags_node/clients/recording": 1383,
+    "sags_node/clients/recording": 1403,
     "sags_node/clients/registration": 483,
     "sags_node/clients/viewer": 1491,
     "sags_node/config": 1354,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1089,
     "sags_node/vision": 5452,
-    "tests": 47263,
+    "tests": 47092,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -90,7 +90,7 @@ def _pulled(
             given = shown_to_node(phantom, number, count, RATE)
             result = pipeline.process(given, StepBudget(STEPS))
             receipt.add(given, result.observation.tissue)
-            frame, now = _frame(result), phantom.tissue.vertices(number / count).astype(np.float64)
+            frame, now = seen(result), phantom.tissue.vertices(number / count).astype(np.float64)
             if number < PINNED:
                 continue
             if number == PINNED:
@@ -133,14 +133,15 @@ def _rows(errors: F64, moved: Any) -> list[dict[str, Any]]:
     return rows
 
 
-def _frame(result: FrameResult) -> TissueFrame:
+def seen(result: FrameResult) -> TissueFrame:
+    """What the overlay would receive of a frame."""
     view, states, pair = result.views["left"], result.anchors, result.pair
     rows = zip(
         states.ids, states.points, states.visibility, states.confidence, states.depth_confidence, strict=True
     )
     anchors = {int(n): Anchor(place.astype(np.float64), *map(float, rest)) for n, place, *rest in rows}
-    seen = view.camera, None, view.depth, result.observation.tissue
-    return TissueFrame(pair.frame_id, pair.t_capture_ns, "", result.epoch, *seen, anchors, view.confidence)
+    shown = view.camera, None, view.depth, result.observation.tissue
+    return TissueFrame(pair.frame_id, pair.t_capture_ns, "", result.epoch, *shown, anchors, view.confidence)
 
 
 def _half_space(ways: F64) -> F64:

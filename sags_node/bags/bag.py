@@ -27,6 +27,7 @@ from sags_node.messaging import cdr
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
+RECORDED = "sags"  # metadata of a bag that says which node was recorded
 RELATIVE = {"sags_units": "relative"}  # metadata of a channel whose lengths have no unit
 
 
@@ -63,6 +64,26 @@ def read_messages(
                 found = _read_with_rosbags(file, topics, start_ns)
             for message in found:
                 yield _unpacked(message) if unpack else message
+
+
+def recorded_namespace(path: Path) -> str | None:
+    """The namespace of the node that was recorded; None where the bag does not say it: it is of another
+    recorder, or no MCAP.
+
+    Raises:
+        UsageError, SagsError: as `read_messages`.
+    """
+    for file in (file for file in storage_files(path)[0] if file.suffix == ".mcap"):
+        with _explained(file), open_file(file) as opened:
+            for head in mcap_file.heads(opened, file.stat().st_size, len(MAGIC)):
+                if head.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+                    break  # it stands before the first message
+                if head.opcode == Opcode.METADATA and head.length <= MAX_METADATA_BYTES:
+                    said = mcap_file.read_metadata(mcap_file.read_content(opened, head))
+                    if said is not None and said.name == RECORDED:
+                        ns: str | None = said.metadata.get("ns")
+                        return ns
+    return None
 
 
 def storage_files(path: Path) -> tuple[list[Path], bool]:

@@ -19,7 +19,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Schema
+from mcap.records import Attachment, Channel, Metadata, Schema
 
 from sags_node.errors import SagsError
 
@@ -150,6 +150,14 @@ def read_attachment(content: bytes) -> Attachment | None:
         return None
     try:
         return Attachment.read(ReadDataStream(BytesIO(content)))
+    except _BAD_BYTES:
+        return None
+
+
+def read_metadata(content: bytes) -> Metadata | None:
+    """Key-value metadata with its name; None if it is damaged."""
+    try:
+        return Metadata.read(ReadDataStream(BytesIO(content)))
     except _BAD_BYTES:
         return None
 

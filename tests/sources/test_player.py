@@ -20,6 +20,7 @@ from waiting import beside, until
 from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
+from sags_node.clients.recording.recover import recover
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr
@@ -149,6 +150,24 @@ def test_flags_of_play(plane_bag: Path, tmp_path: Path) -> None:
         assert subscriber.wait("left/render/depth", 30) is not None
         assert subscriber.latest("left/depth") is None
     assert sags("bag", "play", plane_bag, "--remap", "a=b").exit_code == 2
+
+
+def test_another_namespace_takes_the_place_of_the_recorded_one(plane_bag: Path, tmp_path: Path) -> None:
+    """As ROS would remap it, also of what `recover` saved; topics may be named as the bag has them."""
+    saved, run_dir = tmp_path / "saved", tmp_path / "run"
+    recover(plane_bag, saved)
+    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir)
+    for bag in (plane_bag, saved):
+        options = PlayOptions(topics=("sags/left/depth", "left/camera_info"), loop=True)
+        player = Player(bag, options, config, "other")
+        with beside(player.play, player.stop):
+            until((run_dir / "other.json").exists)
+            came = set()
+            for arrived in listen_to(NodeAddress("other", run_dir=run_dir), [], 60.0):
+                came |= set() if arrived is None else {arrived[0].topic}
+                if len(came) > 1:
+                    break
+        assert came == {"other/left/depth", "other/left/camera_info"}
 
 
 def test_a_clock_tells_the_moment_of_the_recording(plane_bag: Path, tmp_path: Path) -> None:

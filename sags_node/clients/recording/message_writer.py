@@ -10,6 +10,7 @@ import msgspec
 from mcap.records import Schema
 
 from sags_node import __version__
+from sags_node.bags.bag import RECORDED
 from sags_node.bags.camera_info import read_eye
 from sags_node.bags.pictures import encode_file
 from sags_node.clients.recording.backlog import Arrived
@@ -64,7 +65,7 @@ class MessageWriter:
         if meta.session != self._session:
             self._session = meta.session
             self.bag.note(
-                "sags",
+                RECORDED,
                 {"session": meta.session, "protocol": PROTOCOL, "ns": self._ns, "version": __version__},
             )
         relative = meta.units is not msgspec.UNSET

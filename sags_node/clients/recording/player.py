@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sags_node.bags.bag import BagMessage, read_messages
+from sags_node.bags.bag import BagMessage, read_messages, recorded_namespace
 from sags_node.clients.recording.outgoing import COMPRESSED_SUFFIX, original_stamp, outgoing
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
@@ -29,8 +29,8 @@ class PlayOptions:
     """The flags of `ros2 bag play`. Seconds are those of the recording, but for `delay`.
 
     Attributes:
-        topics, exclude: without leading slash and namespace; no topics: all.
-        remap: from old to new name, the same way.
+        topics, exclude: without leading slash, with or without the namespace; no topics: all.
+        remap: from old to new name, the same way, new ones without a namespace.
         clock_hz: how often to publish the recording's time; None: never.
     """
 
@@ -83,7 +83,7 @@ class Player:
         self._path = path
         self._options = options
         self._config = config
-        self._ns = ns
+        self._ns = self._recorded_ns = ns
         self._stopping = threading.Event()
         self._paused = paused
         self._sent = 0
@@ -109,6 +109,14 @@ class Player:
         offered = (*topics.TOPICS, *topics.PLAYER_TOPICS)
         session, recording = uuid.uuid4().hex, self._path.absolute()
         check_name(recording)
+        self._recorded_ns = recorded_namespace(self._path) or self._ns
+        said, plain = self._options, self._plain
+        self._options = replace(
+            said,
+            topics=tuple(map(plain, said.topics)),
+            exclude=tuple(map(plain, said.exclude)),
+            remap={plain(old): new for old, new in said.remap.items()},
+        )
         with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
             self._delay(publisher)
             while not self._stopping.is_set():
@@ -140,8 +148,7 @@ class Player:
             stamp_ns = clock.wall_ns(original)
             name, content = outgoing(message, stamp_ns)
             number = self._frame_number(original) if content.type in FRAME_TYPES else -1
-            name = name.removeprefix(f"{self._ns}/")
-            content = replace(content, relative=message.relative)
+            name, content = self._plain(name), replace(content, relative=message.relative)
             publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, epoch)
             self._sent += 1
 
@@ -183,13 +190,17 @@ class Player:
         publisher.publish_content(CLOCK_TOPIC, cdr.clock(moment_ns), -1, clock.wall_ns(moment_ns), epoch)
 
     def _is_wanted(self, message: BagMessage) -> bool:
-        name = message.topic.lstrip("/").removesuffix(COMPRESSED_SUFFIX).removeprefix(f"{self._ns}/")
+        name = self._plain(message.topic.removesuffix(COMPRESSED_SUFFIX))
         options = self._options
         if not cdr.knows(message.type):
             return False  # it could not be described to anybody
         if options.clock_hz is not None and name == CLOCK_TOPIC:
             return False  # there is one clock
         return (not options.topics or name in options.topics) and name not in options.exclude
+
+    def _plain(self, name: str) -> str:
+        """A topic of the bag without the namespace that was recorded: ours takes its place."""
+        return topics.plain_name(self._recorded_ns, name)
 
     def _frame_number(self, stamp_ns: int) -> int:
         """Number frames by their stamps."""

@@ -14,6 +14,7 @@ from mcap.records import Channel, Schema
 
 from sags_node.bags import mcap_file
 from sags_node.bags.bag import (
+    RECORDED,
     Channels,
     files_in,
     read_messages,
@@ -117,6 +118,12 @@ class _Writer:
             self._attached.add(key)
             self._bag.attach(attachment.name, attachment.media_type, attachment.data, attachment.log_time)
 
+    def note(self, content: bytes) -> None:
+        """Copy what says which node was recorded."""
+        metadata = mcap_file.read_metadata(content)
+        if metadata is not None and metadata.name == RECORDED:
+            self._bag.note(RECORDED, metadata.metadata)
+
 
 def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
     size = path.stat().st_size
@@ -164,8 +171,9 @@ def _summary(file: BinaryIO, size: int) -> Iterator[Schema | Channel]:
 
 def _copy(file: BinaryIO, head: Head, channels: Channels, writer: _Writer, done: Recovery) -> None:
     """One record of the old file; what is damaged inside it is counted and left out."""
-    if head.opcode == Opcode.ATTACHMENT:
-        writer.attach(mcap_file.read_content(file, head))
+    if head.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
+        say = writer.attach if head.opcode == Opcode.ATTACHMENT else writer.note
+        say(mcap_file.read_content(file, head))
         return
     try:
         records = list(records_of(file, head))
