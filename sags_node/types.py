@@ -124,6 +124,18 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
+class ToolPose:
+    """Where a robot says that the tip of one of its tools is."""
+
+    name: str  # its topic
+    error: float  # m, nine of ten are smaller
+    T_cam_tool: (
+        F64 | None
+    )  # [4, 4] in the left rectified camera, z points out of the tip; None: not known now
+    problem: str = ""  # why not
+
+
+@dataclass(frozen=True, slots=True)
 class StereoFrame:
     """A raw stereo picture pair as a source delivers it."""
 
@@ -140,6 +152,7 @@ class StereoFrame:
     t_device_ns: int = 0  # left eye, as the device, sender or recording stamped it by its own clock; 0: none
     t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
     pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
+    tools: tuple[ToolPose, ...] = ()  # where a robot says that its tools are
     warm_up: bool = False  # the model learns from it, and nothing of it is shown or counted
     recorded_s: float | None = None  # its place in the recording, from 0 again when that loops; None: live
 
@@ -388,6 +401,7 @@ class InstrumentStates:
     clearance: F32  # [I] m, from the tip to the nearest tissue
     clearance_confidence: F32  # [I] 0..1
     nearest: F32  # [I, 3] m, world, of the tissue
+    sources: I64  # [I] who tells it: 1 the picture, 2 the robot, 3 the robot corrected by the picture
 
     def __len__(self) -> int:
         return len(self.ids)

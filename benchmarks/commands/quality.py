@@ -213,8 +213,9 @@ def bench_instruments(seeds: int) -> Measured:
     \b
     python -m benchmarks instruments --out benchmarks/results/instruments.json
     """
-    from benchmarks.quality import instruments
+    from benchmarks.quality import instruments, kinematics
 
     with progress("placing") as advance:
         measured = instruments.measure_instruments(seeds, advance)
-    return measured, instruments.tables(measured)
+        measured["kinematics"] = kinematics.measure_kinematics(seeds, advance)
+    return measured, [*instruments.tables(measured), kinematics.table(measured["kinematics"])]

@@ -50,7 +50,6 @@ INSTRUMENT_FIELDS = (
     *("distance", "distance_confidence", "clearance", "clearance_confidence", "source"),
     *("near_x", "near_y", "near_z"),
 )
-BY_MASK = 1  # in the column source: by the tissue mask and both eyes
 POINT_MIN_OPACITY = 0.1
 POINT_BEHIND_SURFACE = 0.003  # m; a Gaussian deeper than this under the drawn surface is not visible
 
@@ -129,7 +128,7 @@ def instruments(result: FrameResult) -> Content:
     rows[:, 7:9] = published.pixels(result.pair, states.pixels)
     rows[:, 10], rows[:, 11] = states.distance, states.distance_confidence
     rows[:, 12], rows[:, 13] = states.clearance, states.clearance_confidence
-    rows[:, 14], rows[:, 15:18] = BY_MASK, states.nearest
+    rows[:, 14], rows[:, 15:18] = states.sources, states.nearest
     dense = bool(np.isfinite(states.tips).all())
     return cdr.point_cloud(rows, INSTRUMENT_FIELDS, result.pair.t_capture_ns, dense)
 

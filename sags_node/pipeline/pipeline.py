@@ -48,6 +48,7 @@ from sags_node.types import (
     RenderedView,
     StereoFrame,
     StereoRig,
+    ToolPose,
 )
 from sags_node.vision.change import StillScene, is_repeat
 from sags_node.vision.depth import DepthChoice, Measured
@@ -143,6 +144,7 @@ class Pipeline:
         self.anchors = Anchors(self.tissue.usable)
         self._instruments = Instruments(self.tissue.usable)
         self._instruments_asked = False  # for the last frame that was mapped
+        self._tools: tuple[ToolPose, ...] = ()  # of the newest frame, as a robot tells them
         self._pose = PoseWatch(needed=vision.pose in ("session", "refine"))
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._freeze = FreezeWatch(vision.tissue.exclude)
@@ -197,6 +199,9 @@ class Pipeline:
         if (lost := self._camera.lost) is not None:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
+        if unknown := "; ".join(tool.problem for tool in self._tools if tool.problem):
+            said = f"{unknown}; instruments come from the picture alone: check the robot's program"
+            found.append(Finding("tool_pose_missing", said))
         if not self.metric:
             found.append(FINDING)
         if self.tissue.problem:
@@ -229,6 +234,7 @@ class Pipeline:
     def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:
         plan, clock = budget.start(request.waited), Stopwatch()
         self._note_gap(frame.t_capture_ns)
+        self._tools = frame.tools
         with clock("rectify"):
             pair = self._rectified(frame)
         self._on_rectified(pair, self._epoch(frame))
@@ -456,6 +462,7 @@ class Pipeline:
             pair.baseline,
             mapped.view,
             0.0 if rows is None else rows.median,
+            self._tools if self.metric else (),
         )
 
     def _skipped(self, measured: Measured) -> dict[str, str]:
