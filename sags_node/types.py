@@ -23,7 +23,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -426,6 +426,15 @@ class RungState:
     depth_every: int  # frames: how often depth is matched
 
 
+class Strained(Protocol):
+    """How tissue is stretched since a moment; see `sags_node.model.strain`."""
+
+    since_ns: int
+
+    def at(self, gaussians: Gaussians) -> F32:
+        """The largest and the smallest principal strain [N, 2] where each Gaussian is; NaN: not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class FrameResult:
     """One frame's whole story."""
@@ -443,6 +452,7 @@ class FrameResult:
     hurried: bool = False  # there was no time to measure its depth
     recorded_s: float | None = None  # as `StereoFrame.recorded_s`
     instruments: InstrumentStates | None = None  # None: nobody asked
+    strain: Strained | None = None  # None: nobody asked
 
 
 @dataclass(frozen=True, slots=True)

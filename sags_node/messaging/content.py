@@ -41,6 +41,7 @@ SPLAT_FIELDS = (
 )
 HEALTHY = ("running", "paused")  # states
 POINT_FIELDS = ("x", "y", "z", "rgb", "confidence")
+STRAIN_FIELDS = ("strain_max", "strain_min", "strain_s")
 ANCHOR_FIELDS = (
     *("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence", "depth_confidence"),
     *("ahead", "x_ahead", "y_ahead", "z_ahead", "u_ahead", "v_ahead"),
@@ -90,15 +91,19 @@ def gaussians_of(points: NDArray[Any]) -> Gaussians:
 
 
 def points(result: FrameResult) -> Content:
-    """The Gaussians that the left eye sees, as rows of `POINT_FIELDS`."""
+    """The Gaussians that the left eye sees, as rows of `POINT_FIELDS`, and `STRAIN_FIELDS` if wanted."""
     gaussians = result.snapshot.gaussians
     seen = _visible(result)
     rgb = np.clip(gaussians.colors[seen] * 255 + 0.5, 0, 255).astype(np.uint32)
-    rows = np.empty((len(rgb), len(POINT_FIELDS)), np.float32)
+    fields = POINT_FIELDS if result.strain is None else (*POINT_FIELDS, *STRAIN_FIELDS)
+    rows = np.empty((len(rgb), len(fields)), np.float32)
     rows[:, 0:3] = gaussians.means[seen]
     rows.view(np.uint32)[:, 3] = rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]
     rows[:, 4] = _confidence(gaussians)[seen]
-    return cdr.point_cloud(rows, POINT_FIELDS, result.pair.t_capture_ns)
+    if result.strain is not None:
+        rows[:, 5:7] = result.strain.at(gaussians)[seen]
+        rows[:, 7] = 1e-9 * (result.snapshot.t_capture_ns - result.strain.since_ns)
+    return cdr.point_cloud(rows, fields, result.pair.t_capture_ns)
 
 
 def anchors(result: FrameResult) -> Content:

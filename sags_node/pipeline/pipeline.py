@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -35,6 +35,7 @@ from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging import published
+from sags_node.model.strain import Strain
 from sags_node.pipeline.repeats import doubted, repeated, unseen
 from sags_node.pipeline.uncalibrated import FINDING, MOST, unsure
 from sags_node.types import (
@@ -156,6 +157,7 @@ class Pipeline:
         self.newest: FrameResult | None = None
         self.held = ""
         self.seen: tuple[SeenFrame, ...] = ()
+        self._strain: Strain | None = None  # since somebody asked for it
         self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
         self._unwatched = 0.0  # m: how far tissue may have moved while no frame was taken in
         self._came_ns: int | None = None  # when the last frame was captured
@@ -176,7 +178,7 @@ class Pipeline:
         self._scene.forget()
         self._still.forget()
         self._memory.forget()
-        self.newest, self._last, self.seen = None, None, ()
+        self.newest, self._last, self.seen, self._strain = None, None, (), None
         self._came_ns = None
         self._unwatched = 0.0
 
@@ -184,6 +186,18 @@ class Pipeline:
         """How far to trust the depth of an anchor that is there, 0..1, now."""
         sure = self.anchors.depth_confidence(anchor_id) * float(confidence_of(np.float32(self._unwatched)))
         return sure if self.metric else min(sure, MOST)
+
+    def start_strain(self) -> int:
+        """From now on frames say how tissue is stretched since the newest one; returns its stamp."""
+        assert self.newest is not None  # else there is no tissue
+        self._strain = Strain(self.newest.snapshot.gaussians, self.newest.snapshot.t_capture_ns)
+        self.newest = replace(self.newest, strain=self._strain)
+        return self._strain.since_ns
+
+    def stop_strain(self) -> dict[str, Any]:
+        """Frames say no more of it."""
+        self._strain = None
+        return {}
 
     def predict_motion(self) -> None:
         """Somebody wants motion predicted. Any thread may call this."""
@@ -285,7 +299,7 @@ class Pipeline:
         self.newest = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
             self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
-            instruments=instruments,
+            instruments=instruments, strain=self._strain,
         )  # fmt: skip
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
