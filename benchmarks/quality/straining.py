@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
-from scipy.spatial import cKDTree
 
 from benchmarks.quality.depth import Advance, rounded
 from sags_node.config.schema import LaunchConfig
@@ -17,7 +16,7 @@ from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.tools.evaluation.receipt import Receipt
-from sags_node.types import F32, F64, StereoFrame
+from sags_node.types import F32, F64, I64, StereoFrame
 
 SIZE = (640, 512)
 SECONDS, RATE, STEPS = 4.0, 15.0, 2  # of one pull; frames a second; steps of the mapper, each frame
@@ -53,8 +52,8 @@ def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
             names = body.encoding.split(",")
             rows = np.frombuffer(body.parts[1], np.float32).reshape(-1, len(names))
             now = phantom.tissue.vertices(number / count)
-            near, vertex = cKDTree(now.reshape(-1, 3)).query(rows[:, :3], distance_upper_bound=NEAR)
-            on = np.isfinite(near)
+            vertex, off = _nearest(now.reshape(-1, 3), rows[:, :3])
+            on = off <= NEAR
             told.append(rows[on][:, [names.index(name) for name in STRAIN_FIELDS[:2]]])
             true.append(true_strain(before, now).reshape(-1, 2)[vertex[on]])
     assert receipt is not None
@@ -65,6 +64,17 @@ def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
         **{name: _summary(found[which], exact[which]) for name, which in parts.items()},
         "receipts": {"phantom": receipt.as_json()},
     }
+
+
+def _nearest(vertices: F32, places: F32) -> tuple[I64, F32]:
+    """The vertex [N] that is the nearest to each place [N, 3], and how far it is [N] (m)."""
+    from open3d.core import Tensor
+    from open3d.core.nns import NearestNeighborSearch
+
+    search = NearestNeighborSearch(Tensor(np.ascontiguousarray(vertices)))
+    search.knn_index()
+    found, squared = search.knn_search(Tensor(np.ascontiguousarray(places)), 1)
+    return found.numpy()[:, 0], np.sqrt(squared.numpy()[:, 0])
 
 
 def true_strain(before: F32, now: F32) -> F64:
