@@ -24,7 +24,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,6 +127,18 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
+class ToolPose:
+    """Where a robot says that the tip of one of its tools is."""
+
+    name: str  # its topic
+    error: float  # m, nine of ten are smaller
+    T_cam_tool: (
+        F64 | None
+    )  # [4, 4] in the left rectified camera, z points out of the tip; None: not known now
+    problem: str = ""  # why not
+
+
+@dataclass(frozen=True, slots=True)
 class StereoFrame:
     """A raw stereo picture pair as a source delivers it."""
 
@@ -143,6 +155,7 @@ class StereoFrame:
     t_device_ns: int = 0  # left eye, as the device, sender or recording stamped it by its own clock; 0: none
     t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
     pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
+    tools: tuple[ToolPose, ...] = ()  # where a robot says that its tools are
     warm_up: bool = False  # the model learns from it, and nothing of it is shown or counted
     recorded_s: float | None = None  # its place in the recording, from 0 again when that loops; None: live
 
@@ -391,6 +404,7 @@ class InstrumentStates:
     clearance: F32  # [I] m, from the tip to the nearest tissue
     clearance_confidence: F32  # [I] 0..1
     nearest: F32  # [I, 3] m, world, of the tissue
+    sources: I64  # [I] who tells it: 1 the picture, 2 the robot, 3 the robot corrected by the picture
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -415,6 +429,15 @@ class RungState:
     depth_every: int  # frames: how often depth is matched
 
 
+class Strained(Protocol):
+    """How tissue is stretched since a moment; see `sags_node.model.strain`."""
+
+    since_ns: int
+
+    def at(self, gaussians: Gaussians) -> F32:
+        """The largest and the smallest principal strain [N, 2] where each Gaussian is; NaN: not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class FrameResult:
     """One frame's whole story."""
@@ -432,6 +455,7 @@ class FrameResult:
     hurried: bool = False  # there was no time to measure its depth
     recorded_s: float | None = None  # as `StereoFrame.recorded_s`
     instruments: InstrumentStates | None = None  # None: nobody asked
+    strain: Strained | None = None  # None: nobody asked
 
 
 @dataclass(frozen=True, slots=True)

@@ -157,6 +157,25 @@ def bench_lengths(launch: tuple[str, ...]) -> Measured:
     return measured, measuring.tables(measured)
 
 
+@click.command("strain")
+@shown("--seeds", type=click.IntRange(1), default=3, help="Phantoms, each pulled once.")
+@measures
+def bench_strain(seeds: int) -> Measured:
+    """How exactly the columns `strain_max` and `strain_min` of `points` tell how tissue is stretched.
+
+    The phantom is pulled. Truth is its grid, by central differences; beside it 0, which is known without
+    measuring.
+
+    \b
+    python -m benchmarks strain --out benchmarks/results/strain.json
+    """
+    from benchmarks.quality import straining
+
+    with progress("straining") as advance:
+        measured = straining.measure_strain(seeds, advance)
+    return measured, straining.tables(measured)
+
+
 @click.command("registration")
 @folder_option("--ct", help="The pair of the Open-CAS set with its CT surface, too.")
 @shown("--seeds", type=click.IntRange(1), default=20, help="Phantoms, and errors of the picked points.")
@@ -213,8 +232,9 @@ def bench_instruments(seeds: int) -> Measured:
     \b
     python -m benchmarks instruments --out benchmarks/results/instruments.json
     """
-    from benchmarks.quality import instruments
+    from benchmarks.quality import instruments, kinematics
 
     with progress("placing") as advance:
         measured = instruments.measure_instruments(seeds, advance)
-    return measured, instruments.tables(measured)
+        measured["kinematics"] = kinematics.measure_kinematics(seeds, advance)
+    return measured, [*instruments.tables(measured), kinematics.table(measured["kinematics"])]

@@ -77,14 +77,21 @@ class Scene:
             depth = np.array(self._rng.uniform(*DEPTHS))
             tip = np.asarray(unproject(self.camera, pixel, depth), np.float64)
             trocar = TROCARS[side] + self._rng.normal(0, SPREAD, 3)
-            tool = self._made(tip, trocar, (tip - trocar) / np.linalg.norm(tip - trocar))
+            kind = str(self._rng.choice(KINDS))
+            tool = self._made(kind, tip, trocar, (tip - trocar) / np.linalg.norm(tip - trocar))
             near = abs(tool.distance - distance) <= NEAR * distance
             inside = bool(np.all((pixel >= 0) & (pixel < SIZE)))
             if (near or not inside) and self._is_free(tool):
                 return tool
 
-    def _made(self, tip: F64, trocar: F64, axis: F64) -> Tool:
-        kind = str(self._rng.choice(KINDS))
+    def moving(self, kind: str, trocar: F64, pixel: F64, t: float) -> Tool:
+        """Its tip at a pixel [2], 8 to 16 mm before the tissue there."""
+        u, v = np.clip(pixel, 0, np.array(SIZE) - 1).astype(int)
+        depth = float(self.bare.depth[v, u]) - 0.012 - 0.004 * np.sin(1.7 * t)
+        tip = np.asarray(unproject(self.camera, pixel, np.array(depth)), np.float64)
+        return self._made(kind, tip, trocar, (tip - trocar) / np.linalg.norm(tip - trocar))
+
+    def _made(self, kind: str, tip: F64, trocar: F64, axis: F64) -> Tool:
         opening = OPENING if kind == "open grasper" else 0.0
         made = self._instruments
         mesh = made.hook(tip, trocar) if kind == "hook" else made.grasper(tip, trocar, opening)
@@ -111,7 +118,7 @@ def _jaws(mesh: Mesh, axis: F64) -> F64:
     return np.asarray(end[[apart.argmin(), apart.argmax()]], np.float64)
 
 
-def _off(tool: Tool, place: F64) -> float:
+def off(tool: Tool, place: F64) -> float:
     """From a place [3] to the tip, mm."""
     way = tool.ends[1] - tool.ends[0]
     share = np.clip((place - tool.ends[0]) @ way / max(way @ way, 1e-12), 0, 1)
@@ -176,14 +183,14 @@ def _compared(tools: list[Tool], result: FrameResult, shown: Bool) -> list[dict[
             at = known[found[number]]
             said = {"distance": states.distance[at], "clearance": states.clearance[at]}
             row |= {f"{name}_mm": 1e3 * abs(float(value) - row[name]) for name, value in said.items()}
-            row["tip_mm"] = _off(tool, states.tips[at].astype(np.float64))
+            row["tip_mm"] = off(tool, states.tips[at].astype(np.float64))
             row["axis_deg"] = float(np.degrees(np.arccos(np.clip(states.axes[at] @ tool.axis, -1, 1))))
             row["told_mm"] = 1e3 * float(error_of(states.confidence[at]))
             row["sure"] = bool(states.confidence[at] >= SURE)
             row["distance_told_mm"] = 1e3 * float(error_of(states.distance_confidence[at]))
         for name, places in ends.items():
             if len(places):
-                row[f"{name}_mm"] = min(_off(tool, place) for place in places)
+                row[f"{name}_mm"] = min(off(tool, place) for place in places)
         rows.append({k: v for k, v in row.items() if isinstance(v, str | bool) or np.isfinite(v)})
     return rows
 

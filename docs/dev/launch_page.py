@@ -20,9 +20,11 @@ from sags_node.config.schema import (
     Guarded,
     LaunchConfig,
     LiveSource,
+    Pose,
     PushRobot,
     RecordedSource,
     RobotPoses,
+    RobotTool,
     Ros2Robot,
     RosGraph,
     Section,
@@ -68,8 +70,10 @@ WORDS: dict[Any, str] = {
     bool: "`true` or `false`",
     int: "whole number",
     float: "number",
+    get_args(Pose)[0]: "4 rows of 4 numbers",
     str: "text",
     Path: "path",
+    RobotTool: "map",
     Box: "`[x, y, width, height]`, px",
     Segments: "map",
 }
@@ -78,6 +82,7 @@ MANY = {
     "number": "numbers",
     "path": "paths",
     "text": "texts",
+    "map": "maps",
     "whole number or text": "whole numbers or texts",
 }
 
@@ -120,6 +125,7 @@ def _robot(prefix: str) -> Iterator[str]:
     yield "## `robot`: who says where the scope is\n"
     yield "`robot.kind` says which way poses come. Without `robot` nobody says it, or the recording does.\n"
     yield from _table(RobotPoses, prefix, "Every kind of robot", list(RobotPoses.model_fields))
+    yield from _table(RobotTool, f"{prefix}tools[].", "Each of `robot.tools`", list(RobotTool.model_fields))
     for section in (Ros2Robot, PushRobot, BagRobot):
         own = [name for name in section.model_fields if name not in {"kind", *RobotPoses.model_fields}]
         yield from _table(section, prefix, f"`robot.kind: {section.model_fields['kind'].default}`", own)
@@ -176,6 +182,8 @@ def _value(field: FieldInfo) -> str:
 def _type(annotation: Any) -> str:
     """The type of a value in a reader's words."""
     origin, inner = get_origin(annotation), get_args(annotation)
+    if annotation in WORDS:
+        return WORDS[annotation]
     if origin is Annotated:
         return _type(inner[0])
     if origin in (Union, UnionType):

@@ -51,7 +51,8 @@ class Ahead(click.ParamType["float | str"]):
     "--ahead",
     type=Ahead(),
     default=0.0,
-    help="Place it where tissue is expected so long after its frame; auto: when that is published.",
+    help="Place it where tissue is expected so long after its frame, tips of instruments not. auto: when "
+    "that is published.",
 )
 @shown("--own-ns", default="overlay", help="Namespace of what is published here.")
 @run_dir_option

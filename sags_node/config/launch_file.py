@@ -294,10 +294,10 @@ def _explain(
         elif item["type"] == "missing":
             lines.append(f"{said}: {where} is missing; set it")
         elif item["type"] in ("union_tag_invalid", "union_tag_not_found"):
-            kinds = ", ".join(repr(kind) for kind in _SOURCES)
+            kinds = ", ".join(repr(one.model_fields["kind"].default) for one in _sections_in(root, path[-1]))
             got = item["input"].get("kind")
-            said = COMMAND_LINE if "source.kind" in given else name
-            lines.append(f"{said}: source.kind: should be one of {kinds} (got {brief(got)})")
+            said = COMMAND_LINE if f"{where}.kind" in given else name
+            lines.append(f"{said}: {where}.kind: should be one of {kinds} (got {brief(got)})")
         else:
             what = _PLAIN.get(item["type"], item["msg"])
             lines.append(f"{said}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")
@@ -324,14 +324,24 @@ def _nearest(path: Sequence[str], root: type[Section]) -> str:
 
 
 def _known_keys(path: Sequence[str], root: type[Section]) -> list[str]:
-    model: Any = root
-    for part in path:
-        field = model.model_fields.get(part)
-        if part in _SOURCES:
-            model = _SOURCES[part]
-        elif field is not None and part != "source":
-            model = field.annotation
-    return list(model.model_fields)
+    there = [root]  # sections that it may be
+    for part in path:  # a key, a kind, or a number in a list
+        kinds = [one for one in there if (kind := one.model_fields.get("kind")) and kind.default == part]
+        inner = [section for one in there for section in _sections_in(one, part)]
+        there = kinds or inner or there
+    return list(dict.fromkeys(name for one in there for name in one.model_fields))
+
+
+def _sections_in(section: type[Section], key: str) -> list[type[Section]]:
+    """What may stand under a key: one, one of several, or a list of them."""
+    field = section.model_fields.get(key)
+    left, found = [] if field is None else [field.annotation], list[type[Section]]()
+    while left:
+        annotation = left.pop(0)
+        if isinstance(annotation, type) and issubclass(annotation, Section):
+            found.append(annotation)
+        left += get_args(annotation)
+    return found
 
 
 _SECTIONS = ("vision", "engine", "mapping", "publish")

@@ -56,6 +56,28 @@ _INSTRUMENTS = (
     "how masks show them: white (above 127), black, or as one of these values and colours, e.g. [85,170] or "
     '["#00ff00"]; what has other values is tissue'
 )
+
+
+def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+    turn = [row[:3] for row in rows[:3]]
+    (a, b, c), (d, e, f), (g, h, i) = turn
+    unit = all(
+        abs(sum(x * y for x, y in zip(one, other, strict=True)) - (one is other)) < ROUNDED
+        for one in turn
+        for other in turn
+    )
+    if not unit or a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0 or rows[3] != LAST_ROW:
+        raise ValueError("should be a rotation and a translation above a last row 0, 0, 0, 1")
+    if max(abs(row[3]) for row in rows[:3]) > FARTHEST_BASE:
+        raise ValueError(f"is more than {FARTHEST_BASE:g} m away; translations are in metres")
+    return rows
+
+
+Row = tuple[Finite, Finite, Finite, Finite]
+Pose = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]  # m
+LAST_ROW = (0, 0, 0, 1)
+ROUNDED = 1e-3  # of a rotation written with few digits
+FARTHEST_BASE = 10.0  # m
 NAMESPACE = r"^[A-Za-z0-9_][A-Za-z0-9_/]*$"
 
 
@@ -452,6 +474,24 @@ Source = Annotated[
 # ---- the robot -------------------------------------------------------------------------------------------
 
 
+class RobotTool(Section):
+    """A tool whose tip the robot tells: topic `instruments`."""
+
+    topic: str = Field(
+        description="of PoseStamped or TransformStamped, e.g. /PSM1/measured_cp: its tip, z points out"
+    )
+    T_base: Pose = Field(
+        ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+        description="4 rows of 4, m: the frame that its poses are in, in that of the scope's poses",
+    )
+    on_hand: bool = Field(
+        False, description="T_base is in what carries the camera, and moves with it: dVRK's poses in the ECM"
+    )
+    error_mm: float = Field(
+        10.0, gt=0, le=100, description="nine of ten of its tips are nearer than this to where the robot says"
+    )
+
+
 class RobotPoses(Section):
     """What all poses of a robot have in common."""
 
@@ -467,6 +507,7 @@ class RobotPoses(Section):
         description="the robot's stamp minus the picture's (before latency_ms), of one moment; default: what "
         "the hand-eye calibration found",
     )
+    tools: tuple[RobotTool, ...] = Field((), max_length=8, description="whose tips the robot tells, too")
 
 
 class Ros2Robot(RobotPoses, RosGraph):

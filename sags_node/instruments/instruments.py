@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sags_node.confidence import confidence_of, error_of
-from sags_node.geometry import project, unproject
+from sags_node.geometry import invert, project, transform, unproject
 from sags_node.instruments.depths import Disparities, Eyes, disparities, eyes
+from sags_node.instruments.kinematics import NINE_OF_TEN, Arm, seen_as
 from sags_node.instruments.outlines import Outline, outlines
-from sags_node.types import F32, F64, I64, U8, Bool, Camera, InstrumentStates, RenderedView
+from sags_node.types import F32, F64, I64, U8, Bool, Camera, InstrumentStates, RenderedView, ToolPose
 
 PERIOD_NS = 100_000_000  # a hand, and who reads a distance, are not quicker; each look costs the mapping time
 NEAREST, FARTHEST = 0.02, 0.2  # m, that an instrument may be away
-NINE_OF_TEN = 1.645  # standard deviations
 HALF = 0.75  # of the spread of its end, by which the tip of open jaws or of a hook is uncertain
 ENTANGLED = 1.5  # times the error, where another one lies over it
 AXIS_ERROR = np.radians(25.0)  # nine of ten are smaller, or there is no axis
@@ -24,6 +25,7 @@ AHEAD, STEP = 0.15, 5e-4  # m, along the axis: how far tissue is looked for, and
 EVERY = 4  # px, of the surface of which the nearest point is sought
 KEPT = 0.5  # s, that a number is kept for an instrument that is not found
 SAME = 0.2  # of the picture's width: farther from where it was it is another
+BY_PICTURE, BY_ROBOT, CORRECTED = 1, 2, 3  # who tells of an instrument
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,8 @@ class _One:
     clearance: float = np.nan
     clearance_error: float = np.inf
     nearest: F64 = field(default_factory=lambda: np.full(3, np.nan))  # m, of the tissue
+    source: int = BY_PICTURE
+    tilt: float = AXIS_BIAS  # of its axis, nine of ten are below
 
 
 class _Tissue(NamedTuple):
@@ -73,12 +77,13 @@ class Instruments:
     def __init__(self, usable: Bool) -> None:
         self._usable = usable
         self._known: dict[int, tuple[F64, int]] = {}  # number -> px, and when it was there
+        self._arms: dict[str, Arm] = {}  # by the robot's name for them
         self._next = 1
         self._due_ns = 0
 
     def update(
         self, tools: Bool | None, left: U8, right: U8 | None, camera: Camera, baseline: float,
-        tissue: RenderedView, row_error: float = 0.0,
+        tissue: RenderedView, row_error: float = 0.0, robot: Sequence[ToolPose] = (),
     ) -> InstrumentStates | None:  # fmt: skip
         """Those of one frame; None: they were looked for less than `PERIOD_NS` before, on the average.
 
@@ -87,6 +92,7 @@ class Instruments:
             left, right: gray pictures [H, W]; no right one: it must not be used.
             tissue: the model as the left eye sees it.
             row_error: by how much the right picture is too low, px.
+            robot: where it says that its tools are.
         """
         if not self._is_due(tissue.t_capture_ns):
             return None
@@ -95,10 +101,24 @@ class Instruments:
         if shown and tools is not None and right is not None:
             both = eyes(left, right, tools, row_error)
         found = [_placed(outline, both, camera, baseline) for outline in shown]
+        arms = self._moved(robot, tissue.t_capture_ns)
+        numbers = dict[int, int]()  # of what is found, where the robot tells which it is
+        seen = seen_as(arms, shown, camera)
+        for place, arm in enumerate(arms):
+            row = seen.get(place)
+            if row is not None and np.isfinite(found[row].tip[0]):
+                arm.learn(transform(invert(camera.T_world_cam), found[row].tip), found[row].error)
+            one = _told(arm, camera, None if row is None else found[row].end)
+            if row is None:
+                row = len(found)
+                found.append(self._doubted(one, arm, tissue) if tools is not None else one)
+            else:
+                found[row] = one
+            numbers[row] = arm.number
         if any(np.isfinite(one.tip[0]) for one in found):
             surface = _Tissue.of(tissue)
             found = [one if np.isnan(one.tip[0]) else _beside_tissue(one, surface) for one in found]
-        return _states(self._numbers([one.end for one in found], tissue.t_capture_ns), found)
+        return _states(self._numbers([one.end for one in found], numbers, tissue.t_capture_ns), found)
 
     def _is_due(self, now_ns: int) -> bool:
         """Keeps the rate also where frames do not come at multiples of the period."""
@@ -108,8 +128,31 @@ class Instruments:
         self._due_ns = now_ns + PERIOD_NS - (late if 0 <= late < PERIOD_NS else 0)
         return True
 
-    def _numbers(self, ends: list[F64], now_ns: int) -> list[int]:
-        """Each keeps the number of the one that was the nearest before."""
+    def _moved(self, robot: Sequence[ToolPose], now_ns: int) -> list[Arm]:
+        """The arms of which the robot tells now."""
+        arms = []
+        for tool in robot:
+            if tool.T_cam_tool is None:
+                continue
+            if tool.name not in self._arms:
+                self._arms[tool.name] = Arm(self._next, tool.error)
+                self._next += 1
+            self._arms[tool.name].move(tool.T_cam_tool, now_ns)
+            arms.append(self._arms[tool.name])
+        return arms
+
+    def _doubted(self, one: _One, arm: Arm, tissue: RenderedView) -> _One:
+        """What the robot alone tells of: where it should be in sight, and no mask shows it, the correction is
+        not believed."""
+        if not _is_inside(one.pixel, tissue.camera):
+            return one
+        u, v = np.rint(one.pixel).astype(int)
+        hidden = 0 < tissue.depth[v, u] < project(tissue.camera, one.tip)[1]
+        seen = self._usable[v, u] and not hidden
+        return replace(one, error=max(one.error, arm.error)) if seen else one
+
+    def _numbers(self, ends: list[F64], given: dict[int, int], now_ns: int) -> list[int]:
+        """Each keeps the number of the one that was the nearest before; some are given."""
         gate = SAME * self._usable.shape[1]
         self._known = {k: v for k, v in self._known.items() if 0 <= now_ns - v[1] < 1e9 * KEPT}
         pairs = sorted(
@@ -117,14 +160,14 @@ class Instruments:
             for row, end in enumerate(ends)
             for number, (at, _) in self._known.items()
         )
-        numbers: dict[int, int] = {}
+        numbers = dict(given)
         for apart, row, number in pairs:
             if apart <= gate and row not in numbers and number not in numbers.values():
                 numbers[row] = number
         for row in range(len(ends)):
             if row not in numbers:
                 numbers[row], self._next = self._next, self._next + 1
-        self._known |= {numbers[row]: (end, now_ns) for row, end in enumerate(ends)}
+        self._known |= {numbers[r]: (end, now_ns) for r, end in enumerate(ends) if np.isfinite(end[0])}
         return [numbers[row] for row in range(len(ends))]
 
 
@@ -149,6 +192,20 @@ def _placed(outline: Outline, both: Eyes | None, camera: Camera, baseline: float
     return replace(one, tip=tip, axis=axis, others=others, pixel=outline.far, error=error)
 
 
+def _told(arm: Arm, camera: Camera, end: F64 | None) -> _One:
+    """Where the robot says that one is, corrected as far as that was learnt; `end` [2] of its mask."""
+    tip, axis = transform(camera.T_world_cam, arm.tip), camera.T_world_cam[:3, :3] @ arm.axis
+    pixel, tilt = project(camera, tip)[0], arm.axis_error
+    return _One(
+        pixel if end is None else end, tip, axis if tilt < AXIS_ERROR else np.full(3, np.nan), (), pixel,
+        arm.tip_error, source=CORRECTED if arm.is_corrected else BY_ROBOT, tilt=tilt,
+    )  # fmt: skip
+
+
+def _is_inside(pixel: F64, camera: Camera) -> bool:
+    return bool(np.all((np.rint(pixel) >= 0) & (np.rint(pixel) < [camera.width, camera.height])))
+
+
 def _tip_and_axis(camera: Camera, ends: F64, depths: F64) -> tuple[F64, F64]:
     """The tip [3] and the unit vector [3] that points out of it, of two pixels [2, 2] at depths [2]."""
     tip, back = np.asarray(unproject(camera, ends, depths), np.float64)
@@ -167,7 +224,8 @@ def _others(camera: Camera, ends: F64, scale: float, found: Disparities) -> tupl
 
 def _beside_tissue(one: _One, tissue: _Tissue) -> _One:
     """How far the tissue is from a tip, and how sure that is."""
-    if len(tissue.at) == 0:
+    beyond = one.source != BY_PICTURE and not _is_inside(one.pixel, tissue.camera)
+    if len(tissue.at) == 0 or beyond:  # tissue there is not seen
         return one
     apart = np.linalg.norm(tissue.places - one.tip.astype(np.float32), axis=1)
     nearest = int(apart.argmin())
@@ -179,17 +237,17 @@ def _beside_tissue(one: _One, tissue: _Tissue) -> _One:
     one = replace(one, clearance=float(apart[nearest]), clearance_error=error, nearest=tissue.places[nearest])
     if np.isnan(one.axis[0]):
         return one
-    met, place = _met(one.tip, np.stack([one.axis, *one.others, *_tilted(one.axis)]), tissue)
+    met, place = _met(one.tip, np.stack([one.axis, *one.others, *_tilted(one.axis, one.tilt)]), tissue)
     if np.isinf(met[0]):
         return one
     error = float(np.linalg.norm([one.error, tissue.error(*place), np.abs(met[1:] - met[0]).max()]))
     return replace(one, distance=float(met[0]), distance_error=error)
 
 
-def _tilted(axis: F64) -> list[F64]:
-    """An axis turned by `AXIS_BIAS` to four sides."""
+def _tilted(axis: F64, tilt: float) -> list[F64]:
+    """An axis turned by an angle to four sides."""
     sides = np.linalg.svd(axis[None])[2][1:]
-    turned = [axis + sign * np.tan(AXIS_BIAS) * side for side in sides for sign in (-1, 1)]
+    turned = [axis + sign * np.tan(tilt) * side for side in sides for sign in (-1, 1)]
     return [each / np.linalg.norm(each) for each in turned]
 
 
@@ -222,4 +280,5 @@ def _states(numbers: list[int], found: list[_One]) -> InstrumentStates:
         clearance=column([one.clearance for one in found]),
         clearance_confidence=confidence_of(column([one.clearance_error for one in found])),
         nearest=column([one.nearest for one in found], 3),
+        sources=np.array([one.source for one in found], np.int64),
     )

@@ -41,6 +41,7 @@ SPLAT_FIELDS = (
 )
 HEALTHY = ("running", "paused")  # states
 POINT_FIELDS = ("x", "y", "z", "rgb", "confidence")
+STRAIN_FIELDS = ("strain_max", "strain_min", "strain_s")
 ANCHOR_FIELDS = (
     *("x", "y", "z", "id", "u", "v", "visibility", "age", "confidence", "depth_confidence"),
     *("ahead", "x_ahead", "y_ahead", "z_ahead", "u_ahead", "v_ahead"),
@@ -50,7 +51,6 @@ INSTRUMENT_FIELDS = (
     *("distance", "distance_confidence", "clearance", "clearance_confidence", "source"),
     *("near_x", "near_y", "near_z"),
 )
-BY_MASK = 1  # in the column source: by the tissue mask and both eyes
 POINT_MIN_OPACITY = 0.1
 POINT_BEHIND_SURFACE = 0.003  # m; a Gaussian deeper than this under the drawn surface is not visible
 
@@ -91,15 +91,19 @@ def gaussians_of(points: NDArray[Any]) -> Gaussians:
 
 
 def points(result: FrameResult) -> Content:
-    """The Gaussians that the left eye sees, as rows of `POINT_FIELDS`."""
+    """The Gaussians that the left eye sees, as rows of `POINT_FIELDS`, and `STRAIN_FIELDS` if wanted."""
     gaussians = result.snapshot.gaussians
     seen = _visible(result)
     rgb = np.clip(gaussians.colors[seen] * 255 + 0.5, 0, 255).astype(np.uint32)
-    rows = np.empty((len(rgb), len(POINT_FIELDS)), np.float32)
+    fields = POINT_FIELDS if result.strain is None else (*POINT_FIELDS, *STRAIN_FIELDS)
+    rows = np.empty((len(rgb), len(fields)), np.float32)
     rows[:, 0:3] = gaussians.means[seen]
     rows.view(np.uint32)[:, 3] = rgb[:, 0] << 16 | rgb[:, 1] << 8 | rgb[:, 2]
     rows[:, 4] = _confidence(gaussians)[seen]
-    return cdr.point_cloud(rows, POINT_FIELDS, result.pair.t_capture_ns)
+    if result.strain is not None:
+        rows[:, 5:7] = result.strain.at(gaussians)[seen]
+        rows[:, 7] = 1e-9 * (result.snapshot.t_capture_ns - result.strain.since_ns)
+    return cdr.point_cloud(rows, fields, result.pair.t_capture_ns)
 
 
 def anchors(result: FrameResult) -> Content:
@@ -129,7 +133,7 @@ def instruments(result: FrameResult) -> Content:
     rows[:, 7:9] = published.pixels(result.pair, states.pixels)
     rows[:, 10], rows[:, 11] = states.distance, states.distance_confidence
     rows[:, 12], rows[:, 13] = states.clearance, states.clearance_confidence
-    rows[:, 14], rows[:, 15:18] = BY_MASK, states.nearest
+    rows[:, 14], rows[:, 15:18] = states.sources, states.nearest
     dense = bool(np.isfinite(states.tips).all())
     return cdr.point_cloud(rows, INSTRUMENT_FIELDS, result.pair.t_capture_ns, dense)
 

@@ -76,6 +76,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     static: bool = False  # draw once
     stereo: bool = False  # and the right eye, at the rig's baseline
     ahead_ms: AheadMs = 0.0  # draw the tissue where it is expected so much later; auto: when it is drawn
+    show: Literal["tissue", "strain"] = "tissue"  # in its own colours, or in those of its strain
 
     def __post_init__(self) -> None:
         if self.width * self.height > MAX_VIEW_PIXELS:

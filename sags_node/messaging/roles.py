@@ -17,7 +17,7 @@ _OPERATIONS: dict[Role, frozenset[str]] = {
     "listen": frozenset({"ping", "get_clock", "get_status", "get_health", "get_parameters", "measure"}),
     "control": frozenset(
         {"set_parameters", "reset_model", "pause", "resume", "add_anchor", "remove_anchor"}
-        | {"open_view", "close_view"}
+        | {"open_view", "close_view", "start_strain", "stop_strain"}
     ),
     "files": frozenset({"save_model", "start_recording", "take_snapshot", "stop_recording"}),
 }

@@ -174,14 +174,15 @@ class PoseSender(Sender):
     ) -> None:
         super().__init__(endpoint, ns, keys)
 
-    def send(self, T_base_hand: F64, stamp_ns: int | None = None) -> bool:
-        """Find where what carries the camera was at a moment, [4, 4], m.
+    def send(self, T_base_hand: F64, stamp_ns: int | None = None, topic: str = "pose") -> bool:
+        """Tell where what carries the camera was at a moment, [4, 4], m.
 
         Args:
             stamp_ns: wall clock (`time.time_ns`); default: now.
+            topic: of one of the node's `robot.tools`, whose tip was there.
         """
         stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        return self._send("pose", cdr.pose(T_base_hand, stamp_ns), stamp_ns)
+        return self._send(topic.lstrip("/"), cdr.pose(T_base_hand, stamp_ns), stamp_ns)
 
 
 def _usual_encoding(picture: NDArray[Any]) -> str:

@@ -47,7 +47,7 @@ class NodeDeformation:
         """Place about `count` nodes over `means` [N, 3] m: the centres of occupied cells of a cubic grid."""
         self.spacing = _spacing_for(means, count)
         self._most = 4 * count  # beyond this, new tissue follows the nodes there are
-        self.nodes = _cell_centres(means, self.spacing)
+        self.nodes = cell_centres(means, self.spacing)
         self.rest = self.nodes.copy()
         self.momentum = np.zeros_like(self.nodes)
         self.variance = np.zeros_like(self.nodes)
@@ -62,7 +62,7 @@ class NodeDeformation:
         index, weight, distance = nearest_nodes(means, self.nodes)
         far = distance > _NEW_NODE_DISTANCE * self.spacing
         if far.any() and len(self.nodes) < self._most:
-            self._add_nodes(_cell_centres(means[far], self.spacing))
+            self._add_nodes(cell_centres(means[far], self.spacing))
             index, weight, _ = nearest_nodes(means, self.nodes)
         model.node_index[rows] = index
         model.node_weight[rows] = weight
@@ -177,7 +177,7 @@ def skinned(moves: F32, index: I32, weight: F32, points: F32) -> F32:
 
 def spread_nodes(means: F32, count: int) -> F32:
     """About `count` places [M, 3] m spread evenly over points [N, 3] m."""
-    return _cell_centres(means, _spacing_for(means, count))
+    return cell_centres(means, _spacing_for(means, count))
 
 
 def _spacing_for(means: F32, count: int) -> float:
@@ -191,7 +191,7 @@ def _spacing_for(means: F32, count: int) -> float:
     return high
 
 
-def _cell_centres(means: F32, cell: float) -> F32:
+def cell_centres(means: F32, cell: float) -> F32:
     """Mean of the points in each occupied cell of a cubic grid, [M, 3]."""
     _, inverse, counts = np.unique(_cells(means, cell), return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(inverse, means[:, k]) for k in range(3)], 1)

@@ -74,6 +74,8 @@ class Operations:
             "add_anchor": lambda args: self.for_mapping.post(lambda: self._add_anchor(args)),
             "remove_anchor": lambda args: self.for_mapping.post(lambda: self._remove_anchor(args)),
             "measure": lambda args: self.for_mapping.post(lambda: self._measure(args)),
+            "start_strain": lambda args: self.for_mapping.post(self._start_strain),
+            "stop_strain": lambda args: self.for_mapping.post(self._state.pipeline.stop_strain),
             "open_view": lambda args: self.for_drawing.post(lambda: self._open_view(args)),
             "close_view": lambda args: self.for_drawing.post(lambda: self._close_view(args)),
             "save_model": self._save_model,
@@ -147,6 +149,11 @@ class Operations:
             **asdict(measured(states, camera, request.anchors, request.area, metric)),
             "stamp_ns": newest.pair.t_capture_ns,
         }
+
+    def _start_strain(self) -> dict[str, Any]:
+        if self._scene() is None:
+            raise SagsError("the tissue of now is not known; begin when frames are taken in")
+        return {"stamp_ns": self._state.pipeline.start_strain()}
 
     def _open_view(self, args: dict[str, Any]) -> dict[str, Any]:
         request = parse(ViewRequest, args)

@@ -25,6 +25,7 @@ from sags_node.messaging import published
 from sags_node.messaging.requests import ViewRequest
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.model.gaussians import for_right_eye
+from sags_node.model.strain import painted
 from sags_node.node.allowance import SHARE, Allowance
 from sags_node.node.teacher import Teacher, is_of
 from sags_node.types import F32, Camera, DrawnView, FrameResult, Gaussians, RenderedView, ViewStatus
@@ -177,14 +178,19 @@ class Views:
         wanted = self._latency() + view.cost if request.ahead_ms == "auto" else 1e-3 * request.ahead_ms
         ahead = reached(snapshot, wanted)
         gaussians = gaussians_ahead(snapshot, ahead) if ahead > 0 else snapshot.gaussians
+        strained = request.show == "strain"
+        if strained:
+            if scene.strain is None:
+                raise SagsError("nothing says since when tissue is stretched: send start_strain first")
+            gaussians = painted(gaussians, scene.strain)
         pictures = {}
         for eye, camera in eyes.items():
-            shown = _published(scene, camera) if eye == "right" and ahead == 0 else None
+            shown = _published(scene, camera) if eye == "right" and ahead == 0 and not strained else None
             if shown is None:
-                drawn = for_right_eye(gaussians, snapshot) if eye == "right" else gaussians
+                drawn = for_right_eye(gaussians, snapshot) if eye == "right" and not strained else gaussians
                 planes = self._planes(drawn, camera)
                 shown = to_view(planes, camera, snapshot.frame_id, snapshot.t_capture_ns)
-                if self._teacher is not None and is_of(seen, snapshot):
+                if self._teacher is not None and is_of(seen, snapshot) and not strained:
                     added = self._teacher.detail(scene, seen, gaussians, shown, ahead, eye == "right")
                     shown = replace(shown, shown=added)
             pictures[eye] = with_confidence(shown, gaussians)

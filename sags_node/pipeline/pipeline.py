@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -35,6 +35,7 @@ from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import LEARN_EVERY, RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging import published
+from sags_node.model.strain import Strain
 from sags_node.pipeline.repeats import doubted, repeated, unseen
 from sags_node.pipeline.uncalibrated import FINDING, MOST, unsure
 from sags_node.types import (
@@ -48,6 +49,7 @@ from sags_node.types import (
     RenderedView,
     StereoFrame,
     StereoRig,
+    ToolPose,
 )
 from sags_node.vision.change import StillScene, is_repeat
 from sags_node.vision.depth import DepthChoice, Measured
@@ -143,6 +145,7 @@ class Pipeline:
         self.anchors = Anchors(self.tissue.usable)
         self._instruments = Instruments(self.tissue.usable)
         self._instruments_asked = False  # for the last frame that was mapped
+        self._tools: tuple[ToolPose, ...] = ()  # of the newest frame, as a robot tells them
         self._pose = PoseWatch(needed=vision.pose in ("session", "refine"))
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._freeze = FreezeWatch(vision.tissue.exclude)
@@ -154,6 +157,7 @@ class Pipeline:
         self.newest: FrameResult | None = None
         self.held = ""
         self.seen: tuple[SeenFrame, ...] = ()
+        self._strain: Strain | None = None  # since somebody asked for it
         self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
         self._unwatched = 0.0  # m: how far tissue may have moved while no frame was taken in
         self._came_ns: int | None = None  # when the last frame was captured
@@ -174,7 +178,7 @@ class Pipeline:
         self._scene.forget()
         self._still.forget()
         self._memory.forget()
-        self.newest, self._last, self.seen = None, None, ()
+        self.newest, self._last, self.seen, self._strain = None, None, (), None
         self._came_ns = None
         self._unwatched = 0.0
 
@@ -182,6 +186,18 @@ class Pipeline:
         """How far to trust the depth of an anchor that is there, 0..1, now."""
         sure = self.anchors.depth_confidence(anchor_id) * float(confidence_of(np.float32(self._unwatched)))
         return sure if self.metric else min(sure, MOST)
+
+    def start_strain(self) -> int:
+        """From now on frames say how tissue is stretched since the newest one; returns its stamp."""
+        assert self.newest is not None  # else there is no tissue
+        self._strain = Strain(self.newest.snapshot.gaussians, self.newest.snapshot.t_capture_ns)
+        self.newest = replace(self.newest, strain=self._strain)
+        return self._strain.since_ns
+
+    def stop_strain(self) -> dict[str, Any]:
+        """Frames say no more of it."""
+        self._strain = None
+        return {}
 
     def predict_motion(self) -> None:
         """Somebody wants motion predicted. Any thread may call this."""
@@ -197,6 +213,9 @@ class Pipeline:
         if (lost := self._camera.lost) is not None:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
+        if unknown := "; ".join(tool.problem for tool in self._tools if tool.problem):
+            said = f"{unknown}; instruments come from the picture alone: check the robot's program"
+            found.append(Finding("tool_pose_missing", said))
         if not self.metric:
             found.append(FINDING)
         if self.tissue.problem:
@@ -229,6 +248,7 @@ class Pipeline:
     def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:
         plan, clock = budget.start(request.waited), Stopwatch()
         self._note_gap(frame.t_capture_ns)
+        self._tools = frame.tools
         with clock("rectify"):
             pair = self._rectified(frame)
         self._on_rectified(pair, self._epoch(frame))
@@ -279,7 +299,7 @@ class Pipeline:
         self.newest = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
             self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
-            instruments=instruments,
+            instruments=instruments, strain=self._strain,
         )  # fmt: skip
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
@@ -458,6 +478,7 @@ class Pipeline:
             pair.baseline,
             mapped.view,
             0.0 if rows is None else rows.median,
+            self._tools if self.metric else (),
         )
 
     def _skipped(self, measured: Measured) -> dict[str, str]:

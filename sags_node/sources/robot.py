@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from sags_node.bags.bag import read_messages
 from sags_node.config.schema import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
 from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import invert
 from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import TF
@@ -24,7 +26,7 @@ from sags_node.ros.graph import Graph
 from sags_node.sources.pose_track import KEPT, POSE_TYPES, NoPoseError, PoseTrack
 from sags_node.sources.ros2 import absolute
 from sags_node.sources.source import Source, findings_of
-from sags_node.types import F64, Finding, StereoFrame, StereoRig
+from sags_node.types import F64, Finding, StereoFrame, StereoRig, ToolPose
 from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
@@ -34,6 +36,11 @@ POLL_S = 0.1
 CLOSE_S = 5.0
 STATIC = "/tf_static"
 WHOLE = 10_000_000  # samples of a bag: all
+TOOL_PROBLEMS = {  # why its pose is not known
+    "pose_missing": "no pose of the picture's time has come",
+    "pose_stopped": "its newest pose is older than the picture",
+    "pose_jumped": "its pose jumped within the last second",
+}
 
 
 class Robot:
@@ -41,6 +48,18 @@ class Robot:
 
     def __init__(self, config: BagRobot | PushRobot | Ros2Robot, kept: int = KEPT) -> None:
         self.track = PoseTrack(config.base, config.hand, kept)
+        self.tools = {absolute(tool.topic): PoseTrack(kept=kept) for tool in config.tools}
+
+    def add(self, topic: str, data: bytes | memoryview, kind: str) -> None:
+        """A message of one of `POSE_TYPES`, of the scope or, by its topic, of a tool.
+
+        Raises:
+            SagsError: see `PoseTrack.add`; or a tree of frames where a tool's pose is wanted.
+        """
+        track = self.tools.get(topic)
+        if track is not None and kind == TF:
+            raise SagsError(f"{topic} holds a tree of frames: a tool needs a topic of PoseStamped")
+        (track or self.track).add(data, kind, fixed=topic == STATIC)
 
     def close(self) -> None:
         """Receive no more poses."""
@@ -58,26 +77,28 @@ class _BagPoses(Robot):
         if not isinstance(source, BagSource):
             raise UsageError("robot.kind bag takes poses from the bag of the pictures: set source.kind:=bag")
         super().__init__(config, WHOLE)
-        wanted = absolute(config.topic)
+        wanted = {absolute(config.topic), *self.tools}
         seen: dict[str, str] = {}
         wrong, first_wrong = 0, ""  # messages that are no pose: at their time there is none, as in tf2
         for message in read_messages(source.path):
             topic = absolute(message.topic)
             seen[topic] = message.type
-            if topic in (wanted, STATIC) and message.type in POSE_TYPES:
+            if topic in {*wanted, STATIC} and message.type in POSE_TYPES:
                 try:
-                    self.track.add(message.data, message.type, fixed=topic == STATIC)
+                    self.add(topic, message.data, message.type)
                 except SagsError as error:
                     wrong += 1
                     first_wrong = first_wrong or f"{topic} at {message.log_ns * 1e-9:.3f} s: {error}"
         if wrong:
             said = "%s: %d messages are no pose and are left out, the first is %s; was the robot homed?"
             log.warning(said, source.path, wrong, first_wrong)
-        if seen.get(wanted) not in POSE_TYPES:
-            there = ", ".join(sorted(name for name, kind in seen.items() if kind in POSE_TYPES)) or "none"
-            raise UsageError(
-                f"{source.path} has no poses on {wanted}; topics with poses: {there}; set robot.topic"
-            )
+        for topic in wanted:
+            if seen.get(topic) not in POSE_TYPES:
+                there = ", ".join(sorted(name for name, kind in seen.items() if kind in POSE_TYPES)) or "none"
+                key = "robot.tools" if topic in self.tools else "robot.topic"
+                raise UsageError(
+                    f"{source.path} has no poses on {topic}; topics with poses: {there}; set {key}"
+                )
 
 
 class _PushedPoses(Robot):
@@ -85,7 +106,7 @@ class _PushedPoses(Robot):
 
     def __init__(self, config: PushRobot) -> None:
         super().__init__(config)
-        self._inbox = Inbox(config.endpoint, config, "robot", self._take, about=_pose_of)
+        self._inbox = Inbox(config.endpoint, config, "robot", self._take, about=self._pose_of)
         self.endpoint = self._inbox.endpoint
 
     def _take(self, message: Message, arrival_ns: int) -> None:
@@ -93,7 +114,14 @@ class _PushedPoses(Robot):
             raise SagsError(
                 f"{message.topic}: {message.meta.type} is no pose; known: {', '.join(POSE_TYPES)}"
             )
-        self.track.add(message.cdr(), message.meta.type, fixed=message.topic.endswith("tf_static"))
+        name = message.topic.partition("/")[2]  # without the sender's namespace
+        self.add(STATIC if name.endswith("tf_static") else absolute(name), message.cdr(), message.meta.type)
+
+    def _pose_of(self, message: Message) -> list[str]:
+        """Transforms of a tree may come from several programs."""
+        topic = absolute(message.topic.partition("/")[2])
+        whose = f"the pose of {topic}" if topic in self.tools else "the robot's pose"
+        return [] if message.meta.type == TF else [whose]
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -103,17 +131,12 @@ class _PushedPoses(Robot):
         self._inbox.close()
 
 
-def _pose_of(message: Message) -> list[str]:
-    """Transforms of a tree may come from several programs."""
-    return [] if message.meta.type == TF else ["the robot's pose"]
-
-
 class _RosPoses(Robot):
     """Poses of a ROS 2 graph; see `Graph`."""
 
     def __init__(self, config: Ros2Robot) -> None:
         super().__init__(config)
-        self._topic = absolute(config.topic)
+        self._topics = {absolute(config.topic), STATIC, *self.tools}
         self._graph = Graph(config)
         self._readers: dict[str, Reader] = {}
         self._seldom = RateLimitedLog()
@@ -133,10 +156,10 @@ class _RosPoses(Robot):
 
     def _subscribe(self) -> None:
         """Subscribe as soon as somebody publishes: only then the type is known."""
-        if self._topic in self._readers and STATIC in self._readers:
+        if self._topics <= self._readers.keys():
             return
         there = self._graph.publications()
-        for topic in {self._topic, STATIC} - self._readers.keys():
+        for topic in self._topics - self._readers.keys():
             kinds = there.get(topic, set()) & set(POSE_TYPES)
             if kinds:
                 fixed = topic == STATIC
@@ -145,7 +168,7 @@ class _RosPoses(Robot):
 
     def _add(self, topic: str, kind: str, data: bytes) -> None:
         try:
-            self.track.add(data, kind, fixed=topic == STATIC)
+            self.add(topic, data, kind)
         except SagsError as error:
             if self._seldom.due():
                 log.warning("%s: left out: %s", topic, error)
@@ -176,7 +199,7 @@ class Posed:
     """A `Source` whose frames know where the robot says that the left rectified camera is.
 
     Nothing is delivered before the first pose. Later a frame without one keeps the last pose, and says why
-    (`StereoFrame.pose_problem`).
+    (`StereoFrame.pose_problem`). Tools are told where their poses are known (`StereoFrame.tools`).
 
     Args:
         source: of the pictures.
@@ -197,6 +220,7 @@ class Posed:
         if isinstance(config.source, LiveSource):  # the offset is to the stamp, latency included
             self._offset_ns += round(config.source.latency_ms * 1e6)
         self.robot = open_robot(config)
+        self._tools = config.robot.tools
         self._recorded = isinstance(config.robot, BagRobot)
         self._source = source
         self._without = 0  # frames before the first pose
@@ -235,9 +259,12 @@ class Posed:
         last: F64 | None = None
         for frame in self._source:
             t_ns = frame.t_device_ns if self._recorded else frame.t_capture_ns
-            problem = None
+            problem, tools = None, ()
+            deadline = time.monotonic() + WAIT_S
             try:
-                last = self.robot.track.at(t_ns + self._offset_ns, WAIT_S) @ self._T_hand_cam
+                T_base_hand = self.robot.track.at(t_ns + self._offset_ns, WAIT_S)
+                last = T_base_hand @ self._T_hand_cam
+                tools = self._told(t_ns + self._offset_ns, T_base_hand, deadline)
             except NoPoseError as error:
                 problem = error.finding
             if last is None:
@@ -245,7 +272,22 @@ class Posed:
                 if self._seldom.due():
                     log.warning("no frame is taken before the first pose: %s", problem and problem.text)
                 continue
-            yield replace(frame, T_world_cam=last, pose_problem=problem)
+            yield replace(frame, T_world_cam=last, pose_problem=problem, tools=tools)
+
+    def _told(self, t_ns: int, T_base_hand: F64, deadline: float) -> tuple[ToolPose, ...]:
+        """Where the tools are; poses that are on their way are waited for."""
+        T_cam_base, told = invert(T_base_hand @ self._T_hand_cam), []
+        for tool in self._tools:
+            T = np.array(tool.T_base)
+            T_cam = T_cam_base @ (T_base_hand @ T if tool.on_hand else T)
+            T_cam_tool, problem = None, ""
+            try:
+                left = max(0.0, deadline - time.monotonic())
+                T_cam_tool = T_cam @ self.robot.tools[absolute(tool.topic)].at(t_ns, left)
+            except NoPoseError as error:
+                problem = f"{tool.topic}: {TOOL_PROBLEMS[error.finding.code]}"
+            told.append(ToolPose(tool.topic, 1e-3 * tool.error_mm, T_cam_tool, problem))
+        return tuple(told)
 
 
 def rectified(T_hand_cam: F64, rig: StereoRig) -> F64:

@@ -94,6 +94,8 @@ def test_a_mistake_is_named_with_its_fix(override: str, said: str) -> None:
         ("a: [", "not valid YAML"),
         ("a: \xff", "unknown key"),
         ("source: {kind: [videos]}", "source.kind: should be one of"),
+        ("robot: {kind: foo}", "robot.kind: should be one of 'ros2', 'push', 'bag'"),
+        ("robot: {kind: bag, hand_eyes: a}", "robot.hand_eyes.; did you mean .hand_eye."),
     ],
 )
 def test_files_that_are_no_launch_files(tmp_path: Path, content: str, said: str) -> None:

@@ -46,6 +46,7 @@ def plane_instruments() -> InstrumentStates:
     return InstrumentStates(
         np.array([2, 5]), column(0.01, -0.02, 0.06), column(0, 0.6, 0.8), column(30, 20), sure(0.7),
         column(0.012)[:, 0], sure(0.5), column(0.009)[:, 0], sure(0.6), column(0.01, -0.02, 0.069),
+        np.array([3, 1]),
     )  # fmt: skip
 
 

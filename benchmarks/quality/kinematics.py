@@ -1,0 +1,162 @@
+"""How exactly tips are placed by a robot's kinematics, with and without the picture: before the phantom."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from rich.table import Table
+
+from benchmarks.quality.depth import Advance, rounded
+from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, off
+from sags_node.confidence import SURE, error_of
+from sags_node.config.schema import LaunchConfig
+from sags_node.instruments.instruments import Instruments
+from sags_node.mapping.budget import StepBudget
+from sags_node.phantom.instruments import NOTHING, joined
+from sags_node.phantom.scene import PhantomScene
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
+from sags_node.types import F64, InstrumentStates, StereoFrame, ToolPose
+from sags_node.vision.pyramid import pyramids
+
+RATE, SECONDS, LEAVES = 5.0, 8.0, 6.0  # a second; s; s after which the tip leaves the picture
+SETTLED = 2.0  # s, after which corrections are counted apart
+SHIFT, TURN = 0.005, np.radians(5.0)  # m, and about MIDDLE: how far kinematics are off
+MIDDLE = np.array([0.0, 0.0, 0.06])  # m, of where instruments work
+ERROR = 0.010  # m, as robot.tools says unless it is told better
+CASES = {  # whether the picture is used, and whether the robot's kinematics are: exact, or off
+    "picture": (True, None), "exact": (False, "exact"), "off": (False, "off"),
+    "exact_corrected": (True, "exact"), "off_corrected": (True, "off"),
+}  # fmt: skip
+
+
+@dataclass
+class _Case:
+    found: Instruments
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+
+def measure_kinematics(seeds: int, advance: Advance) -> dict[str, Any]:
+    """Of one moving tool, before `seeds` phantoms."""
+    config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in CASES}
+    for seed in range(FIRST, FIRST + seeds):
+        advance(seed - FIRST, seeds, "kinematics")
+        scene, rng = Scene(seed), np.random.default_rng(1000 + seed)
+        kind, trocar = KINDS[seed % len(KINDS)], TROCARS["left"] + rng.normal(0, 0.015, 3)
+        E = _error(rng, MIDDLE - trocar)
+        pipeline = Pipeline(config, scene.phantom.rig, rate=RATE)
+        cases = {name: _Case(Instruments(pipeline.tissue.usable)) for name in CASES}
+        count = round(SECONDS * RATE)
+        for number in range(-3, count):
+            tool = scene.moving(kind, trocar, _pixel(number / RATE), number / RATE) if number >= 0 else None
+            tools = joined([NOTHING] if tool is None else [NOTHING, tool.mesh])
+            seen = scene.phantom.frame(number + 3, count + 3, tools=tools)
+            stamp = round((1 + (number + 3) / RATE) * 1e9)
+            frame = StereoFrame(number + 3, stamp, stamp, seen.left, seen.right, tissue=~seen.tool)
+            result = pipeline.process(frame, StepBudget(STEPS), FrameRequest(instruments=True))
+            right, row_error = pyramids(result.pair)[1], pipeline.depth.stereo.rows.newest
+            if tool is None:
+                continue
+            T = _pose(tool)
+            for name, (by_picture, robot) in CASES.items():
+                poses = {"exact": T, "off": E @ T}
+                told = () if robot is None else (ToolPose("tool", ERROR, poses[robot]),)
+                states = cases[name].found.update(
+                    pipeline.tissue.instruments if by_picture else None, result.observation.gray,
+                    None if right is None else right.full, result.observation.camera, result.pair.baseline,
+                    result.views["left"], 0.0 if row_error is None else row_error.median, told,
+                )  # fmt: skip
+                assert states is not None
+                row = {"seed": seed, "kind": kind, "t_s": number / RATE, **_compared(tool, states)}
+                row["in_picture"] = number / RATE < LEAVES
+                rows[name].append(row)
+    return {
+        "rows": rows,
+        **{
+            name: {part: _summary(c) for part, c in _parts(all_rows).items()}
+            for name, all_rows in rows.items()
+        },
+    }
+
+
+def _pixel(t: float) -> F64:
+    """Where [2] px the tip is: about in the picture, then out of it."""
+    u, v = 0.45 + 0.18 * np.sin(1.3 * t), 0.45 + 0.15 * np.sin(2.1 * t + 1)
+    u -= 0.8 * max(0.0, t - LEAVES) ** 0.5 * (t > LEAVES)
+    return np.array([u, v]) * SIZE
+
+
+def _error(rng: np.random.Generator, tool: F64) -> F64:
+    """By which [4, 4] kinematics are off: turned about an axis across the tool [3]: all of it shows."""
+    way, turn = rng.normal(size=(2, 3))
+    turn = np.cross(tool, turn)
+    way, turn = way / np.linalg.norm(way), turn / np.linalg.norm(turn)
+    E = np.eye(4)
+    E[:3, :3] = cv2.Rodrigues(TURN * turn)[0]
+    E[:3, 3] = MIDDLE - E[:3, :3] @ MIDDLE + SHIFT * way
+    return E
+
+
+def _pose(tool: Tool) -> F64:
+    """What exact kinematics say [4, 4]: the tip, out of which z points."""
+    x = np.cross(tool.axis, [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(tool.axis, x), tool.axis], -1)
+    T[:3, 3] = tool.tip
+    return T
+
+
+def _compared(tool: Tool, states: InstrumentStates) -> dict[str, Any]:
+    """What is said of the tip that is the nearest to the true one."""
+    known = np.nonzero(np.isfinite(states.tips[:, 0]))[0]
+    row: dict[str, Any] = {"rows": len(states)}
+    if len(known):
+        tips = states.tips[known].astype(np.float64)
+        at = known[int(np.linalg.norm(tips - tool.tip, axis=1).argmin())]
+        row["tip_mm"] = off(tool, states.tips[at].astype(np.float64))
+        row["told_mm"] = 1e3 * float(error_of(states.confidence[at]))
+        row["sure"], row["source"] = bool(states.confidence[at] >= SURE), int(states.sources[at])
+        if np.isfinite(states.axes[at, 0]):
+            row["axis_deg"] = float(np.degrees(np.arccos(np.clip(states.axes[at] @ tool.axis, -1, 1))))
+    return row
+
+
+def _parts(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    within = [row for row in rows if row["in_picture"]]
+    return {
+        "first": [row for row in within if row["t_s"] < SETTLED],
+        "settled": [row for row in within if row["t_s"] >= SETTLED],
+        "outside": [row for row in rows if not row["in_picture"]],
+    }
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    placed = [row for row in rows if "tip_mm" in row]
+    said: dict[str, Any] = {
+        "frames": len(rows),
+        "placed": len(placed),
+        "sure": sum(r["sure"] for r in placed),
+    }
+    for name in ("tip_mm", "axis_deg"):
+        values = [row[name] for row in placed if name in row]
+        if values:
+            said[name] = {"median": rounded(np.median(values)), "p90": rounded(np.quantile(values, 0.9))}
+    if placed:
+        said["within_told"] = rounded(np.mean([row["tip_mm"] <= row["told_mm"] for row in placed]))
+    return said
+
+
+def table(measured: dict[str, Any]) -> Table:
+    """For people."""
+    names = "tip_mm", "axis_deg"
+    shown = Table("", "", "placed", "sure", "within told", *names, title="kinematics: median, nine of ten")
+    for case in CASES:
+        for part, row in measured[case].items():
+            figures = [f"{row[n]['median']}, {row[n]['p90']}" if n in row else "" for n in names]
+            placed = f"{row['placed']} of {row['frames']}"
+            shown.add_row(case, part, placed, str(row["sure"]), str(row.get("within_told", "")), *figures)
+    return shown

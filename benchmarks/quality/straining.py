@@ -1,0 +1,120 @@
+"""How exactly the strain of a surface that is pulled is told: before the phantom, whose strain is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from benchmarks.quality.depth import Advance, rounded
+from sags_node.config.schema import LaunchConfig
+from sags_node.kernels.threads import configure_threads
+from sags_node.mapping.budget import StepBudget
+from sags_node.messaging.content import STRAIN_FIELDS, points
+from sags_node.phantom.scene import Phantom, PhantomScene
+from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.warm_up import warm_up
+from sags_node.tools.evaluation.receipt import Receipt
+from sags_node.types import F32, F64, I64, StereoFrame
+
+SIZE = (640, 512)
+SECONDS, RATE, STEPS = 4.0, 15.0, 2  # of one pull; frames a second; steps of the mapper, each frame
+SINCE, EVERY = 10, 3  # frames: the moment, before the pull; one of so many is measured
+STRAINED = 0.05  # of what is counted apart
+ACROSS = 4  # vertices to each side of one, over which its true strain is taken: about 2 mm
+NEAR = 0.002  # m, from a point to the surface
+
+
+def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
+    """Of what each message of `points` says while the tissue is pulled."""
+    config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
+    warm_up(config)
+    configure_threads(config.engine.threads)
+    told, true, receipt, count = [], [], None, round(SECONDS * RATE)
+    for seed in range(seeds):
+        phantom = Phantom(PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1], seed=seed))
+        pipeline = Pipeline(config, phantom.rig, rate=RATE)
+        receipt = receipt or Receipt(phantom.rig, SIZE, None)
+        before = phantom.tissue.vertices(SINCE / count)
+        for number in range(count * 3 // 4):
+            advance(number, count * 3 // 4, f"seed {seed}")
+            seen = phantom.frame(number, count)
+            stamp = round((1 + number / RATE) * 1e9)
+            frame = StereoFrame(number, stamp, stamp, seen.left, seen.right, tissue=~seen.tool)
+            result = pipeline.process(frame, StepBudget(STEPS))
+            receipt.add(frame, result.observation.tissue)
+            if number == SINCE:
+                pipeline.start_strain()
+            if number <= SINCE or number % EVERY:
+                continue
+            body = points(result)
+            names = body.encoding.split(",")
+            rows = np.frombuffer(body.parts[1], np.float32).reshape(-1, len(names))
+            now = phantom.tissue.vertices(number / count)
+            vertex, off = _nearest(now.reshape(-1, 3), rows[:, :3])
+            on = off <= NEAR
+            told.append(rows[on][:, [names.index(name) for name in STRAIN_FIELDS[:2]]])
+            true.append(true_strain(before, now).reshape(-1, 2)[vertex[on]])
+    assert receipt is not None
+    found, exact = np.concatenate(told), np.concatenate(true)
+    parts = {"all": np.ones(len(exact), np.bool_), "strained": np.abs(exact).max(1) >= STRAINED}
+    return {
+        "points": len(exact),
+        **{name: _summary(found[which], exact[which]) for name, which in parts.items()},
+        "receipts": {"phantom": receipt.as_json()},
+    }
+
+
+def _nearest(vertices: F32, places: F32) -> tuple[I64, F32]:
+    """The vertex [N] that is the nearest to each place [N, 3], and how far it is [N] (m)."""
+    from open3d.core import Tensor
+    from open3d.core.nns import NearestNeighborSearch
+
+    search = NearestNeighborSearch(Tensor(np.ascontiguousarray(vertices)))
+    search.knn_index()
+    found, squared = search.knn_search(Tensor(np.ascontiguousarray(places)), 1)
+    return found.numpy()[:, 0], np.sqrt(squared.numpy()[:, 0])
+
+
+def true_strain(before: F32, now: F32) -> F64:
+    """The largest and smallest principal strain [rows, cols, 2] at the vertices of a grid [rows, cols, 3],
+    by central differences along its rows and columns; NaN at its edges."""
+    metrics, inner = [], slice(ACROSS, -ACROSS)
+    for vertices in (before.astype(np.float64), now.astype(np.float64)):
+        down = (vertices[2 * ACROSS :] - vertices[: -2 * ACROSS])[:, inner]
+        along = (vertices[:, 2 * ACROSS :] - vertices[:, : -2 * ACROSS])[inner]
+        D = np.stack([down, along], -1)
+        metrics.append(np.swapaxes(D, -1, -2) @ D)
+    C = np.linalg.solve(*metrics)
+    half, det = 0.5 * (C[..., 0, 0] + C[..., 1, 1]), np.linalg.det(C)
+    apart = np.sqrt(np.maximum(half**2 - det, 0))
+    strain = np.full((*now.shape[:2], 2), np.nan)
+    strain[inner, inner] = np.sqrt(np.maximum(np.stack([half + apart, half - apart], -1), 0)) - 1
+    return strain
+
+
+def _summary(found: F32, exact: F64) -> dict[str, Any]:
+    said: dict[str, Any] = {}
+    for column, name in enumerate(STRAIN_FIELDS[:2]):
+        truth, told = exact[:, column], found[:, column]
+        known = np.isfinite(told) & np.isfinite(truth)
+        errors, nothing = np.abs(told - truth)[known], np.abs(truth)[known]
+        said[name] = {
+            "known": rounded(known.sum() / max(1, np.isfinite(truth).sum())),
+            "true_p90": rounded(np.quantile(np.abs(truth[np.isfinite(truth)]), 0.9)),
+            "error": {"median": rounded(np.median(errors)), "p90": rounded(np.quantile(errors, 0.9))},
+            "bias": rounded(np.median((told - truth)[known])),
+            "zero": {"median": rounded(np.median(nothing)), "p90": rounded(np.quantile(nothing, 0.9))},
+        }
+    return said
+
+
+def tables(measured: dict[str, Any]) -> list[Table]:
+    """For people."""
+    table = Table("points", "strain", "known", "true, p90", "error", "0 is told", title="median, nine of ten")
+    for part in ("all", "strained"):
+        for name, row in measured[part].items():
+            figures = [f"{row[n]['median']}, {row[n]['p90']}" for n in ("error", "zero")]
+            table.add_row(part, name, str(row["known"]), str(row["true_p90"]), *figures)
+    return [table]

@@ -1,0 +1,100 @@
+"""How the surface is stretched since a moment: principal strains, from how Gaussians lie to each other.
+
+Of each patch of the surface the affine map is sought that takes its Gaussians from where they lay to where
+they lie (least squares). In the patch's tangent plane that is a deformation gradient F [3, 2]; the roots of
+the eigenvalues of F^T F are the principal stretches, and a strain is a stretch less 1 (Biot's, nominal).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from sags_node.confidence import HALVING
+from sags_node.model.deformation import cell_centres, nearest_nodes
+from sags_node.types import F32, F64, I64, Bool, Gaussians
+
+PATCH = 0.004  # m between patches: each has the Gaussians of about twice that
+FEWEST = 12  # Gaussians of a patch
+LEAST_SPREAD = 0.25  # of `PATCH`, standard deviation of them along each direction of the surface
+LEAST_OPACITY = 0.1
+FULL = 0.3  # strain with the brightest colour
+UNKNOWN = (0.35, 0.35, 0.35)  # RGB
+
+
+class Strain:
+    """How tissue is stretched since a moment; immutable.
+
+    Args:
+        gaussians: of that moment.
+
+    Attributes:
+        since_ns: when it was.
+    """
+
+    def __init__(self, gaussians: Gaussians, since_ns: int) -> None:
+        self.since_ns = since_ns
+        kept = np.flatnonzero(_is_sure(gaussians) & (gaussians.opacities >= LEAST_OPACITY))
+        kept = kept[np.argsort(gaussians.ids[kept])]
+        self._ids, self._places = gaussians.ids[kept], gaussians.means[kept]
+        if len(kept):
+            self._patches = cell_centres(self._places, PATCH)
+            self._index, self._weight, _ = nearest_nodes(self._places, self._patches)
+
+    def at(self, gaussians: Gaussians) -> F32:
+        """The largest and the smallest strain [N, 2] where each Gaussian is; NaN: not known, as it is new, or
+        its depth or too much around it is not sure to 3 mm, then or now."""
+        found = np.full((len(gaussians), 2), np.nan, np.float32)
+        if len(self._ids) == 0:
+            return found
+        at = np.searchsorted(self._ids, gaussians.ids)
+        at[at == len(self._ids)] = 0
+        known = (self._ids[at] == gaussians.ids) & _is_sure(gaussians)
+        at = at[known]
+        strains = self._of_patches(at, gaussians.means[known])
+        weight = np.where(np.isnan(strains[self._index[at], 0]), 0, self._weight[at])
+        shares = weight / np.maximum(weight.sum(1, keepdims=True), 1e-9)
+        mean = np.einsum("nk,nka->na", shares, np.nan_to_num(strains)[self._index[at]])
+        mean[weight[:, 0] == 0] = np.nan  # its own patch is not known
+        found[known] = mean
+        return found
+
+    def _of_patches(self, at: I64, now: F32) -> F64:
+        """[M, 2] of all patches, by the Gaussians that are known: their numbers [K] and places [K, 3]."""
+        near, count = self._index[at].ravel(), len(self._patches)
+        own = self._patches[near]
+        before = np.repeat(self._places[at], self._index.shape[1], 0) - own
+        after = np.repeat(now, self._index.shape[1], 0) - own
+        both = np.hstack([before, after]).astype(np.float64)
+        members = np.bincount(near, minlength=count)
+        many = np.maximum(members, 1)[:, None]
+        mean = np.stack([np.bincount(near, column, count) for column in both.T], -1) / many
+        moments = np.stack(
+            [np.bincount(near, both[:, i] * both[:, j], count) for i in range(6) for j in range(3)], -1
+        )
+        moments = (moments / many).reshape(count, 6, 3) - mean[:, :, None] * mean[:, None, :3]
+        spreads, axes = np.linalg.eigh(moments[:, :3])
+        good = (members >= FEWEST) & (spreads[:, 1] > (LEAST_SPREAD * PATCH) ** 2)
+        strains = np.full((count, 2), np.nan)
+        tangents = axes[good][:, :, 1:]  # [G, 3, 2], in which the moments are diagonal
+        F = moments[good][:, 3:] @ tangents / spreads[good][:, None, 1:]
+        stretches = np.sqrt(np.maximum(np.linalg.eigvalsh(np.swapaxes(F, 1, 2) @ F), 0))
+        strains[good] = stretches[:, ::-1] - 1
+        return strains
+
+
+def painted(gaussians: Gaussians, strain: Strain) -> Gaussians:
+    """The Gaussians in the colours of their largest strain: dark at 0, yellow at `FULL`; grey: not known."""
+    largest = strain.at(gaussians)[:, 0]
+    levels = np.nan_to_num(np.clip(largest / FULL, 0, 1) * 255).astype(np.uint8)
+    colors = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1].astype(np.float32) / 255
+    colors[np.isnan(largest)] = UNKNOWN
+    return replace(gaussians, colors=colors, slopes=None, sh_rest=None)
+
+
+def _is_sure(gaussians: Gaussians) -> Bool:
+    if gaussians.depth_errors is None:
+        return np.ones(len(gaussians), np.bool_)
+    return np.asarray(gaussians.depth_errors <= HALVING)

@@ -1,0 +1,85 @@
+"""Strain of a surface: of plain motions it is known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from sags_node.model.strain import FULL, UNKNOWN, Strain, painted
+from sags_node.types import F32, F64, Gaussians
+
+S = 1_000_000_000
+
+
+def surface(count: int = 3000, bend: float = 0.0) -> Gaussians:
+    """Gaussians on a patch of 60 x 60 mm, bent like a dome; sure to 1 mm."""
+    xy = np.random.default_rng(0).uniform(-0.03, 0.03, (count, 2))
+    means = np.column_stack([xy, 0.08 + bend * (xy**2).sum(1)]).astype(np.float32)
+    ones = np.ones((count, 4), np.float32)
+    return Gaussians(
+        means, ones, 1e-3 * ones[:, :3], ones[:, 0], 0.5 * ones[:, :3], np.arange(count)[::-1].copy(),
+        depth_errors=np.full(count, 1e-3, np.float32),
+    )  # fmt: skip
+
+
+def moved(gaussians: Gaussians, F: F64) -> Gaussians:
+    return replace(gaussians, means=(gaussians.means @ F.T + 0.01).astype(np.float32))
+
+
+TURN = cv2.Rodrigues(np.array([0.4, -0.3, 0.8]))[0]
+
+
+@pytest.mark.parametrize(
+    ("F", "strain"),
+    [
+        (TURN, (0.0, 0.0)),  # a rigid motion is none
+        (TURN @ np.diag([1.2, 0.9, 1.0]), (0.2, -0.1)),
+        (np.diag([0.8, 0.8, 1.0]), (-0.2, -0.2)),
+        # Simple shear by 0.2: the stretches are sqrt(1 + 0.01) +- 0.1.
+        (np.array([[1, 0.2, 0], [0, 1, 0], [0, 0, 1]]), (np.sqrt(1.01) - 0.9, np.sqrt(1.01) - 1.1)),
+    ],
+)
+def test_a_plane_that_is_stretched_alike_everywhere(F: F64, strain: tuple[float, float]) -> None:
+    before = surface()
+    found = Strain(before, S).at(moved(before, F))
+    known = np.isfinite(found[:, 0])
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(found[known], np.broadcast_to(strain, (known.sum(), 2)), atol=1e-4)
+
+
+def test_a_curved_surface_that_grows_by_a_tenth() -> None:
+    before = surface(bend=4.0)
+    found = Strain(before, S).at(moved(before, 1.1 * TURN))
+    assert np.nanmax(np.abs(found - 0.1)) < 1e-4
+
+
+def test_what_is_new_hidden_or_alone_is_not_known() -> None:
+    before = surface()
+    strain, now = Strain(before, S), moved(before, 1.1 * TURN)
+    new = before.ids < 100
+    errors = np.where(before.means[:, 0] > 0, 0.004, 0.001).astype(np.float32)  # half is not sure to 3 mm
+    found = strain.at(replace(now, ids=np.where(new, before.ids + 10_000, before.ids), depth_errors=errors))
+    unknown = np.isnan(found[:, 0])
+    assert unknown[new].all() and unknown[errors > 0.003].all()
+    assert not unknown[~new & (before.means[:, 0] < -0.005)].any()
+    few = surface(5)
+    assert np.isnan(Strain(few, S).at(few)).all()
+    unsure = replace(before, depth_errors=np.full(len(before), 0.004, np.float32))
+    assert np.isnan(Strain(unsure, S).at(before)).all()
+
+
+def test_colours_go_with_the_largest_strain_and_grey_is_not_known() -> None:
+    def colour(F: F64) -> F32:
+        before = surface()
+        return np.median(painted(moved(before, F), Strain(before, S)).colors, 0)
+
+    ends = cv2.applyColorMap(np.array([[0], [255]], np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1] / 255
+    np.testing.assert_allclose(colour(np.eye(3)), ends[0], atol=0.01)
+    np.testing.assert_allclose(colour((1 + 2 * FULL) * np.eye(3)), ends[1], atol=1e-6)
+    few = surface(5)
+    np.testing.assert_allclose(
+        painted(few, Strain(few, S)).colors, np.broadcast_to(UNKNOWN, (5, 3)), atol=1e-6
+    )
