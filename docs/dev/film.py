@@ -104,7 +104,7 @@ class Vessel:
         relief = self._tissue.relief
         columns = np.interp(places[:, 0], relief.x, np.arange(len(relief.x))).astype(np.float32)
         rows = np.interp(places[:, 1], relief.y, np.arange(len(relief.y))).astype(np.float32)
-        return cv2.remap(values, columns[None], rows[None], cv2.INTER_LINEAR)[0].astype(np.float64)
+        return np.asarray(cv2.remap(values, columns[None], rows[None], cv2.INTER_LINEAR)[0], np.float64)
 
 
 def smooth(points: F64) -> F64:
@@ -149,7 +149,7 @@ def film(advance: Callable[[int], object]) -> Iterator[Image.Image]:
     configure_threads(config.engine.threads)
     vessel = Vessel(phantom)
     vertices, triangles = vessel.shape(PINNED / FRAMES)
-    colors = np.tile(np.float32(COLOR), (len(triangles), 1))
+    colors = np.tile(np.array(COLOR, np.float32), (len(triangles), 1))
     body = Body(Mesh(vertices.astype(np.float32), triangles.astype(np.int32), colors), OPACITY, None)
     anchors = [{"place": pin, "at": pin} for pin in vessel.pins(PINNED / FRAMES).tolist()]
     spec = ObjectSpec.model_validate({"file": "vessel.ply", "deform": True, "anchors": anchors})

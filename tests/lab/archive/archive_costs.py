@@ -1,8 +1,8 @@
 """What an archive itself costs.
 
-    python benchmarks/archive_itself.py efficiency FOLDER
-    python benchmarks/archive_itself.py tiny FOLDER         # 2000 recordings that do next to nothing
-    python benchmarks/archive_itself.py large FOLDER        # 100,000 that are done
+    python tests/lab/archive/archive_costs.py efficiency FOLDER
+    python tests/lab/archive/archive_costs.py tiny FOLDER         # 2000 recordings that do next to nothing
+    python tests/lab/archive/archive_costs.py large FOLDER        # 100,000 that are done
 
 Each takes some minutes of two cores; FOLDER must be new. benchmarks/archive.md has what came out.
 """
@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 HELPERS = ROOT / "tests/helpers"
 sys.path.insert(0, str(HELPERS))
 from tiny_archive import quick_plan, quick_work, write_quick_recordings  # noqa: E402
