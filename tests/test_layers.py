@@ -29,7 +29,7 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10590,
+    "benchmarks": 10400,
     "sags_lab": 5023,
     "sags_node": 1197,
     "sags_node/bags": 902,
@@ -44,7 +44,7 @@ LINES = {
     "sags_node/config": 1405,
     "sags_node/detail": 886,
     "sags_node/engine": 4070,
-    "sags_node/instruments": 836,
+    "sags_node/instruments": 838,
     "sags_node/field": 1747,
     "sags_node/kernels": 1222,
     "sags_node/mapping": 5673,
@@ -57,7 +57,7 @@ LINES = {
     "sags_node/quality": 267,
     "sags_node/rig": 1187,
     "sags_node/ros": 332,
-    "sags_node/sources": 5875,
+    "sags_node/sources": 5876,
     "sags_node/terminal": 372,
     "sags_node/tools": 526,
     "sags_node/tools/calibration": 1877,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1089,
     "sags_node/vision": 5452,
-    "tests": 47438,
+    "tests": 47628,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

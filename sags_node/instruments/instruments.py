@@ -107,7 +107,8 @@ class Instruments:
         for place, arm in enumerate(arms):
             row = seen.get(place)
             if row is not None and np.isfinite(found[row].tip[0]):
-                arm.learn(transform(invert(camera.T_world_cam), found[row].tip), found[row].error)
+                tip = np.asarray(transform(invert(camera.T_world_cam), found[row].tip), np.float64)
+                arm.learn(tip, found[row].error)
             one = _told(arm, camera, None if row is None else found[row].end)
             if row is None:
                 row = len(found)
@@ -194,8 +195,9 @@ def _placed(outline: Outline, both: Eyes | None, camera: Camera, baseline: float
 
 def _told(arm: Arm, camera: Camera, end: F64 | None) -> _One:
     """Where the robot says that one is, corrected as far as that was learnt; `end` [2] of its mask."""
-    tip, axis = transform(camera.T_world_cam, arm.tip), camera.T_world_cam[:3, :3] @ arm.axis
-    pixel, tilt = project(camera, tip)[0], arm.axis_error
+    tip = np.asarray(transform(camera.T_world_cam, arm.tip), np.float64)
+    axis, tilt = camera.T_world_cam[:3, :3] @ arm.axis, arm.axis_error
+    pixel = np.asarray(project(camera, tip)[0], np.float64)
     return _One(
         pixel if end is None else end, tip, axis if tilt < AXIS_ERROR else np.full(3, np.nan), (), pixel,
         arm.tip_error, source=CORRECTED if arm.is_corrected else BY_ROBOT, tilt=tilt,

@@ -44,13 +44,13 @@ class Arm:
         self._off = np.zeros(6)  # rad about the pivot, then m
         self._spread = np.diag([*3 * [TURN], *3 * [error / (NINE_OF_TEN * np.sqrt(3))]]) ** 2
         self._most = np.diag(self._spread).copy()
-        self._pivot: F64 | None = None
+        self._pivot = np.full(3, np.nan)
         self._told_ns = self._learnt_ns = 0
 
     def move(self, T_cam_tool: F64, t_ns: int) -> None:
         """It is there now, as the robot tells [4, 4]: the tip, out of which z points."""
         self._tip, self._axis = T_cam_tool[:3, 3], T_cam_tool[:3, 2]
-        if self._pivot is None:
+        if np.isnan(self._pivot[0]):
             self._pivot, self._told_ns = self._tip, t_ns
         older = max(0, t_ns - self._told_ns) * 1e-9
         grown = np.diag(self._spread) + older * DRIFT

@@ -14,7 +14,7 @@ import numpy as np
 
 from sags_node.confidence import HALVING
 from sags_node.model.deformation import cell_centres, nearest_nodes
-from sags_node.types import F32, F64, I64, Bool, Gaussians
+from sags_node.types import F32, F64, I64, Bool, Gaussians, Strained
 
 PATCH = 0.004  # m between patches: each has the Gaussians of about twice that
 FEWEST = 12  # Gaussians of a patch
@@ -71,10 +71,10 @@ class Strain:
         members = np.bincount(near, minlength=count)
         many = np.maximum(members, 1)[:, None]
         mean = np.stack([np.bincount(near, column, count) for column in both.T], -1) / many
-        moments = np.stack(
+        sums = np.stack(
             [np.bincount(near, both[:, i] * both[:, j], count) for i in range(6) for j in range(3)], -1
         )
-        moments = (moments / many).reshape(count, 6, 3) - mean[:, :, None] * mean[:, None, :3]
+        moments = (sums / many).reshape(count, 6, 3) - mean[:, :, None] * mean[:, None, :3]
         spreads, axes = np.linalg.eigh(moments[:, :3])
         good = (members >= FEWEST) & (spreads[:, 1] > (LEAST_SPREAD * PATCH) ** 2)
         strains = np.full((count, 2), np.nan)
@@ -85,7 +85,7 @@ class Strain:
         return strains
 
 
-def painted(gaussians: Gaussians, strain: Strain) -> Gaussians:
+def painted(gaussians: Gaussians, strain: Strained) -> Gaussians:
     """The Gaussians in the colours of their largest strain: dark at 0, yellow at `FULL`; grey: not known."""
     largest = strain.at(gaussians)[:, 0]
     levels = np.nan_to_num(np.clip(largest / FULL, 0, 1) * 255).astype(np.uint8)

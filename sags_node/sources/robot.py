@@ -259,7 +259,8 @@ class Posed:
         last: F64 | None = None
         for frame in self._source:
             t_ns = frame.t_device_ns if self._recorded else frame.t_capture_ns
-            problem, tools = None, ()
+            problem = None
+            tools: tuple[ToolPose, ...] = ()
             deadline = time.monotonic() + WAIT_S
             try:
                 T_base_hand = self.robot.track.at(t_ns + self._offset_ns, WAIT_S)
