@@ -132,9 +132,7 @@ class ToolPose:
 
     name: str  # its topic
     error: float  # m, nine of ten are smaller
-    T_cam_tool: (
-        F64 | None
-    )  # [4, 4] in the left rectified camera, z points out of the tip; None: not known now
+    T_cam_tool: F64 | None  # [4, 4] in the left rectified camera, z out of its tip; None: not known now
     problem: str = ""  # why not
 
 

@@ -31,7 +31,7 @@ FOLDERS = sorted(PLACES)
 LINES = {
     "benchmarks": 10400,
     "sags_lab": 5023,
-    "sags_node": 1197,
+    "sags_node": 1195,
     "sags_node/bags": 902,
     "sags_node/cli": 3539,
     "sags_node/clients": 1,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1089,
     "sags_node/vision": 5452,
-    "tests": 47628,
+    "tests": 47651,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -447,13 +447,13 @@ class Pipeline:
         self._right_views += 1
         if self._detail is not None and self.seen:
             now, gaussians = self.seen[0], mapped.snapshot.gaussians
-            if self._right_views % ASIDE_EVERY == 1:
-                self._detail.learn_aside(now, mapped.snapshot, published.picture(pair, "right"), baseline)
             camera = replace(published.camera_of(pair), T_world_cam=view.camera.T_world_cam)
             drawn = view.colours.at(camera.width, camera.height)
             tint = self._detail.tint(mapped.snapshot, gaussians, camera)
             shown = self._detail.view(drawn, view.depth, camera, gaussians, now, baseline, tint=tint)
             view = replace(view, shown=shown)
+            if self._right_views % ASIDE_EVERY == 1:
+                self._detail.learn_aside(now, mapped.snapshot, published.picture(pair, "right"), baseline)
         if self._right_views % LEARN_EVERY == 0:
             assert seen.right is not None  # else nothing is drawn for it
             rgb = view.rgb

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from engine_scenes import rasterize
 from places import SESSION
 
+from sags_node.detail.show import Detail
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapped import Mapped
@@ -89,6 +91,27 @@ def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
                 came += 1
                 assert quality(result, shown(result)) > quality(result, model_alone(result))
     assert came == 2
+
+
+def test_a_frame_is_drawn_before_its_right_picture_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[str] = []
+    for kind, name in ((Detail, "view"), (Detail, "learn_aside"), (RightView, "draw"), (RightView, "learn")):
+        inner = getattr(kind, name)
+
+        def spied(*args: object, inner: Any = inner, name: str = name, **more: object) -> Any:
+            called.append(name)
+            return inner(*args, **more)
+
+        monkeypatch.setattr(kind, name, spied)
+    session = open_session(SESSION, ["source.pace:=step", "source.frames:=3", *FEW])
+    pipeline = Pipeline(session.config, session.rig)
+    with session.source as source:
+        for frame in source:
+            called.append("frame")
+            pipeline.process(frame, StepBudget(1), FrameRequest(right=True))
+    frames = " ".join(called).split("frame")[1:]
+    assert all(calls.split()[:2] == ["draw", "view"] for calls in frames)
+    assert "learn_aside" in called and "learn" in called
 
 
 def test_who_comes_while_the_input_is_frozen_sees_something() -> None:
