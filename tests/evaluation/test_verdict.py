@@ -58,7 +58,7 @@ def test_a_verdict_has_what_an_overlay_needs_first_with_units_and_baselines() ->
         "picture": "36.9 dB PSNR of the next frame, the model alone 33.6 dB. The picture before, shown again:"
         " 35.8 dB; near while tissue rests, but without depth, another view or hidden tissue",
         "points": "0.38 mm off (median), nine of ten within 0.88 mm;"
-        " 33% given up (the Gaussians near them are gone)",
+        " 33% lost with their Gaussians (anchors take new ones)",
         "overlay": "on 249 of 268 frames (93%), 39 ms (p50), 97 ms (p99) after the camera;"
         " 19 without: being pinned",
         "right eye": "34.1 dB PSNR (left picture, warped: 32.6 dB)",
@@ -80,7 +80,7 @@ def test_without_truth_a_verdict_says_what_a_recording_can_tell_of_itself() -> N
     apart = "0.31 mm from the frame's own stereo (median), nine of ten within 1.20 mm"
     assert said["depth"] == f"{apart}; on 99% of the tissue, stereo alone on 80%"
     back = "0.42 mm off (median), nine of ten within 1.10 mm once back at the first frame, after moving"
-    assert said["points"] == f"{back} 12.30 mm; 17% given up (the Gaussians near them are gone)"
+    assert said["points"] == f"{back} 12.30 mm; 17% lost with their Gaussians (anchors take new ones)"
     assert said["played again"].startswith("the first 150 frames, frame by frame")
     gone = {"forth_back.median_mm": None, "forth_back.p90_mm": None, "forth_back.lost": 1.0}
     assert dict(verdict(figures | gone))["points"] == "all given up"

@@ -287,8 +287,8 @@ def _points(figures: Flat) -> str:
     """Beside true points, else by those that were followed forth and back."""
     for group, more in (("track", ()), ("forth_back", _RETURNED)):
         lost = f"{group}.lost"
-        given_up = lost, "; {:.0%} given up (the Gaussians near them are gone)"
-        said = _said(figures, *_off(group), *more, given_up)
+        gone = lost, "; {:.0%} lost with their Gaussians (anchors take new ones)"
+        said = _said(figures, *_off(group), *more, gone)
         if said or figures.get(lost) is not None:
             return said or "all given up"
     return ""
