@@ -15,7 +15,7 @@ import numpy as np
 from sags_node.config.schema import LaunchConfig
 from sags_node.detail.memory import Matched, Memory
 from sags_node.detail.seen import SeenFrame
-from sags_node.detail.show import LESSON_EVERY, Detail, Lessons
+from sags_node.detail.show import ASIDE_EVERY, LESSON_EVERY, Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer, to_view
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import UsageError
@@ -284,12 +284,12 @@ class Measurer:
 
     def _learn(self, now: _Mapped) -> None:
         """As a node that draws views learns from a frame."""
-        if self._detail is None or len(self.rows) % LESSON_EVERY:
+        if self._detail is None:
             return
         right = now.recorded.pair.right
-        if right is not None:
+        if right is not None and len(self.rows) % ASIDE_EVERY == 0:
             self._detail.learn_aside(now.lent, now.shown.snapshot, right, now.shown.baseline)
-        if self._earlier:
+        if self._earlier and len(self.rows) % LESSON_EVERY == 0:
             before = self._earlier[0]
             expected = extrapolated(before.shown.snapshot, now.recorded.seconds - before.recorded.seconds)
             self._detail.learn_ahead(before.lent, expected, now.lent)
