@@ -26,6 +26,7 @@ from sags_node.messaging import cdr
 from sags_node.messaging import stream as data_stream
 from sags_node.messaging.freshness import StaleError
 from sags_node.messaging.received import (
+    Received,
     ReceivedCameraInfo,
     ReceivedCloud,
     ReceivedImage,
@@ -77,10 +78,18 @@ def test_a_paused_subscriber_costs_the_node_nothing_and_goes_on_with_what_is_new
             newest, status = subscriber.latest(name), subscriber.latest("status")
             assert subscriber.wait("status", 30, after=status)
             assert subscriber.latest(name) is newest
+            resumed = time.time_ns()
             subscriber.resume()
-            later = subscriber.wait(name, 30, after=newest)
-            assert later is not None and later.age() < 1.0
-            assert subscriber.problem(name, max_age=1.0) is None, "what was not asked for is not lost"
+            until(lambda: subscriber.latest(name) is not newest)
+            until(lambda: cast(Received, subscriber.latest(name)).stamp_ns > resumed)
+            until(lambda: subscriber.ok(name))  # what was not asked for is not lost
+
+
+def _read_if_fresh(subscriber: Subscriber, name: str) -> Received | None:
+    try:
+        return subscriber.read(name)
+    except StaleError:  # a busy machine may hold the sender up
+        return None
 
 
 def test_strict_read_raises_when_the_frames_stop(tmp_path: Path) -> None:
@@ -89,9 +98,7 @@ def test_strict_read_raises_when_the_frames_stop(tmp_path: Path) -> None:
             with pytest.raises(StaleError, match="sags/left/depth is stale: nothing received"):
                 subscriber.read("left/depth")
             with stream(running):
-                assert subscriber.wait("left/depth", 30) is not None
-                until(lambda: subscriber.ok("left/depth"))
-                assert subscriber.read("left/depth").age() >= 0
+                assert until(lambda: _read_if_fresh(subscriber, "left/depth")).age() >= 0
             until(lambda: not subscriber.ok("left/depth"))
             with pytest.raises(StaleError, match="too old"):
                 subscriber.read("left/depth")

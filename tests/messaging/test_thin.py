@@ -51,7 +51,7 @@ def frame_of(running: Publisher, *names: str) -> dict[str, np.ndarray]:
             assert leading is not None, subscriber.problem(names[0])
             frame = subscriber.aligned(names, leading.stamp_ns, timeout=0.2)
             if frame is not None:
-                assert all(subscriber.ok(name) for name in names)
+                until(lambda: all(subscriber.ok(name) for name in names))
                 return {name: frame[name].array for name in names}  # type: ignore[attr-defined]
     raise AssertionError("no whole frame")
 

@@ -244,9 +244,9 @@ def test_the_saved_video_is_whole_also_where_there_is_no_overlay(run_dir: Path, 
 
 @pytest.mark.usefixtures("node")
 def test_what_nobody_sees_is_not_counted_as_an_overlay(run_dir: Path, tmp_path: Path) -> None:
-    """It is held 12 mm above the upper edge."""
+    """Its lowest edge begins 20 pixels above the picture; the phantom moves there by 13."""
     scene = tmp_path / "aside.yaml"
-    scene.write_text("objects: [{shape: sphere, anchors: [{pixel: [160, 6], at: [0, -0.012, 0]}]}]")
+    scene.write_text("objects: [{shape: sphere, anchors: [{pixel: [160, 2], at: [0, -0.016, 0]}]}]")
     summary = run_overlay(OverlayOptions(NodeAddress(run_dir=run_dir), scene=scene, seconds=3.0))
     assert summary["overlay"] == 0 and summary["objects"][0]["reason"] is None
     assert summary["blanked"][UNSEEN] > 5
