@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1089,
     "sags_node/vision": 5452,
-    "tests": 47652,
+    "tests": 47659,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
