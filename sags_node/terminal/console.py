@@ -26,8 +26,9 @@ SAME_SIGNAL = 0.5  # s
 LOOK_AGAIN = 0.02  # s until a Ctrl-C that could not come through is tried again
 LONGEST_WAIT = 10.0  # s, after which it is tried whatever becomes of it
 _IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
-# Finalisers, and what LLVM calls when it has compiled or loaded a kernel: the first Python code for long.
-_LOSING = {"__del__", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
+# Finalisers, what LLVM calls when it has compiled or loaded a kernel (the first Python code for long), and
+# the hook below, while it has a lost one sent again.
+_LOSING = {"__del__", "_raw_object_cache_notify", "_raw_object_cache_getbuffer", "unraisable"}
 
 console = Console(stderr=True, highlight=False)
 log = logging.getLogger(__name__)

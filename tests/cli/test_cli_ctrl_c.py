@@ -136,6 +136,24 @@ def test_a_ctrl_c_that_is_lost_comes_through_after_it(
 
 
 @pytest.mark.usefixtures("interrupting")
+def test_a_ctrl_c_that_comes_while_it_is_sent_again_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine the thread that sends it may do so before it is known to have begun."""
+    waits = [0.1]
+
+    class Delayed(threading.Timer):
+        def start(self) -> None:
+            super().start()
+            time.sleep(waits.pop() if waits else 0)
+
+    monkeypatch.setattr(sys, "unraisablehook", interrupt.unraisable)
+    monkeypatch.setattr(threading, "Timer", Delayed)
+    with pytest.raises(KeyboardInterrupt):
+        _called()
+        time.sleep(10)
+    assert not waits
+
+
+@pytest.mark.usefixtures("interrupting")
 def test_an_import_that_hangs_is_broken_off_in_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
