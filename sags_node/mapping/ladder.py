@@ -76,8 +76,8 @@ class Prices:
 
 
 USED = 0.82  # of the Gaussians that a rung allows: so many a model has, the rest is room for what appears
-# Two cores of one machine, by 18 runs at three working sizes (`benchmarks/ladder.md`).
-ON_CPU = Prices(every_frame=8.5, depth=3.0, worked=0.8, drawn=3.6, stepped=2.4, per_thousand=0.33)
+# Two cores of one machine, live with somebody looking, at three working sizes (`benchmarks/ladder.md`).
+ON_CPU = Prices(every_frame=10.0, depth=3.0, worked=2.2, drawn=3.6, stepped=2.4, per_thousand=0.33)
 # One H200 beside 16 cores, by five runs (`benchmarks/gpu.md`), which took 1.07 to 1.12 times as long. Not run
 # on a card since.
 ON_GPU = Prices(every_frame=8.5, depth=5.0, worked=0.8, drawn=3.6, stepped=1.2, per_thousand=0.08)
@@ -99,7 +99,8 @@ FIRST_FRAMES = FIRST_LOOKS[-1]
 
 
 SCALES = (1.0, 0.75, 0.5, 0.375, 0.25)  # of the working size, that a machine may choose from
-SMALLEST = 320 * 256  # px, that it may choose: less saves nothing
+SMALLEST = 480 * 360  # px, that it may choose: less saves nothing
+ROOMY = 3  # the rung that must fit: what the lower ones save is for what else the machine does
 PIXELS_PER_GAUSSIAN = 4  # fewer pixels have no more to tell of its colour, slopes and place
 WITH_OTHERS = 1.1  # times as long as prices say: the least that live frames take (`benchmarks/ladder.md`)
 
@@ -118,24 +119,17 @@ def price(rung: Rung, gaussians: float, pixels: int, prices: Prices = ON_CPU) ->
 
 
 def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float) -> float:
-    """Which of `SCALES` shows most. A smaller picture costs less, so it affords more Gaussians; but many
-    Gaussians in few pixels show no more than the pixels do. `benchmarks/ladder.md` has the measurements.
+    """The largest of `SCALES` that leaves room; `benchmarks/ladder.md` has what sizes give and cost.
 
     Args:
         pixels: of the picture at scale 1.
         seconds, speed: see `Ladder`.
     """
     affords = FIRST_AIM * 1e3 * seconds / (WITH_OTHERS * speed)  # ms, in units of the prices
+    rung = rungs[min(ROOMY, len(rungs) - 1)]
     scales = [scale for scale in SCALES if scale == 1 or scale**2 * pixels >= SMALLEST]
-    shown = {scales[-1]: 0.0}
-    for scale in scales:
-        for rung in rungs:
-            spare = affords - price(rung, USED * rung.gaussians, round(scale**2 * pixels))
-            if spare >= 0:  # a frame has room for some more than the rung says
-                most = (rung.scale * scale) ** 2 * pixels / PIXELS_PER_GAUSSIAN
-                gaussians = min(USED * rung.gaussians + 1e3 * spare / ON_CPU.per_thousand, most)
-                shown[scale] = max(shown.get(scale, 0.0), 1 / (1 / gaussians + 1 / most))
-    return max(shown, key=shown.__getitem__)
+    costs = (price(rung, USED * rung.gaussians, round(scale**2 * pixels)) for scale in scales)
+    return next((scale for scale, ms in zip(scales, costs, strict=True) if ms <= affords), scales[-1])
 
 
 class Ladder:

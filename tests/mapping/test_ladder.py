@@ -205,16 +205,16 @@ def test_a_new_budget_goes_on_at_the_speed_of_the_one_before() -> None:
     assert fast is not None and slow is not None and fast.number > slow.number
 
 
-def test_the_slower_a_machine_the_smaller_its_pictures() -> None:
-    """By steps of two: rungs lie so far apart that less may change nothing, or too much."""
-    scales = [best_scale(RUNGS, FULL, SECONDS, speed) for speed in 0.1 * 2.0 ** np.arange(10)]
-    assert scales[0] == SCALES[0] and scales[-1] ** 2 * FULL == SMALLEST  # at the last nothing fits
+@pytest.mark.parametrize("pixels", [FULL, 1280 * 1024, 720 * 576, 640 * 480])
+def test_the_slower_a_machine_the_smaller_its_pictures(pixels: int) -> None:
+    scales = [best_scale(RUNGS, pixels, SECONDS, speed) for speed in np.geomspace(0.1, 50, 500)]
     assert scales == sorted(scales, reverse=True)
+    smaller = [scale for scale in SCALES if scale**2 * pixels >= SMALLEST]
+    assert (scales[0], scales[-1]) == (1, smaller[-1]) and smaller[-1] < 1  # at the last nothing fits
 
 
-def test_many_gaussians_in_few_pixels_are_worth_no_less_of_the_picture() -> None:
-    """Where the top rung fits at every size, the largest shows most."""
-    assert best_scale(RUNGS[-1:], FULL, 10.0, 1.0) == 1.0
+def test_pictures_that_are_small_already_stay_as_they_are() -> None:
+    assert best_scale(RUNGS, 320 * 256, SECONDS, 50) == 1
 
 
 def test_the_scale_is_chosen_in_real_time_only_and_never_over_a_person(
@@ -227,7 +227,7 @@ def test_the_scale_is_chosen_in_real_time_only_and_never_over_a_person(
         return with_scale(config, 640, 512, 30.0).vision.scale
 
     assert chosen() == best_scale(RUNGS, FULL, 1e-3 * MappingConfig().frame_ms(30.0), 2.0) < 1
-    assert chosen(mapping={"method": "sags"}) == 0.5  # its frames take several times as long
+    assert chosen(mapping={"method": "sags"}) == 0.75  # its frames take several times as long
     assert chosen(source={"kind": "phantom", "pace": "step"}) == 1.0  # results repeat
     assert chosen(mapping={"iterations": 2}) == 1.0
     assert chosen(vision={"scale": 0.5}) == 0.5 and chosen(vision={"scale": 1}) == 1
