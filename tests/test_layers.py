@@ -59,14 +59,14 @@ LINES = {
     "sags_node/ros": 332,
     "sags_node/sources": 5876,
     "sags_node/terminal": 373,
-    "sags_node/tools": 526,
+    "sags_node/tools": 534,
     "sags_node/tools/calibration": 1877,
     "sags_node/tools/evaluation": 3153,
     "sags_node/tools/export": 891,
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1089,
     "sags_node/vision": 5452,
-    "tests": 47677,
+    "tests": 47685,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -156,7 +156,7 @@ SIDES: tuple[Side, Side] = ("left", "right")
 
 def _of(shot: Shot, image: U8) -> Picture:
     """One eye's picture of what a device delivered."""
-    return Picture(shot.t_ns, image, shot.device_ns, shot.arrival_ns)
+    return Picture(shot.t_ns, image, shot.device_ns or 0, shot.arrival_ns)
 
 
 class DeviceReader:

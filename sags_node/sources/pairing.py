@@ -36,7 +36,7 @@ class Shot(NamedTuple):
     t_ns: int  # wall clock
     image: Samples  # [H, W, 3] RGB
     side: Side | None = None  # whose it is, where one device delivers either eye's
-    device_ns: int = 0  # by the clock of the device; 0: it gave none
+    device_ns: int | None = None  # by the clock of the device, which may begin at 0; None: it gave none
     arrival_ns: int = 0  # wall clock; 0: not known
 
 
@@ -211,7 +211,7 @@ class Alternation:
         if before is None:
             return 1
         passed_ns = self._arrived_ns - last_ns
-        if picture.device_ns and before.device_ns:
+        if picture.device_ns is not None and before.device_ns is not None:
             passed_ns = picture.device_ns - before.device_ns
         return max(1, round(passed_ns / self._period_ns))
 

@@ -30,7 +30,7 @@ from sags_node.tools.evaluation.session import completed, measure
 from sags_node.types import U8, FrameResult
 
 VIDEO, LAYERS = "overlay.mp4", "overlay.layers"
-OVERLAY_START = 15.0  # s for the overlay to load its shapes and listen
+OVERLAY_START = 60.0  # s for the overlay to load its shapes and listen
 OVERLAY_GRACE = 15.0  # s for the overlay to end after the node
 OVERLAY_STOP = 2.0  # s for it when the demo is interrupted
 _OPTIONS = MeasureOptions(hold_out=0, second=True)
@@ -121,12 +121,20 @@ def _start_overlay(config: LaunchConfig, seconds: float, layers: Path) -> subpro
 
 
 def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str], stop: threading.Event) -> None:
-    """Wait until it listens: a short demo would be over before."""
+    """Wait until it listens: a short demo would be over before.
+
+    Raises:
+        SagsError: it does not come up in time.
+    """
     ready = connection_path(config.publish.run_dir or default_run_dir(), "overlay")
     deadline = time.monotonic() + OVERLAY_START
-    while not ready.exists() and overlay.poll() is None and time.monotonic() < deadline:
+    while not ready.exists() and overlay.poll() is None:
         if stop.wait(0.02):
             return
+        if time.monotonic() > deadline:
+            raise SagsError(
+                f"the overlay subscriber did not come up in {OVERLAY_START:.0f} s: the machine is too busy"
+            )
 
 
 def _finish_overlay(overlay: subprocess.Popen[str]) -> dict[str, Any]:

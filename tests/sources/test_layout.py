@@ -150,13 +150,13 @@ def pairs_of(
 ) -> tuple[list[tuple[int, int]], int]:
     """Of a camera of 60 Hz, by number; even ones are of the first eye. `stamped`: by its clock as well;
     the wall clock is set before the eleventh."""
-    moments = [round(1e9 / 60 * i) + 1 for i in indices]
+    moments = [round(1e9 / 60 * i) for i in indices]
     jitter = np.random.default_rng(1).uniform(-jitter_ms, jitter_ms, len(indices))
     times = iter([moment + round(late * 1e6) for moment, late in zip(moments, jitter, strict=True)])
     joining, found = Alternation(1e9 / 60, lambda: next(times)), []
     for i, moment in zip(indices, moments, strict=True):
         wall = 10**18 + moment + round((i > 10) * set_ms * 1e6)
-        shot = Shot(wall, np.full((2, 2, 3), i, np.uint8), device_ns=moment if stamped else 0)
+        shot = Shot(wall, np.full((2, 2, 3), i, np.uint8), device_ns=moment if stamped else None)
         if (pair := joining.add(shot)) is not None:
             found.append(pair)
     return [(int(a.image[0, 0, 0]), int(b.image[0, 0, 0])) for a, b in found], joining.alone
@@ -170,8 +170,10 @@ def test_a_clock_that_is_set_does_not_exchange_the_eyes(stamped: bool) -> None:
         assert pairs == [(i, i + 1) for i in range(0, 30, 2)] and alone == 0
 
 
-def test_eyes_in_turn_are_paired_in_order() -> None:
-    assert pairs_of(list(range(6)), jitter_ms=4) == ([(0, 1), (2, 3), (4, 5)], 0)
+@pytest.mark.parametrize(("late_ms", "stamped"), [(4, False), (100, True)])
+def test_eyes_in_turn_are_paired_in_order(late_ms: float, stamped: bool) -> None:
+    """A camera's own stamps tell, from the first picture on, however late a busy machine takes it in."""
+    assert pairs_of(list(range(6)), late_ms, stamped) == ([(0, 1), (2, 3), (4, 5)], 0)
 
 
 def test_a_lost_picture_does_not_exchange_the_eyes() -> None:
