@@ -29,7 +29,7 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10400,
+    "benchmarks": 10401,
     "sags_lab": 5023,
     "sags_node": 1195,
     "sags_node/bags": 902,

@@ -20,7 +20,7 @@ from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.mapped import SETTLED
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.processes import resident_mb
 from sags_node.quality.metrics import as_float, psnr
@@ -33,6 +33,7 @@ Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 MOST_BYTES = 4_000_000_000  # of pictures kept in memory
 TURN = 0.05  # chance per frame that a walk goes the other way
+WATCHED = FrameRequest(left=True, right=True)  # somebody looks at both eyes
 STILL_FRAMES = 100
 CAMERA_NOISE = 2.0  # grey levels, standard deviation
 SIGNIFICANT = 3.0  # standard errors: a smaller slope is no trend
@@ -82,7 +83,7 @@ class _Run:
         frame = replace(frame, frame_id=self._number, t_capture_ns=stamp, t_capture_right_ns=stamp, epoch=0)
         self._number += 1
         began, cpu_began = time.perf_counter(), time.process_time()
-        result = self.pipeline.process(frame, self._budget)
+        result = self.pipeline.process(frame, self._budget, WATCHED)
         ms, cpu_ms = (time.perf_counter() - began) * 1e3, (time.process_time() - cpu_began) * 1e3
         shown, seen = as_float(result.views["left"].rgb), result.observation
         quality = psnr(shown, as_float(seen.image), seen.tissue)
