@@ -104,7 +104,8 @@ def test_a_namesake_in_the_graph_is_said_until_it_goes(
 
 def test_only_what_is_read_is_asked_of_the_node(tmp_path: Path) -> None:
     with plane_bridged(run_ros2, options(tmp_path)) as (running, _):
-        time.sleep(0.4)
+        until(lambda: running.wanted("status"))
+        time.sleep(0.4)  # for others to arrive, if there are any
         assert {name for name in FRAME_TOPICS if running.wanted(name)} == {"status"}
         with Listener(("/sags/anchors", topics.POINT_CLOUD)) as joined:
             until(lambda: joined.came["/sags/anchors"])
