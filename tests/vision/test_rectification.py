@@ -30,7 +30,7 @@ def centroid(image: U8) -> np.ndarray:
     return np.array([(x * weights).sum(), (y * weights).sum()]) / weights.sum()
 
 
-@pytest.mark.parametrize("size", [(640, 480), (320, 240), (500, 400)])
+@pytest.mark.parametrize("size", [(640, 480), (320, 240), (500, 400), (240, 180), (480, 384)])
 @pytest.mark.parametrize("point", [(0.004, -0.006, 0.07), (-0.02, 0.02, 0.1)])
 def test_a_point_lands_where_the_rectified_cameras_see_it(
     size: tuple[int, int], point: tuple[float, float, float]
