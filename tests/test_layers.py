@@ -47,7 +47,7 @@ LINES = {
     "sags_node/instruments": 838,
     "sags_node/field": 1747,
     "sags_node/kernels": 1222,
-    "sags_node/mapping": 5679,
+    "sags_node/mapping": 5680,
     "sags_node/media": 896,
     "sags_node/messaging": 5348,
     "sags_node/model": 1083,

@@ -366,7 +366,8 @@ def _look(table: _Table, observation: Observation, view: RenderedView) -> None:
     carriers = np.einsum("ak,akc->ac", table.weights, table.means) / np.where(share > 0, share, np.nan)
     own = project(observation.camera, carriers)[1] - depths
     offsets = np.where(np.isnan(table.depth_offsets), own, table.depth_offsets)
-    table.visibility[:] = _seen(table.pixels, depths + offsets, observation.tissue, view.depth)
+    expected = np.asarray(depths + offsets, np.float64)
+    table.visibility[:] = _seen(table.pixels, expected, observation.tissue, view.depth)
     drawn = np.zeros(len(depths))
     clear = np.flatnonzero(table.visibility == 1)
     columns, rows = np.rint(table.pixels[clear]).astype(np.intp).T
