@@ -167,7 +167,8 @@ def test_register_hold_pull_occlude_come_near_and_measure(tmp_path: Path) -> Non
         zoned(scene, zone[0])
         ids = [control.request("add_anchor", {"u": u, "v": v})["id"] for u, v in PINS.tolist()]
         assert is_right()
-        control.request("start_strain")
+        # After a gap on a busy machine too little is sure to begin with; then it begins again.
+        until(lambda: control.request("start_strain") and film.play(rest) is None and strain() < LITTLE)
         control.request("open_view", {"name": "strain", "show": "strain", "width": WIDTH, "height": HEIGHT})
         _, watcher = enter(overlay(run_dir, scene=scene))
         told = enter(Subscriber([PROXIMITY], ns="overlay", run_dir=run_dir))
@@ -176,7 +177,6 @@ def test_register_hold_pull_occlude_come_near_and_measure(tmp_path: Path) -> Non
             return [each["reason"] for each in watcher.status().get("objects", ())] == [None, None]
 
         until(held)
-        until(lambda: strain() < LITTLE)
         assert until(lambda: node.latest(VIEW)).array.shape == (HEIGHT, WIDTH, 4)
 
         # Pull: lengths follow, and the tissue is strained.
