@@ -29,7 +29,7 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 10401,
+    "benchmarks": 10408,
     "sags_lab": 5023,
     "sags_node": 1195,
     "sags_node/bags": 902,
@@ -37,7 +37,7 @@ LINES = {
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2591,
     "sags_node/clients/latency": 431,
-    "sags_node/clients/overlay": 3059,
+    "sags_node/clients/overlay": 3067,
     "sags_node/clients/recording": 1403,
     "sags_node/clients/registration": 483,
     "sags_node/clients/viewer": 1491,
@@ -47,13 +47,13 @@ LINES = {
     "sags_node/instruments": 838,
     "sags_node/field": 1747,
     "sags_node/kernels": 1222,
-    "sags_node/mapping": 5667,
+    "sags_node/mapping": 5674,
     "sags_node/media": 896,
     "sags_node/messaging": 5348,
-    "sags_node/model": 1061,
+    "sags_node/model": 1083,
     "sags_node/node": 1823,
     "sags_node/phantom": 1591,
-    "sags_node/pipeline": 899,
+    "sags_node/pipeline": 901,
     "sags_node/quality": 267,
     "sags_node/rig": 1187,
     "sags_node/ros": 332,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1089,
     "sags_node/vision": 5460,
-    "tests": 47686,
+    "tests": 47994,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

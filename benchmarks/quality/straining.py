@@ -22,23 +22,24 @@ SIZE = (640, 512)
 SECONDS, RATE, STEPS = 4.0, 15.0, 2  # of one pull; frames a second; steps of the mapper, each frame
 SINCE, EVERY = 10, 3  # frames: the moment, before the pull; one of so many is measured
 STRAINED = 0.05  # of what is counted apart
+PULLED, BACK = 0.75, 0.8  # of the session: "all" ends, and the tissue is where it was
 ACROSS = 4  # vertices to each side of one, over which its true strain is taken: about 2 mm
 NEAR = 0.002  # m, from a point to the surface
 
 
 def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
-    """Of what each message of `points` says while the tissue is pulled."""
+    """Of what each message of `points` says while the tissue is pulled, and once it is back."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     warm_up(config)
     configure_threads(config.engine.threads)
-    told, true, receipt, count = [], [], None, round(SECONDS * RATE)
+    told, true, back, receipt, count = [], [], [], None, round(SECONDS * RATE)
     for seed in range(seeds):
         phantom = Phantom(PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1], seed=seed))
         pipeline = Pipeline(config, phantom.rig, rate=RATE)
         receipt = receipt or Receipt(phantom.rig, SIZE, None)
         before = phantom.tissue.vertices(SINCE / count)
-        for number in range(count * 3 // 4):
-            advance(number, count * 3 // 4, f"seed {seed}")
+        for number in range(count):
+            advance(number, count, f"seed {seed}")
             seen = phantom.frame(number, count)
             stamp = round((1 + number / RATE) * 1e9)
             frame = StereoFrame(number, stamp, stamp, seen.left, seen.right, tissue=~seen.tool)
@@ -46,7 +47,7 @@ def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
             receipt.add(frame, result.observation.tissue)
             if number == SINCE:
                 pipeline.start_strain()
-            if number <= SINCE or number % EVERY:
+            if number <= SINCE or number % EVERY or PULLED * count <= number < BACK * count:
                 continue
             body = points(result)
             names = body.encoding.split(",")
@@ -56,9 +57,11 @@ def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
             on = off <= NEAR
             told.append(rows[on][:, [names.index(name) for name in STRAIN_FIELDS[:2]]])
             true.append(true_strain(before, now).reshape(-1, 2)[vertex[on]])
+            back.append(np.full(np.count_nonzero(on), number >= BACK * count))
     assert receipt is not None
     found, exact = np.concatenate(told), np.concatenate(true)
-    parts = {"all": np.ones(len(exact), np.bool_), "strained": np.abs(exact).max(1) >= STRAINED}
+    rest = np.concatenate(back)
+    parts = {"all": ~rest, "strained": ~rest & (np.abs(exact).max(1) >= STRAINED), "back": rest}
     return {
         "points": len(exact),
         **{name: _summary(found[which], exact[which]) for name, which in parts.items()},
@@ -103,7 +106,11 @@ def _summary(found: F32, exact: F64) -> dict[str, Any]:
         said[name] = {
             "known": rounded(known.sum() / max(1, np.isfinite(truth).sum())),
             "true_p90": rounded(np.quantile(np.abs(truth[np.isfinite(truth)]), 0.9)),
-            "error": {"median": rounded(np.median(errors)), "p90": rounded(np.quantile(errors, 0.9))},
+            "error": {
+                "median": rounded(np.median(errors)),
+                "p90": rounded(np.quantile(errors, 0.9)),
+                "p99": rounded(np.quantile(errors, 0.99)),
+            },
             "bias": rounded(np.median((told - truth)[known])),
             "zero": {"median": rounded(np.median(nothing)), "p90": rounded(np.quantile(nothing, 0.9))},
         }
@@ -113,7 +120,7 @@ def _summary(found: F32, exact: F64) -> dict[str, Any]:
 def tables(measured: dict[str, Any]) -> list[Table]:
     """For people."""
     table = Table("points", "strain", "known", "true, p90", "error", "0 is told", title="median, nine of ten")
-    for part in ("all", "strained"):
+    for part in ("all", "strained", "back"):
         for name, row in measured[part].items():
             figures = [f"{row[n]['median']}, {row[n]['p90']}" for n in ("error", "zero")]
             table.add_row(part, name, str(row["known"]), str(row["true_p90"]), *figures)

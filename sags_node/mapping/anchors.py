@@ -361,7 +361,13 @@ def _look(table: _Table, observation: Observation, view: RenderedView) -> None:
     """Find where each anchor is and how much of it is seen; it keeps its distance to the drawn surface."""
     pixels, depths = project(observation.camera, table.points)
     table.pixels[:], table.depths[:] = pixels, depths
-    table.visibility[:] = _seen(table.pixels, table.depths, observation.tissue, view.depth)
+    # What lies under tissue, as a vessel does, is not hidden by the tissue that carries it.
+    share = table.weights.sum(1, keepdims=True)
+    carriers = np.einsum("ak,akc->ac", table.weights, table.means) / np.where(share > 0, share, np.nan)
+    own = project(observation.camera, carriers)[1] - depths
+    offsets = np.where(np.isnan(table.depth_offsets), own, table.depth_offsets)
+    expected = np.asarray(depths + offsets, np.float64)
+    table.visibility[:] = _seen(table.pixels, expected, observation.tissue, view.depth)
     drawn = np.zeros(len(depths))
     clear = np.flatnonzero(table.visibility == 1)
     columns, rows = np.rint(table.pixels[clear]).astype(np.intp).T
@@ -442,7 +448,8 @@ def _selected(table: _Table, kept: Bool) -> _Table:
 
 
 def _seen(pixels: F64, depths: F64, tissue: Bool, drawn: F32) -> F64:
-    """Share [A] of the pixels around each anchor that show tissue, none of it in front of the anchor."""
+    """Share [A] of the pixels around each anchor that show tissue, none of it in front of its own, which is
+    expected at `depths` [A] (m)."""
     height, width = tissue.shape
     around = np.arange(-SEEN_RADIUS, SEEN_RADIUS + 1)
     known: Bool = np.asarray(np.isfinite(pixels).all(1))

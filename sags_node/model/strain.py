@@ -7,19 +7,20 @@ the eigenvalues of F^T F are the principal stretches, and a strain is a stretch 
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from sags_node.confidence import HALVING
 from sags_node.model.deformation import cell_centres, nearest_nodes
-from sags_node.types import F32, F64, I64, Bool, Gaussians, Strained
+from sags_node.types import F32, F64, I64, Bool, Gaussians, Snapshot, Strained
 
 PATCH = 0.004  # m between patches: each has the Gaussians of about twice that
 FEWEST = 12  # Gaussians of a patch
 LEAST_SPREAD = 0.25  # of `PATCH`, standard deviation of them along each direction of the surface
 LEAST_OPACITY = 0.1
+SURE = 2e-3  # m, error of a depth: what may be further off tells no strain
 FULL = 0.3  # strain with the brightest colour
 UNKNOWN = (0.35, 0.35, 0.35)  # RGB
 
@@ -28,38 +29,59 @@ class Strain:
     """How tissue is stretched since a moment; immutable.
 
     Args:
-        gaussians: of that moment.
+        snapshot: the model at that moment.
 
     Attributes:
         since_ns: when it was.
     """
 
-    def __init__(self, gaussians: Gaussians, since_ns: int) -> None:
-        self.since_ns = since_ns
+    def __init__(self, snapshot: Snapshot) -> None:
+        gaussians = snapshot.gaussians
+        self.since_ns = snapshot.t_capture_ns
         kept = np.flatnonzero(_is_sure(gaussians) & (gaussians.opacities >= LEAST_OPACITY))
         kept = kept[np.argsort(gaussians.ids[kept])]
         self._ids, self._places = gaussians.ids[kept], gaussians.means[kept]
+        self._followed = np.ones(len(kept), np.bool_)  # none of them may have slid since
         if len(kept):
             self._patches = cell_centres(self._places, PATCH)
             self._index, self._weight, _ = nearest_nodes(self._places, self._patches)
 
+    def followed(self, snapshot: Snapshot) -> Strain:
+        """It in the next frame. What was not sure by itself, as behind an instrument, may have slid, however
+        sure it is again. Where most is not, as after a gap, tissue in sight is found again by its motion."""
+        at, rows = self._found(snapshot.gaussians)
+        sure = _is_sure(snapshot.gaussians)[rows]
+        if 2 * np.count_nonzero(sure) < len(sure) or sure.all():
+            return self
+        after = copy(self)
+        after._followed = self._followed.copy()
+        after._followed[at] &= sure
+        return after
+
     def at(self, gaussians: Gaussians) -> F32:
-        """The largest and the smallest strain [N, 2] where each Gaussian is; NaN: not known, as it is new, or
-        its depth or too much around it is not sure to 3 mm, then or now."""
+        """The largest and the smallest strain [N, 2] where each Gaussian of this frame is; NaN: not known, as
+        it is new, or its depth or too much around it is not `SURE`, then, now or under way."""
         found = np.full((len(gaussians), 2), np.nan, np.float32)
-        if len(self._ids) == 0:
+        at, rows = self._found(gaussians)
+        sure = self._followed[at] & _is_sure(gaussians)[rows]
+        at, rows = at[sure], rows[sure]
+        if len(at) == 0:
             return found
-        at = np.searchsorted(self._ids, gaussians.ids)
-        at[at == len(self._ids)] = 0
-        known = (self._ids[at] == gaussians.ids) & _is_sure(gaussians)
-        at = at[known]
-        strains = self._of_patches(at, gaussians.means[known])
+        strains = self._of_patches(at, gaussians.means[rows])
         weight = np.where(np.isnan(strains[self._index[at], 0]), 0, self._weight[at])
         shares = weight / np.maximum(weight.sum(1, keepdims=True), 1e-9)
         mean = np.einsum("nk,nka->na", shares, np.nan_to_num(strains)[self._index[at]])
         mean[weight[:, 0] == 0] = np.nan  # its own patch is not known
-        found[known] = mean
+        found[rows] = mean
         return found
+
+    def _found(self, gaussians: Gaussians) -> tuple[I64, I64]:
+        """Which of the moment's Gaussians are still there: their numbers, and their rows now."""
+        if len(self._ids) == 0:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        at = np.minimum(np.searchsorted(self._ids, gaussians.ids), len(self._ids) - 1)
+        rows = np.flatnonzero(self._ids[at] == gaussians.ids)
+        return at[rows], rows
 
     def _of_patches(self, at: I64, now: F32) -> F64:
         """[M, 2] of all patches, by the Gaussians that are known: their numbers [K] and places [K, 3]."""
@@ -97,4 +119,4 @@ def painted(gaussians: Gaussians, strain: Strained) -> Gaussians:
 def _is_sure(gaussians: Gaussians) -> Bool:
     if gaussians.depth_errors is None:
         return np.ones(len(gaussians), np.bool_)
-    return np.asarray(gaussians.depth_errors <= HALVING)
+    return np.asarray(gaussians.depth_errors <= SURE)

@@ -190,7 +190,7 @@ class Pipeline:
     def start_strain(self) -> int:
         """From now on frames say how tissue is stretched since the newest one; returns its stamp."""
         assert self.newest is not None  # else there is no tissue
-        self._strain = Strain(self.newest.snapshot.gaussians, self.newest.snapshot.t_capture_ns)
+        self._strain = Strain(self.newest.snapshot)
         self.newest = replace(self.newest, strain=self._strain)
         return self._strain.since_ns
 
@@ -293,6 +293,8 @@ class Pipeline:
             self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
             self.anchors.age(pair.t_capture_ns)
             anchors = self.anchors.ahead(self.anchors.states(), mapped.snapshot, request.latency)
+        if self._strain is not None:
+            self._strain = self._strain.followed(mapped.snapshot)
         self._instruments_asked = request.instruments
         with clock("instruments"):
             instruments = self._located_instruments(seen, observation, mapped, judged, request)

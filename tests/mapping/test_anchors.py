@@ -142,6 +142,25 @@ def test_it_keeps_its_distance_to_the_drawn_surface() -> None:
     assert only(at(anchors, 0))[0][2] == pytest.approx(DEPTH + 1.5e-3, abs=2e-5)
 
 
+@pytest.mark.parametrize("below", [0.0, 2e-3, 4e-3])
+def test_what_lies_under_tissue_is_in_sight_with_it(below: float) -> None:
+    """As a vessel: the tissue that carries it does not hide it, also where the drawn surface is 2 mm wrong.
+    Other tissue does, at the pinning, too."""
+    place = np.array([0, 0, DEPTH + below])
+    anchors = Anchors()
+    anchors.add_point(place, *scene(0))
+    for i in range(1, 6):
+        anchors.update(*scene(i, texture((i, 0)), DEPTH - 2e-3))
+        _, pixel, visibility, confidence = only(at(anchors, i * PERIOD_NS))
+        assert np.allclose(pixel, CENTRE + np.array([i, 0]), atol=0.1)
+        assert visibility == 1 and confidence > 0.8
+    anchors.update(*scene(6, texture((5, 0)), DEPTH - 6e-3))
+    assert only(at(anchors, 6 * PERIOD_NS))[2] == 0
+    covered = Anchors()
+    covered.add_point(place, *scene(0, drawn=DEPTH - 6e-3))
+    assert only(at(covered, 0))[2] == 0
+
+
 def test_removed_gaussians_are_replaced_by_their_neighbours() -> None:
     anchors = Anchors()
     anchors.add_pixel(60, 45, *flat(0))

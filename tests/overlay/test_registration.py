@@ -210,20 +210,24 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
 
 @pytest.fixture
 def files(organ: Organ, tmp_path: Path) -> Path:
-    """The organ in mm, and its pairs."""
+    return written(organ, tmp_path)
+
+
+def written(organ: Organ, folder: Path) -> Path:
+    """The organ in mm, and its pairs, in a folder."""
     import open3d as o3d
 
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(1e3 * organ.vertices), o3d.utility.Vector3iVector(organ.triangles)
     )
-    assert o3d.io.write_triangle_mesh(str(tmp_path / "organ.ply"), mesh)
+    assert o3d.io.write_triangle_mesh(str(folder / "organ.ply"), mesh)
     pairs = [
         {"pixel": pixel, "at": (1e3 * at).tolist()}
         for pixel, at in zip(PICKS.tolist(), organ.at, strict=True)
     ]
     targets = (1e3 * organ.targets).tolist()
-    (tmp_path / "pairs.yaml").write_text(yaml.safe_dump({"pairs": pairs, "targets": targets}))
-    return tmp_path
+    (folder / "pairs.yaml").write_text(yaml.safe_dump({"pairs": pairs, "targets": targets}))
+    return folder
 
 
 @pytest.mark.live

@@ -27,6 +27,8 @@ LEAST_ANCHORS = 3  # for a rigid fit
 FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
 MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of ten are within half of it
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
+AGAIN = "it comes back once recognised; else pin it again, by four anchors or more"
+GONE = f"the tissue at its anchors left the model; {AGAIN}"
 
 log = logging.getLogger(__name__)
 
@@ -134,21 +136,26 @@ class HeldObject:
         """Why its anchors do not hold it, or not yet."""
         if self._refused is not None:
             return self._refused
-        if self._lost is not None and not self._may_pin_again(frame):
-            return self._lost
         if self._ids and frame.session != self._session:
             return self._lose("the node was started anew", self._pinner.forget)
+        may_pin = self._lost is None or self._may_pin_again(frame)
         if not self._ids:
-            return self._pin(frame)
+            return self._pin(frame) if may_pin else str(self._lost)
         states = [frame.anchors.get(anchor) for anchor in self._ids]
         known = [state for state in states if state is not None]
         if self._model is None and len(known) < len(states):
             return "being pinned"  # the anchors come with one of the next frames
         self._states = known
-        if not any(np.isfinite(state.place).all() for state in known):
-            why = "the model was started anew" if known else "its anchors were removed"
-            return self._lose(why, self._pinner.remove)
-        self._held_s = frame.recorded_s
+        if not known:
+            return self._lose("its anchors were removed", self._pinner.remove)
+        found = sum(np.isfinite(state.place).all() for state in known)
+        if found == 0 or (self._model is None and found < len(states)):
+            if self._lost is not None and may_pin:
+                self._lose(GONE, self._pinner.remove)
+                return self._pin(frame)
+            self._lost = f"lost: {GONE}"
+            return self._lost
+        self._lost, self._held_s, self._began_anew = None, frame.recorded_s, False
         if self._model is None:
             self._begin(frame, known)
         if self._refused is not None:
@@ -191,7 +198,7 @@ class HeldObject:
             self._bend.release(release)
         self._follow()
         self._ids, self._states, self._model, self._normal = [], [], None, None
-        self._lost, self._began_anew = f"lost: {why}", False
+        self._lost = f"lost: {why}"
         return self._lost
 
     def _may_pin_again(self, frame: TissueFrame) -> bool:
@@ -304,7 +311,8 @@ class HeldObject:
             return self._on_surface(frame, list(chosen.values()))
         model = self._model[list(chosen)]
         if len(chosen) < LEAST_ANCHORS:
-            return None, f"{len(chosen)} of its {len(states)} anchors hold it, {LEAST_ANCHORS} are needed"
+            few = f"{len(chosen)} of its {len(states)} anchors hold it"
+            return None, f"{few}, {LEAST_ANCHORS} are needed; {AGAIN}"
         if on_a_line(model):
             return None, "the anchors that hold it lie on a line"
         weights = np.array([state.confidence * state.depth_confidence for state in chosen.values()])
@@ -328,7 +336,7 @@ class HeldObject:
     def _on_surface(self, frame: TissueFrame, holding: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
         assert self._model is not None
         if not holding:
-            return None, "its anchor was not recognised for too long"
+            return None, f"its anchor was not recognised for too long; {AGAIN}"
         self.is_sure, self.unsure = holding[0].is_sure, None
         normal = surface_normal(frame, holding[0].place)
         if normal is not None and self._normal is not None:
