@@ -55,18 +55,18 @@ LINES = {
     "sags_node/phantom": 1591,
     "sags_node/pipeline": 899,
     "sags_node/quality": 267,
-    "sags_node/rig": 1187,
+    "sags_node/rig": 1210,
     "sags_node/ros": 332,
     "sags_node/sources": 5876,
     "sags_node/terminal": 372,
     "sags_node/tools": 526,
-    "sags_node/tools/calibration": 1877,
+    "sags_node/tools/calibration": 1862,
     "sags_node/tools/evaluation": 3153,
     "sags_node/tools/export": 891,
     "sags_node/tools/fitting": 1544,
-    "sags_node/tools/importing": 1089,
-    "sags_node/vision": 5452,
-    "tests": 47659,
+    "sags_node/tools/importing": 1120,
+    "sags_node/vision": 5453,
+    "tests": 47706,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
