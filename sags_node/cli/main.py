@@ -174,9 +174,10 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
 
     It plays a launch file, a recording, a folder of videos or pictures (see sags import --check), or a video
     that shows both eyes; without any the built-in phantom session in a loop. Without a calibration it plays
-    all the same: depth then has no unit, and all that is published says so. Of the table at its end, dropped
-    frames were not shown; skipped counts frames by the step that they went without, or by "frame": they
-    equalled the one before. Depth is matched as often as the line "quality" says.
+    all the same: depth then has no unit, and all that is published says so.
+
+    In the table at its end "dropped" frames were not shown. "skipped" counts frames that went without a step,
+    or, as "frame", equalled the one before. "quality" says how often depth was matched.
 
     \b
     sags run my_folder

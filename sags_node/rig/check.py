@@ -183,11 +183,8 @@ def _check_size(rig: StereoRig) -> list[Finding]:
 
 
 def wrong_size(path: Path | str, calibrated: tuple[int, int], size: tuple[int, int]) -> Finding | None:
-    """What is wrong where pictures of this `size` come to the calibration at `path`; None where it fits.
-
-    Args:
-        calibrated, size: width and height, px.
-    """
+    """What is wrong where pictures of this `size` (width, height, px) come to the calibration at `path`; None
+    where they fit it."""
     ratio, down = size[0] / calibrated[0], size[1] / calibrated[1]
     what = "the calibration is for {}x{} px, the pictures are {}x{}".format(*calibrated, *size)
     if ratio != down:

@@ -359,6 +359,7 @@ def test_help_mentions_every_argument_and_option(path: tuple[str, ...]) -> None:
     for name in path:
         command = command.commands[name]
     result = sags(*path, "--help")
+    assert not re.search(r"^  \w.* {4,}--", result.stdout, re.M), "an example lost its line break"
     assert result.exit_code == 0
     if isinstance(command, click.Group):
         assert "..." not in result.stdout.split("--help")[1], "a summary is cut off"
