@@ -59,14 +59,14 @@ LINES = {
     "sags_node/ros": 332,
     "sags_node/sources": 5876,
     "sags_node/terminal": 372,
-    "sags_node/tools": 526,
+    "sags_node/tools": 528,
     "sags_node/tools/calibration": 1862,
     "sags_node/tools/evaluation": 3153,
     "sags_node/tools/export": 891,
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1120,
     "sags_node/vision": 5453,
-    "tests": 47707,
+    "tests": 47713,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -400,6 +400,12 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
 
 
+@pytest.mark.fault("process: the node of a demo takes longer to start than it plays")
+def test_a_demo_on_a_slow_machine_has_its_report(user_files: Path, tmp_path: Path) -> None:
+    result = sags("demo", *videos(user_files), "--seconds", "0.2", "--out", tmp_path / "demo", "--json")
+    assert result.exit_code == 0 and pure_json(result.stdout)["frames"] == 2, result.stderr
+
+
 def test_eval_says_what_it_found_in_a_dozen_lines(user_files: Path, tmp_path: Path) -> None:
     """Figures in groups only when asked for, and never as Python prints a dictionary."""
     session = [*videos(user_files), "source.frames:=4", "--pace", "step"]
