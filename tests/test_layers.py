@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1544,
     "sags_node/tools/importing": 1120,
     "sags_node/vision": 5453,
-    "tests": 47713,
+    "tests": 47714,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
