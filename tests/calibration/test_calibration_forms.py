@@ -400,19 +400,12 @@ def test_text_matrices_that_are_refused(tmp_path: Path) -> None:
 # ---- other formats ---------------------------------------------------------------------------------------
 
 
-def test_what_the_page_does_with_a_camchain_of_kalibr(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cameras = [
-        {
-            "intrinsics": [float(each) for each in (K_eye[0, 0], K_eye[1, 1], K_eye[0, 2], K_eye[1, 2])],
-            "distortion_coeffs": lens[:4].tolist(),
-            "resolution": [*SIZE],
-        }
-        for K_eye, lens in zip(K, PLUMB_BOB, strict=True)
-    ]
-    T_right_left = np.block([[R, T[:, None]], [np.zeros(3), np.ones(1)]])
-    chain = {"cam0": cameras[0], "cam1": cameras[1] | {"T_cn_cnm1": T_right_left.tolist()}}
+def test_the_page_converts_kalibrs_camchain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chain = {}
+    for number, (K_eye, lens) in enumerate(zip(K, PLUMB_BOB, strict=True)):
+        numbers = {"intrinsics": K_eye[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), "resolution": [*SIZE]}
+        chain[f"cam{number}"] = numbers | {"distortion_coeffs": lens[:4].tolist()}
+    chain["cam1"]["T_cn_cnm1"] = np.block([[R, T[:, None]], [np.zeros(3), np.ones(1)]]).tolist()
     (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(chain))
     page = (ROOT / "docs/calibration.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)

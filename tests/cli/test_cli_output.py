@@ -14,6 +14,7 @@ from ctypes.util import find_library
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import click
 import pytest
@@ -25,6 +26,7 @@ from sags_node.cli.main import main
 from sags_node.errors import SagsError
 from sags_node.files import check_file, check_results, whole
 from sags_node.terminal import console as terminal
+from sags_node.tools.doctor import OPEN3D_LIBRARIES
 from sags_node.tools.evaluation.report import check_report
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
@@ -295,6 +297,17 @@ def test_doctor_asks_for_the_packages_that_a_launch_file_needs(
     monkeypatch.setattr("sags_node.tools.doctor.find_spec", lambda name: None)
     code, checks = doctor(user_files, str(ROOT / "launch/ros2.yaml"))
     assert code == 1 and "cyclonedds" in checks["source"]["found"] and "[ros2]" in checks["source"]["fix"]
+
+
+def test_a_missing_library_of_the_system_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    error = ImportError("libidn2.so.0: cannot open shared object file: No such file or directory")
+    monkeypatch.setattr("sags_node.tools.doctor.examine", Mock(side_effect=error))
+    refused(2, "doctor", said=("libidn2.so.0 is missing on this system; sags doctor says which package",))
+
+
+@pytest.mark.parametrize("file", ["Makefile", "README.md", "examples/container/Containerfile"])
+def test_what_open3d_needs_is_installed_wherever_it_is(file: str) -> None:
+    assert " ".join(OPEN3D_LIBRARIES.values()) in (ROOT / file).read_text(encoding="utf-8")
 
 
 @pytest.mark.skipif(find_library("gstapp-1.0") is None, reason="GStreamer is not installed")

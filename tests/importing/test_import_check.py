@@ -638,4 +638,4 @@ def test_a_calibration_that_is_not_used_is_named(names: list[str], tmp_path: Pat
         (folder / name).write_text("%YAML:1.0\n---\n" if Path(name).stem in "ab" else "")
     (said,) = (each for each in check_folder(folder) if each.level != "ok")
     assert said.what == f"no calibration is used, though {', '.join(names)} lies there"
-    assert f"sags calib check {folder / names[0]} " in said.fix and f"rig:={folder / names[0]}" in said.fix
+    assert f"set rig:={folder / names[0]} if sags calib check {folder / names[0]} takes" in said.fix

@@ -236,14 +236,10 @@ def calibrated(config: LaunchConfig, path: Path) -> list[Finding]:
 
 
 def _none_used(folder: Path) -> Finding:
-    there = seem_calibrations(folder)
-    if not there:
+    if not (there := seem_calibrations(folder)):
         return Finding("warning", "no calibration lies beside the pictures", MAKE_ONE)
     named, first = ", ".join(str(file.relative_to(folder)) for file in there[:MOST_NAMED]), _quoted(there[0])
-    fix = (
-        f"sags calib check {first} says whether it can be read: then set {override('rig', first)}, else see "
-        "docs/calibration.md#other-formats"
-    )
+    fix = f"set {override('rig', first)} if sags calib check {first} takes it, else docs/calibration.md"
     return Finding("warning", f"no calibration is used, though {named} lies there", fix)
 
 
