@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip install -q --disable-pip-version-check -c constraints.txt
 STAMP := $(VENV)/.installed
 # Shared libraries that Open3D needs and its wheel does not bring.
-DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
+DEBIAN := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6 libidn2-0
 # What tests use beyond that: a browser for the viewer and the web gateway, compilers for the C++ and C# clients
 # and OpenIGTLink's peers, two machines in one, GStreamer.
 DEBIAN_TESTS := chromium g++ cmake pkg-config cppzmq-dev libmsgpack-cxx-dev faketime iproute2 \

@@ -3,8 +3,8 @@
     sags run launch/d4d_pull.yaml &
     python examples/follow_point.py 320 256
 
-`pip install sags-node` is enough for it. It may be started before the node. Ctrl-C ends it, and removes the
-point.
+`pip install .` in a clone is enough for it. It may be started before the node. Ctrl-C ends it, and removes
+the point.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
     python tests/container.py FOLDER [--torch-index URL] [--share PATH ...]
 
 Needs root, debootstrap and unshare, some minutes, and 4 GB in FOLDER, which stays. The base is Debian's own
-Python 3.11, not the image `python:3.11-slim-bookworm`. At the end the image's user plays `sags demo`.
+Python 3.11, not the image `python:3.11-slim-bookworm`. PATH: what pip reads here, as /etc/ssl/certs behind a
+proxy. At the end the image's user plays `sags demo`.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def bag() -> None:
     metavar="SECONDS",
     help="Keep only the last seconds in memory; write them on SIGUSR1.",
 )
-@click.option("--stdin", "from_stdin", is_flag=True, help="A line on stdin saves the ring; its end ends it.")
+@click.option("--stdin", "from_stdin", is_flag=True, help="A line on stdin is as SIGUSR1, its end as Ctrl-C.")
 @data_options
 @click.option("--seconds", type=positive, help="Stop after so long; default: Ctrl-C.")
 @as_json
@@ -276,7 +276,7 @@ def play(
 @recording
 @as_json
 def info(path: Path, json_out: bool) -> None:
-    """Return what a recording holds: topics, types, counts, rates, gaps.
+    """Say what a recording holds: topics, types, counts, rates, gaps.
 
     Reads it through, so a damaged file is found here: rosbag2 folders, .mcap, .db3 and ROS 1 .bag files.
     """

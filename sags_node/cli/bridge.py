@@ -223,7 +223,7 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
     \b
     sags overlay &
     sags bridge gst --left 'videoconvert ! autovideosink'
-    sags bridge gst --left 'unixfdsink socket-type=abstract socket-path=dvrk_gst:left_ar:RIG' \
+    sags bridge gst --left 'unixfdsink socket-type=abstract socket-path=dvrk_gst:left_ar:RIG' \\
                     --right 'unixfdsink socket-type=abstract socket-path=dvrk_gst:right_ar:RIG'
 
     unixfdsink, for dVRK's sockets, needs GStreamer 1.24.

@@ -70,7 +70,7 @@ def pin(pixel: tuple[float, float], json_out: bool, node: NodeAddress) -> None:
 @endpoint_option
 @asking
 def list_anchors(json_out: bool, node: NodeAddress) -> None:
-    """Find where the anchors are in the newest frame.
+    """Say where the anchors are in the newest frame.
 
     Columns: number, x y z (m, world), pixel, visibility, confidence (it is still on its tissue) and depth
     confidence. Show no anchor as sure whose confidence is below 0.5.
@@ -119,7 +119,7 @@ def param() -> None:
 
 
 @param.command()
-@click.argument("name", metavar="KEY", required=False)
+@click.argument("name", metavar="[KEY]", required=False)
 @asking
 def get(name: str | None, json_out: bool, node: NodeAddress) -> None:
     """Print the configuration in force, or the part of it that KEY names.

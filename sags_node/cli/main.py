@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
 import shlex
 import signal
 import sys
@@ -104,11 +105,13 @@ class Sags(click.Group):
             return super().invoke(ctx)
         except SagsError as error:
             said, code = str(error), error.exit_code
-        except ModuleNotFoundError as error:
-            if str(error.name).partition(".")[0] not in OF_THE_NODE:
+        except ImportError as error:
+            library, code = re.match(r"(lib\S+\.so\S*): cannot open", str(error)), 2
+            if library is None and str(error.name).partition(".")[0] not in OF_THE_NODE:
                 raise
             said = f"{error.name} is not installed: this is for a client; for all of it {install('node')}"
-            code = 2
+            if library is not None:
+                said = f"{library[1]} is missing on this system; sags doctor says which package has it"
         except OSError as error:
             if error.errno not in NO_ROOM:
                 raise
@@ -174,9 +177,10 @@ def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
 
     It plays a launch file, a recording, a folder of videos or pictures (see sags import --check), or a video
     that shows both eyes; without any the built-in phantom session in a loop. Without a calibration it plays
-    all the same: depth then has no unit, and all that is published says so. Of the table at its end, dropped
-    frames were not shown; skipped counts frames by the step that they went without, or by "frame": they
-    equalled the one before. Depth is matched as often as the line "quality" says.
+    all the same: depth then has no unit, and all that is published says so.
+
+    In the table at its end "dropped" frames were not shown. "skipped" counts frames that went without a step,
+    or, as "frame", equalled the one before. "quality" says how often depth was matched.
 
     \b
     sags run my_folder

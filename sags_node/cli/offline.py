@@ -61,7 +61,7 @@ HOLD_OUT = 8  # every so many frames, as in the literature
 @click.option(
     "--hidden",
     is_flag=True,
-    help="Also hide boxes of tissue in a second run (--pace step); what is shown there.",
+    help="Also hide boxes of tissue in a second run (--pace step): how good is what is shown there?",
 )
 @click.option(
     "--aside", is_flag=True, help="Also views from 2 to 20 mm aside (--pace step, the phantom alone)."
@@ -94,7 +94,7 @@ def evaluate(
     It is played, then read once more and compared with what was shown. In real time that is what a
     subscriber gets: rate, latency, pictures and depth. Then up to 150 frames are played again, frame by
     frame, for the right eye and hidden tissue; without truth also for depth beside its own stereo, and
-    points that are followed forth and back. --pace step measures all that a model can tell.
+    points that are followed forth and back. --pace step shows the model every frame on any machine.
 
     \b
     sags eval launch/d4d_pull.yaml --out out.json

@@ -45,14 +45,14 @@ class Ahead(click.ParamType["float | str"]):
 @click.option("--repin", is_flag=True, help="Pin again where it was after the model was started anew.")
 @shown("--max-age", type=positive, default=0.5, help="Seconds after which an overlay is blanked.")
 @click.option(
-    "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye."
+    "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye's picture."
 )
 @click.option(
     "--ahead",
     type=Ahead(),
     default=0.0,
-    help="Place it where tissue is expected so long after its frame, tips of instruments not. auto: when "
-    "that is published.",
+    help="Draw it where tissue is expected so long after the frame; not for tips of instruments. auto: "
+    "when it is published.",
 )
 @shown("--own-ns", default="overlay", help="Namespace of what is published here.")
 @run_dir_option

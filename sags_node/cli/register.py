@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("model", metavar="MODEL.ply|stl|obj", type=click.Path(path_type=Path, dir_okay=False))
-@file_option("--points", required=True, metavar="PAIRS.yaml", help="3 to 20 pairs of points, see below.")
+@file_option("--points", required=True, metavar="PAIRS.yaml", help="3 to 20 pairs of points, as shown above.")
 @file_option("-o", "--out", required=True, metavar="SCENE.yaml", help="Scene file for sags overlay.")
 @shown("--scale", type=positive, default=0.001, help="Metres per unit of MODEL; files of scans are in mm.")
 @shown("--seconds", type=positive, default=1.0, help="How long the surface is looked at.")

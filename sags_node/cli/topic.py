@@ -57,7 +57,7 @@ def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
 @shown("--seconds", type=positive, default=1.0, help="How long to listen.")
 @as_json
 def topic_info(name: str, seconds: float, json_out: bool, node: NodeAddress) -> None:
-    """Return what topic NAME is: type, content, and how many send it now."""
+    """Say what topic NAME is: type, content, and how many send it now."""
     from sags_node.messaging import introspection as tool
 
     found = tool.topic_info(name, node, seconds)

@@ -9,6 +9,7 @@ from sags_node.rig.check import (
     check_intrinsics,
     check_pair,
     check_rig,
+    wrong_size,
 )
 from sags_node.rig.read import (
     GUESSED_FOV,
@@ -62,4 +63,5 @@ __all__ = [
     "save_rig",
     "unknown_form",
     "with_unit",
+    "wrong_size",
 ]

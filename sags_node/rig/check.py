@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -179,6 +180,23 @@ def _check_size(rig: StereoRig) -> list[Finding]:
     )
     fix = f"if the pictures are {eye.width}x{eye.height}, multiply camera_matrix and projection_matrix by "
     return [Finding("warning", what, f"{fix}{1 / size:.3g}, or calibrate at that size")]
+
+
+def wrong_size(path: Path | str, calibrated: tuple[int, int], size: tuple[int, int]) -> Finding | None:
+    """What is wrong where pictures of this `size` (width, height, px) come to the calibration at `path`; None
+    where they fit it."""
+    ratio, down = size[0] / calibrated[0], size[1] / calibrated[1]
+    what = "the calibration is for {}x{} px, the pictures are {}x{}".format(*calibrated, *size)
+    if ratio != down:
+        fix = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
+        return Finding("error", what, fix)
+    fix = (
+        f"calibrate at {size[0]}x{size[1]}, or if the pictures are only resized, not cropped: "
+        f"sags calib convert {shlex.quote(str(path))} -o FOLDER --scale {ratio:g}"
+    )
+    return (
+        None if ratio == 1 else Finding("error", f"{what}, {ratio:.3g} times as large", fix, {"scale": ratio})
+    )
 
 
 def _check_rows(rig: StereoRig) -> list[Finding]:

@@ -47,7 +47,7 @@ def topics_table(rows: Sequence[Record]) -> Table:
 
 
 def hz_text(figures: Record) -> str:
-    frozen = f"{figures['freezes']} freezes, {figures['frozen_s']:.2f} s in all"
+    frozen = f"freezes: {figures['freezes']}, {figures['frozen_s']:.2f} s in all"
     return f"average rate: {figures['average_rate']:.3f} Hz\n  {_spread(figures)}\n  {frozen}"
 
 

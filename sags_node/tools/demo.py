@@ -31,7 +31,8 @@ from sags_node.types import U8, FrameResult
 
 VIDEO, LAYERS = "overlay.mp4", "overlay.layers"
 OVERLAY_START = 60.0  # s for the overlay to load its shapes and listen
-OVERLAY_GRACE = 15.0  # s for the overlay to end after the node
+OVERLAY_LAST = 0.5  # s for the overlay of the last frames
+OVERLAY_GRACE = 15.0  # s for the overlay to end after that
 OVERLAY_STOP = 2.0  # s for it when the demo is interrupted
 _OPTIONS = MeasureOptions(hold_out=0, second=True)
 
@@ -57,7 +58,6 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
     """
     out.mkdir(parents=True, exist_ok=True)
     frames = session.source.frame_count
-    seconds = (frames or 0) / session.source.rate
     with Run() as run:
 
         def keep(result: FrameResult, latency_ms: float) -> None:
@@ -66,7 +66,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
 
         with stop_signals() as stop:
             node = Node(session.config, session.rig, session.source, on_result=keep)
-            overlay = _start_overlay(session.config, seconds, run.folder / LAYERS)
+            overlay = _start_overlay(session.config, run.folder / LAYERS)
             try:
                 _await_overlay(session.config, overlay, stop)
                 node.start()
@@ -112,11 +112,11 @@ class Shown:
         self._file.add(left if self._shown is None else self._shown)
 
 
-def _start_overlay(config: LaunchConfig, seconds: float, layers: Path) -> subprocess.Popen[str]:
-    """The consumer is a process of its own, as it would be in a theatre."""
+def _start_overlay(config: LaunchConfig, layers: Path) -> subprocess.Popen[str]:
+    """The consumer is a process of its own, as it would be in a theatre; it waits for a slow start."""
     command = [sys.executable, "-m", "sags_node", "overlay", "--ns", config.ns, "--repin"]
     command += ["--run-dir", str(config.publish.run_dir or default_run_dir())]
-    command += ["--seconds", f"{seconds:.1f}", "--layers", str(layers), "--json"]
+    command += ["--layers", str(layers), "--json"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -138,6 +138,8 @@ def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str], stop: t
 
 
 def _finish_overlay(overlay: subprocess.Popen[str]) -> dict[str, Any]:
+    time.sleep(OVERLAY_LAST)
+    overlay.terminate()
     try:
         stdout, stderr = overlay.communicate(timeout=OVERLAY_GRACE)
     except subprocess.TimeoutExpired:

@@ -65,6 +65,7 @@ OPEN3D_LIBRARIES = {
     "EGL": "libegl1",
     "gomp": "libgomp1",
     "X11": "libx11-6",
+    "idn2": "libidn2-0",
 }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from sags_node import geometry
 from sags_node.errors import SagsError, UsageError
-from sags_node.rig import rectified_camera
+from sags_node.rig import rectified_camera, wrong_size
 from sags_node.types import F32, F64, U8, Bool, Camera, Eye, Published, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.pyramid import gray_pyramid
 
@@ -106,9 +106,11 @@ class Rectifier:
             SagsError: the pictures do not have the calibration's size.
             UsageError: the pose is none.
         """
-        self._check(frame.left, "left")
+        height, width = frame.left.shape[:2]
+        if wrong := wrong_size(self.path, self.raw_size, (width, height)):
+            raise SagsError(f"{wrong.what}; {wrong.fix}")
         if frame.right is not None:
-            self._check(frame.right, "right")
+            self._check(frame.right, "right picture")
         camera = self.camera
         if frame.T_world_cam is not None:
             if not np.isfinite(frame.T_world_cam).all():
@@ -145,9 +147,9 @@ class Rectifier:
         """A mask of the raw left picture, rectified at the working size; False outside the raw picture.
 
         Raises:
-            SagsError: the mask does not have the calibration's size.
+            SagsError: the mask does not have the pictures' size.
         """
-        self._check(mask, "left mask")
+        self._check(mask, "mask")
         return self._left.mask(mask)
 
     def depth(self, depth: F32) -> F32:
@@ -155,16 +157,15 @@ class Rectifier:
         an edge is a surface that does not exist.
 
         Raises:
-            SagsError: the depth picture does not have the calibration's size.
+            SagsError: the depth picture does not have the pictures' size.
         """
-        self._check(depth, "depth")
+        self._check(depth, "depth picture")
         resized: F32 = cv2.resize(depth, self._size, interpolation=cv2.INTER_NEAREST_EXACT)
         return resized
 
     def _check(self, picture: U8 | Bool | F32, name: str) -> None:
         width, height = self.raw_size
         if picture.shape[:2] != (height, width):
-            raise SagsError(
-                f"calibration is for {width}x{height} but the {name} picture is "
-                f"{picture.shape[1]}x{picture.shape[0]}; calibrate at this size or fix the source"
-            )
+            size = f"{picture.shape[1]}x{picture.shape[0]}"
+            fix = "all that belongs to a frame needs one size: fix the source"
+            raise SagsError(f"the {name} is {size} px, the left picture {width}x{height}; {fix}")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import ran
+from places import ROOT
 from test_calibration import PLUMB_BOB, SIZE, K, R, T, make_rig
 
 from sags_node.config.units import UNITS
@@ -394,6 +395,25 @@ def test_text_matrices_that_are_refused(tmp_path: Path) -> None:
     assert "holds 3 numbers" in refusal(folder, SIZE)
     np.savetxt(folder / "old.left.intrinsics.txt", K[0])
     assert "calib.left.intrinsics.txt, old.left.intrinsics.txt" in refusal(folder, SIZE)
+
+
+# ---- other formats ---------------------------------------------------------------------------------------
+
+
+def test_the_page_converts_kalibrs_camchain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    chain = {}
+    for number, (K_eye, lens) in enumerate(zip(K, PLUMB_BOB, strict=True)):
+        numbers = {"intrinsics": K_eye[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), "resolution": [*SIZE]}
+        chain[f"cam{number}"] = numbers | {"distortion_coeffs": lens[:4].tolist()}
+    chain["cam1"]["T_cn_cnm1"] = np.block([[R, T[:, None]], [np.zeros(3), np.ones(1)]]).tolist()
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(chain))
+    page = (ROOT / "docs/calibration.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    exec(page.split("### Other formats")[1].split("```python")[1].split("```")[0], {})
+    lenses = [np.r_[lens[:4], 0] for lens in PLUMB_BOB]
+    assert_same(
+        load_rig(tmp_path / "calib.yml"), rectify_eyes("calib", SIZE, K, (lenses[0], lenses[1]), R, T)
+    )
 
 
 # ---- which form, and from one to another -----------------------------------------------------------------

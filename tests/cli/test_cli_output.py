@@ -14,6 +14,7 @@ from ctypes.util import find_library
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import click
 import pytest
@@ -25,6 +26,7 @@ from sags_node.cli.main import main
 from sags_node.errors import SagsError
 from sags_node.files import check_file, check_results, whole
 from sags_node.terminal import console as terminal
+from sags_node.tools.doctor import OPEN3D_LIBRARIES
 from sags_node.tools.evaluation.report import check_report
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
@@ -297,6 +299,17 @@ def test_doctor_asks_for_the_packages_that_a_launch_file_needs(
     assert code == 1 and "cyclonedds" in checks["source"]["found"] and "[ros2]" in checks["source"]["fix"]
 
 
+def test_a_missing_library_of_the_system_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    error = ImportError("libidn2.so.0: cannot open shared object file: No such file or directory")
+    monkeypatch.setattr("sags_node.tools.doctor.examine", Mock(side_effect=error))
+    refused(2, "doctor", said=("libidn2.so.0 is missing on this system; sags doctor says which package",))
+
+
+@pytest.mark.parametrize("file", ["Makefile", "README.md", "examples/container/Containerfile"])
+def test_what_open3d_needs_is_installed_wherever_it_is(file: str) -> None:
+    assert " ".join(OPEN3D_LIBRARIES.values()) in (ROOT / file).read_text(encoding="utf-8")
+
+
 @pytest.mark.skipif(find_library("gstapp-1.0") is None, reason="GStreamer is not installed")
 def test_doctor_lets_gstreamer_read_the_launch_string(user_files: Path) -> None:
     for launch, level, said in (
@@ -359,6 +372,7 @@ def test_help_mentions_every_argument_and_option(path: tuple[str, ...]) -> None:
     for name in path:
         command = command.commands[name]
     result = sags(*path, "--help")
+    assert not re.search(r"^  \w.* {4,}--", result.stdout, re.M), "an example lost its line break"
     assert result.exit_code == 0
     if isinstance(command, click.Group):
         assert "..." not in result.stdout.split("--help")[1], "a summary is cut off"
@@ -397,6 +411,12 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     assert "pictures of {width}x{height} px".format_map(summary["settings"]) in result.stderr
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
     check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
+
+
+@pytest.mark.fault("process: the node of a demo takes longer to start than it plays")
+def test_a_demo_on_a_slow_machine_has_its_report(user_files: Path, tmp_path: Path) -> None:
+    result = sags("demo", *videos(user_files), "--seconds", "0.2", "--out", tmp_path / "demo", "--json")
+    assert result.exit_code == 0 and pure_json(result.stdout)["frames"] == 2, result.stderr
 
 
 def test_eval_says_what_it_found_in_a_dozen_lines(user_files: Path, tmp_path: Path) -> None:

@@ -622,5 +622,20 @@ def test_what_cannot_be_played_has_exit_code_1(tmp_path: Path, what: str) -> Non
 def test_a_calibration_beside_videos_is_compared_with_them(tmp_path: Path) -> None:
     folder = write_eyes(tmp_path / "case", moving(40), moving(40, -DISPARITY))
     shutil.copytree(SESSION / "calib", folder / "calib")  # of 320x256 px
-    said = [each.what for each in check_folder(folder) if each.level == "error"]
-    assert any("the calibration is for 320x256 px, the pictures are 160x120" in each for each in said), said
+    (wrong,) = (each for each in check_folder(folder) if each.level == "error")
+    assert "the calibration is for 320x256 px, the pictures are 160x120" in wrong.what
+
+
+@pytest.mark.parametrize("names", [
+    ["camchain.yaml"], ["ost.yaml"], ["cam0_info.yml"], ["a.yml", "b.xml"],
+    ["files/a.xml"], ["stereoParams.mat"], ["StereoCalibration.ini"], ["intrinsics.txt"], ["more/calib.json"],
+])  # fmt: skip
+def test_a_calibration_that_is_not_used_is_named(names: list[str], tmp_path: Path) -> None:
+    folder = made(tmp_path / "case")
+    (folder / "calib_board.png").write_bytes((folder / "masks/000.png").read_bytes())
+    for name in names:
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("%YAML:1.0\n---\n" if Path(name).stem in "ab" else "")
+    (said,) = (each for each in check_folder(folder) if each.level != "ok")
+    assert said.what == f"no calibration is used, though {', '.join(names)} lies there"
+    assert f"set rig:={folder / names[0]} if sags calib check {folder / names[0]} takes" in said.fix

@@ -309,7 +309,7 @@ def test_it_goes_blank_when_the_node_stops_is_reset_or_dies(
 
         with ControlClient(run_dir=run_dir) as client:
             client.request("reset_model", timeout=30)
-        until(lambda: watcher.newest_epoch() > before)  # its anchor is recognised in the new model, or pinned anew
+        until(lambda: watcher.newest_epoch() > before)  # recognised there, or pinned anew
         running.end()
     with overlay(run_dir, repin=True) as (running, watcher):
         watcher.pictures(3, drawn=True)

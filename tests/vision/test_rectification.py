@@ -100,9 +100,14 @@ def test_the_frame_pose_is_the_camera_pose() -> None:
 def test_pictures_of_another_size_are_refused() -> None:
     rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
     good, bad = np.zeros((540, 675, 3), np.uint8), np.zeros((480, 640, 3), np.uint8)
-    with pytest.raises(SagsError, match="calibration is for 675x540 but the right picture is 640x480"):
+    with pytest.raises(SagsError, match="the right picture is 640x480 px, the left picture 675x540"):
         rectifier(make_frame(good, bad))
-    with pytest.raises(SagsError, match="left mask"):
+    with pytest.raises(SagsError, match="have another shape"):
+        rectifier(make_frame(bad, bad))
+    twice = np.zeros((1080, 1350, 3), np.uint8)
+    with pytest.raises(SagsError, match=f"sags calib convert {ROOT / 'calib/d4d'} -o FOLDER --scale 2$"):
+        rectifier(make_frame(twice, twice))
+    with pytest.raises(SagsError, match="mask is 640x480 px, the left picture 675x540"):
         rectifier.mask(np.zeros((480, 640), np.bool_))
 
 

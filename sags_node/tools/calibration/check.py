@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -24,8 +23,8 @@ from sags_node.rig import (
     rectifies,
     unknown_form,
     with_unit,
+    wrong_size,
 )
-from sags_node.sources.pictures import size_text
 from sags_node.sources.rectified import as_named, as_pictures_come
 from sags_node.sources.source import recorded_rig
 from sags_node.tools.calibration.guess import first_pairs
@@ -115,9 +114,9 @@ def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 |
     Args:
         depths: what is known of each pair's depth, [H, W] m of the left rectified picture, 0 unknown.
     """
-    size = pairs[0][0].shape[1], pairs[0][0].shape[0]
-    if size != (rig.left.width, rig.left.height):
-        return [_wrong_size(rig, size)]
+    height, width = pairs[0][0].shape[:2]
+    if wrong := wrong_size(rig.path, (rig.left.width, rig.left.height), (width, height)):
+        return [wrong]
     found = [match_eyes(*pair) for pair in pairs]
     matches = np.concatenate(found)
     rectified = judge_rectified(rig, matches)
@@ -167,20 +166,6 @@ def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | 
     if rig is None:
         raise UsageError("the session names no calibration: set rig to its folder")
     return as_pictures_come(with_unit(rig, metres), config)
-
-
-def _wrong_size(rig: StereoRig, size: tuple[int, int]) -> Finding:
-    calibrated = rig.left.width, rig.left.height
-    ratio = size[0] / calibrated[0]
-    what = f"the calibration is for {size_text(*calibrated)} px, the pictures are {size_text(*size)}"
-    if ratio != size[1] / calibrated[1]:
-        fix = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
-        return Finding("error", what, fix)
-    fix = (
-        f"calibrate at {size_text(*size)}, or if the pictures are only resized, not cropped: "
-        f"sags calib convert {shlex.quote(str(rig.path))} -o FOLDER --scale {ratio:g}"
-    )
-    return Finding("error", f"{what}, {ratio:.3g} times as large", fix, {"scale": ratio})
 
 
 def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:

@@ -34,12 +34,20 @@ from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.calibration.pictures import pairs_of_session
 from sags_node.tools.calibration.rows import PLAUSIBLE_DEPTH, RECTIFIED
 from sags_node.tools.importing import pictures, videos
-from sags_node.tools.importing.folder import Contents, both_eyes, calibration_of, override, recognise
+from sags_node.tools.importing.folder import (
+    Contents,
+    both_eyes,
+    calibration_of,
+    override,
+    recognise,
+    seem_calibrations,
+)
 from sags_node.tools.importing.timing import LOOKED_AT, Timing
 from sags_node.types import U8
 from sags_node.vision.watch.color_watch import EXCHANGED, is_blue
 
 MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
+MOST_NAMED = 4  # files in one sentence
 MOST_SAID = 1 << 16  # lines in the log
 
 
@@ -72,7 +80,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
         config = load_launch(folder, launch)
         plays = played(config)
         apart = any("clocks_differ_ms" in each.figures for each in plays)  # then rows tell of the clocks
-        judged = [] if apart else calibrated(config)
+        judged = [] if apart else calibrated(config, folder)
         return plays + (judged if is_wrong(plays) else as_warnings(judged))
 
     found = _once(found + _tried("frames", look))
@@ -206,8 +214,8 @@ def _fits(config: LaunchConfig) -> list[Finding]:
     return []
 
 
-def calibrated(config: LaunchConfig) -> list[Finding]:
-    """The calibration with which it is played, against its pictures."""
+def calibrated(config: LaunchConfig, path: Path) -> list[Finding]:
+    """The calibration with which it is played, against its pictures, which lie in or at `path`."""
 
     def compare() -> list[Finding]:
         source = config.source
@@ -215,7 +223,7 @@ def calibrated(config: LaunchConfig) -> list[Finding]:
         if config.one_camera or one_eyed or isinstance(source, LiveSource | PhantomSource):
             return []
         if lacks_rig(config):
-            return [Finding("warning", "no calibration lies beside the pictures", MAKE_ONE)]
+            return [_none_used(path if path.is_dir() else path.parent)]
         pairs, depths = pairs_of_session(config)
         size = pairs[0][0].shape[1], pairs[0][0].shape[0]
         rig = recorded_rig(source) if config.rig is None else read_rig(config.rig, size)
@@ -225,6 +233,14 @@ def calibrated(config: LaunchConfig) -> list[Finding]:
         return [each for each in judged if each.level != "ok"] or [last]  # all is well in one line
 
     return _tried("calibration", compare)
+
+
+def _none_used(folder: Path) -> Finding:
+    if not (there := seem_calibrations(folder)):
+        return Finding("warning", "no calibration lies beside the pictures", MAKE_ONE)
+    named, first = ", ".join(str(file.relative_to(folder)) for file in there[:MOST_NAMED]), _quoted(there[0])
+    fix = f"set {override('rig', first)} if sags calib check {first} takes it, else docs/calibration.md"
+    return Finding("warning", f"no calibration is used, though {named} lies there", fix)
 
 
 def _within_reach(judged: list[Finding], config: LaunchConfig) -> list[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Iterable
 from contextlib import suppress
@@ -29,6 +30,9 @@ KITTI_EYES = (
 )
 MASKS = ("masks", "mask", "tools", "toolmask", "tool_mask")
 LAUNCH_SUFFIXES = (".yaml", ".yml")
+SEEMS = re.compile(
+    r"calib|(in|ex)trinsic|camchain|camera_?(info|param)|stereo_?param|^(ost|cam\w*)\.ya?ml$", re.I
+)
 CALIBRATIONS = (".", "calib", "calibration", "camera", "rig")
 DEPTHS = ("depth", "depths", "depth01", "depth_mm_x100")
 
@@ -174,6 +178,13 @@ def calibration_of(folder: Path) -> Path | None:
     files = [file for place in places for file in place.glob(SHOWN) if is_opencv(file)]
     named = [file for file in files if file.parent != folder or "calib" in file.stem.lower()]
     return named[0] if known is None and len(named) == 1 else known
+
+
+def seem_calibrations(folder: Path) -> list[Path]:
+    """Files in a folder, and in the folders there, that by name or content seem to be a calibration."""
+    files = [*folder.glob(SHOWN), *folder.glob(f"{SHOWN}/{SHOWN}")]
+    named = [file for file in files if is_opencv(file) or (SEEMS.search(file.name) and file.is_file())]
+    return sorted(file for file in named if file.suffix.lower() not in (*SUFFIXES, *VIDEO_SUFFIXES))
 
 
 def is_video(file: Path) -> bool:

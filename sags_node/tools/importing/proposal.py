@@ -61,7 +61,7 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
             if each.launch and each.launch[0] in done
         ]
         looked = _looked_at(load_launch(named[0], launch))
-    return Proposal(launch, [*found, *looked, *calibrated(load_launch(named[0], launch))])
+    return Proposal(launch, [*found, *looked, *calibrated(load_launch(named[0], launch), named[0])])
 
 
 def _launch_of(named: Sequence[Path], overrides: Sequence[str]) -> list[str]:
