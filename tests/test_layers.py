@@ -63,7 +63,7 @@ LINES = {
     "sags_node/tools/calibration": 1862,
     "sags_node/tools/evaluation": 3153,
     "sags_node/tools/export": 891,
-    "sags_node/tools/fitting": 1544,
+    "sags_node/tools/fitting": 1542,
     "sags_node/tools/importing": 1116,
     "sags_node/vision": 5461,
     "tests": 48055,

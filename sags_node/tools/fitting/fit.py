@@ -45,8 +45,7 @@ REFINE_RATES = LearningRates()  # the mapper's, gentle: the start is good
 REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
 REFINE_RELAXATION = 1.6  # of the colour step: a frame is seen again after many others
 REFINE_DECAY = 0.1
-REST_RELAXATION = 0.9  # of the colour step of the paper's schedule in its warm-up, as the mapper's
-RELAXATION = 0.1  # of the same afterwards: colours are those of all frames, not of the last ones
+RELAXATION = 0.9  # of the colour step of the paper's schedule; it falls with the rates, so frames average out
 
 
 class Fit:
@@ -189,9 +188,8 @@ class Fit:
         share = settings.rate_share(*self.stage)
         colors = 0.0
         if settings.slopes:
-            relaxation = share * (RELAXATION if deformed else REST_RELAXATION)
             pixels = float(np.mean([np.count_nonzero(frame.tissue) for frame in frames]))
-            colors = relaxation * 3 * pixels * settings.color_softness / settings.weights.color
+            colors = share * RELAXATION * 3 * pixels * settings.color_softness / settings.weights.color
         rates = Rates(
             self._rates * np.float32(share) ** self._decays, settings.field_rates.scaled(share), colors
         )
