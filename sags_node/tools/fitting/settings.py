@@ -143,7 +143,7 @@ PAPER = FitSettings(
     tokens="self",
     iterations=3000,
     shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
-    rates=RowRates(log_scale=2e-2, quat=5e-3, color=5e-3, logit=0.015),
+    rates=RowRates(mean_px=0.16, log_scale=1e-2, quat=5e-3, color=5e-3, logit=0.015),
     field_rates=FieldRates(cells=2.5e-2, decoder=5e-4, lines=5e-2),
     decay=0.03,
     stable=0.7,
