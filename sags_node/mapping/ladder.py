@@ -102,7 +102,7 @@ SCALES = (1.0, 0.75, 0.5, 0.375, 0.25)  # of the working size, that a machine ma
 SMALLEST = 480 * 360  # px, that it may choose: less saves nothing
 ROOMY = 3  # the rung that must fit: what the lower ones save is for what else the machine does
 PIXELS_PER_GAUSSIAN = 4  # fewer pixels have no more to tell of its colour, slopes and place
-WITH_OTHERS = 1.1  # times as long as prices say: the least that live frames take (`benchmarks/ladder.md`)
+WITH_OTHERS = 1.1  # times as long as prices say, for what else the machine does: a guess before frames tell
 
 
 def price(rung: Rung, gaussians: float, pixels: int, prices: Prices = ON_CPU) -> float:
