@@ -142,12 +142,12 @@ def fit_session(
     everything = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
     found = {
         "session": session.name,
-        "settings": asdict(settings),
+        "settings": asdict(fit.settings),
         "machine": machine_name(),
         "device": "cpu" if device is None else choose_device("auto").name,
         "seconds": round(fit.seconds, 1),
         "gaussians": len(fit.model),
-        "cap": settings.max_gaussians,
+        "cap": fit.settings.max_gaussians,
         "pruned": fit.pruned,
         "split": fit.split,
         "heldout": score(

@@ -173,7 +173,7 @@ def evaluate(
 @click.option(
     "--max-gaussians",
     type=click.IntRange(100, 2_000_000),
-    help="Cap on N.  [default: 60000; released: 960000]",
+    help="Cap on N.  [default: one for 3.3 px of tissue; released: 960000]",
 )
 @click.option(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Any other setting, say shape.levels=4."
@@ -225,6 +225,8 @@ def fit(
         raise UsageError("--monocular needs --schedule paper: the online start measures distances")
     options = MeasureOptions(hold_out, 1, lpips_weights)
     given = {name: value for name, value in asked.items() if value is not None}
+    if "max_gaussians" in given:
+        given["pixels_each"] = 0.0
     if monocular:
         given["weights"] = replace(settings.weights, **MONOCULAR)
     settings = replace(settings, antialias=not no_alias_free, **given)

@@ -436,4 +436,4 @@ def test_a_cut_in_the_recording_keeps_the_cap(clip: Clip) -> None:
 @pytest.mark.fault("memory: a clip is too long for a fit")
 def test_a_clip_too_long_for_its_memory_is_refused_at_once(clip: Clip) -> None:
     with pytest.raises(SagsError, match="max-gaussians"):
-        fitted(clip, dataclasses.replace(SMALL, max_gaussians=5_000_000))
+        fitted(clip, dataclasses.replace(SMALL, max_gaussians=5_000_000, pixels_each=0.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -9,17 +10,19 @@ import pytest
 from sags_node.errors import UsageError
 from sags_node.model import columns
 from sags_node.tools.fitting.field import marked, row_rates
+from sags_node.tools.fitting.residuals import check_size
 from sags_node.tools.fitting.score import published
 from sags_node.tools.fitting.settings import (
     ONLINE,
+    PAPER,
     PRESETS,
     RELEASED,
     FieldShape,
     RowRates,
     Units,
+    path_frames,
     with_changes,
 )
-from sags_node.tools.fitting.start import PATH_EVERY
 
 SH_0 = 0.28209479  # of a spherical harmonic of degree 0, which their colour rate is of
 
@@ -98,10 +101,21 @@ def test_slots_of_time_grow_with_the_clip() -> None:
     assert [shape.slots(frames) for frames in (1, 30, 63, 300)] == [2, 11, 22, 25]
 
 
+def test_the_number_of_gaussians_follows_the_clip() -> None:
+    by_clip = dataclasses.replace(PAPER, max_gaussians=900, pixels_each=4.0)
+    assert [by_clip.of_clip(pixels, 10).max_gaussians for pixels in (0, 1, 2000, 9000)] == [0, 1, 500, 900]
+    given = dataclasses.replace(PAPER, max_gaussians=900, pixels_each=0.0)
+    assert given.of_clip(9000, 10) == given and RELEASED.of_clip(9000, 10) == RELEASED
+    # a long clip has fewer, so that all times of its residuals have room
+    most = ONLINE.of_clip(330_000, 2000).max_gaussians
+    check_size(len(path_frames(2000)), most)
+    assert 0 < most < PAPER.of_clip(330_000, 2000).max_gaussians == 100_000
+
+
 @pytest.mark.parametrize("frames", [30, 63, 179, 1000])
 def test_the_paths_tell_the_field_of_each_slot_of_time(frames: int) -> None:
     train = [frame for frame in range(frames) if frame % 8]  # as `sags fit` does
-    told = {*train[::PATH_EVERY], train[-1]}
+    told = [train[place] for place in path_frames(len(train))]
     slots = ONLINE.shape.slots(frames)
     for slot in range(slots - 1):
         begin, end = (frames - 1) * slot / (slots - 1), (frames - 1) * (slot + 1) / (slots - 1)

@@ -59,8 +59,9 @@ class Fit:
             device: on which Warp draws and torch keeps all that is learnt, and the pictures; not for
                 schedule = online. None: the kernels of the CPU.
         """
+        seen = np.any([frame.tissue for frame in clip.train], axis=0)
         self.clip = clip
-        self.settings = settings
+        self.settings = settings = settings.of_clip(int(np.count_nonzero(seen)), len(clip.train))
         self._device = torch.device(device or "cpu")
         self.iteration = 0
         self.seconds = 0.0  # spent on starting and iterating
@@ -72,7 +73,7 @@ class Fit:
         if device is not None:
             self._learning = Canvas(width, height, self._device, settings.antialias)
         self._residual: float | Tensor = 0.0
-        unseen = ~np.any([frame.tissue for frame in clip.train], axis=0) | settings.smooth_everywhere
+        unseen = ~seen | settings.smooth_everywhere
         self._unseen = unseen if device is None else torch.from_numpy(unseen).to(self._device)
         self._shown: dict[int, tuple[Tensor, ...]] = {}
         self._v_planes = np.zeros((5, height, width), np.float32)

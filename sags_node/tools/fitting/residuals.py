@@ -24,17 +24,20 @@ COLOR_DAMPING = 0.3  # px: a barely seen Gaussian changes its colour slowly
 MAX_BYTES = 1 << 29  # of the values; their optimiser's state takes twice as much again
 
 
+def room(times: int) -> int:
+    """How many Gaussians may have residuals at so many times."""
+    return MAX_BYTES // (times * columns.COUNT * 4)
+
+
 def check_size(times: int, count: int) -> None:
     """
     Raises:
         SagsError: residuals of that many Gaussians at that many times take more memory than they may.
     """
-    size = times * count * columns.COUNT * 4
-    if size > MAX_BYTES:
+    if count > room(times):
         raise SagsError(
-            f"residuals of {count} Gaussians at {times} times take {size / 1e6:.0f} MB, the limit is "
-            f"{MAX_BYTES / 1e6:.0f} MB: take fewer frames (source.frames, source.stride) or a smaller "
-            "--max-gaussians"
+            f"residuals of {count} Gaussians at {times} times take more than the {MAX_BYTES / 1e6:.0f} MB "
+            "that they may: take fewer frames (source.frames, source.stride) or a smaller --max-gaussians"
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
@@ -14,6 +14,7 @@ from sags_node.errors import UsageError
 from sags_node.field.decoder import Block, Tokens
 from sags_node.field.deformation import FieldRates
 from sags_node.field.losses import LossWeights
+from sags_node.tools.fitting.residuals import room
 
 Schedule = Literal["paper", "online"]
 Part = Literal["means", "log_scales", "quats", "colors", "logits"]  # of a Gaussian's parameters
@@ -21,6 +22,7 @@ Part = Literal["means", "log_scales", "quats", "colors", "logits"]  # of a Gauss
 PARTS: tuple[Part, ...] = ("means", "log_scales", "quats", "colors", "logits")
 
 
+PATH_EVERY = 3  # training frames from one time of the paths to the next
 STEREO = LossWeights(coverage=0.1)
 MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # of these weights: depth up to scale and shift
 
@@ -44,8 +46,8 @@ class FieldShape:
     levels: int = 2
     cells: int = 64  # along each axis, coarsest level
     channels: int = 32  # of each level
-    # How many of the clip's frames from one slot of time to the next. The paths are given at every third
-    # training frame: each slot has two of their times, as one without any is left to chance.
+    # How many of the clip's frames from one slot of time to the next. Each slot has two of the times of
+    # `path_frames`, as one without any is left to chance.
     frames_per_slot: float = 7.0
     most_slots: int | None = None  # however long the clip is
     first_values: tuple[float, float] = (0.7, 1.3)  # of the planes in space, at random between these
@@ -74,7 +76,7 @@ class RowRates:
 class Growth:
     """How the canonical Gaussians begin and become more; only with schedule = paper."""
 
-    first: int = 30_000  # Gaussians to begin with
+    first: int | None = 30_000  # Gaussians to begin with; None: as many as there may be
     opacity: float = 0.1  # of those
     scale: float = 1.0  # of those, in distances to their neighbours
     every: int = 300  # iterations
@@ -92,7 +94,10 @@ class FitSettings:
     tokens: Tokens = "nodes"
     block: Block = "adaptive"  # what stands before the decoder's heads
     antialias: bool = True  # both filters
-    max_gaussians: int = 60_000
+    max_gaussians: int = 1_000_000
+    # px of tissue for each Gaussian, as long as there are no more than max_gaussians and, after an online
+    # start, than residuals have room for; 0: always max_gaussians
+    pixels_each: float = 3.3
     seed: int = 0
     shape: FieldShape = FieldShape()
     rates: RowRates = RowRates()  # only with schedule = paper
@@ -128,6 +133,16 @@ class FitSettings:
         if self.slopes and not (self.color_softness > 0 and self.weights.color > 0):
             raise UsageError("slopes need a color_softness and a weights.color above 0, or set slopes=false")
 
+    def of_clip(self, pixels: int, frames: int) -> FitSettings:
+        """These settings with as many Gaussians as suit a clip of so many training frames, of which so many
+        pixels show tissue."""
+        if not self.pixels_each:
+            return self
+        most = min(self.max_gaussians, math.ceil(pixels / self.pixels_each))
+        if self.schedule == "online":
+            most = min(most, room(len(path_frames(frames))))
+        return replace(self, max_gaussians=most)
+
     def rate_share(self, done: int, of: int) -> float:
         """The rate share of rates that decay: the share that is left after `done` of a stage's iterations."""
         if self.stable is None:
@@ -143,11 +158,11 @@ PAPER = FitSettings(
     tokens="self",
     iterations=3000,
     shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
-    rates=RowRates(mean_px=0.16, log_scale=1e-2, quat=5e-3, color=5e-3, logit=0.015),
+    rates=RowRates(log_scale=1e-2, quat=5e-3, color=5e-3, logit=0.015),
     field_rates=FieldRates(cells=2.5e-2, decoder=5e-4, lines=5e-2),
     decay=0.03,
     stable=0.7,
-    growth=Growth(first=60_000, opacity=0.9, scale=0.6, share=0.15),
+    growth=Growth(first=None, opacity=0.9, scale=0.6, share=0.15),
     batch_size=2,
     color_softness=0.15,  # more than most differences
     slopes=True,
@@ -160,6 +175,7 @@ RELEASED = FitSettings(
     tokens="self",
     iterations=3000,
     max_gaussians=960_000,  # doubled five times
+    pixels_each=0.0,
     shape=FieldShape(
         levels=4,
         channels=64,
@@ -175,6 +191,11 @@ RELEASED = FitSettings(
     smooth_everywhere=True,
 )
 PRESETS = {"online": ONLINE, "paper": PAPER, "released": RELEASED}
+
+
+def path_frames(frames: int) -> list[int]:
+    """The ones of so many training frames at whose times the field is told where Gaussians are."""
+    return sorted({*range(0, frames, PATH_EVERY), max(0, frames - 1)})
 
 
 def with_changes(settings: FitSettings, changes: Sequence[str]) -> FitSettings:

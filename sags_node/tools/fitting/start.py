@@ -29,7 +29,7 @@ from sags_node.model import columns
 from sags_node.model.exposure import Exposure
 from sags_node.tools.fitting.clip import Clip, ClipFrame
 from sags_node.tools.fitting.residuals import Residuals, check_size
-from sags_node.tools.fitting.settings import FitSettings
+from sags_node.tools.fitting.settings import FitSettings, path_frames
 from sags_node.types import F32, I64, Bool, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
@@ -37,7 +37,6 @@ ONLINE_STEPS = 2  # of the mapper per frame
 CUT = 0.08  # mean difference of two frames, 0..1; a beating heart stays below half of it
 PATH_POINTS = 8192  # Gaussians per step of the regression
 PATH_STEPS = 1500
-PATH_EVERY = 3  # training frames from one time of the paths to the next
 CARRIERS = 8  # Gaussians that tell a new one where it lay before
 NEIGHBOURS_AT_A_TIME = 2048  # points whose distances to all others a GPU holds
 HIDDEN = -5.0  # of an opacity logit
@@ -68,7 +67,8 @@ def pooled_rows(
     means, colors = (np.concatenate(parts) for parts in zip(*pools, strict=True))
     if len(means) == 0:
         raise SagsError("no training frame has a depth on tissue; check vision.stereo and the masks")
-    count = min(settings.growth.first, settings.max_gaussians, len(means))
+    most = settings.max_gaussians
+    count = min(settings.growth.first or most, most, len(means))
     picked = rng.choice(len(means), count, replace=False)
     means, colors = means[picked], colors[picked]
     gaussians = Gaussians(
@@ -135,7 +135,7 @@ def follow_online(
     Raises:
         SagsError: no frame had depth enough to start a model, or the clip is too long for its memory.
     """
-    slots = {*range(0, len(clip.train), PATH_EVERY), len(clip.train) - 1}
+    slots = path_frames(len(clip.train))
     check_size(len(slots), settings.max_gaussians)
     refiner = CpuRefiner(lambda width, height: rasterizer)  # all frames have its size
     mapper, budget = Mapper(refiner, TissueMap(settings.max_gaussians)), StepBudget(ONLINE_STEPS)
@@ -177,7 +177,7 @@ def follow_online(
     slopes /= known.sum(0)[:, None]
     rows = (states * (known[..., None] / known.sum(0)[None, :, None]).astype(np.float32)).sum(0)
     rows[:, columns.MEAN] = first.of(ids)
-    times_ns = np.array([clip.train[slot].t_capture_ns for slot in sorted(slots)])
+    times_ns = np.array([clip.train[slot].t_capture_ns for slot in slots])
     return rows, slopes, Paths(times_ns, states, known)
 
 
