@@ -110,7 +110,7 @@ def fit_session(
     if resume and not stored.is_file():
         raise UsageError(f"there is no {stored} to resume from; start without --resume")
     lpips = None if options.lpips_weights is None else Lpips(options.lpips_weights)
-    configure_threads(session.config.engine.threads)
+    torch.set_num_threads(configure_threads(session.config.engine.threads))
     count = session.source.frame_count
     receipt = Receipt(session.rig, session.working_size, options.lpips_weights)
 
