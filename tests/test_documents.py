@@ -1,4 +1,4 @@
-"""Documents name files, threads, rooms, warnings and each other as they are: docs/dev/check_docs.py."""
+"""Documents name files, threads, folders, warnings and each other as they are: docs/dev/check_docs.py."""
 
 from __future__ import annotations
 

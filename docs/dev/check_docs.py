@@ -114,13 +114,13 @@ def check_index() -> Iterator[str]:
 
 
 def check_house() -> Iterator[str]:
-    """The drawing in docs/architecture.md has the rooms that there are."""
-    drawn = section("The house").split("sags_lab/")[0].split("sags_node/\n")[1]
+    """The drawing in docs/architecture.md has the folders that there are."""
+    drawn = section("Folders").split("sags_lab/")[0].split("sags_node/\n")[1]
     package, parts = ROOT / "sags_node", ("", "clients/", "tools/")
     there = {file.name for part in parts for file in package.glob(f"{part}*.py")} - {"__init__.py"}
     there |= {f"{init.parent.name}/" for part in parts for init in package.glob(f"{part}*/__init__.py")}
     for name in set(re.findall(r"(?:^ {2,4}| )(\w+/|\w+\.py)(?=[ \n])", drawn, re.MULTILINE)) ^ there:
-        yield f"architecture.md, the house: {name} is {'not drawn' if name in there else 'gone'}"
+        yield f"architecture.md, folders: {name} is {'not drawn' if name in there else 'gone'}"
 
 
 def check_names() -> Iterator[str]:

@@ -133,7 +133,7 @@ def _replaced(page: str, *tables: str) -> str:
 
 def _plain(name: str) -> str:
     """A table of README.md."""
-    return table(" | the model | beside it", list(map(filled, lines(name))))
+    return table(" | the model | compared with", list(map(filled, lines(name))))
 
 
 def _claims() -> str:
@@ -141,7 +141,7 @@ def _claims() -> str:
         f"{filled(line)} | {', '.join(f'`{name}`' for name in claimed(line))}" for line in lines("claims.txt")
     ]
     origins = f"{_origin('revision')} {_origin('machine')}"
-    return f"{table(' | this | beside it | run | `results/`', rows)}\n{origins}\n"
+    return f"{table(' | this | compared with | run | `results/`', rows)}\n{origins}\n"
 
 
 def _origin(key: str) -> str:

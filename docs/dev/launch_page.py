@@ -122,8 +122,8 @@ def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
 
 def _robot(prefix: str) -> Iterator[str]:
     """What all robots have in common, then what each kind has beyond it."""
-    yield "## `robot`: who says where the scope is\n"
-    yield "`robot.kind` says which way poses come. Without `robot` nobody says it, or the recording does.\n"
+    yield "## `robot`: poses of the scope\n"
+    yield "`robot.kind` says which way poses come. Without `robot` the recording has poses, or none come.\n"
     yield from _table(RobotPoses, prefix, "Every kind of robot", list(RobotPoses.model_fields))
     yield from _table(RobotTool, f"{prefix}tools[].", "Each of `robot.tools`", list(RobotTool.model_fields))
     for section in (Ros2Robot, PushRobot, BagRobot):

@@ -475,20 +475,20 @@ Source = Annotated[
 
 
 class RobotTool(Section):
-    """A tool whose tip the robot tells: topic `instruments`."""
+    """A tool whose tip comes from the robot; published in the topic `instruments`."""
 
     topic: str = Field(
         description="of PoseStamped or TransformStamped, e.g. /PSM1/measured_cp: its tip, z points out"
     )
     T_base: Pose = Field(
         ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
-        description="4 rows of 4, m: the frame that its poses are in, in that of the scope's poses",
+        description="4 rows of 4, m: the base frame of its poses, in that of the scope's poses",
     )
     on_hand: bool = Field(
-        False, description="T_base is in what carries the camera, and moves with it: dVRK's poses in the ECM"
+        False, description="T_base is in the frame that carries the camera, which moves: dVRK's in the ECM"
     )
     error_mm: float = Field(
-        10.0, gt=0, le=100, description="nine of ten of its tips are nearer than this to where the robot says"
+        10.0, gt=0, le=100, description="assumed error of its uncorrected tips; nine of ten are smaller"
     )
 
 
@@ -507,7 +507,7 @@ class RobotPoses(Section):
         description="the robot's stamp minus the picture's (before latency_ms), of one moment; default: what "
         "the hand-eye calibration found",
     )
-    tools: tuple[RobotTool, ...] = Field((), max_length=8, description="whose tips the robot tells, too")
+    tools: tuple[RobotTool, ...] = Field((), max_length=8, description="tools whose tips come from the robot")
 
 
 class Ros2Robot(RobotPoses, RosGraph):
@@ -849,7 +849,7 @@ class LaunchConfig(Section):
     )
     source: Source = PhantomSource()
     robot: Robot | None = Field(
-        None, description="who says where the scope is; null: nobody, or the recording. docs/inputs.md"
+        None, description="where the scope's poses come from; null: the recording, or none. docs/inputs.md"
     )
     vision: VisionConfig = VisionConfig()
     engine: EngineConfig = EngineConfig()
