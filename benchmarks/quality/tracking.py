@@ -10,13 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.quality.followers import (
-    CONSISTENT,
-    FOLLOWERS,
-    Follower,
-    dis_flow,
-    sample,
-)
+from benchmarks.quality.followers import CONSISTENT, FOLLOWERS, Follower, dis_flow, sample
 from sags_lab.protocols.point_tracks import (
     average_jaccard,
     calibration_error,

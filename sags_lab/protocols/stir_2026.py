@@ -192,11 +192,7 @@ def _play(
 
 
 def _judge(
-    judged: dict[str, _Judged],
-    sequence: Stir2026Sequence,
-    followed: Followed,
-    truth: Annotated,
-    first: bool,
+    judged: dict[str, _Judged], sequence: Stir2026Sequence, followed: Followed, truth: Annotated, first: bool
 ) -> None:
     """Compare one frame."""
     rig, known = sequence.rig, np.flatnonzero(np.isfinite(followed.points).all(1))

@@ -3,14 +3,7 @@
 Imports config.
 """
 
-from sags_node.rig.check import (
-    accept_rig,
-    check_eyes,
-    check_intrinsics,
-    check_pair,
-    check_rig,
-    wrong_size,
-)
+from sags_node.rig.check import accept_rig, check_eyes, check_intrinsics, check_pair, check_rig, wrong_size
 from sags_node.rig.read import (
     GUESSED_FOV,
     Form,

@@ -241,11 +241,7 @@ CAMERAS = (str(ROOT / "launch/v4l2.yaml"), "source.left:=/dev/null", "source.rig
 PUSHED = ("source.kind:=push", "rig:=FILES/calib", "robot.kind:=push", "robot.hand_eye:=FILES/gone.yaml")
 NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says what is wrong, and how
     "a video": (("VIDEOS", "source.left:=FILES/gone.mp4"), "source", "gone.mp4 does not exist"),
-    "a video cut short": (
-        ("VIDEOS", "source.right:=FILES/short.mp4"),
-        "source",
-        "short.mp4 has 6 pictures",
-    ),
+    "a video cut short": (("VIDEOS", "source.right:=FILES/short.mp4"), "source", "short.mp4 has 6 pictures"),
     "a calibration": (("VIDEOS", "rig:=FILES/gone"), "calibration", "gone/left.yaml"),
     "a calibration of another size": (("VIDEOS", "rig:=FILES/double"), "calibration", "640x512"),
     "a camera": ((*CAMERAS, "source.left:=/dev/no-camera"), "/dev/no-camera", "no such camera"),

@@ -33,14 +33,7 @@ from benchmarks.kernels import reference
 from sags_node import geometry
 from sags_node.config.schema import LaunchConfig
 from sags_node.engine.interface import MIN_ALPHA
-from sags_node.engine.rasterizer import (
-    binning,
-    compositing,
-    cpu,
-    projection,
-    projection_backward,
-    smoothing,
-)
+from sags_node.engine.rasterizer import binning, compositing, cpu, projection, projection_backward, smoothing
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer, to_view
 from sags_node.errors import UsageError
