@@ -263,18 +263,10 @@ def table(measured: Mapping[str, Any]) -> Table:
     """For people; `measured` as `measure_endurance` returns it."""
     made = Table(*HEADINGS, title=f"{measured['session']}, {measured['order'].replace('-', ' ')}")
     for row in measured["windows"]:
-        made.add_row(
-            str(row["frames"]),
-            f"{row['ms_p50']:.1f}",
-            f"{row['ms_p99']:.1f}",
-            f"{row['psnr']:.2f}",
-            str(row["gaussians"]),
-            str(row["nodes"]),
-            f"{row['rss_mb']:.0f}",
-            str(row["still"]),
-            str(row["hurried"]),
-            str(row["restarts"]),
-        )
+        ms, mb = (f"{row[key]:.1f}" for key in ("ms_p50", "ms_p99")), f"{row['rss_mb']:.0f}"
+        sizes, counts = ("gaussians", "nodes"), ("still", "hurried", "restarts")
+        figures = (f"{row['psnr']:.2f}", *(str(row[key]) for key in sizes), mb)
+        made.add_row(str(row["frames"]), *ms, *figures, *(str(row[key]) for key in counts))
     return made
 
 

@@ -33,6 +33,7 @@ from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.pipeline import warm_up
 from sags_node.pipeline.pipeline import Pipeline
+from sags_node.quality import metrics
 from sags_node.quality.metrics import as_float
 from sags_node.rig import rectified_rig
 from sags_node.types import F32, Camera, Observation, RenderedView, Snapshot, StereoFrame, StereoRig
@@ -72,10 +73,7 @@ def frame(i: int, seed: int = 1, brightness: float = 1.0, instrument: bool = Tru
 
 
 def psnr(view: RenderedView, observation: Observation) -> float:
-    return float(
-        -10
-        * np.log10(np.mean(np.square(as_float(view.rgb) - as_float(observation.image))[observation.tissue]))
-    )
+    return metrics.psnr(as_float(view.rgb), as_float(observation.image), observation.tissue)
 
 
 @dataclass

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from frames import played
 from numbered_pictures import HEIGHT, WIDTH, number_of, numbers, picture, write_png
 from PIL import Image
 
@@ -17,12 +18,6 @@ from sags_node.config.launch_file import section_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.pictures import say
 from sags_node.sources.source import open_source
-from sags_node.types import StereoFrame
-
-
-def played(config: cfg.FoldersSource) -> list[StereoFrame]:
-    with open_source(config) as source:
-        return list(source)
 
 
 def eyes(folder: Path, names: list[str]) -> cfg.FoldersSource:
