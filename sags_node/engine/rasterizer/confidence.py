@@ -65,7 +65,9 @@ def doubted(view: RenderedView, error: float) -> RenderedView:
     nothing = np.float32(0)
     stated = confidence >= np.float32(LEAST)
     return replace(
-        view, depth=np.where(stated, view.depth, nothing), confidence=np.where(stated, confidence, nothing)
+        view,
+        depth=np.where(stated, view.depth, nothing),
+        confidence=np.where(stated, confidence, nothing),
     )
 
 

@@ -50,7 +50,16 @@ from sags_node.engine.rasterizer.projection import (
     whitening,
 )
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, prefetch_read, take
-from sags_node.kernels.vectors import LANES, RECORD, larger, load, load_records, select, spread, store
+from sags_node.kernels.vectors import (
+    LANES,
+    RECORD,
+    larger,
+    load,
+    load_records,
+    select,
+    spread,
+    store,
+)
 from sags_node.types import F32, I64
 
 f4 = np.float32

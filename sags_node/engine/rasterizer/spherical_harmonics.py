@@ -121,7 +121,14 @@ def color(
 
 @kernel
 def _block_backward(
-    means: F32, sh_rest: F32, centre: Row, first: int, last: int, v_colors: F32, v_sh_rest: F32, v_means: F32
+    means: F32,
+    sh_rest: F32,
+    centre: Row,
+    first: int,
+    last: int,
+    v_colors: F32,
+    v_sh_rest: F32,
+    v_means: F32,
 ) -> None:
     terms = sh_rest.shape[1]
     basis, v_basis = np.empty(MOST, f4), np.empty(MOST, f4)
@@ -157,5 +164,12 @@ def color_backward(
     for block in numba.prange((count + BLOCK - 1) // BLOCK):
         first = block * BLOCK
         _block_backward(
-            means, sh_rest, centre, first, min(first + BLOCK, count), v_colors, v_sh_rest, v_means
+            means,
+            sh_rest,
+            centre,
+            first,
+            min(first + BLOCK, count),
+            v_colors,
+            v_sh_rest,
+            v_means,
         )
