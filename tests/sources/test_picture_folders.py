@@ -197,13 +197,8 @@ TISSUE = np.array([140, 84, 81])  # RGB
 @pytest.mark.parametrize(
     ("pattern", "is_told"),
     [
-        ("RGGB", True),
-        ("BGGR", True),
-        ("GRBG", True),
-        ("GBRG", True),
-        ("GGGG", False),
-        ("RRGG", False),
-        ("RGRG", False),
+        *((pattern, True) for pattern in ("RGGB", "BGGR", "GRBG", "GBRG")),
+        *((pattern, False) for pattern in ("GGGG", "RRGG", "RGRG")),
     ],
 )
 def test_grey_pictures_that_are_a_mosaic_are_told(
