@@ -27,26 +27,8 @@ from sags_node.messaging.sender import FrameSender, PoseSender
 from sags_node.messaging.subscriber import Subscriber
 
 __all__ = [
-    "MEASURING",
-    "AsyncSubscriber",
-    "ClientKeys",
-    "ControlClient",
-    "Frame",
-    "FrameSender",
-    "Measured",
-    "NodeClock",
-    "Offset",
-    "PoseSender",
-    "Received",
-    "ReceivedCameraInfo",
-    "ReceivedCloud",
-    "ReceivedCompressed",
-    "ReceivedImage",
-    "ReceivedRos",
-    "ReceivedText",
-    "SagsError",
-    "StaleError",
-    "Subscriber",
-    "TopicName",
-    "measure",
-]
+    "MEASURING", "AsyncSubscriber", "ClientKeys", "ControlClient", "Frame", "FrameSender", "Measured",
+    "NodeClock", "Offset", "PoseSender", "Received", "ReceivedCameraInfo", "ReceivedCloud",
+    "ReceivedCompressed", "ReceivedImage", "ReceivedRos", "ReceivedText", "SagsError", "StaleError",
+    "Subscriber", "TopicName", "measure",
+]  # fmt: skip

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
 from command_line import RUN_HERE
+from frames import Frames
 from places import SESSION
 from synthetic import at_frame, plane_result
 
@@ -32,26 +33,18 @@ def frame(number: int, seconds: float, epoch: int = 0) -> StereoFrame:
     return StereoFrame(number, stamp, stamp, PICTURE, PICTURE, epoch=epoch)
 
 
-class Camera:
+class Camera(Frames):
     """Sends faster than it said."""
 
-    rate, frame_count, dropped = 30.0, None, 0
+    rate = 30.0
 
     def __init__(self, hz: float, frames: int) -> None:
-        self._hz, self._frames = hz, frames
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
+        super().__init__(*(frame(number, number / hz) for number in range(frames)))
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        for number in range(self._frames):
-            yield frame(number, number / self._hz)
+        for one in self._frames:
+            yield one
             time.sleep(0.002)
-
-    def stop(self) -> None:
-        self._frames = 0
 
 
 @pytest.fixture

@@ -7,10 +7,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks.commands.measuring import (
-    STEP,
-    split,
-)
+from benchmarks.commands.measuring import STEP, split
 from sags_node.cli.launching import (
     as_json,
     check_files,

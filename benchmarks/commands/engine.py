@@ -9,12 +9,7 @@ from typing import Any
 
 import click
 
-from benchmarks.commands.measuring import (
-    Measured,
-    measures,
-    split,
-    step_by_step,
-)
+from benchmarks.commands.measuring import Measured, measures, split, step_by_step
 from sags_node.cli.launching import (
     as_json,
     check_files,

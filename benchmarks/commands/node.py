@@ -7,13 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from benchmarks.commands.measuring import (
-    Measured,
-    each_recording,
-    measures,
-    split,
-    step_by_step,
-)
+from benchmarks.commands.measuring import Measured, each_recording, measures, split, step_by_step
 from sags_node.cli.launching import (
     as_json,
     check_files,
@@ -157,9 +151,7 @@ def bench_endurance(launch: tuple[str, ...], frames: int, window: int, order: Or
 )
 @shown("--window", type=click.IntRange(2), default=900, help="Frames of a line of the table.")
 @click.option(
-    "--check",
-    is_flag=True,
-    help="Fail if a figure gets worse beyond its scatter, by a tenth an hour.",
+    "--check", is_flag=True, help="Fail if a figure gets worse beyond its scatter, by a tenth an hour."
 )
 @figures_option
 @as_json

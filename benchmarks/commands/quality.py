@@ -6,13 +6,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks.commands.measuring import (
-    STEP,
-    Measured,
-    each_recording,
-    measures,
-    step_by_step,
-)
+from benchmarks.commands.measuring import STEP, Measured, each_recording, measures, step_by_step
 from sags_node.cli.launching import (
     as_json,
     check_files,

@@ -14,17 +14,7 @@ SHORTEST_MS = 0.1  # shorter stages are mostly the start of threads, and are not
 TRIES = 3
 SECTIONS = ("rasterize", "losses", "adam")
 # what tells rows of a section apart
-SETTINGS = (
-    "n",
-    "of",
-    "columns",
-    "width",
-    "height",
-    "scene",
-    "active_tiles",
-    "sh_degree",
-    "threads",
-)
+SETTINGS = ("n", "of", "columns", "width", "height", "scene", "active_tiles", "sh_degree", "threads")
 
 Table = Mapping[str, Any]
 Kernel = tuple[Any, ...]

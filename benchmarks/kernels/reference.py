@@ -106,10 +106,7 @@ class Splats:
 
 
 def project(
-    camera: Camera,
-    inputs: Sequence[Tensor],
-    smoothing: Tensor | None = None,
-    antialias: bool = True,
+    camera: Camera, inputs: Sequence[Tensor], smoothing: Tensor | None = None, antialias: bool = True
 ) -> Splats:
     """EWA projection (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
 
@@ -146,10 +143,7 @@ def project(
     held_y = torch.clamp(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
     J = torch.stack(
-        [
-            torch.stack([fx / z, zero, -fx * held_x / z], 1),
-            torch.stack([zero, fy / z, -fy * held_y / z], 1),
-        ],
+        [torch.stack([fx / z, zero, -fx * held_x / z], 1), torch.stack([zero, fy / z, -fy * held_y / z], 1)],
         1,
     )
     V = J @ R @ rotations(quats[rows]) * scales[rows, None, :]

@@ -72,7 +72,7 @@ def _drawings(rows: Sequence[Row]) -> Table:
 
 
 def _stages(measured: Row) -> Table:
-    made = stages_table()
+    made = new_table("stage", "of", "ms", "of peak", "bound by", "pairs/s")
     for row in measured["rasterize"]:
         if _is_plain(row, measured["threads"]):
             add_stages(made, row, drawing_name(row))
@@ -80,11 +80,6 @@ def _stages(measured: Row) -> Table:
         for row in measured[section]:
             add_stages(made, row, _kernel(section, row))
     return made
-
-
-def stages_table() -> Table:
-    """To be filled by `add_stages`."""
-    return new_table("stage", "of", "ms", "of peak", "bound by", "pairs/s")
 
 
 def _kernel(section: str, row: Row) -> str:

@@ -16,10 +16,7 @@ Stages = Mapping[tuple[ModuleType | type, str], str]  # (module or class, name o
 
 
 def times_ms(
-    function: Callable[[], object],
-    runs: int,
-    warm_up: int = WARM_UP_CALLS,
-    period_s: float = 0.0,
+    function: Callable[[], object], runs: int, warm_up: int = WARM_UP_CALLS, period_s: float = 0.0
 ) -> list[float]:
     """Times of `runs` calls, after `warm_up` calls that do not count.
 

@@ -42,12 +42,7 @@ def stage_rows(times_ms: Mapping[str, float], work: Mapping[str, Work], peak: Pe
     rows = []
     for stage, ms in times_ms.items():
         todo = work[stage]
-        row = {
-            "stage": stage,
-            "ms": ms,
-            "bound": todo.bound(peak),
-            "share_of_peak": todo.least_ms(peak) / ms,
-        }
+        row = {"stage": stage, "ms": ms, "bound": todo.bound(peak), "share_of_peak": todo.least_ms(peak) / ms}
         if todo.pairs is not None:
             row["pairs_per_s"] = todo.pairs / (ms * 1e-3)
         rows.append(row)

@@ -112,14 +112,9 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     )
     for row in rows:
         given = ["", "", "", ""]
-        if "age_ms" in row:
-            ages = row["age_ms"]
-            given = [
-                f"{row['pictures_hz']:.1f}",
-                f"{row['mb_per_s']:.1f}",
-                f"{ages['p50']:.0f}, {ages['p90']:.0f}",
-            ]
-            given.append(f"{row['cpu_ms_per_frame']:.1f}")
+        if (ages := row.get("age_ms")) is not None:
+            given = [f"{row[key]:.1f}" for key in ("pictures_hz", "mb_per_s", "cpu_ms_per_frame")]
+            given.insert(2, f"{ages['p50']:.0f}, {ages['p90']:.0f}")
         node = [f"{row['node_rate_hz']:.1f}", f"{row['node_p50_ms']:.0f}, {row['node_p99_ms']:.0f}"]
         made.add_row(row["bridge"], *given, *node)
     return made

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,13 +43,8 @@ def _camera(height: int) -> str:
     )
 
 
-def _gst_two() -> Source:
-    return open_source(GstSource(launch=f"{_camera(HEIGHT)} ! tee name=t  t. ! left.  t. ! right."))
-
-
-def _gst_over_under() -> Source:
-    geometry = GeometryConfig(layout="over_under")
-    return open_source(GstSource(launch=_camera(2 * HEIGHT), geometry=geometry))
+TWO = GstSource(launch=f"{_camera(HEIGHT)} ! tee name=t  t. ! left.  t. ! right.")
+OVER_UNDER = GstSource(launch=_camera(2 * HEIGHT), geometry=GeometryConfig(layout="over_under"))
 
 
 # ---- other programs --------------------------------------------------------------------------------------
@@ -101,8 +97,8 @@ def _send_always(send: Send) -> None:
 
 
 WAYS: dict[str, Opener] = {
-    "gst, two branches": _gst_two,
-    "gst, over-under": _gst_over_under,
+    "gst, two branches": partial(open_source, TWO),
+    "gst, over-under": partial(open_source, OVER_UNDER),
     "push": _push,
     "ros2": _ros2,
 }
@@ -149,12 +145,8 @@ def _measure(opener: Opener, seconds: float) -> dict[str, Any]:
             if now < warm:
                 continue
             if not until:
-                until, cpu, senders, dropped = (
-                    now + seconds,
-                    time.process_time(),
-                    _children_s(),
-                    source.dropped,
-                )
+                until, dropped = now + seconds, source.dropped
+                cpu, senders = time.process_time(), _children_s()
             latencies.append(time.time_ns() - frame.t_capture_ns)
             unequal += frame.t_capture_ns != frame.t_capture_right_ns
             if now > until:

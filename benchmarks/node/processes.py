@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 STOPPING = 5.0  # s for a process to end
 TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
@@ -34,22 +34,13 @@ def cpu_seconds(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def descriptors(process: int) -> int:
-    """How many files, sockets and pipes it holds open.
+def listed(process: int, what: Literal["fd", "task"]) -> int:
+    """How many files, sockets and pipes it holds open, or how many threads it has.
 
     Raises:
         OSError: it has ended, or is another user's.
     """
-    return len(os.listdir(f"/proc/{process}/fd"))
-
-
-def threads(process: int) -> int:
-    """How many threads it has.
-
-    Raises:
-        OSError: it has ended.
-    """
-    return len(os.listdir(f"/proc/{process}/task"))
+    return len(os.listdir(f"/proc/{process}/{what}"))
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from rich.table import Table
 from benchmarks.node import neighbours
 from benchmarks.node.crowd import Advance, node_beside
 from benchmarks.node.endurance import SIGNIFICANT, slope, trends
-from benchmarks.node.processes import descriptors, program, threads
+from benchmarks.node.processes import listed, program
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freezes import Freezes
@@ -217,8 +217,8 @@ def _window(
         latency_p99_ms=float(p99),
         psnr=float(np.median(known)) if known else float("nan"),
         rss_mb=resident_mb(node),
-        descriptors=descriptors(node),
-        threads=threads(node),
+        descriptors=listed(node, "fd"),
+        threads=listed(node, "task"),
         overlay_mb=resident_mb(overlay),
         viewer_mb=None if viewer is None else resident_mb(viewer),
     )
@@ -227,17 +227,12 @@ def _window(
 def _overall(heard: _Heard) -> dict[str, Any]:
     if not heard.latency_ms:
         raise SagsError("stopped before the first frame that counts")
-    p50, p99, p999 = np.percentile(heard.latency_ms, [50, 99, 99.9])
+    p50, p99, p999 = map(float, np.percentile(heard.latency_ms, [50, 99, 99.9]))
     return {
         "frames": heard.taken,
         "published": len(heard.latency_ms),
         "seconds": heard.published[-1] - heard.published[0],
-        "latency_ms": {
-            "p50": float(p50),
-            "p99": float(p99),
-            "p99.9": float(p999),
-            "max": max(heard.latency_ms),
-        },
+        "latency_ms": {"p50": p50, "p99": p99, "p99.9": p999, "max": max(heard.latency_ms)},
         "freezes": heard.freezes.status(),
         "missed": heard.missed,
         "dropped": heard.dropped,
@@ -384,17 +379,14 @@ def worsening(measured: Mapping[str, Any]) -> list[str]:
 
 def table(measured: Mapping[str, Any]) -> Table:
     """For people; `measured` as `measure_soak` returns it."""
-    made = Table("frames", *HEADINGS, title=_title(measured))
-    for row in measured["windows"]:
-        made.add_row(str(row["frames"]), *(_figure(row[figure]) for figure in FIGURES))
-    return made
-
-
-def _title(measured: Mapping[str, Any]) -> str:
-    return (
+    title = (
         f"{measured['frames']} frames of the camera in {measured['seconds']:.0f} s, "
         f"{measured['published']} published"
     )
+    made = Table("frames", *HEADINGS, title=title)
+    for row in measured["windows"]:
+        made.add_row(str(row["frames"]), *(_figure(row[figure]) for figure in FIGURES))
+    return made
 
 
 def _figure(value: float | None) -> str:

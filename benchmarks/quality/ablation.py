@@ -236,17 +236,8 @@ def _split(clip: Clip) -> tuple[Clip, list[ClipFrame]]:
 def tables(measured: dict[str, Any]) -> list[Table]:
     """A row for each variant, mean and half of the range over its seeds; and one for each part."""
     headings = (
-        "",
-        "PSNR* held-out",
-        "train",
-        "half size",
-        "quarter",
-        "SSIM",
-        "ahead",
-        "track mm",
-        "N",
-        "ms/it",
-    )
+        "", "PSNR* held-out", "train", "half size", "quarter", "SSIM", "ahead", "track mm", "N", "ms/it",
+    )  # fmt: skip
     made = _table(headings)
     for name, rows in measured["variants"].items():
         columns: list[list[float | None]] = [[figure(row) for row in rows] for figure in FIGURES.values()]

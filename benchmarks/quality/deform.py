@@ -25,13 +25,12 @@ from sags_node.clients.overlay.pinner import Pinner
 from sags_node.clients.overlay.registering import holding
 from sags_node.clients.overlay.scene import ObjectSpec
 from sags_node.config.schema import LaunchConfig
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.relief import SPACING
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.phantom.tissue import LIFT
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F64, I32, FrameResult
 
@@ -63,8 +62,7 @@ def measure_deform(seeds: int, advance: Advance) -> dict[str, Any]:
     """All of it, of each seed's phantom."""
     scene = PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1])
     config = LaunchConfig(source=scene)
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     receipt = Receipt(Phantom(scene).rig, SIZE, None)
     found, checked = [], []
     for seed in range(seeds):

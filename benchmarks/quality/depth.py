@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config.schema import OnnxConfig, StereoConfig, VisionConfig
@@ -146,6 +147,11 @@ def error_figures(errors_mm: F64) -> dict[str, float | None]:
 
 def rounded(value: float | np.floating[Any]) -> float:
     return round(float(value), 4)
+
+
+def spread(values: Sequence[float] | NDArray[np.floating[Any]]) -> dict[str, float]:
+    """What half of them are below, and nine of ten."""
+    return {"median": rounded(np.median(values)), "p90": rounded(np.quantile(values, 0.9))}
 
 
 class Comparison:

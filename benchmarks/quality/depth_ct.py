@@ -14,14 +14,7 @@ import cv2
 import numpy as np
 
 from benchmarks.kernels.timing import median_ms
-from benchmarks.quality.depth import (
-    Advance,
-    Matcher,
-    by_confidence,
-    error_figures,
-    make_matchers,
-    rounded,
-)
+from benchmarks.quality.depth import Advance, Matcher, by_confidence, error_figures, make_matchers, rounded
 from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError
 from sags_node.geometry import project, unproject

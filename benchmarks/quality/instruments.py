@@ -9,17 +9,16 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks.quality.depth import Advance, rounded, spread
 from sags_node.confidence import SURE, error_of
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import project, unproject
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.casting import Bodies
 from sags_node.phantom.instruments import NOTHING, OPENING, Instruments, Mesh, joined
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, Bool, Camera, FrameResult, StereoFrame
 from sags_node.vision.stereo import StereoDepth
@@ -128,8 +127,7 @@ def off(tool: Tool, place: F64) -> float:
 def measure_instruments(seeds: int, advance: Advance) -> dict[str, Any]:
     """Of every setting and distance, `seeds` times."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     rows: list[dict[str, Any]] = []
     receipt: Receipt | None = None
     for seed in range(FIRST, FIRST + seeds):
@@ -242,10 +240,7 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         for name in columns:
             values = [row[name] for row in among if name in row]
             if values:
-                said[f"{prefix}{name}"] = {
-                    "count": len(values), "median": rounded(np.median(values)),
-                    "p90": rounded(np.quantile(values, 0.9)),
-                }  # fmt: skip
+                said[f"{prefix}{name}"] = {"count": len(values), **spread(values)}
     return said
 
 

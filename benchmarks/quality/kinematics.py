@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks.quality.depth import Advance, rounded, spread
 from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, off
 from sags_node.confidence import SURE, error_of
 from sags_node.config.schema import LaunchConfig
@@ -144,7 +144,7 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     for name in ("tip_mm", "axis_deg"):
         values = [row[name] for row in placed if name in row]
         if values:
-            said[name] = {"median": rounded(np.median(values)), "p90": rounded(np.quantile(values, 0.9))}
+            said[name] = spread(values)
     if placed:
         said["within_told"] = rounded(np.mean([row["tip_mm"] <= row["told_mm"] for row in placed]))
     return said

@@ -16,7 +16,6 @@ from benchmarks.quality.depth import Advance, rounded
 from benchmarks.quality.tracking import middle, pin, true_points
 from sags_node.errors import SagsError
 from sags_node.geometry import project
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging import cdr
 from sags_node.messaging.content import FRAME_CONTENT
@@ -25,7 +24,7 @@ from sags_node.messaging.received import Frame, interpret
 from sags_node.messaging.wire import Message, Meta
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F64, Bool, FrameResult
 
@@ -54,8 +53,7 @@ def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[s
     Raises:
         SagsError: it has none, or nothing can be pinned.
     """
-    warm_up(session.config)
-    configure_threads(session.config.engine.threads)
+    prepare(session.config)
     pipeline, budget = Pipeline(session.config, session.rig), StepBudget(STEPS)
     receipt = Receipt(session.rig, session.working_size, None)
     tallies: dict[str, _Tally] = defaultdict(_Tally)

@@ -20,12 +20,11 @@ from sags_lab.protocols.point_tracks import SURE
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomFrame
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F64, AnchorStates, Bool, Camera, FrameResult, StereoFrame
 
@@ -79,8 +78,7 @@ def measure_recall(session: Session, away: float, advance: Advance) -> dict[str,
     source = session.config.source
     if not isinstance(source, PhantomSource):
         raise UsageError("benchmarks recall needs the phantom, whose points are known: launch/phantom.yaml")
-    warm_up(session.config)
-    configure_threads(session.config.engine.threads)
+    prepare(session.config)
     counts = [round(seconds * RATE) for seconds in (BEFORE, away, AFTER)]
     phantom = Phantom(source.model_copy(update={"seconds": sum(counts) / RATE}))
     said, film = _Said(), _Film(phantom, sum(counts))

@@ -21,11 +21,10 @@ from sags_node.clients.registration.rigid import kabsch
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import invert, project, transform
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I32, I64, Camera, StereoFrame
 
@@ -91,8 +90,7 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
         ct: folder of the pair with a CT surface; None: the phantom only.
     """
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     placings: list[Placing] = []
     refusals: list[tuple[str, Registration, str]] = []
     receipt: Receipt | None = None

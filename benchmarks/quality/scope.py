@@ -18,13 +18,12 @@ from rich.table import Table
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
 from sags_node.geometry import project
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.phantom.motion import BREATH
 from sags_node.phantom.scene import Phantom, PhantomFrame, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.tools.evaluation.trajectory import RigidOdometry, trajectory_errors
@@ -121,8 +120,7 @@ def measure_scope(
         raise UsageError("benchmarks scope needs the phantom, whose scope is known: launch/phantom.yaml")
     if seconds < 2 * BREATH:
         raise UsageError(f"--seconds {seconds:g} is too short: two breaths take {2 * BREATH:g}")
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     rate = source.rate or RATE
     rows: list[dict[str, Any]] = []
     receipts: dict[str, Any] = {}

@@ -14,7 +14,7 @@ from sags_node.vision.pyramid import inner, level, pyramids
 from sags_node.vision.stereo import StereoDepth
 
 BLOCK = 5  # px
-PENALTIES = {"P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2}
+COMMON = {"blockSize": BLOCK, "P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "disp12MaxDiff": 1}
 
 
 class PlainSGBM:
@@ -27,14 +27,7 @@ class PlainSGBM:
         self._smallest = int(self._focal * baseline / config.max_depth)
         count = 16 * int(np.ceil((self._focal * baseline / config.nearest - self._smallest) / 16))
         self._matcher = cv2.StereoSGBM.create(
-            minDisparity=self._smallest,
-            numDisparities=count,
-            blockSize=BLOCK,
-            **PENALTIES,
-            disp12MaxDiff=1,
-            uniquenessRatio=10,
-            speckleWindowSize=100,
-            speckleRange=2,
+            self._smallest, count, **COMMON, uniquenessRatio=10, speckleWindowSize=100, speckleRange=2
         )
 
     def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
@@ -61,16 +54,9 @@ class JudgedSGBM:
         count = 16 * int(np.ceil((largest + 1 - self._smallest) / 16))
         self._pad = self._smallest + count
         self._matcher = cv2.StereoSGBM.create(
-            minDisparity=self._smallest,
-            numDisparities=count,
-            blockSize=BLOCK,
-            **PENALTIES,
-            disp12MaxDiff=1,
-            uniquenessRatio=5,
-            speckleWindowSize=50,
-            speckleRange=1,
+            self._smallest, count, **COMMON, uniquenessRatio=5, speckleWindowSize=50, speckleRange=1,
             mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-        )
+        )  # fmt: skip
 
     def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
         # OpenCV leaves out the columns that the largest disparity would push out of the picture: pad them.

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks.quality.depth import Advance, rounded, spread
 from sags_node.config.schema import LaunchConfig
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import STRAIN_FIELDS, points
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I64, StereoFrame
 
@@ -30,8 +29,7 @@ NEAR = 0.002  # m, from a point to the surface
 def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
     """Of what each message of `points` says while the tissue is pulled, and once it is back."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     told, true, back, receipt, count = [], [], [], None, round(SECONDS * RATE)
     for seed in range(seeds):
         phantom = Phantom(PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1], seed=seed))
@@ -106,13 +104,9 @@ def _summary(found: F32, exact: F64) -> dict[str, Any]:
         said[name] = {
             "known": rounded(known.sum() / max(1, np.isfinite(truth).sum())),
             "true_p90": rounded(np.quantile(np.abs(truth[np.isfinite(truth)]), 0.9)),
-            "error": {
-                "median": rounded(np.median(errors)),
-                "p90": rounded(np.quantile(errors, 0.9)),
-                "p99": rounded(np.quantile(errors, 0.99)),
-            },
+            "error": {**spread(errors), "p99": rounded(np.quantile(errors, 0.99))},
             "bias": rounded(np.median((told - truth)[known])),
-            "zero": {"median": rounded(np.median(nothing)), "p90": rounded(np.quantile(nothing, 0.9))},
+            "zero": spread(nothing),
         }
     return said
 

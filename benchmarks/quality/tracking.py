@@ -10,13 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.quality.followers import (
-    CONSISTENT,
-    FOLLOWERS,
-    Follower,
-    dis_flow,
-    sample,
-)
+from benchmarks.quality.followers import CONSISTENT, FOLLOWERS, Follower, dis_flow, sample
 from sags_lab.protocols.point_tracks import (
     average_jaccard,
     calibration_error,
@@ -27,11 +21,10 @@ from sags_lab.protocols.point_tracks import (
 from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.errors import SagsError
 from sags_node.geometry import project, transform
-from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.quality.metrics import percentiles
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I64, AnchorStates, Bool, FrameResult, StereoFrame
@@ -83,8 +76,7 @@ def measure_tracking(
     Raises:
         SagsError: the recording is too short, or nothing can be pinned.
     """
-    warm_up(session.config)
-    configure_threads(session.config.engine.threads)
+    prepare(session.config)
     pipeline, budget, last = Pipeline(session.config, session.rig), StepBudget(1), max(frames)
     receipt = Receipt(session.rig, session.working_size, None)
     run: _Run | None = None

@@ -14,11 +14,7 @@ from sags_node.errors import SagsError, UsageError, install
 
 NEEDED = ("ray", "pyarrow", "fsspec")  # the extra `archive`
 OBJECT_STORE = 80 << 20  # bytes: nothing large is passed; Ray wants 75 MiB at least
-QUIET = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_DEDUP_LOGS": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-}
+QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 LOCAL = {
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # its sockets are of loopback only
     "RAY_AUTH_MODE": "token",  # other users of this machine are kept out

@@ -18,10 +18,9 @@ from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
-from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_posed
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.quality import metrics
 from sags_node.sources.pictures import list_pictures
 from sags_node.sources.truth import load_npy
@@ -64,8 +63,7 @@ def _measure_clip(clip: D4dClip, overrides: Sequence[str], progress: Progress) -
     pose = ["vision.pose:=estimate"] if clip.is_moved else []
     launch = [*given, f"source.rate:={clip.rate}", AS_GIVEN, *pose, *STEP, *overrides]
     config = load_launch(None, launch)
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     run = _Run(clip, config)
     with open_posed(config, clip.rig, references=False) as frames:
         for frame in frames:

@@ -99,7 +99,8 @@ class PointTracker:
                 self._pipeline.anchors.remove(anchor)
                 del self._said[anchor]
         fresh = np.flatnonzero(anchors < 0)
-        for point, (u, v) in zip(fresh, self._to_working(pixels[fresh]), strict=True):
+        places = to_working(self._rig.left, self._pipeline.rectifier.camera, pixels[fresh])
+        for point, (u, v) in zip(fresh, places, strict=True):
             view = newest.views["left"]
             try:
                 anchor = self._pipeline.anchors.add_pixel(u, v, newest.observation, newest.snapshot, view)
@@ -124,9 +125,6 @@ class PointTracker:
                 found[number], visible[number] = True, seen[row]
             pixels[number], points[number] = self._said[anchor]
         return Followed(pixels, points, found, visible, anchors)
-
-    def _to_working(self, pixels: F64) -> F64:
-        return to_working(self._rig.left, self._pipeline.rectifier.camera, pixels)
 
 
 def to_working(eye: Eye, camera: Camera, pixels: F64) -> F64:

@@ -27,11 +27,10 @@ from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
-from sags_node.kernels.threads import configure_threads
 from sags_node.media.video import Video
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_posed, rig_of
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.quality.metrics import resample_nearest
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
@@ -66,8 +65,7 @@ def measure_scared(folder: Path, overrides: Sequence[str], progress: Progress) -
     """Mean absolute depth error of each frame, mm, and its mean over frames: of stereo and of the model."""
     config = load_launch(folder, [*overrides, *STEP])
     rig = rig_of(config)
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     pipeline = Pipeline(config, rig)
     budget, size = pipeline.make_budget(), config.vision.working_size(rig.left.width, rig.left.height)
     errors: dict[str, list[tuple[float, float]]] = {"measured": [], "model": []}
@@ -145,8 +143,7 @@ def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress
     check_sizes(Video(sequence.video), sequence.rig)
     given = ["source.kind:=videos", f"source.left:={sequence.video}", "source.geometry.layout:=over_under"]
     config = load_launch(None, [*given, "vision.pose:=estimate", *STEP, *overrides])
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     ways = [_way(config, sequence, frames, progress) for frames in sequence.ranges]
     ways = [(estimated, known) for estimated, known in ways if len(known) >= LEAST_POSES]
     if not ways:
@@ -201,8 +198,7 @@ class _Tracks:
 def _follow(launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progress: Progress) -> _Tracks:
     """As STIR's evaluator drives a method: each call is given what the one before it returned."""
     config = load_launch(None, launch)
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     tracker, followed = PointTracker(config, rig), Followed.unknown(starts)
     points_mm = np.full((len(starts), 3), np.inf)
     times: list[float] = []

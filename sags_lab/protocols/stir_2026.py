@@ -26,10 +26,9 @@ from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
-from sags_node.kernels.threads import configure_threads
 from sags_node.media.video import Video
 from sags_node.pipeline.session import open_posed
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
 
 QUERIES, TRUTH = "queries.json", "annotations.json"
@@ -173,8 +172,7 @@ def _play(
     given = ["source.kind:=videos", f"source.left:={left}", f"source.right:={right}"]
     config = load_launch(None, [*given, *STEP, *overrides])
     stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     tracker = PointTracker(config, sequence.rig)
     pixels, times = sequence.queries, list[float]()
     before: StereoFrame | None = None
@@ -192,11 +190,7 @@ def _play(
 
 
 def _judge(
-    judged: dict[str, _Judged],
-    sequence: Stir2026Sequence,
-    followed: Followed,
-    truth: Annotated,
-    first: bool,
+    judged: dict[str, _Judged], sequence: Stir2026Sequence, followed: Followed, truth: Annotated, first: bool
 ) -> None:
     """Compare one frame."""
     rig, known = sequence.rig, np.flatnonzero(np.isfinite(followed.points).all(1))

@@ -27,8 +27,7 @@ from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
-from sags_node.kernels.threads import configure_threads
-from sags_node.pipeline.warm_up import warm_up
+from sags_node.pipeline.warm_up import prepare
 from sags_node.rig import rectified_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
@@ -153,8 +152,7 @@ def measure_tracked(folder: Path, overrides: Sequence[str], progress: Progress) 
         f"source.rate:={RATE}",
     ]
     config = load_launch(None, [*given, *STEP, *overrides])
-    warm_up(config)
-    configure_threads(config.engine.threads)
+    prepare(config)
     found = _followed(sequence, config, progress)
     size = sequence.rig.left.width, sequence.rig.left.height
     truth, visible = sequence.pixels[:, : found.shape[1]], sequence.visible[:, : found.shape[1]]

@@ -272,12 +272,7 @@ def stereo(
 @force_option
 @as_json
 def hand_eye(
-    launch: tuple[str, ...],
-    views: int,
-    out: Path,
-    force: bool,
-    json_out: bool,
-    **board_of: Any,
+    launch: tuple[str, ...], views: int, out: Path, force: bool, json_out: bool, **board_of: Any
 ) -> None:
     """Find how the camera sits on the robot.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +19,7 @@ if TYPE_CHECKING:
 ANCHORS_WAIT = 3.0  # s for the anchors of a frame
 
 
-def asking(command: Callable[..., None]) -> Callable[..., None]:
-    """Options of a command that asks a node; it gets the node as `node`."""
-    return group_of(asked_options, as_json)(command)
+asking = group_of(asked_options, as_json)  # of a command that asks a node; it gets the node as `node`
 
 
 def ask(node: NodeAddress, op: str, args: dict[str, Any] | None = None) -> Any:

@@ -18,7 +18,6 @@ from sags_node.terminal.console import console, progress, show
 
 if TYPE_CHECKING:
     from sags_node.config.schema import Source
-    from sags_node.engine.device import Device
     from sags_node.pipeline.session import Guess, Session
 
 
@@ -159,8 +158,9 @@ def open_launched(path: str | None, overrides: Sequence[str], guess: Guess | Non
         warm_up(session.config)
     session = at_best_scale(session)
     (width, height), worked = session.published_size, session.working_size
+    device = device_of(session.config)
     console.print(
-        f"{_runs_on(device_of(session.config))}, pictures of {width}x{height} px"
+        f"refining on {device.name}{device.reason and f' ({device.reason})'}, pictures of {width}x{height} px"
         + ("" if worked == (width, height) else f", worked at {worked[0]}x{worked[1]} px"),
         soft_wrap=True,
     )
@@ -194,10 +194,6 @@ def _pictures_text(session: Session) -> str:
         rig = f"no calibration: {GUESSED_FOV:g} degrees across are guessed, depth has no unit (sags calib)"
     assumed = source.assumed if isinstance(source, Replay) else ""
     return f"{eye.width}x{eye.height} px at {source.rate:g} frames/s{assumed}{length}; {rig}"
-
-
-def _runs_on(device: Device) -> str:
-    return f"refining on {device.name}" + (f" ({device.reason})" if device.reason else "")
 
 
 def check_files(*files: Path | None, force: bool | None = None) -> None:

@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sags_node.cli.launching import (
-    as_json,
-    check_files,
-    file_option,
-    force_option,
-    positive,
-    shown,
-)
+from sags_node.cli.launching import as_json, check_files, file_option, force_option, positive, shown
 from sags_node.cli.node_options import data_options, run_dir_option
 from sags_node.errors import SagsError
 from sags_node.files import whole

@@ -11,12 +11,7 @@ from typing import Any, TypeVar, get_args
 
 from pydantic import ValidationError
 
-from sags_node.config.schema import (
-    LaunchConfig,
-    PhantomSource,
-    Section,
-    Source,
-)
+from sags_node.config.schema import LaunchConfig, PhantomSource, Section, Source
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import UsageError, brief
 from sags_node.files import SHOWN, check_name, open_file
@@ -186,10 +181,7 @@ def known_recording(folder: Path) -> dict[str, Any] | None:
         return {"source": {"kind": "endonerf", "folder": str(folder)}}
     if (folder / "endoscope_calibration.yaml").is_file() or (folder / "data/rgb.mp4").is_file():
         # No instrument is in view; the search for them by colour would only take tissue away.
-        return {
-            "source": {"kind": "scared", "folder": str(folder)},
-            "vision": {"tissue": {"method": "none"}},
-        }
+        return {"source": {"kind": "scared", "folder": str(folder)}, "vision": {"tissue": {"method": "none"}}}
     return None
 
 

@@ -149,12 +149,7 @@ class Ladder:
     """
 
     def __init__(
-        self,
-        rungs: Sequence[Rung],
-        pixels: int,
-        seconds: float,
-        speed: float = 1.0,
-        prices: Prices = ON_CPU,
+        self, rungs: Sequence[Rung], pixels: int, seconds: float, speed: float = 1.0, prices: Prices = ON_CPU
     ) -> None:
         """
         Args:

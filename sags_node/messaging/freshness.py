@@ -35,10 +35,7 @@ class Freshness:
     """
 
     def __init__(
-        self,
-        rate_hz: float | None = None,
-        periodic: bool = True,
-        clock: Callable[[], float] = time.monotonic,
+        self, rate_hz: float | None = None, periodic: bool = True, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.lost = 0  # messages of this sender that never came
         self.last: Meta | None = None

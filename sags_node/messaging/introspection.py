@@ -177,11 +177,7 @@ def topic_figures(
 
 def _spread(values: NDArray[np.float64]) -> Record:
     """The spread of intervals or delays, s."""
-    return {
-        "min_s": float(values.min()),
-        "max_s": float(values.max()),
-        "std_dev_s": float(values.std()),
-    }
+    return {"min_s": float(values.min()), "max_s": float(values.max()), "std_dev_s": float(values.std())}
 
 
 def _listen_to(topic: str, node: NodeAddress, seconds: float) -> list[_Sample]:

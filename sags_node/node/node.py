@@ -273,11 +273,7 @@ class Node:
                 waited = time.monotonic() - at if self._live else 0.0
                 latency = self._state.statistics.latency_s
                 request = FrameRequest(
-                    waited,
-                    self._left_is_watched,
-                    self._right_is_watched,
-                    latency,
-                    self._instruments_asked,
+                    waited, self._left_is_watched, self._right_is_watched, latency, self._instruments_asked
                 )
                 self._working_since = time.monotonic()
                 result = self._state.pipeline.process(frame, self._state.budget, request)

@@ -261,7 +261,8 @@ class Pipeline:
         if judged.is_new_scene:
             self._forget()
         # 2. Segment: where is tissue? Cover, and drops on the lens, are none.
-        seen, still = self._in_usual_light(pair, judged), self._still_frames(pair)
+        seen = pair if judged.gain is None else exposed(pair, judged.gain)  # as the model was exposed
+        still = self._still_frames(pair)
         with clock("mask"):
             tissue = self._segmented(frame, seen, judged)
         # 3. Depth, where both eyes see tissue and the plan has time for it.
@@ -351,10 +352,6 @@ class Pipeline:
             self._unwatched = max(self._unwatched, UNWATCHED * seconds)
         elif seconds > 0:
             self._steps.append(seconds)
-
-    def _in_usual_light(self, pair: RectifiedPair, judged: Judgement) -> RectifiedPair:
-        """The pair in the exposure that the model has."""
-        return pair if judged.gain is None else exposed(pair, judged.gain)
 
     def _still_frames(self, pair: RectifiedPair) -> int:
         """Count for how many frames nothing has moved."""

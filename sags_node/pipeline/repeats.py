@@ -26,11 +26,7 @@ def repeated(
         pair=pair,
         observation=replace(mapped.observation, frame_id=frame_id, t_capture_ns=stamp),
         snapshot=replace(
-            mapped.snapshot,
-            frame_id=frame_id,
-            t_capture_ns=stamp,
-            velocities=still,
-            counts={"iterations": 0},
+            mapped.snapshot, frame_id=frame_id, t_capture_ns=stamp, velocities=still, counts={"iterations": 0}
         ),
         views=views,
         epoch=epoch,

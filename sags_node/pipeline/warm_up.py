@@ -13,6 +13,7 @@ import numpy as np
 from sags_node.config.schema import LaunchConfig, MappingConfig, VisionConfig
 from sags_node.instruments.instruments import Instruments
 from sags_node.kernels.cache import is_cold
+from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.devices import device_of
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
@@ -63,6 +64,12 @@ def warm_up(config: LaunchConfig) -> None:
     tools = np.zeros((_HEIGHT, _WIDTH), np.bool_)
     tools[: _HEIGHT // 2, : _WIDTH // 8] = True
     Instruments(np.ones_like(tools)).update(tools, gray, gray, view.camera, _BASELINE, view)  # if asked for
+
+
+def prepare(config: LaunchConfig) -> None:
+    """Warm up, and let this thread's kernels use as many cores as the launch says."""
+    warm_up(config)
+    configure_threads(config.engine.threads)
 
 
 def compile_vision() -> None:

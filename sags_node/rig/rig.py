@@ -80,12 +80,7 @@ def part_of_sensor(eye: Eye, roi: tuple[int, int, int, int], binning: tuple[int,
 
 
 def rectify_eyes(
-    name: str,
-    size: tuple[int, int],
-    K: tuple[F64, F64],
-    distortion: tuple[F64, F64],
-    R: F64,
-    T: F64,
+    name: str, size: tuple[int, int], K: tuple[F64, F64], distortion: tuple[F64, F64], R: F64, T: F64
 ) -> StereoRig:
     """A rig from two cameras, rectified by `cv2.stereoRectify`: rows and zero disparity agree, and no
     rectified pixel lies outside the raw pictures.

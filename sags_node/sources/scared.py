@@ -98,8 +98,7 @@ class ScaredPairs(Pairs):
         if pair is None:
             return None
         return pair._replace(
-            T_world_cam=None if self._poses is None else self._poses[index],
-            reference=self._reference(index),
+            T_world_cam=None if self._poses is None else self._poses[index], reference=self._reference(index)
         )
 
     def close(self) -> None:

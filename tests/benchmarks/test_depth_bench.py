@@ -16,12 +16,7 @@ from benchmarks.quality.depth import (
     measure_faults,
     regions_of,
 )
-from benchmarks.quality.depth_ct import (
-    CTPair,
-    distances_to_surface,
-    errors_along_z,
-    read_ct_pair,
-)
+from benchmarks.quality.depth_ct import CTPair, distances_to_surface, errors_along_z, read_ct_pair
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from frames import played
 from places import ROOT
 
 from benchmarks.disturbances import DISTURBANCES, Scene, disturbed
@@ -17,7 +18,6 @@ from benchmarks.quality.disturbances import frames_to_recover, warning_times
 from sags_node.phantom.camera import SMOKE_COLOR
 from sags_node.pipeline.session import Session, open_session
 from sags_node.rig import rectified_rig
-from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, StereoFrame
 
 SESSION = ROOT / "replay/phantom_pull"
@@ -37,8 +37,7 @@ def session() -> Session:
 
 @pytest.fixture(scope="module")
 def frames(session: Session) -> list[StereoFrame]:
-    with open_source(session.config.source) as source:
-        return list(source)
+    return played(session.config.source)
 
 
 def scene_of(session: Session, frames: list[StereoFrame]) -> Scene:

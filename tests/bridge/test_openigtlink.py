@@ -12,17 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bridging import (
-    HIDDEN,
-    LOST,
-    SEEN,
-    UNSURE,
-    anchored_at,
-    bridged,
-    plane_bridged,
-    senders,
-    sockets,
-)
+from bridging import HIDDEN, LOST, SEEN, UNSURE, anchored_at, bridged, plane_bridged, senders, sockets
 from igtl_peer import PEER, Peer, built
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
@@ -126,10 +116,7 @@ def test_debians_own_example_receives_it_unchanged(tmp_path: Path) -> None:
     client = built(RECEIVE_CLIENT, tmp_path)
     with plane_bridged(run_openigtlink, options(tmp_path)) as (_, port):
         said = tmp_path / "said"
-        with (
-            said.open("w") as file,
-            subprocess.Popen([client, "127.0.0.1", str(port)], stderr=file) as shown,
-        ):
+        with said.open("w") as file, subprocess.Popen([client, "127.0.0.1", str(port)], stderr=file) as shown:
             try:
                 until(lambda: all(words in said.read_text() for words in EXAMPLE_SAYS))
             finally:
@@ -226,10 +213,7 @@ def test_nothing_is_asked_of_the_node_while_nobody_is_connected(tmp_path: Path, 
         assert not any(running.wanted(name) for name in asked)
         with Peer(program, port) as joined:
             until(lambda: joined.newest("SagsPicture"))
-            assert [name for name in asked if running.wanted(name)] == [
-                "left/image_rect_color",
-                "anchors",
-            ]
+            assert [name for name in asked if running.wanted(name)] == ["left/image_rect_color", "anchors"]
         until(lambda: not any(running.wanted(name) for name in asked))
 
 

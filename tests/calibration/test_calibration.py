@@ -117,13 +117,8 @@ def test_not_a_camera_info_file(folder: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),  # None: the key is missing
     [
-        ("image_width", None),
-        ("camera_matrix", None),
-        ("distortion_coefficients", None),
-        ("projection_matrix", None),
-        ("image_width", 0),
-        ("image_width", "640"),
-        ("image_width", True),
+        *((key, None) for key in ("camera_matrix", "distortion_coefficients", "projection_matrix")),
+        *(("image_width", value) for value in (None, 0, "640", True)),
         ("image_height", 10**9),
         ("distortion_model", "rational_polynomial"),
         ("distortion_coefficients", {"data": [0.1] * 8}),

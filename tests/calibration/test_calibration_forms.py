@@ -22,6 +22,7 @@ from sags_node.geometry import scale_intrinsics
 from sags_node.rig import check_rig, load_rig, read_rig, rectify_eyes, resized_rig, save_rig
 from sags_node.types import F64, StereoRig
 
+MATRICES = {"M1": K[0], "D1": PLUMB_BOB[0], "M2": K[1], "D2": PLUMB_BOB[1], "R": R, "T": T}
 RATIONAL = (
     np.array([0.3, 0.1, 1e-3, -5e-4, 0.02, 0.5, 0.2, 0.01]),
     np.array([0.2, 0.1, -1e-3, 4e-4, 0.01, 0.4, 0.2, 0.02]),
@@ -292,8 +293,7 @@ def test_one_opencv_file(tmp_path: Path, names: tuple[str, ...], size: dict[str,
 
 def test_the_size_as_a_sequence(tmp_path: Path) -> None:
     """As C++ programs write a cv::Size."""
-    matrices = {"M1": K[0], "D1": PLUMB_BOB[0], "M2": K[1], "D2": PLUMB_BOB[1], "R": R, "T": T}
-    file = write(tmp_path / "rig.yml", matrices)
+    file = write(tmp_path / "rig.yml", MATRICES)
     text = file.read_text()
     file.write_text(text.replace("---", "---\nimageSize: [ 640, 480 ]", 1))
     assert_same(read_rig(file), make_rig())
@@ -307,8 +307,8 @@ def test_a_rectification_in_the_files_is_kept(tmp_path: Path) -> None:
         K[0], PLUMB_BOB[0], K[1], PLUMB_BOB[1], SIZE, R, T[:, None] * 1000, alpha=1
     )  # another one than is made here
     names = "R1", "R2", "P1", "P2"
-    matrices = {"M1": K[0], "D1": PLUMB_BOB[0], "M2": K[1], "D2": PLUMB_BOB[1], "R": R, "T": T * 1000}
-    file = write(tmp_path / "rig.yml", matrices | dict(zip(names, whole[:4], strict=True)))
+    matrices = MATRICES | {"T": T * 1000} | dict(zip(names, whole[:4], strict=True))
+    file = write(tmp_path / "rig.yml", matrices)
     rig = read_rig(file, SIZE, 1e-3)
     np.testing.assert_allclose(rig.right.R, whole[1])
     np.testing.assert_allclose(rig.right.P[:, :3], whole[3][:, :3])
@@ -339,8 +339,7 @@ def test_zeros_after_the_coefficients_do_not_count(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_matrices_are_named(tmp_path: Path, change: dict[str, object], said: str) -> None:
-    matrices = {"M1": K[0], "D1": PLUMB_BOB[0], "M2": K[1], "D2": PLUMB_BOB[1], "R": R, "T": T} | change
-    kept = {key: value for key, value in matrices.items() if value is not None}
+    kept = {key: value for key, value in (MATRICES | change).items() if value is not None}
     message = refusal(write(tmp_path / "rig.yml", kept), SIZE)
     assert "rig" in message and said in message
 

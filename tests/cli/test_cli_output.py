@@ -61,14 +61,9 @@ WRITERS = [  # commands, and their options for one file
     ("eval --protocol stir DATA", "--out"),
     ("archive scan FOLDER", "--out"),
     ("archive costs SESSION --frames 4", "--out"),
-    ("export", "--splats"),
-    ("export", "--points"),
-    ("export", "--mesh"),
-    ("export", "--orbit"),
-    ("export --session SESSION", "--tracks"),
-    ("export --session SESSION", "--render"),
-    ("overlay", "--out"),
-    ("overlay", "--layers"),
+    *(("export", option) for option in ("--splats", "--points", "--mesh", "--orbit")),
+    *(("export --session SESSION", option) for option in ("--tracks", "--render")),
+    *(("overlay", option) for option in ("--out", "--layers")),
     ("calib live SESSION", "--out"),
     ("bridge foxglove", "--layout"),
 ]
@@ -241,11 +236,7 @@ CAMERAS = (str(ROOT / "launch/v4l2.yaml"), "source.left:=/dev/null", "source.rig
 PUSHED = ("source.kind:=push", "rig:=FILES/calib", "robot.kind:=push", "robot.hand_eye:=FILES/gone.yaml")
 NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says what is wrong, and how
     "a video": (("VIDEOS", "source.left:=FILES/gone.mp4"), "source", "gone.mp4 does not exist"),
-    "a video cut short": (
-        ("VIDEOS", "source.right:=FILES/short.mp4"),
-        "source",
-        "short.mp4 has 6 pictures",
-    ),
+    "a video cut short": (("VIDEOS", "source.right:=FILES/short.mp4"), "source", "short.mp4 has 6 pictures"),
     "a calibration": (("VIDEOS", "rig:=FILES/gone"), "calibration", "gone/left.yaml"),
     "a calibration of another size": (("VIDEOS", "rig:=FILES/double"), "calibration", "640x512"),
     "a camera": ((*CAMERAS, "source.left:=/dev/no-camera"), "/dev/no-camera", "no such camera"),

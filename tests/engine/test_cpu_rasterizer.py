@@ -33,14 +33,7 @@ from benchmarks.kernels import reference
 from sags_node import geometry
 from sags_node.config.schema import LaunchConfig
 from sags_node.engine.interface import MIN_ALPHA
-from sags_node.engine.rasterizer import (
-    binning,
-    compositing,
-    cpu,
-    projection,
-    projection_backward,
-    smoothing,
-)
+from sags_node.engine.rasterizer import binning, compositing, cpu, projection, projection_backward, smoothing
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer, to_view
 from sags_node.errors import UsageError
@@ -271,18 +264,10 @@ def test_kernels_compile_once_and_warm_up_has_done_it() -> None:
     """Also for frozen arrays and other float types, which are other types to Numba."""
     warm_up(LaunchConfig())
     kernels: list[Any] = [
-        projection.project,
-        projection_backward.project_backward,
-        binning.sort_by_depth,
-        binning.emit_pairs,
-        binning.sort_into_tiles,
-        compositing.composite,
-        compositing.composite_backward,
-        smoothing.smooth,
-        smoothing.smooth_backward,
-        harmonics.color,
-        harmonics.color_backward,
-    ]
+        projection.project, projection_backward.project_backward, binning.sort_by_depth, binning.emit_pairs,
+        binning.sort_into_tiles, compositing.composite, compositing.composite_backward, smoothing.smooth,
+        smoothing.smooth_backward, harmonics.color, harmonics.color_backward,
+    ]  # fmt: skip
     compiled = [len(kernel.signatures) for kernel in kernels]
     plain, full = random_gaussians(1, 50, WIDE), scene(30)
     for gaussians in (plain, full):

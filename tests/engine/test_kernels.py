@@ -40,15 +40,8 @@ ELSEWHERE = {"mapping.focus.sum_residuals", "mapping.focus._sum_row"}  # tests/m
 # They read pictures in the pixel in which a Gaussian is seen. Four roundings of 6e-8 at 128 px are 3e-5 px.
 # So near to a border, on either side and along two axes, lie 1.2e-4 of the places: either pixel is right.
 LOOKED_UP, NEAR_A_BORDER = {"mapping.surface._find_surface"}, 1e-3
-SMALL = [
-    "source.pace:=step",
-    "source.frames:=4",
-    "vision.width:=128",
-    "vision.height:=96",
-    "publish.right:=true",
-    "vision.tissue.method:=classical",
-    "vision.pose:=refine",
-]
+SMALL = ["source.pace:=step", "source.frames:=4", "vision.width:=128", "vision.height:=96"]
+SMALL += ["publish.right:=true", "vision.tissue.method:=classical", "vision.pose:=refine"]
 
 
 def names_of(code: CodeType) -> Iterator[str]:

@@ -304,12 +304,8 @@ SPOILED: list[tuple[str, Any]] = [
 ]
 SPOILED += [("quats", 0.0), ("quats", 1e-13), ("quats", 1e-30), ("quats", 1e19)]
 SPOILED += [
-    ("means", 0.0),
-    ("means", -0.07),
-    ("means", (0, 0, 0.9 * NEAR_PLANE)),
-    ("opacities", 0.99 * MIN_ALPHA),
-    ("opacities", 0.0),
-    ("opacities", -1.0),
+    *(("means", place) for place in (0.0, -0.07, (0, 0, 0.9 * NEAR_PLANE))),
+    *(("opacities", opacity) for opacity in (0.99 * MIN_ALPHA, 0.0, -1.0)),
     ("scales", 1e30),
 ]
 WITHOUT_FILTER = [*SPOILED, ("scales", 0.0), ("scales", 1e-30)]  # a filter gives these a size

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from engine_scenes import rasterize, round_gaussians
+from engine_scenes import as_bytes, rasterize, round_gaussians
 from golden import Golden, Tolerance, compare, read_golden, write_golden
 from places import ROOT
 
@@ -22,7 +22,7 @@ from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
-from sags_node.rig import save_rig
+from sags_node.rig import rectified_rig, save_rig
 from sags_node.tools.evaluation import plots
 from sags_node.tools.evaluation.figures import MEANS, POOLED
 from sags_node.tools.evaluation.measure import MeasureOptions, Measurer
@@ -34,7 +34,6 @@ from sags_node.tools.evaluation.session import evaluate
 from sags_node.tools.evaluation.summary import STAGES, summarise
 from sags_node.types import (
     Camera,
-    Eye,
     FrameResult,
     Gaussians,
     Observation,
@@ -58,11 +57,7 @@ CONFIG = load_launch(None, ["device:=cpu", "publish.detail:=false", "vision.tiss
 
 
 def rig() -> StereoRig:
-    P = np.column_stack([K, np.zeros(3)])
-    P_right = P.copy()
-    P_right[0, 3] = -FOCAL * BASELINE
-    eyes = [Eye(WIDTH, HEIGHT, K, np.zeros(5), np.eye(3), each) for each in (P, P_right)]
-    return StereoRig("synthetic", *eyes)
+    return rectified_rig("synthetic", WIDTH, HEIGHT, K, BASELINE)
 
 
 def tissue_at(seconds: float) -> Gaussians:
@@ -76,10 +71,6 @@ def tissue_at(seconds: float) -> Gaussians:
     return round_gaussians(moved, 0.6 * spacing, np.clip((texture - 0.5) * 4 + 0.5, 0, 1))
 
 
-def as_uint8(rgb: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-
-
 def stereo_frame(frame_id: int) -> StereoFrame:
     """What two cameras with different exposures see, with an instrument on the left and exact truth."""
     stamp = frame_id * PERIOD_NS
@@ -90,7 +81,7 @@ def stereo_frame(frame_id: int) -> StereoFrame:
     planes = make_rasterizer("numba", WIDTH, HEIGHT).forward(
         tissue_at(stamp * 1e-9), CAMERA.moved_right(BASELINE)
     )
-    right = as_uint8(0.8 * colours_of(planes) + 0.05)
+    right = as_bytes(0.8 * colours_of(planes) + 0.05)
     right[40:60, 88:] = (200, 255, 200)
     points = tissue_at(0).means[7350:7400].astype(np.float64) + SPEED * stamp * 1e-9
     reference = Reference(

@@ -83,21 +83,8 @@ NUMBERS = [
     for value in values
 ]
 WORDS = [
-    b"\n",
-    b"\r",
-    b"\0",
-    b" ",
-    b"-",
-    b"9" * 30,
-    b"nan",
-    b"1e999",
-    b"[" * 50,
-    b"{",
-    b": ",
-    b"&a",
-    b"*a",
-    b"!!",
-]
+    b"\n", b"\r", b"\0", b" ", b"-", b"9" * 30, b"nan", b"1e999", b"[" * 50, b"{", b": ", b"&a", b"*a", b"!!",
+]  # fmt: skip
 
 
 @st.composite
@@ -253,9 +240,8 @@ def read_message(data: bytes, _: Path) -> None:
 
 
 def masks(_: Path) -> list[bytes]:
-    result = plane_result(stamp_ns=1_000_000)
-    body = content.FRAME_CONTENT["left/tissue_mask"](result)
-    return [joined("left/tissue_mask", body)]
+    made = content.FRAME_CONTENT["left/tissue_mask"](plane_result(stamp_ns=1_000_000))
+    return [joined("left/tissue_mask", made)]
 
 
 def use_mask(data: bytes, _: Path) -> None:
@@ -275,10 +261,6 @@ def thin_files(_: Path) -> list[bytes]:
     )
     asked = {name: topics.thin_picture(f"thin/half/{name}") for name in names}
     return [bytes(made.parts[1]) for made in thin.thin_pictures(plane_result(), asked).values()]
-
-
-def read_thin(data: bytes, _: Path) -> None:
-    thin.decode("sags/thin", 0.01, data)
 
 
 def poses(_: Path) -> list[bytes]:
@@ -379,10 +361,6 @@ def read_numbered(data: bytes, folder: Path) -> None:
     files.close()
 
 
-def launch_files(_: Path) -> list[bytes]:
-    return [file.read_bytes() for file in sorted((ROOT / "launch").glob("*.yaml"))]
-
-
 def read_launch(data: bytes, folder: Path) -> None:
     (folder / "launch.yaml").write_bytes(data)
     try:
@@ -392,12 +370,11 @@ def read_launch(data: bytes, folder: Path) -> None:
         raise SagsError(str(error).splitlines()[0]) from None
 
 
-def ros_rigs(_: Path) -> list[bytes]:
-    return [(ROOT / f"calib/d4d/{side}.yaml").read_bytes() for side in ("left", "right")]
+RIG = [ROOT / f"calib/d4d/{side}.yaml" for side in ("left", "right")]
 
 
 def read_ros_rig(data: bytes, folder: Path) -> None:
-    shutil.copy(ROOT / "calib/d4d/right.yaml", folder)
+    shutil.copy(RIG[1], folder)
     (folder / "left.yaml").write_bytes(data)
     check_rig(read_rig(folder))
 
@@ -405,8 +382,8 @@ def read_ros_rig(data: bytes, folder: Path) -> None:
 def archives(_: Path) -> list[bytes]:
     raw = io.BytesIO()
     with tarfile.open(fileobj=raw, mode="w") as archive:
-        for side in ("left", "right"):
-            archive.add(ROOT / f"calib/d4d/{side}.yaml", f"{side}.yaml")
+        for file in RIG:
+            archive.add(file, file.name)
     return [raw.getvalue()]
 
 
@@ -520,15 +497,17 @@ TARGETS: dict[str, Target] = {
     "requests": Target(requests, answer),
     "messages": Target(messages, read_message),
     "masks": Target(masks, use_mask),
-    "thin pictures": Target(thin_files, read_thin),
+    "thin pictures": Target(thin_files, lambda data, _: thin.decode("sags/thin", 0.01, data)),
     "poses": Target(poses, read_pose),
     "pictures": Target(pictures, read_picture),
     **{kind: bag(kind) for kind in BAGS},
     "arrays": Target(arrays, read_arrays),
     "sidecars": Target(sidecars, read_dvrk),
     "numbered archive": Target(numbered_archives, read_numbered),
-    "launch files": Target(launch_files, read_launch),
-    "ros calibration": Target(ros_rigs, read_ros_rig),
+    "launch files": Target(
+        lambda _: [f.read_bytes() for f in sorted((ROOT / "launch").glob("*.yaml"))], read_launch
+    ),
+    "ros calibration": Target(lambda _: [file.read_bytes() for file in RIG], read_ros_rig),
     "calibration archive": Target(archives, read_archive),
     "opencv calibration": Target(opencv_rigs, read_opencv_rig),
     "ply": mesh_files(ply_files, ".ply"),

@@ -13,14 +13,8 @@ import numpy as np
 
 def _random_value(rng: np.random.Generator, depth: int = 0) -> Any:
     choices: list[Any] = [
-        None,
-        True,
-        -1,
-        2**64 - 1,
-        float("nan"),
-        "x" * int(rng.integers(300)),
-        rng.bytes(20),
-    ]
+        None, True, -1, 2**64 - 1, float("nan"), "x" * int(rng.integers(300)), rng.bytes(20),
+    ]  # fmt: skip
     if depth < 3:
         choices += [
             [_random_value(rng, depth + 1) for _ in range(int(rng.integers(4)))],

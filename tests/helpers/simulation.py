@@ -10,7 +10,6 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Self
 
 from greenlet import getcurrent, greenlet
@@ -140,9 +139,7 @@ class World:
                     world.wait(lambda: True)
                 return self
 
-            def __exit__(
-                self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
-            ) -> None: ...
+            def __exit__(self, *_: object) -> None: ...
 
             def notify_all(self) -> None:
                 self._told += 1

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from bag_files import ROS2, stereo_rows, write_rosbag2
+from frames import Frames, told
 from instrument_scenes import HEIGHT, WIDTH, filmed
 from waiting import until
 
@@ -154,25 +155,6 @@ def robot_of(folder: Path, *tools: RobotTool) -> PushRobot:
     )
 
 
-def told(track: object, T: F64, t_ns: int) -> None:
-    track.add(bytes(cdr.pose(T, t_ns).parts[0]), cdr.POSE)  # type: ignore[attr-defined]
-
-
-class Frames:
-    rate, frame_count, dropped = 10.0, None, 0
-
-    def __init__(self, *frames: object) -> None:
-        self._frames = frames
-
-    def __enter__(self) -> Frames:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-    def stop(self) -> None: ...
-    def __iter__(self) -> object:
-        return iter(self._frames)
-
-
 @pytest.mark.fault("robot: a tool's pose stops")
 def test_a_pose_comes_through_base_and_hand_eye_and_one_that_stopped_is_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -189,7 +171,7 @@ def test_a_pose_comes_through_base_and_hand_eye_and_one_that_stopped_is_not_used
     ]
     monkeypatch.setattr("sags_node.sources.robot.WAIT_S", 0.0)
     config = LaunchConfig(robot=robot_of(tmp_path, *tools))
-    with Posed(Frames(*frames), config, rig) as posed:  # type: ignore[arg-type]
+    with Posed(Frames(*frames), config, rig) as posed:
         for number in range(80):
             t_ns = S // 2 + number * S // 50
             told(posed.robot.track, T_base_hand, t_ns)

@@ -18,11 +18,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.sources.source import open_source
-from sags_node.types import (
-    AnchorStates,
-    Forecast,
-    MotionState,
-)
+from sags_node.types import AnchorStates, Forecast, MotionState
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 128, 96, 100.0, 0.08
 CENTRE = (WIDTH - 1) / 2, (HEIGHT - 1) / 2

@@ -10,13 +10,7 @@ from places import SESSION
 
 from sags_node.config.launch_file import with_parameters
 from sags_node.config.schema import LaunchConfig, MappingConfig
-from sags_node.mapping.budget import (
-    FIRST_SECONDS,
-    LEAST_FIRST_STEPS,
-    Budget,
-    StepBudget,
-    TimeBudget,
-)
+from sags_node.mapping.budget import FIRST_SECONDS, LEAST_FIRST_STEPS, Budget, StepBudget, TimeBudget
 from sags_node.mapping.devices import make_budget
 from sags_node.mapping.ladder import FULL, Ladder, Rung
 from sags_node.pipeline.pipeline import Pipeline

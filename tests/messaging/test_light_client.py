@@ -51,20 +51,10 @@ def test_the_front_door_opens_without_it(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "topic list",
-        "anchor list",
-        "measure 1 2",
-        "param get",
-        "health",
-        "pause",
-        "reset",
-        "export --help",
-        "--help",
-    ],
-)
+@pytest.mark.parametrize("command", [
+    "topic list", "anchor list", "measure 1 2", "param get", "health", "pause", "reset", "export --help",
+    "--help",
+])  # fmt: skip
 def test_commands_that_ask_a_node_work_without_it(command: str, tmp_path: Path) -> None:
     asked = command.split() if "help" in command else [*command.split(), "--ns", "other"]
     done = without_the_node(COMMAND, *asked, folder=tmp_path)

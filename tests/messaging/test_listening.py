@@ -92,20 +92,10 @@ def test_one_subscriber_takes_no_view_from_others(tmp_path: Path, monkeypatch: p
         assert not running.wanted("left/depth")
 
 
-@pytest.mark.parametrize(
-    "endpoint",
-    [
-        "tcp://*:5556",
-        "tcp://0.0.0.0:5556",
-        "tcp://192.168.1.4:5556",
-        "tcp://[::]:5556",
-        "tcp://eth0:5556",
-        "udp://127.0.0.1:1",
-        "127.0.0.1:5556",
-        "tcp://",
-        "ipc://@sags",
-    ],
-)
+@pytest.mark.parametrize("endpoint", [
+    "tcp://*:5556", "tcp://0.0.0.0:5556", "tcp://192.168.1.4:5556", "tcp://[::]:5556", "tcp://eth0:5556",
+    "udp://127.0.0.1:1", "127.0.0.1:5556", "tcp://", "ipc://@sags",
+])  # fmt: skip
 @pytest.mark.parametrize("key", ["data", "control"])
 def test_other_machines_are_refused(tmp_path: Path, key: str, endpoint: str) -> None:
     value: Any = (endpoint,) if key == "data" else endpoint

@@ -48,19 +48,8 @@ for number in range(round(seconds * rate)):
     pose.publish(where)
     for eye in range(2):
         info.p = [
-            focal,
-            0.0,
-            width / 2,
-            -focal * baseline * eye,
-            0.0,
-            focal,
-            height / 2,
-            0.0,
-            0.0,
-            0.0,
-            1.0,
-            0.0,
-        ]
+            focal, 0.0, width / 2, -focal * baseline * eye, 0.0, focal, height / 2, 0.0, 0.0, 0.0, 1.0, 0.0,
+        ]  # fmt: skip
         infos[eye].publish(info)
         pictures[eye].publish(image)
 time.sleep(0.5)

@@ -27,27 +27,17 @@ from sags_node.vision.rectify import Rectifier
 @pytest.mark.parametrize(
     ("name", "rectified"),
     [
-        ("/stereo/left/image_rect", True),
-        ("/stereo/left/image_rect_color", True),
-        ("/camera/infra1/image_rect_raw", True),
-        ("/zed/left/color/rect/image", True),
-        ("/stereo/left/image_raw", False),
-        ("/rect_test/left/image_raw", False),
-        ("/rig/left/rectangle", False),
-        (Path("case/left_rectified"), True),
-        (Path("case/leftRectified"), True),
-        (Path("hamlyn/rectified01/image01"), True),
-        (Path("rectified.mp4"), True),
-        (Path("case/rect/left"), True),
-        (Path("case/left"), False),
-        (Path("rect_resection/left"), False),
-        (Path("test_what_is_rectified/left"), False),
-        (Path("/data/rect_resection_3.mp4"), False),
-        (Path("case/left_unrectified"), False),
-        (Path("case/not_rectified/left"), False),
-        (Path("case/rectified/left_raw"), False),
+        *((name, True) for name in ("/stereo/left/image_rect", "/stereo/left/image_rect_color",
+                                    "/camera/infra1/image_rect_raw", "/zed/left/color/rect/image")),
+        *((name, False) for name in ("/stereo/left/image_raw", "/rect_test/left/image_raw",
+                                     "/rig/left/rectangle")),
+        *((Path(name), True) for name in ("case/left_rectified", "case/leftRectified", "rectified.mp4",
+                                          "hamlyn/rectified01/image01", "case/rect/left")),
+        *((Path(name), False) for name in ("case/left", "rect_resection/left", "case/left_unrectified",
+                                           "test_what_is_rectified/left", "/data/rect_resection_3.mp4",
+                                           "case/not_rectified/left", "case/rectified/left_raw")),
     ],
-)
+)  # fmt: skip
 def test_names_that_say_it(name: Path | str, rectified: bool) -> None:
     assert named_rectified(name) is rectified
 

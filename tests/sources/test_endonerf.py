@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from command_line import figures_of
+from frames import played
 from mistakes import frames_until_error, refused_at_opening
 
 from sags_node.cli.main import main
@@ -75,8 +76,7 @@ def clip(tmp_path: Path) -> Path:
 
 
 def play(clip: Path, **options: Any) -> list[StereoFrame]:
-    with open_source(cfg.EndoNerfSource(folder=clip, pace="step", **options)) as source:
-        return list(source)
+    return played(cfg.EndoNerfSource(folder=clip, pace="step", **options))
 
 
 # ---- what is read ----------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from frames import played
 from numbered_pictures import HEIGHT, WIDTH, number_of, numbers, picture, write_png
 from PIL import Image
 
@@ -17,12 +18,6 @@ from sags_node.config.launch_file import section_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.pictures import say
 from sags_node.sources.source import open_source
-from sags_node.types import StereoFrame
-
-
-def played(config: cfg.FoldersSource) -> list[StereoFrame]:
-    with open_source(config) as source:
-        return list(source)
 
 
 def eyes(folder: Path, names: list[str]) -> cfg.FoldersSource:
@@ -202,13 +197,8 @@ TISSUE = np.array([140, 84, 81])  # RGB
 @pytest.mark.parametrize(
     ("pattern", "is_told"),
     [
-        ("RGGB", True),
-        ("BGGR", True),
-        ("GRBG", True),
-        ("GBRG", True),
-        ("GGGG", False),
-        ("RRGG", False),
-        ("RGRG", False),
+        *((pattern, True) for pattern in ("RGGB", "BGGR", "GRBG", "GBRG")),
+        *((pattern, False) for pattern in ("GGGG", "RRGG", "RGRG")),
     ],
 )
 def test_grey_pictures_that_are_a_mosaic_are_told(

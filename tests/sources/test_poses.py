@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from bag_files import ROS2
+from frames import Frames, told
 from places import SESSION
 from waiting import until
 
@@ -31,10 +31,6 @@ from sags_node.sources.robot import Posed, open_robot, rectified
 from sags_node.types import F64, StereoFrame
 
 MS, S = 1_000_000, 1_000_000_000
-
-
-def told(track: PoseTrack, T: F64, t_ns: int) -> None:
-    track.add(bytes(cdr.pose(T, t_ns).parts[0]), cdr.POSE)
 
 
 def shifted(x: float) -> F64:
@@ -182,23 +178,6 @@ def test_frames_of_tf_are_chained_also_across_branches() -> None:
 # ---- with frames -----------------------------------------------------------------------------------------
 
 
-class Frames:
-    """A source of given frames."""
-
-    rate, frame_count, dropped = 10.0, None, 0
-
-    def __init__(self, frames: list[StereoFrame]) -> None:
-        self._frames = frames
-
-    def __enter__(self) -> Frames:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-    def stop(self) -> None: ...
-    def __iter__(self) -> Iterator[StereoFrame]:
-        return iter(self._frames)
-
-
 @pytest.mark.fault("robot: it tells no pose")
 def test_a_frame_without_a_pose_is_held_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames at 10 Hz; the robot tells its pose from the third to the sixth, and from the ninth on."""
@@ -207,7 +186,7 @@ def test_a_frame_without_a_pose_is_held_and_said(tmp_path: Path, monkeypatch: py
         frames = [replace(frame, T_world_cam=None) for frame, _ in zip(source, range(12), strict=False)]
     save_hand_eye(HandEye(shifted(0.01)), tmp_path, {})
     robot = PushRobot(endpoint="tcp://127.0.0.1:*", hand_eye=tmp_path / "hand_eye.yaml", offset_ms=0)
-    posed = Posed(Frames(frames), session.config.model_copy(update={"robot": robot}), session.rig)
+    posed = Posed(Frames(*frames), session.config.model_copy(update={"robot": robot}), session.rig)
     known = [*range(18, 57), *range(78, 130)]  # in 1/100 s
     for number in known:
         told(posed.robot.track, shifted(0.3), number * 10 * MS)
@@ -237,7 +216,7 @@ def test_the_offset_is_to_the_stamp_before_its_latency_is_taken_off(tmp_path: Pa
     config = LaunchConfig(source=PushSource(latency_ms=40), robot=robot)
     picture = np.zeros((48, 64, 3), np.uint8)
     frame = StereoFrame(0, S - 40 * MS, S - 40 * MS, picture, picture, t_device_ns=S)
-    with Posed(Frames([frame]), config, rig) as posed:
+    with Posed(Frames(frame), config, rig) as posed:
         for number in range(90, 111):
             told(posed.robot.track, shifted(0.001 * number), number * 10 * MS)
         (came,) = list(posed)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import figures_of
+from frames import played
 from mistakes import frames_until_error, refused_at_opening
 from numbered_pictures import write_video
 from stamped_videos import write
@@ -155,8 +156,7 @@ def unpack(keyframe: Path) -> None:
 
 
 def play(keyframe: Path, **options: Any) -> list[StereoFrame]:
-    with open_source(cfg.ScaredSource(folder=keyframe, pace="step", **options)) as source:
-        return list(source)
+    return played(cfg.ScaredSource(folder=keyframe, pace="step", **options))
 
 
 # ---- what is read ----------------------------------------------------------------------------------------

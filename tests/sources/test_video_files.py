@@ -9,6 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from frames import played
 from stamped_videos import number_in, numbered, write
 from test_sources import Clock, replay
 
@@ -63,11 +64,6 @@ def pair_of(folder: Path, left: Path, right: Path | None, **geometry: object) ->
     return cfg.VideosSource(
         left=left, right=right, pace="step", geometry=cfg.GeometryConfig.model_validate(geometry)
     )
-
-
-def played(config: cfg.VideosSource) -> list[StereoFrame]:
-    with open_source(config) as source:
-        return list(source)
 
 
 def numbers_of(frames: list[StereoFrame]) -> list[tuple[int, int]]:

@@ -213,14 +213,7 @@ def test_a_drawn_depth_is_no_surer_than_it_agrees_with_what_is_measured() -> Non
 
 def test_a_model_that_does_not_know_its_errors_has_no_confidence() -> None:
     gaussians = replace(wall(1e-3).gaussians(), depth_errors=None)
-    view = RenderedView(
-        0,
-        0,
-        CAMERA,
-        BLACK,
-        np.ones(SHAPE, np.float32),
-        np.ones(SHAPE, np.float32),
-    )
+    view = RenderedView(0, 0, CAMERA, BLACK, np.ones(SHAPE, np.float32), np.ones(SHAPE, np.float32))
     assert with_confidence(view, gaussians) is view
 
 

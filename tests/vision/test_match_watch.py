@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from frames import played
 
 from sags_node.config.schema import PhantomSource
 from sags_node.mapping.budget import StepBudget
@@ -16,7 +17,6 @@ from sags_node.mapping.ladder import RUNGS
 from sags_node.phantom import write_session
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
-from sags_node.sources.source import open_source
 from sags_node.types import F32, GrayPyramid
 from sags_node.vision.alignment import RowErrors
 from sags_node.vision.pyramid import gray_pyramid
@@ -115,8 +115,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def warned(recording: Path, delay: int, rung: int, kept: str) -> set[str]:
     """All codes of a run on one rung whose right pictures are so many frames old."""
     session = open_session(recording, ["source.pace:=step"])
-    with open_source(session.config.source) as source:
-        frames = list(source)
+    frames = played(session.config.source)
     pipeline, budget, codes = Pipeline(session.config, session.rig), StepBudget(1, RUNGS[rung]), set()
     for number in range(delay, len(frames)):
         if kept[number % len(kept)] == "1":

@@ -86,9 +86,7 @@ def test_a_limit_that_is_set_stays_and_is_told_of() -> None:
 
 @pytest.mark.fault("depth: tissue is nearer than 10 mm")
 @pytest.mark.parametrize("depths", [(5,), (6.5,), (8,), (9,), (20, 6), (6, 30), (8, 15), (15,), (60,)])
-def test_what_is_too_near_to_be_matched_is_told_and_never_surely_farther(
-    depths: tuple[float, ...],
-) -> None:
+def test_what_is_too_near_to_be_matched_is_told_and_never_surely_farther(depths: tuple[float, ...]) -> None:
     """Planes below each other, mm; a scope that moves along them."""
     width, height, focal, baseline = 320, 256, 288.0, 4.3e-3
     K = np.array([[focal, 0, 159.5], [0, focal, 127.5], [0, 0, 1]])

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from frames import played
 from numbered_pictures import write_video
 from onnx_networks import save_matcher, save_odd, save_table
 
@@ -23,7 +24,6 @@ from sags_node.messaging.content import status
 from sags_node.node.health import Statistics
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
-from sags_node.sources.source import open_source
 from sags_node.types import F32, U8, Bool, FrameResult, RectifiedPair, StereoFrame
 from sags_node.vision.mono_depth import MonoDepth, fit_scale_shift
 from sags_node.vision.onnx_depth import DepthNetwork
@@ -50,9 +50,7 @@ class Scene(NamedTuple):
 
 @pytest.fixture(scope="module")
 def frames(phantom_session: Path) -> list[StereoFrame]:
-    config = load_launch(phantom_session, ["source.pace:=step", f"source.frames:={FRAMES}"])
-    with open_source(config.source) as source:
-        return list(source)
+    return played(load_launch(phantom_session, ["source.pace:=step", f"source.frames:={FRAMES}"]).source)
 
 
 @pytest.fixture(scope="module")

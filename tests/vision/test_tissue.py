@@ -123,11 +123,7 @@ def instrument_frame() -> tuple[StereoFrame, Bool]:
 @pytest.mark.parametrize(
     ("answer", "tissue_is"),
     [
-        ("logit", "white"),
-        ("probability", "white"),
-        ("labels", "white"),
-        ("half", "white"),
-        ("scores", "white"),
+        *((answer, "white") for answer in ("logit", "probability", "labels", "half", "scores")),
         ("scores", (2,)),
         ("scores", (1, 2)),
     ],

@@ -261,11 +261,6 @@ def request_of(text: str) -> tuple[str, dict[str, float]] | None:
 # ---- what is sent ----------------------------------------------------------------------------------------
 
 
-def _overlaid(frame: Frame) -> U8:
-    """The picture with the overlay over it."""
-    return over(frame[PICTURE].array, frame[OVERLAY].array)
-
-
 def _anchors(cloud: ReceivedCloud, device: str, seconds: float) -> bytes | None:
     """The anchors whose place is known, by number. Orange: not sure of; red: hidden."""
     rows = cloud.points
@@ -292,7 +287,9 @@ class _Picture:
 PICTURES = {
     "Picture": _Picture({PICTURE: 3}, lambda frame: frame[PICTURE].array),
     "Render": _Picture({RENDER: 4}, lambda frame: over_black(frame[RENDER].array)),
-    "Overlay": _Picture({PICTURE: 3, OVERLAY: 4}, _overlaid),
+    "Overlay": _Picture(
+        {PICTURE: 3, OVERLAY: 4}, lambda frame: over(frame[PICTURE].array, frame[OVERLAY].array)
+    ),
 }
 
 

@@ -29,17 +29,8 @@ FIELDS = (
     *("near_x", "near_y", "near_z"),
 )
 NEEDED = {
-    "id",
-    "x",
-    "y",
-    "z",
-    "confidence",
-    "clearance",
-    "clearance_confidence",
-    "near_x",
-    "near_y",
-    "near_z",
-}
+    "id", "x", "y", "z", "confidence", "clearance", "clearance_confidence", "near_x", "near_y", "near_z",
+}  # fmt: skip
 MOST = 32  # instruments; a node tells of 8
 TISSUE = 0  # in the column zone; others are numbers of objects in the scene file, from 1
 LINE = (255, 255, 255)  # RGB, of a distance that is larger than the margin

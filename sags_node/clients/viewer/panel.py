@@ -191,11 +191,7 @@ class Panel:
             self._offer("Snapshot of the last s", viser.Icon.CAMERA, "take_snapshot")
 
     def _offer(
-        self,
-        label: str,
-        icon: viser.IconName,
-        op: str,
-        args: Callable[[], Mapping[str, Any]] = dict,
+        self, label: str, icon: viser.IconName, op: str, args: Callable[[], Mapping[str, Any]] = dict
     ) -> None:
         """A button for one operation of the node."""
         self._button(label, icon, lambda client: self._asker.ask(client, label, op, args()))

@@ -157,10 +157,7 @@ def coverage_hints(views: Sequence[StereoView], board_poses: F64, size: tuple[in
     hints = []
     if len(views) < GOOD_VIEWS:
         hints.append(f"{len(views)} views are few; take {GOOD_VIEWS} to 30")
-    for eye, corners in (
-        ("left", [view.left for view in views]),
-        ("right", [view.right for view in views]),
-    ):
+    for eye, corners in (("left", [view.left for view in views]), ("right", [view.right for view in views])):
         empty = _empty_cells(np.concatenate(corners), size)
         if empty:
             hints.append(

@@ -30,11 +30,7 @@ class Curtain(TissueMask):
 
 
 def measure_hidden(
-    config: LaunchConfig,
-    rig: StereoRig,
-    source: Source,
-    frames: int,
-    progress: Callable[[str, int], None],
+    config: LaunchConfig, rig: StereoRig, source: Source, frames: int, progress: Callable[[str, int], None]
 ) -> dict[int, dict[str, float]]:
     """Play a recording with boxes of it hidden; figures of those pixels by frame number.
 

@@ -12,13 +12,7 @@ from pathlib import Path
 
 from sags_node.checks import Finding, as_warnings, is_wrong, parted, refused
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import (
-    EndoNerfSource,
-    LaunchConfig,
-    LiveSource,
-    PhantomSource,
-    RecordedSource,
-)
+from sags_node.config.schema import EndoNerfSource, LaunchConfig, LiveSource, PhantomSource, RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import lacks_rig, open_posed, rig_to_play

@@ -22,13 +22,7 @@ from sags_node.vision.pyramid import gray_pyramid, inner, narrowed, pyramid_of, 
 from sags_node.vision.watch.clarity import SMOKE
 from sags_node.vision.watch.judgement import Evidence, Judgement
 from sags_node.vision.watch.palette import Palette
-from sags_node.vision.watch.picture_fit import (
-    COVERED,
-    FEWEST,
-    GREEN,
-    LEAST_MATCH,
-    Fit,
-)
+from sags_node.vision.watch.picture_fit import COVERED, FEWEST, GREEN, LEAST_MATCH, Fit
 from sags_node.vision.watch.standing import Debounced
 
 WIDTH = 80  # px of the small pictures
