@@ -173,7 +173,7 @@ def evaluate(
 @click.option(
     "--max-gaussians",
     type=click.IntRange(100, 2_000_000),
-    help="Cap on N.  [default: one for 3.3 px of tissue; released: 960000]",
+    help="Cap on N.  [default: one for 3.3 px of tissue, at least 60000; released: 960000]",
 )
 @click.option(
     "--set", "changes", multiple=True, metavar="KEY=VALUE", help="Any other setting, say shape.levels=4."

@@ -13,6 +13,7 @@ from sags_node.tools.fitting.field import marked, row_rates
 from sags_node.tools.fitting.residuals import check_size
 from sags_node.tools.fitting.score import published
 from sags_node.tools.fitting.settings import (
+    LEAST,
     ONLINE,
     PAPER,
     PRESETS,
@@ -102,8 +103,9 @@ def test_slots_of_time_grow_with_the_clip() -> None:
 
 
 def test_the_number_of_gaussians_follows_the_clip() -> None:
-    by_clip = dataclasses.replace(PAPER, max_gaussians=900, pixels_each=4.0)
-    assert [by_clip.of_clip(pixels, 10).max_gaussians for pixels in (0, 1, 2000, 9000)] == [0, 1, 500, 900]
+    by_clip = dataclasses.replace(PAPER, max_gaussians=90_000, pixels_each=4.0)
+    found = [by_clip.of_clip(pixels, 10).max_gaussians for pixels in (0, 20_000, 280_000, 500_000)]
+    assert found == [LEAST, LEAST, 70_000, 90_000]
     given = dataclasses.replace(PAPER, max_gaussians=900, pixels_each=0.0)
     assert given.of_clip(9000, 10) == given and RELEASED.of_clip(9000, 10) == RELEASED
     # a long clip has fewer, so that all times of its residuals have room

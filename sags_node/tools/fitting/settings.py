@@ -22,6 +22,7 @@ Part = Literal["means", "log_scales", "quats", "colors", "logits"]  # of a Gauss
 PARTS: tuple[Part, ...] = ("means", "log_scales", "quats", "colors", "logits")
 
 
+LEAST = 60_000  # Gaussians: small pictures, of which these are quickly drawn, gain by more for each pixel
 PATH_EVERY = 3  # training frames from one time of the paths to the next
 STEREO = LossWeights(coverage=0.1)
 MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # of these weights: depth up to scale and shift
@@ -95,8 +96,8 @@ class FitSettings:
     block: Block = "adaptive"  # what stands before the decoder's heads
     antialias: bool = True  # both filters
     max_gaussians: int = 1_000_000
-    # px of tissue for each Gaussian, as long as there are no more than max_gaussians and, after an online
-    # start, than residuals have room for; 0: always max_gaussians
+    # px of tissue for each Gaussian, as long as there are no fewer than LEAST and no more than max_gaussians
+    # and, after an online start, than residuals have room for; 0: always max_gaussians
     pixels_each: float = 3.3
     seed: int = 0
     shape: FieldShape = FieldShape()
@@ -138,7 +139,7 @@ class FitSettings:
         pixels show tissue."""
         if not self.pixels_each:
             return self
-        most = min(self.max_gaussians, math.ceil(pixels / self.pixels_each))
+        most = min(self.max_gaussians, max(LEAST, math.ceil(pixels / self.pixels_each)))
         if self.schedule == "online":
             most = min(most, room(len(path_frames(frames))))
         return replace(self, max_gaussians=most)
