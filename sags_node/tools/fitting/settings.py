@@ -96,8 +96,8 @@ class FitSettings:
     block: Block = "adaptive"  # what stands before the decoder's heads
     antialias: bool = True  # both filters
     max_gaussians: int = 1_000_000
-    # px of tissue for each Gaussian, as long as there are no fewer than LEAST and no more than max_gaussians
-    # and, after an online start, than residuals have room for; 0: always max_gaussians
+    # px of tissue for each Gaussian. There are at least LEAST and at most max_gaussians; after an online
+    # start also at most `residuals.room`. 0: always max_gaussians.
     pixels_each: float = 3.3
     seed: int = 0
     shape: FieldShape = FieldShape()
