@@ -101,8 +101,8 @@ def test_disturbances(tmp_path: Path) -> None:
 
 
 def test_endurance(tmp_path: Path) -> None:
-    asked = "mapping.max_gaussians:=2000 source.frames:=12 --frames 24 --window 6 --order wrap"
-    found = measured(tmp_path, "endurance", SESSION, *asked.split())
+    asked = "mapping.max_gaussians:=2000 source.frames:=12 --frames 24 --window 6 --order wrap".split()
+    found = measured(tmp_path, "endurance", SESSION, *asked)
     assert found["recorded_frames"] == 12 and [each["frames"] for each in found["windows"]] == [6, 12, 18, 24]
     assert all(slope is not None for slope in found["per_1000_frames"].values())
     still = found["still"]
