@@ -168,6 +168,17 @@ def test_follows_the_tissue_as_the_cpu_does() -> None:
     assert 0 < device[5] < 1.05 * loss  # the CPU's counts what it did not draw anew
 
 
+def test_as_many_steps_as_the_budget_gives() -> None:
+    losses = []
+    for steps in (1, 3):
+        played = on_device()
+        played.take(frame(0))
+        snapshot, _ = played.take(frame(1), steps=steps)
+        assert snapshot.counts["iterations"] == steps
+        losses.append(snapshot.loss)
+    assert losses[1] < losses[0]  # before the last step
+
+
 def test_the_model_is_the_devices_until_it_is_fetched_and_adams_moments_stay_there() -> None:
     played = on_device()
     played.take(frame(0))
