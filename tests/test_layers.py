@@ -58,7 +58,7 @@ LINES = {
     "sags_node/rig": 1171,
     "sags_node/ros": 332,
     "sags_node/sources": 5875,
-    "sags_node/terminal": 373,
+    "sags_node/terminal": 374,
     "sags_node/tools": 537,
     "sags_node/tools/calibration": 1859,
     "sags_node/tools/evaluation": 3149,

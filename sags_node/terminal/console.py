@@ -30,7 +30,7 @@ _IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
 # the hook below, while it has a lost one sent again.
 _LOSING = {"__del__", "_raw_object_cache_notify", "_raw_object_cache_getbuffer", "unraisable"}
 
-console = Console(stderr=True, highlight=False)
+console = Console(stderr=True, highlight=False, emoji=False)  # a name or a key may hold ":x:"
 log = logging.getLogger(__name__)
 
 
@@ -85,7 +85,8 @@ def _print(line: str) -> None:
 def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[Callable[..., None]]:
     """A progress bar that appears with its first advance(done, total=None, what=None); where there is no
     terminal, a line now and then."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    described = TextColumn("{task.description}", markup=False)
+    columns = (described, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None, visible=False)
         said = began = now()
@@ -121,7 +122,7 @@ def show(result: Table | str | dict[str, Any] | list[dict[str, Any]]) -> None:
 
 
 def _drawn(table: Table) -> str:
-    screen = Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, markup=False)
+    screen = Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, markup=False, emoji=False)
     with screen.capture() as captured:
         screen.print(table)
     return "\n".join(line.rstrip() for line in captured.get().splitlines())

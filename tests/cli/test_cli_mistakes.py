@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
     ("arguments", "said"),
     [
         (["nowhere.yaml"], ("nowhere.yaml", "No such file", "check the path")),
-        (["[/bold].yaml"], ("[/bold].yaml", "check the path")),  # is not taken for rich's markup
+        (["[/bold]:x:.yaml"], ("[/bold]:x:.yaml", "check the path")),  # no markup and no emoji of rich
         ([f"{ROOT}/launch/d4d_pul.yaml"], ("No such file", f"did you mean {ROOT}/launch/d4d_pull.yaml?")),
         (["a.yaml", "b.yaml"], ("one launch file", "a.yaml, b.yaml")),
         (["mapping.budgt_ms:=25"], ("mapping.budgt_ms", "did you mean 'budget_ms'")),
