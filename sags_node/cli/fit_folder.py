@@ -180,6 +180,7 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
         while not fit.done:
             fit.iterate()
             stage = "warming up" if fit.iteration < fit.warm_up else "fitting"
+            stage += " at half the size" if fit.is_coarse else ""
             if fit.iteration % SHOWN_EVERY == 0 or fit.done:
                 what = f"{stage}, colours differ by {fit.residual:.4f}, {len(fit.model)} Gaussians"
                 advance(*fit.stage, what)

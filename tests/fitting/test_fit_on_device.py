@@ -28,9 +28,9 @@ from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.settings import PAPER, FieldShape
 
 SETTINGS = dataclasses.replace(
-    PAPER, warm_up=0, iterations=8, max_gaussians=400, batch_size=1,
+    PAPER, warm_up=0, coarse=1.0, iterations=4, max_gaussians=800, batch_size=1,
     shape=FieldShape(cells=16, channels=16, frames_per_slot=2, xavier=True),
-    growth=dataclasses.replace(PAPER.growth, first=300, every=6, until=1),
+    growth=dataclasses.replace(PAPER.growth, first=150, every=3, until=1),
 )  # fmt: skip
 SMALL = [
     "source.pace:=step",

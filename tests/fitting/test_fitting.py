@@ -21,12 +21,14 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.field.decoder import Decoder
 from sags_node.field.losses import LossWeights, compare
 from sags_node.field.model import FADE_NS, LOOK_BACK_NS
+from sags_node.geometry import quat_to_matrix
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.pipeline.session import open_session
 from sags_node.quality.metrics import psnr
 from sags_node.tools.fitting import checkpoint, start
 from sags_node.tools.fitting.clip import Clip, read_clip
+from sags_node.tools.fitting.density import quarter
 from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.refined import RefinedModel
 from sags_node.tools.fitting.score import score, score_between, score_depth, score_tracks
@@ -283,8 +285,39 @@ def _restarted(fit: Fit) -> Fit:
     return other
 
 
+def test_four_for_one_have_its_place_and_its_colours(clip: Clip) -> None:
+    settings = dataclasses.replace(STEEP, coarse=1.0)
+    fit = fitted(clip, settings, iterations=settings.warm_up + settings.iterations - 1)
+    learning = _restarted(fit)
+    before, count, model = score(fit, clip.test, {})["psnr"], len(fit.model), fit.model
+    assert model.slopes is not None
+    parents, slopes = model.table.copy(), model.slopes.detach().numpy().copy()
+    quarter(model)
+    assert len(np.unique(model.ids)) == 4 * count
+    family = model.table.reshape(4, count, -1)
+    np.testing.assert_allclose(family[..., columns.MEAN].mean(0), parents[:, columns.MEAN], atol=1e-7)
+    np.testing.assert_allclose(family[..., columns.COLOR].mean(0), parents[:, columns.COLOR], atol=1e-6)
+    areas = (parents - family)[..., columns.LOG_SCALE].sum(2)
+    np.testing.assert_allclose(areas, np.log(4), rtol=1e-5)
+    axes, scales = quat_to_matrix(parents[:, columns.QUAT]), np.exp(parents[:, columns.LOG_SCALE])
+    away = np.einsum("nij,fni->fnj", axes, (family - parents)[..., columns.MEAN]) / scales
+    steeper = (away * slopes).sum(2, keepdims=True)  # as `types.Gaussians` says
+    np.testing.assert_allclose((family - parents)[..., columns.COLOR], steeper.repeat(3, 2), atol=1e-4)
+    while not learning.done:
+        learning.iterate()
+    assert len(learning.model) == 4 * count <= settings.max_gaussians
+    assert score(learning, clip.test, {})["psnr"] > before + 1
+
+
 @pytest.mark.parametrize(
-    "settings", [SMALL, dataclasses.replace(PAPER, tokens="nodes"), STEEP], ids=["self", "nodes", "slopes"]
+    "settings",
+    [
+        SMALL,
+        dataclasses.replace(PAPER, tokens="nodes"),
+        STEEP,
+        dataclasses.replace(PAPER, slopes=True, color_softness=0.15, coarse=0.5),
+    ],
+    ids=["self", "nodes", "slopes", "coarse"],
 )
 def test_a_resumed_fit_gives_the_same_bits(clip: Clip, settings: FitSettings, tmp_path: Path) -> None:
     """Also where Gaussians were split, and where somebody asked how long the rest takes."""
@@ -294,7 +327,7 @@ def test_a_resumed_fit_gives_the_same_bits(clip: Clip, settings: FitSettings, tm
     resumed = Fit(clip, settings)
     checkpoint.load(resumed, tmp_path / "checkpoint.npz")
     assert resumed.seconds_left() > 0
-    assert not settings.slopes or whole.split > 0
+    assert settings.growth != STEEP.growth or whole.split > 0
     for fit in (whole, resumed):
         while not fit.done:
             fit.iterate()

@@ -15,7 +15,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import whole
 from sags_node.tools.fitting.fit import Fit
 
-VERSION = 4
+VERSION = 5
 
 
 def save(fit: Fit, path: Path) -> None:

@@ -15,6 +15,7 @@ from sags_node.errors import SagsError
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
 from sags_node.types import F32, U8, Bool, Camera, Observation, Reference, StereoFrame
+from sags_node.vision.observe import resized
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,13 @@ class ClipFrame:
             tissue=self.tissue,
             depth=self.depth,
             depth_confidence=(self.depth > 0).astype(np.float32),
+        )
+
+    def halved(self) -> ClipFrame:
+        """The frame at half its size, without what it knows to be true."""
+        small = resized(self.observation(), 0.5)
+        return ClipFrame(
+            self.frame_id, self.t_capture_ns, small.camera, small.image, small.tissue, small.depth, None
         )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,22 +20,21 @@ from torch import Tensor
 
 from sags_node.engine.adam import AdamState
 from sags_node.engine.losses.tissue import tissue_loss
-from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
+from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.field.adam import RowAdam
-from sags_node.field.canvas import Canvas
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, Field, NodeField
 from sags_node.field.drawing import Drawing
 from sags_node.field.hexplane import for_clip
-from sags_node.field.losses import compare
 from sags_node.field.model import DeformableModel, Rates
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model import columns
 from sags_node.model.exposure import Exposure
 from sags_node.tools.fitting.clip import Clip, ClipFrame
-from sags_node.tools.fitting.density import Density
+from sags_node.tools.fitting.density import Density, quarter
 from sags_node.tools.fitting.field import make_box, make_field, marked, row_rates, unit_row
+from sags_node.tools.fitting.pictures import Pictures
 from sags_node.tools.fitting.refined import RefinedModel
 from sags_node.tools.fitting.residuals import Residuals
 from sags_node.tools.fitting.settings import FitSettings
@@ -62,28 +62,29 @@ class Fit:
         seen = np.any([frame.tissue for frame in clip.train], axis=0)
         self.clip = clip
         self.settings = settings = settings.of_clip(int(np.count_nonzero(seen)), len(clip.train))
+        self._on_device = device
         self._device = torch.device(device or "cpu")
         self.iteration = 0
         self.seconds = 0.0  # spent on starting and iterating
         self.pruned = self.split = 0
-        first = clip.train[0]
-        height, width = first.tissue.shape
+        height, width = clip.train[0].tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
-        self._learning: Rasterizer | Canvas = self.rasterizer
-        if device is not None:
-            self._learning = Canvas(width, height, self._device, settings.antialias)
         self._residual: float | Tensor = 0.0
-        unseen = ~seen | settings.smooth_everywhere
-        self._unseen = unseen if device is None else torch.from_numpy(unseen).to(self._device)
-        self._shown: dict[int, tuple[Tensor, ...]] = {}
         self._v_planes = np.zeros((5, height, width), np.float32)
         self._weight = np.zeros((height, width), np.float32)
         self._rng = np.random.default_rng(settings.seed)
         self._order: list[int] = []
-        known = first.depth[first.depth > 0]
-        pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
-        self._rates = row_rates(settings.rates, pixel)
         self._decays = marked(settings.rates.decaying)
+        self._look()
+
+    def _look(self) -> None:
+        """Take up the pictures that this stage looks at."""
+        settings, frames = self.settings, self.clip.train
+        self._cap = settings.max_gaussians
+        if self.is_coarse:
+            frames, self._cap = [frame.halved() for frame in frames], self._cap // 4
+        self._pictures = Pictures(frames, settings, self._on_device)
+        self._rates = row_rates(settings.rates, self._pictures.pixel)
         self._refine_rates = self._rates.copy()
         if settings.slopes:
             self._rates[columns.COLOR] = 0  # which has its closed form
@@ -100,8 +101,8 @@ class Fit:
         started = time.perf_counter()
         settings, exposure = self.settings, self._make_exposure()
         if settings.schedule == "paper":
-            on_device = self._device if isinstance(self._learning, Canvas) else None
-            rows = pooled_rows(self.clip, exposure, settings, on_device)
+            on_device = None if self._on_device is None else self._device
+            rows = pooled_rows(self.clip, exposure, replace(settings, max_gaussians=self._cap), on_device)
             field = self._make_field(rows[:, columns.MEAN])
             slopes = np.zeros((len(rows), 3), np.float32) if settings.slopes else None
             self.model = DeformableModel(rows, field, exposure, settings.antialias, slopes)
@@ -126,13 +127,24 @@ class Fit:
         return self.settings.warm_up if self.settings.schedule == "paper" else 0
 
     @property
+    def coarse(self) -> int:
+        """Iterations with deformation on pictures of half the size."""
+        share = self.settings.coarse if self.settings.schedule == "paper" else 0.0
+        return round(share * self.settings.iterations)
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether it looks at pictures of half the size now."""
+        return self.coarse > 0 and self.iteration < self.warm_up + self.coarse
+
+    @property
     def done(self) -> bool:
         return self.iteration >= self.total
 
     @property
     def total(self) -> int:
         """Iterations in all."""
-        return self.warm_up + self.settings.iterations
+        return self.warm_up + self.coarse + self.settings.iterations
 
     def iterate(self) -> None:
         """One step on one training frame."""
@@ -145,12 +157,15 @@ class Fit:
 
     def seconds_left(self) -> float:
         """About how long the iterations that are left take here: one of each kind is begun, and not ended."""
-        rest = min(self.total - self.iteration, self.settings.iterations)
+        rest = self.total - self.iteration
+        fine = min(rest, self.settings.iterations)
+        plain = max(0, self.warm_up - self.iteration)
+        deformed = rest - fine - plain + (4 if self.is_coarse else 1) * fine
         seconds = 0.0
-        for deformed, count in ((False, self.total - self.iteration - rest), (True, rest * self._batch)):
+        for with_field, count in ((False, plain), (True, deformed * self._batch)):
             for _ in range(2 if count else 0):  # the first may have to compile kernels
                 started = time.perf_counter()
-                self._differentiated(self.clip.train[0], deformed)
+                self._differentiated(self._pictures.frames[0], with_field)
                 float(self._residual)  # waits for the device
                 took = time.perf_counter() - started
             seconds += count * took if count else 0.0
@@ -167,12 +182,8 @@ class Fit:
             )  # fmt: skip
             drawing.differentiate(self._v_planes, self._weight)
             return drawing
-        drawing = self.model.draw(self._learning, frame.t_capture_ns, frame.camera, deformed)
-        image, tissue, depth = self._tensors(frame)
-        found = compare(
-            drawing.planes, image, tissue, depth, self._unseen, self.settings.weights,
-            self.settings.color_softness,
-        )  # fmt: skip
+        drawing = self.model.draw(self._pictures.drawer, frame.t_capture_ns, frame.camera, deformed)
+        found = self._pictures.compare(drawing.planes, frame)
         gain = float(self.model.exposure.at(frame.t_capture_ns).mean())
         drawing.differentiate(found.loss, found.weight * gain**2)  # of a colour before exposure
         self._residual = found.terms["color"].detach()
@@ -181,12 +192,12 @@ class Fit:
     def _descend(self) -> None:
         """A step of the paper's schedule."""
         settings, deformed = self.settings, self.iteration >= self.warm_up
-        frames = [self._next_frame() for _ in range(self._batch)] if deformed else self.clip.train[:1]
+        frames = [self._next_frame() for _ in range(self._batch)] if deformed else self._pictures.frames[:1]
         drawings = []
         for frame in frames:
             drawings.append(self._differentiated(frame, deformed))
             self._density.observe(drawings[-1].v_means, drawings[-1].contribution)
-        share = settings.rate_share(*self.stage)
+        share = 1.0 if deformed and self.is_coarse else settings.rate_share(*self.stage)
         colors = 0.0
         if settings.slopes:
             pixels = float(np.mean([np.count_nonzero(frame.tissue) for frame in frames]))
@@ -195,9 +206,14 @@ class Fit:
             self._rates * np.float32(share) ** self._decays, settings.field_rates.scaled(share), colors
         )
         self.model.descend(drawings, rates)
+        was_coarse = self.is_coarse
         self.iteration += 1
         growth = settings.growth
-        if self.iteration % growth.every == 0 and self._progress() < growth.until:
+        if was_coarse and not self.is_coarse:
+            self._look()
+            quarter(self.model)
+            self._density = self._make_density()
+        elif self.iteration % growth.every == 0 and self._progress() < growth.until:
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
 
@@ -303,9 +319,10 @@ class Fit:
                 _, number, key = name.split(".")
                 optimizer["state"].setdefault(int(number), {})[key] = torch.from_numpy(values)
         deltas.optimizer.load_state_dict(optimizer)
+        self.iteration, self._order = int(state["iteration"]), list(state["order"])
+        self._look()
         self._density = self._make_density()
         self._density.pull, self._density.seen = map(self._tensor, (arrays["pull"], arrays["seen"]))
-        self.iteration, self._order = int(state["iteration"]), list(state["order"])
         self.seconds = float(state["seconds"])
         self.pruned, self.split = int(state["pruned"]), int(state["split"])
         self._rng.bit_generator.state = state["rng"]
@@ -322,21 +339,18 @@ class Fit:
     @property
     def stage(self) -> tuple[int, int]:
         """Iterations of the stage that are done, and all it has."""
-        if self.iteration < self.warm_up:
-            return self.iteration, self.warm_up
-        return self.iteration - self.warm_up, self.settings.iterations
+        before = 0
+        for length in (self.warm_up, self.coarse):
+            if self.iteration < before + length:
+                return self.iteration - before, length
+            before += length
+        return self.iteration - before, self.settings.iterations
 
     def _next_frame(self) -> ClipFrame:
         """Every training frame once, in random order, then again."""
         if not self._order:
             self._order = self._rng.permutation(len(self.clip.train)).tolist()
-        return self.clip.train[self._order.pop()]
-
-    def _tensors(self, frame: ClipFrame) -> tuple[Tensor, ...]:
-        """Picture, tissue and depth of a frame on the device, where they stay."""
-        if frame.frame_id not in self._shown:
-            self._shown[frame.frame_id] = tuple(map(self._tensor, (frame.image, frame.tissue, frame.depth)))
-        return self._shown[frame.frame_id]
+        return self._pictures.frames[self._order.pop()]
 
     def _tensor(self, array: NDArray[Any]) -> Tensor:
         return torch.from_numpy(array).to(self._device)
@@ -365,7 +379,7 @@ class Fit:
         return make_field(Deltas(hexplane, decoder, unit_row(shape.units)), means, settings.tokens)
 
     def _make_density(self) -> Density:
-        return Density(self.model, self.settings.max_gaussians, self.settings.growth.share)
+        return Density(self.model, self._cap, self.settings.growth.share)
 
 
 def _array(values: Tensor | NDArray[Any]) -> NDArray[Any]:

@@ -92,6 +92,9 @@ class FitSettings:
     schedule: Schedule = "online"  # how it starts: see `fitting.start`
     warm_up: int = 1000  # iterations on the first frame without deformation; only with schedule = paper
     iterations: int = 2000  # on all training frames, with deformation
+    # For each of these, so many before them on pictures of half the size, with a quarter of the Gaussians;
+    # the warm-up then looks at such a picture too. Only with schedule = paper; 0: all are on whole pictures.
+    coarse: float = 0.0
     tokens: Tokens = "nodes"
     block: Block = "adaptive"  # what stands before the decoder's heads
     antialias: bool = True  # both filters
@@ -121,7 +124,8 @@ class FitSettings:
         """
         Raises:
             UsageError: the block is an MLP, but its tokens attend to each other; `stable` is no share;
-                `batch_size` is below 1; slopes without a soft loss, which alone has a second derivative.
+                `coarse` is below 0; `batch_size` is below 1; slopes without a soft loss, which alone has a
+                second derivative.
         """
         if self.block == "mlp" and self.tokens != "self":
             raise UsageError(
@@ -129,6 +133,8 @@ class FitSettings:
             )
         if self.stable is not None and not 0 <= self.stable < 1:
             raise UsageError(f"stable is a share of a stage from 0 to below 1, not {self.stable}")
+        if not 0 <= self.coarse < math.inf:
+            raise UsageError(f"coarse is at least 0, not {self.coarse}")
         if self.batch_size < 1:
             raise UsageError(f"batch_size is at least 1 frame, not {self.batch_size}")
         if self.slopes and not (self.color_softness > 0 and self.weights.color > 0):
@@ -158,6 +164,7 @@ PAPER = FitSettings(
     schedule="paper",
     tokens="self",
     iterations=3000,
+    coarse=0.6,
     shape=FieldShape(frames_per_slot=3.0, most_slots=25),  # each slot needs its share of the iterations
     rates=RowRates(log_scale=1e-2, quat=5e-3, color=5e-3, logit=0.015),
     field_rates=FieldRates(cells=2.5e-2, decoder=5e-4, lines=5e-2),

@@ -1,0 +1,53 @@
+"""The training frames at one size, with what draws them: all that a fit looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
+from sags_node.field.canvas import Canvas
+from sags_node.field.losses import Compared, compare
+from sags_node.tools.fitting.clip import ClipFrame
+from sags_node.tools.fitting.settings import FitSettings
+
+
+class Pictures:
+    """Frames of one size on a device.
+
+    Attributes:
+        frames: in the order of their times.
+        drawer: draws pictures of their size.
+        pixel: m, how wide one is at the tissue's median depth in the first frame.
+    """
+
+    def __init__(self, frames: Sequence[ClipFrame], settings: FitSettings, device: str | None) -> None:
+        """`device`: as of `Fit`."""
+        self.frames, self._settings, self._device = frames, settings, torch.device(device or "cpu")
+        first = frames[0]
+        height, width = first.tissue.shape
+        self.drawer: Rasterizer | Canvas
+        if device is None:
+            self.drawer = make_rasterizer("numba", width, height, antialias=settings.antialias)
+        else:
+            self.drawer = Canvas(width, height, self._device, settings.antialias)
+        known = first.depth[first.depth > 0]
+        self.pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
+        unseen = ~np.any([frame.tissue for frame in frames], axis=0) | settings.smooth_everywhere
+        self._unseen = unseen if device is None else self._tensor(unseen)
+        self._shown: dict[int, tuple[Tensor, ...]] = {}  # frames that are on the device already
+
+    def compare(self, planes: Tensor, frame: ClipFrame) -> Compared:
+        """The loss of a frame that was drawn as these planes [5, H, W]."""
+        if frame.frame_id not in self._shown:
+            self._shown[frame.frame_id] = tuple(map(self._tensor, (frame.image, frame.tissue, frame.depth)))
+        settings = self._settings
+        image, tissue, depth = self._shown[frame.frame_id]
+        return compare(planes, image, tissue, depth, self._unseen, settings.weights, settings.color_softness)
+
+    def _tensor(self, array: NDArray[np.generic]) -> Tensor:
+        return torch.from_numpy(array).to(self._device)
