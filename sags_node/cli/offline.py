@@ -151,9 +151,7 @@ def evaluate(
 )
 @click.option("--warm-up", type=click.IntRange(0), help="Iterations; not for online.  [default: 1000]")
 @click.option(
-    "--iterations",
-    type=click.IntRange(0),
-    help="With deformation, on whole pictures.  [default: 2000; not online: 3000]",
+    "--iterations", type=click.IntRange(0), help="With deformation.  [default: 2000; not online: 3000]"
 )
 @click.option(
     "--tokens",
