@@ -30,7 +30,7 @@ from sags_node.tools.fitting import checkpoint
 from sags_node.tools.fitting.clip import read_clip
 from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.score import published, score, score_between, score_depth, score_tracks
-from sags_node.tools.fitting.settings import FitSettings, Schedule
+from sags_node.tools.fitting.settings import LEAST, FitSettings, Schedule
 from sags_node.types import Bool, StereoFrame
 
 log = logging.getLogger(__name__)
@@ -121,6 +121,11 @@ def fit_session(
     clip = read_clip(session, options.holds_out, lambda done: advance(done, count, "reading"), noted)
     try:
         fit = Fit(clip, settings, device)
+        if (most := fit.settings.max_gaussians) < min(settings.max_gaussians, LEAST):
+            tell(
+                f"a clip as long as this has room for {most:,} Gaussians only; set source.frames or "
+                "source.stride for a shorter one, or give --schedule paper"
+            )
         if resume:
             advance(0, None, "reading the checkpoint")
             checkpoint.load(fit, stored)

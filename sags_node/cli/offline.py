@@ -225,7 +225,7 @@ def fit(
         raise UsageError("--monocular needs --schedule paper: the online start measures distances")
     options = MeasureOptions(hold_out, 1, lpips_weights)
     given = {name: value for name, value in asked.items() if value is not None}
-    if "max_gaussians" in given:
+    if "max_gaussians" in given or any(change.startswith("max_gaussians=") for change in changes):
         given["pixels_each"] = 0.0
     if monocular:
         given["weights"] = replace(settings.weights, **MONOCULAR)

@@ -129,22 +129,22 @@ def measured(
     visibility, confidence = states.visibility[chosen], states.confidence[chosen]
     depth_confidence = states.depth_confidence[chosen]
 
-    def named(which: Bool | np.bool_, what: str) -> list[str]:
-        listed = ", ".join(
-            str(number) for number, one in zip(distinct, np.atleast_1d(which), strict=True) if one
-        )
-        return [f"anchor {listed} {what}"] if listed else []
+    def named(which: Bool | np.bool_, of_one: str, of_many: str) -> list[str]:
+        listed = [str(number) for number, one in zip(distinct, np.atleast_1d(which), strict=True) if one]
+        if len(listed) < 2:
+            return [f"anchor {number} {of_one}" for number in listed]
+        return [f"anchors {', '.join(listed)} {of_many}"]
 
-    if lost := named(~np.isfinite(points).all(1), "is lost"):
+    if lost := named(~np.isfinite(points).all(1), "is lost", "are lost"):
         return Measured(None, None, lost[0], metric)
     if area and _crosses(points):
         why = "the polygon crosses itself: name its anchors in the order in which they lie around it"
         return Measured(None, None, why, metric)
-    slipped = named(confidence < SURE_OF_ANCHOR, "may be on other tissue")
+    slipped = named(confidence < SURE_OF_ANCHOR, "may be on other tissue", "may be on other tissue")
     unsure = [
         *slipped,
-        *named(visibility < 1, "is not wholly in sight"),
-        *named(~(depth_confidence >= SURE), "has a depth that is a guess"),
+        *named(visibility < 1, "is not wholly in sight", "are not wholly in sight"),
+        *named(~(depth_confidence >= SURE), "has a depth that is a guess", "have depths that are guesses"),
     ]
 
     def value_of(places: F64) -> float:

@@ -26,13 +26,13 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.pipeline.session import open_session
 from sags_node.quality.metrics import psnr
-from sags_node.tools.fitting import checkpoint, start
+from sags_node.tools.fitting import checkpoint, residuals, start
 from sags_node.tools.fitting.clip import Clip, read_clip
 from sags_node.tools.fitting.density import quarter
 from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.refined import RefinedModel
 from sags_node.tools.fitting.score import score, score_between, score_depth, score_tracks
-from sags_node.tools.fitting.settings import FieldShape, FitSettings, Growth, RowRates, Units
+from sags_node.tools.fitting.settings import FieldShape, FitSettings, Growth, RowRates, Units, path_frames
 from sags_node.tools.fitting.start import follow_online
 from sags_node.types import F32
 
@@ -419,13 +419,15 @@ def test_monocular_depth_is_for_the_papers_schedule(phantom_session: Path, tmp_p
         "2",
         "--iterations",
         "2",
-        "--max-gaussians",
-        "500",
+        "--set",
+        "max_gaussians=500",
         "--json",
     ]
     result = sags_fit(phantom_session, "source.frames:=6", "--monocular", *options, "--out", tmp_path / "fit")
     assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["settings"]["weights"]["inverse_depth"] == 0
+    found = json.loads(result.stdout)
+    assert found["settings"]["weights"]["inverse_depth"] == 0
+    assert 0 < found["gaussians"] <= found["cap"] == 500
 
 
 @pytest.mark.parametrize("schedule", ["online", "paper"])
@@ -467,6 +469,14 @@ def test_a_cut_in_the_recording_keeps_the_cap(clip: Clip) -> None:
 
 
 @pytest.mark.fault("memory: a clip is too long for a fit")
+def test_a_clip_so_long_that_few_gaussians_have_room_is_told(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(residuals, "MAX_BYTES", 900 * len(path_frames(5)) * columns.COUNT * 4)
+    result = sags_fit(phantom_session, "source.frames:=6", "--iterations", "2", "--out", tmp_path / "fit")
+    assert result.exit_code == 0 and "room for 900 Gaussians only" in result.output
+
+
 def test_a_clip_too_long_for_its_memory_is_refused_at_once(clip: Clip) -> None:
     with pytest.raises(SagsError, match="max-gaussians"):
         fitted(clip, dataclasses.replace(SMALL, max_gaussians=5_000_000, pixels_each=0.0))

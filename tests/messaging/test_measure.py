@@ -133,6 +133,8 @@ def test_what_is_lost_hidden_or_unsure_is_never_given_as_sure() -> None:
             )
             assert (measured.error is None) == unknown
         assert measure(frame, [1, 3]).unsure is None
+    guessed = measure(frame_of(pinned([1e-3] * 4, depth_confidence=0.4 * ones)), [3, 1])
+    assert guessed.unsure == "anchors 3, 1 have depths that are guesses"
     unknown = measure(frame_of(pinned([1e-3] * 4)), [1, 9])
     assert unknown.value is None and unknown.unsure == "there is no anchor 9"
     assert not measure(frame_of(pinned([4e-3] * 4), units="relative"), [1, 2]).metric

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import threading
 import time
@@ -15,6 +16,7 @@ import independent_client as client
 import numpy as np
 import pytest
 import zmq
+from places import ROOT
 from rosbags.typesys import Stores, get_typestore
 from synthetic import (
     BASELINE,
@@ -179,6 +181,10 @@ def test_status_is_json_and_says_what_was_skipped(received: dict[str, list[clien
     assert status["state"] == "running" and status["rate_hz"] == 30.0
     assert status["latency_ms"] == {"p50": 40.0, "max": None}
     assert status["last_frame"]["skipped"] == {"keyframe": "budget spent"}
+    told = (ROOT / "docs/wire.md").read_text().split("### Keys of `status`")[1].split("###")[0]
+    assert set(status) == {
+        name for row in re.findall(r"^\| (`.*?) \|", told, re.M) for name in re.findall(r"`(\w+)`", row)
+    }
 
 
 def test_joined_parts_are_ros_messages(received: dict[str, list[client.Received]]) -> None:
