@@ -468,7 +468,6 @@ def test_a_cut_in_the_recording_keeps_the_cap(clip: Clip) -> None:
         assert score(fit, [frame], {})["psnr"] > 18  # two scenes share the cap
 
 
-@pytest.mark.fault("memory: a clip is too long for a fit")
 def test_a_clip_so_long_that_few_gaussians_have_room_is_told(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -477,6 +476,7 @@ def test_a_clip_so_long_that_few_gaussians_have_room_is_told(
     assert result.exit_code == 0 and "room for 900 Gaussians only" in result.output
 
 
+@pytest.mark.fault("memory: a clip is too long for a fit")
 def test_a_clip_too_long_for_its_memory_is_refused_at_once(clip: Clip) -> None:
     with pytest.raises(SagsError, match="max-gaussians"):
         fitted(clip, dataclasses.replace(SMALL, max_gaussians=5_000_000, pixels_each=0.0))
