@@ -63,7 +63,7 @@ LINES = {
     "sags_node/tools/calibration": 1859,
     "sags_node/tools/evaluation": 3149,
     "sags_node/tools/export": 891,
-    "sags_node/tools/fitting": 1674,
+    "sags_node/tools/fitting": 1675,
     "sags_node/tools/importing": 1110,
     "sags_node/vision": 5455,
     "tests": 47906,
