@@ -96,15 +96,22 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
         if not path.is_file():
             raise UsageError(f"recording {path} does not exist; check the path")
         if path.name.endswith(UNFINISHED):
+            named = shlex.quote(str(path))
             raise UsageError(
-                f"{path} was not closed: its recorder was killed; with ROS 1 at hand: rosbag reindex {path}, "
-                f"then mv {path} {path.with_suffix('')}"
+                f"{path} was not closed: its recorder was killed; with ROS 1: rosbag reindex {named}, "
+                f"then mv {named} {shlex.quote(str(path.with_suffix('')))}"
             )
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path} is not a recording; what is read: folders, {', '.join(SUFFIXES)}")
         return [path], False
     if not (path / METADATA).is_file():
-        files = files_in(path, ".mcap") or files_in(path, ".db3")
+        files = (mcap := files_in(path, ".mcap")) or files_in(path, ".db3")
+        stems = {_stem(file.stem) for file in (*mcap, *files_in(path, ".db3"))}
+        if len(stems) > 1:
+            raise UsageError(
+                f"{path} holds {len(stems)} recordings and no {METADATA} that names one: "
+                f"{', '.join(sorted(stems)[:3])}; give one of its files"
+            )
         if not files:
             raise UsageError(
                 f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
@@ -127,6 +134,12 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
 def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
     return sorted(folder.glob(f"{SHOWN}{suffix}"), key=lambda file: (_number(file.stem), file.name))
+
+
+def _stem(stem: str) -> str:
+    """The name of a recording whose files are numbered: case_0, case_1."""
+    name, _, digits = stem.rpartition("_")
+    return name if digits.isdecimal() else stem
 
 
 def _number(stem: str) -> int:
@@ -264,7 +277,7 @@ def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int
     if log.is_file() and log.stat().st_size:  # `rosbags` would pass over it
         raise SagsError(
             f"{log} holds messages that {file.name} lacks: its recorder was killed or still runs; "
-            f'then: sqlite3 {file} "PRAGMA wal_checkpoint(TRUNCATE)"'
+            f'then: sqlite3 {shlex.quote(str(file))} "PRAGMA wal_checkpoint(TRUNCATE)"'
         )
     positions = rosbag1_check.chunk_positions(file) if ros1 else frozenset()
     reader: Any = rosbag1.Reader(file) if ros1 else rosbag2.Reader(file)

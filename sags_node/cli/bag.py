@@ -258,6 +258,7 @@ def play(
     from sags_node.clients.recording.player import Player, PlayOptions
     from sags_node.config.schema import PublishConfig
 
+    ns = ns.strip("/")
     options = PlayOptions(
         topics=tuple(plain_name(ns, name) for name in topics),
         exclude=tuple(plain_name(ns, name) for name in exclude),

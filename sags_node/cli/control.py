@@ -167,7 +167,7 @@ def set_parameters(overrides: tuple[str, ...], json_out: bool, node: NodeAddress
     \b
     sags param set mapping.budget_ms:=25
     """
-    from sags_node.config.yaml_reader import parse_yaml
+    from sags_node.config.yaml_reader import parse_word
 
     if len(overrides) == 2 and not any(":=" in word for word in overrides):
         raise UsageError(f"write {overrides[0]}:={overrides[1]}, as for sags run")
@@ -175,7 +175,7 @@ def set_parameters(overrides: tuple[str, ...], json_out: bool, node: NodeAddress
         if ":=" not in word:
             raise UsageError(f"'{word}' is not an override; write key:=value, e.g. mapping.budget_ms:=25")
     pairs = (word.split(":=", 1) for word in overrides)
-    said = {key: parse_yaml(value, f"the value of {key}:=") for key, value in pairs}
+    said = {key: parse_word(value, f"the value of {key}:=") for key, value in pairs}
     ask(node, "set_parameters", said)
     show(said if json_out else ", ".join(word.replace(":=", " is ", 1) for word in overrides))
 

@@ -134,7 +134,8 @@ def export(
         return
     if sequence is not None:
         fitted = None if fit is None else str(fit.resolve())
-        about = {"session": opened.name, "overrides": changed, "fit": fitted}
+        recording = None if path is None else str(Path(path).resolve())
+        about = {"session": opened.name, "recording": recording, "overrides": changed, "fit": fitted}
         many.check_sequence(sequence, about, force)
         with progress("exporting") as advance:
             if fit is None:

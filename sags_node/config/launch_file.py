@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import ValidationError
 
 from sags_node.config.schema import LaunchConfig, PhantomSource, Section, Source
-from sags_node.config.yaml_reader import parse_yaml, read_yaml
+from sags_node.config.yaml_reader import parse_word, read_yaml
 from sags_node.errors import UsageError, brief
 from sags_node.files import SHOWN, check_name, open_file
 
@@ -142,9 +142,11 @@ def _with_texts(
         for kind in kinds:  # grows
             kinds += get_args(kind)
         if isinstance(value, dict):
-            sections = (kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section))
-            part = _SOURCES.get(str(value.get("kind"))) if key == "source" else next(sections, None)
-            return _with_texts(value, change, part)
+            sections = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)]
+            if len(sections) > 1:  # of which `kind` chooses one
+                named = value.get("kind")
+                sections = [each for each in sections if each.model_fields["kind"].default == named]
+            return _with_texts(value, change, next(iter(sections), None))
         if isinstance(value, list):
             return [changed(key, item) for item in value]
         return change(key, value, Path in kinds) if isinstance(value, str) else value
@@ -252,7 +254,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     key, separator, text = override.partition(":=")
     if not separator or not key:
         raise UsageError(f"'{override}' is not an override; write key:=value, e.g. mapping.budget_ms:=33")
-    _set(tree, key, parse_yaml(text, f"the value of {key}:="), override)
+    _set(tree, key, parse_word(text, f"the value of {key}:="), override)
 
 
 def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:

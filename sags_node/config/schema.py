@@ -78,7 +78,7 @@ Pose = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]  # m
 LAST_ROW = (0, 0, 0, 1)
 ROUNDED = 1e-3  # of a rotation written with few digits
 FARTHEST_BASE = 10.0  # m
-NAMESPACE = r"^[A-Za-z0-9_][A-Za-z0-9_/]*$"
+NAMESPACE = r"^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$"
 
 
 class Section(BaseModel):

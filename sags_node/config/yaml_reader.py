@@ -19,6 +19,7 @@ from sags_node.files import NO_TEXT, is_text, near, read_file
 LARGEST_FILE = 1 << 20  # bytes
 MOST_VALUES = 100_000  # with all aliases unfolded
 LONGEST = 200  # characters of what PyYAML says
+EMPTY = {"", "~", "null", "Null", "NULL"}  # as YAML writes None
 
 
 def read_yaml(file: Path, what: str, largest: int = LARGEST_FILE) -> Any:
@@ -62,6 +63,18 @@ def parse_yaml(content: bytes | str, where: str) -> Any:
         # PyYAML lets these through: a date that is none, a number of too many digits, `!!int x`.
         problem = f"a value is not what it looks like: {error}"[:LONGEST]
     raise UsageError(f"{where} is not valid YAML: {problem}") from None
+
+
+def parse_word(text: str, where: str) -> Any:
+    """The value of a word on the command line. There `#` begins no comment and `&` names nothing: a text that
+    YAML would shorten stays as it is.
+
+    Raises:
+        UsageError: as `parse_yaml`.
+    """
+    value, said = parse_yaml(text, where), text.strip()
+    shortened = said not in EMPTY if value is None else isinstance(value, str) and value != said
+    return said if shortened and said[0] not in "'\"!|>" else value
 
 
 def check_dialect(text: str, where: str) -> None:

@@ -81,6 +81,9 @@ class NodeAddress:
     keys: ClientKeys | None = None
     clock: Clock | None = None
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ns", self.ns.strip("/"))  # as ROS writes it: /sags
+
     def now_ns(self) -> int:
         """Return what the clock that stamps what it sends shows now, at the latest."""
         return time.time_ns() if self.clock is None else self.clock.latest_ns()

@@ -53,5 +53,5 @@ def needed(op: str) -> Role:
 
 def client_of(file: Path) -> Client:
     """Whose key a `.pub` file holds, by its place."""
-    folder = file.absolute().parent.name
+    folder = file.absolute().parent.name.lower()
     return Client(file.stem, next((role for role in ROLES if role == folder), ALL))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shlex
 import stat
 from pathlib import Path
 
@@ -59,7 +60,9 @@ def private_directory(path: Path) -> Path:
             f"run directory {path} is not a directory of yours; choose another with publish.run_dir"
         )
     if info.st_mode & 0o077:
-        raise UsageError(f"run directory {path} is open to other users; run: chmod 700 {path}")
+        raise UsageError(
+            f"run directory {path} is open to other users; run: chmod 700 {shlex.quote(str(path))}"
+        )
     return path
 
 
@@ -72,7 +75,7 @@ class RunDirectory:
     """
 
     def __init__(self, path: Path | None, ns: str) -> None:
-        self.folder = path or default_run_dir()
+        self.folder = (path or default_run_dir()).absolute()  # clients in other folders find it too
         self._ns = ns
         self.connection_file = connection_path(self.folder, ns)
         self.ipc_path = self.connection_file.with_suffix(".ipc")
@@ -175,5 +178,5 @@ def _check_ours(path: Path, info: os.stat_result, linked_by: int) -> None:
     if not {info.st_uid, linked_by} <= {os.getuid(), 0} or info.st_mode & 0o022:
         raise UsageError(
             f"{path} is not yours alone, so it is not believed where the node is; say it (--endpoint and "
-            f"--control), or run: chmod go-w {path}, if it is yours"
+            f"--control), or run: chmod go-w {shlex.quote(str(path))}, if it is yours"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 import re
+import shlex
 import struct
 import threading
 import time
@@ -91,7 +92,7 @@ def read_key_pair(file: Path) -> KeyPair:
     if secret is None:
         raise UsageError(f"{file} holds no secret key; give the .key file that sags keygen wrote")
     if file.stat().st_mode & 0o077:
-        raise UsageError(f"{file} can be read by others; run: chmod 600 {file}")
+        raise UsageError(f"{file} can be read by others; run: chmod 600 {shlex.quote(str(file))}")
     if not _is_key(secret) or zmq.curve_public(secret) != public:
         raise UsageError(f"{file} is damaged; make a new key pair with sags keygen")
     return KeyPair(public, secret)

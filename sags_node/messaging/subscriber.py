@@ -91,7 +91,8 @@ class Receiver:
         self.refusal: str | None = None
         self.absent: str | None = None
         self.rejected = 0
-        self._ns = ns
+        node = NodeAddress(ns, endpoint, None, run_dir, keys)
+        ns = self._ns = node.ns
         self._clock = clock
         self._clock_ns = clock_ns if clock is None else clock.latest_ns
         self._fresh = {topic.name: Freshness(rates.get(topic.name), topic.periodic) for topic in wanted}
@@ -103,7 +104,7 @@ class Receiver:
         self._stopping = threading.Event()
         self._names = {topics.full_name(ns, name): name for name in self._kept}
         self._asked = _ALWAYS if paused else frozenset(self._kept)
-        self._find = NodeAddress(ns, endpoint, None, run_dir, keys).data
+        self._find = node.data
         self._resources = ExitStack()  # holds the socket; only the receiver thread uses it once it runs
         self._socket: zmq.Socket[bytes] | None = None  # before there is a node
         self._address: Address | None = None

@@ -316,4 +316,5 @@ class _Child:
         said = " ".join(self._errors.read().split())
         if said:
             return f"the recorder failed: {said}"
-        return f"the recorder was ended; save what it wrote with: sags bag recover {self.folder} -o OUT"
+        folder = shlex.quote(str(self.folder))
+        return f"the recorder was ended; save what it wrote with: sags bag recover {folder} -o OUT"

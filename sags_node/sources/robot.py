@@ -106,6 +106,7 @@ class _PushedPoses(Robot):
 
     def __init__(self, config: PushRobot) -> None:
         super().__init__(config)
+        self._scope: str | None = None  # the topic of its pose, which the first such message names
         self._inbox = Inbox(config.endpoint, config, "robot", self._take, about=self._pose_of)
         self.endpoint = self._inbox.endpoint
 
@@ -114,12 +115,28 @@ class _PushedPoses(Robot):
             raise SagsError(
                 f"{message.topic}: {message.meta.type} is no pose; known: {', '.join(POSE_TYPES)}"
             )
-        name = message.topic.partition("/")[2]  # without the sender's namespace
-        self.add(STATIC if name.endswith("tf_static") else absolute(name), message.cdr(), message.meta.type)
+        topic = self._topic_of(message)
+        if message.meta.type != TF and topic not in self.tools:
+            if self._scope not in (None, topic):
+                listed = ", ".join(self.tools) or "none are listed"
+                raise SagsError(
+                    f"{topic} is none of robot.tools ({listed}), and the scope's pose comes on "
+                    f"{self._scope}; list it there, or do not send it"
+                )
+            self._scope = topic
+        self.add(topic, message.cdr(), message.meta.type)
+
+    def _topic_of(self, message: Message) -> str:
+        """Whose topic it is: a tool's, or as it came without the sender's namespace, which may have parts."""
+        sent = absolute(message.topic)
+        name = absolute(message.topic.partition("/")[2])
+        return next(
+            (tool for tool in self.tools if sent.endswith(tool)), STATIC if name.endswith(STATIC) else name
+        )
 
     def _pose_of(self, message: Message) -> list[str]:
         """Transforms of a tree may come from several programs."""
-        topic = absolute(message.topic.partition("/")[2])
+        topic = self._topic_of(message)
         whose = f"the pose of {topic}" if topic in self.tools else "the robot's pose"
         return [] if message.meta.type == TF else [whose]
 

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-WIDE = 200  # columns of a table that goes to a file or another program, and so is not cut to a screen
+WIDE = 10_000  # columns of a table that goes to a file or another program, and so is not cut to a screen
 
 SAY_EVERY = 10.0  # s between two lines of progress, where no terminal shows a bar
 SAME_SIGNAL = 0.5  # s
@@ -123,6 +123,8 @@ def show(result: Table | str | dict[str, Any] | list[dict[str, Any]]) -> None:
 
 def _drawn(table: Table) -> str:
     screen = Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, markup=False, emoji=False)
+    for column in table.columns:
+        column.overflow = "fold"  # a path or a command that is cut off is of no use
     with screen.capture() as captured:
         screen.print(table)
     return "\n".join(line.rstrip() for line in captured.get().splitlines())

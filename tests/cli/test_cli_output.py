@@ -26,6 +26,7 @@ from sags_node.cli.main import main
 from sags_node.errors import SagsError
 from sags_node.files import check_file, check_results, whole
 from sags_node.terminal import console as terminal
+from sags_node.terminal import text
 from sags_node.tools.doctor import OPEN3D_LIBRARIES
 from sags_node.tools.evaluation.report import check_report
 
@@ -331,6 +332,13 @@ def test_a_table_for_another_program_is_not_cut(monkeypatch: pytest.MonkeyPatch)
         "rotations, focal lengths and principal points are plausible"
         in sags("calib", "check", ROOT / "calib/d4d").stdout
     )
+
+
+def test_a_long_path_in_a_table_is_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    table, path = text.table(), f"/{'long/' * 100}[/red]:x:.html"
+    table.add_row("report", path)
+    terminal.show(table)
+    assert path in capsys.readouterr().out
 
 
 def test_where_no_terminal_is_progress_is_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,7 @@ from sags_node.config.schema import (
     FoldersSource,
     LaunchConfig,
     MappingConfig,
+    PushRobot,
     Section,
     V4l2Source,
     VideosSource,
@@ -46,6 +47,24 @@ def test_paths_are_relative_to_the_file_and_variables_are_expanded(
     assert config.source.left == tmp_path / "left"
     assert config.source.right == Path("/somewhere/right")
     assert config.rig == tmp_path / "calib"
+
+
+def test_paths_of_a_section_of_several_kinds_are_those_of_its_kind(tmp_path: Path) -> None:
+    file = tmp_path / "launch.yaml"
+    file.write_text("robot: {kind: push, key: a.key, allow: clients, hand_eye: he.yaml}\n")
+    robot = load_launch(file).robot
+    assert isinstance(robot, PushRobot)
+    assert (robot.key, robot.allow) == (tmp_path / "a.key", (tmp_path / "clients",))
+    assert robot.hand_eye == tmp_path / "he.yaml"
+
+
+@pytest.mark.parametrize("name", ["/data/Case #3/left", "#2", "&abc def", "a # b", "left"])
+def test_a_word_of_the_command_line_has_no_comments(name: str) -> None:
+    eyes = "source.kind:=folders", "source.right:=right"
+    for left in (name, f"'{name}'"):
+        config = load_launch(None, [*eyes, f"source.left:={left}"])
+        assert isinstance(config.source, FoldersSource) and str(config.source.left) == name
+    assert load_launch(None, ["rig:=null"]).rig is None
 
 
 def test_a_word_that_is_a_path_elsewhere_is_none(tmp_path: Path) -> None:

@@ -276,6 +276,15 @@ def test_an_export_that_a_full_disk_ended_goes_on(tmp_path: Path, monkeypatch: p
     assert {name: (tmp_path / name).stat().st_mtime_ns for name in stamps} == stamps
 
 
+def test_a_recording_of_the_same_name_is_another_one(tmp_path: Path) -> None:
+    first, second = (tmp_path / patient / "clip" for patient in ("anna", "bert"))
+    for seed, folder in enumerate((first, second)):
+        write_tiny_session(folder, seed)
+    into = ("source.frames:=2", "--sequence", tmp_path / "out")
+    assert sags("export", first, *into).exit_code == 0
+    refused(2, "export", second, *into, said=("holds another sequence", "--force"))
+
+
 def test_files_of_something_else_stay_unless_forced(tmp_path: Path) -> None:
     sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
     written(tmp_path)

@@ -9,7 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
+from sags_node.errors import SagsError
+
 T = TypeVar("T")
+
+LONGEST_LISTENING = 60.0  # s
 
 
 def until(done: Callable[[], T], seconds: float = 60.0) -> T:
@@ -20,6 +24,19 @@ def until(done: Callable[[], T], seconds: float = 60.0) -> T:
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.01)
     return found
+
+
+def heard(listen: Callable[[float], T], seconds: float = 1.0) -> T:
+    """What `listen` finds in so many seconds; on a machine that stood still meanwhile, in more of them."""
+    while True:
+        try:
+            if found := listen(seconds):
+                return found
+        except SagsError:  # it heard too little
+            if seconds > LONGEST_LISTENING:
+                raise
+        assert seconds < LONGEST_LISTENING, "listened in vain"
+        seconds *= 2
 
 
 @contextmanager

@@ -227,14 +227,22 @@ def test_a_tool_that_cannot_be_is_refused(given: str, said: str) -> None:
 
 @pytest.mark.live
 def test_a_tool_is_handed_in_by_its_topic(tmp_path: Path) -> None:
-    robot = open_robot(LaunchConfig(robot=robot_of(tmp_path, RobotTool(topic="/PSM1/measured_cp"))))
-    track = robot.tools["/PSM1/measured_cp"]
+    tools = [RobotTool(topic=f"/PSM{number}/measured_cp") for number in (1, 3)]
+    robot = open_robot(LaunchConfig(robot=robot_of(tmp_path, *tools)))
+    track, third = robot.tools["/PSM1/measured_cp"], robot.tools["/PSM3/measured_cp"]
     try:
         with PoseSender(robot.endpoint) as sender:  # type: ignore[attr-defined]
             for number in range(3):
                 sender.send(np.eye(4), S + number)
                 sender.send(moved(0.1, 0, 0), S + number, "/PSM1/measured_cp")
             until(lambda: track.newest_ns == S + 2 and robot.track.newest_ns == S + 2)
-        assert track.at(S + 1)[0, 3] == pytest.approx(0.1) and robot.track.at(S + 1)[0, 3] == 0
+            sender.send(moved(0.2, 0, 0), S + 3, "/PSM2/measured_cp")  # is nobody's: not the scope's either
+            with PoseSender(robot.endpoint, ns="lab/dvrk") as other:  # type: ignore[attr-defined]
+                other.send(moved(0.1, 0, 0), S + 4, "PSM3/measured_cp")
+                until(lambda: third.newest_ns == S + 4)
+            sender.send(np.eye(4), S + 5)
+            until(lambda: robot.track.newest_ns == S + 5)
+        assert track.at(S + 1)[0, 3] == pytest.approx(0.1)
+        assert robot.track.at(S + 1)[0, 3] == robot.track.at(S + 3)[0, 3] == 0
     finally:
         robot.close()

@@ -24,7 +24,7 @@ from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import publisher as publishing
 from sags_node.messaging.publisher import Publisher
-from sags_node.messaging.rundir import connection_path, read_connection
+from sags_node.messaging.rundir import RunDirectory, connection_path, read_connection
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
@@ -238,3 +238,14 @@ def test_a_directory_that_is_open_to_others_is_not_used(
         assert caplog.text.count("is open to other users") == 1 and not any(run_dir.iterdir())
         os.chmod(run_dir, 0o700)
         until(lambda: running.poll(10) or (run_dir / "sags.json").exists())
+
+
+def test_the_socket_of_a_relative_run_directory_is_found_from_anywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    place = RunDirectory(Path("run"), "sags")
+    try:
+        assert place.ipc_endpoint == f"ipc://{tmp_path}/run/sags.ipc"
+    finally:
+        place.close()

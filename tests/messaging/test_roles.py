@@ -34,6 +34,9 @@ def test_the_folder_of_a_key_is_its_role(tmp_path: Path) -> None:
     assert named == {"in_": "files", "in_listen": "listen", "in_control": "control", "in_files": "files"}
     (one,) = read_allow_list([clients / "listen/in_listen.pub"]).values()  # given by itself
     assert one == Client("in_listen", "listen")
+    (clients / "listen").rename(clients / "Listen")  # must not give it more
+    assert list(read_allow_list([clients / "Listen"]).values()) == [one]
+    (clients / "Listen").rename(clients / "listen")
     # Who may watch may not therefore hand pictures in.
     assert {client.name for client in read_allow_list([clients], "source").values()} == {"in_"}
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from made_messages import MS, meta
 from synthetic import HEIGHT, WIDTH, health, publisher, stream
-from waiting import repeating
+from waiting import heard, repeating
 
 from sags_node.cli.main import main
 from sags_node.clients.overlay.draw import color_key
@@ -80,14 +82,19 @@ def overlay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OverlayStream]
 
 def test_an_overlay_is_listed_and_measured(overlay: OverlayStream) -> None:
     endpoint = overlay.endpoints[-1]
-    rows = {row["topic"]: row for row in topic_list(NodeAddress("overlay", endpoint), seconds=2.0)}
+
+    def listed(seconds: float) -> dict[str, Any] | None:
+        rows = {row["topic"]: row for row in topic_list(NodeAddress("overlay", endpoint), seconds=seconds)}
+        return rows if rows["overlay/left/overlay/image"]["rate_hz"] else None
+
+    rows = heard(listed, 2.0)
     assert set(rows) == {f"overlay/{topic.name}" for topic in topics.OVERLAY_TOPICS}
     assert rows["overlay/left/overlay/image"]["rate_hz"] > 0
     assert rows["overlay/left/overlay/image"]["mean_bytes"] > 4 * WIDTH * HEIGHT
     assert rows["overlay/status"]["messages"] >= 1
     assert rows["overlay/right/overlay/color_key"]["type"] == topics.IMAGE
     hz, bw = (
-        topic_figures(kind, f"left/overlay/{name}", NodeAddress("overlay", endpoint), seconds=2.0)
+        heard(partial(topic_figures, kind, f"left/overlay/{name}", NodeAddress("overlay", endpoint)), 2.0)
         for kind, name in (("hz", "color_key"), ("bw", "image"))
     )
     assert hz["window"] >= 2
@@ -96,16 +103,22 @@ def test_an_overlay_is_listed_and_measured(overlay: OverlayStream) -> None:
     assert said["content"]["state"] == "running"
 
 
+@pytest.mark.parametrize("ns", ["overlay", "/overlay", "overlay/"])
 def test_an_overlay_is_found_by_its_namespace_alone(
-    overlay: OverlayStream, monkeypatch: pytest.MonkeyPatch
+    ns: str, overlay: OverlayStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As people type it: `sags topic list --ns overlay`."""
     run_dir = Path(overlay.endpoints[0].removeprefix("ipc://")).parent
     monkeypatch.setattr("sags_node.messaging.rundir.default_run_dir", lambda: run_dir)
-    result = CliRunner().invoke(main, ["topic", "list", "--ns", "overlay", "--seconds", "2", "--json"])
-    assert result.exit_code == 0, result.output
-    heard = {row["topic"] for row in json.loads(result.stdout) if row["messages"]}
-    assert heard >= {"overlay/left/overlay/image", "overlay/right/overlay/image", "overlay/status"}
+    wanted = {"overlay/left/overlay/image", "overlay/right/overlay/image", "overlay/status"}
+
+    def listed(seconds: float) -> bool:
+        command = ["topic", "list", "--ns", ns, "--seconds", str(seconds), "--json"]
+        result = CliRunner().invoke(main, command)
+        assert result.exit_code == 0, result.output
+        return wanted <= {row["topic"] for row in json.loads(result.stdout) if row["messages"]}
+
+    assert heard(listed, 2.0)
 
 
 def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> None:
@@ -117,8 +130,12 @@ def test_what_a_node_sends_beside_its_fixed_topics_is_listed(tmp_path: Path) -> 
             running.publish_content("clock", cdr.clock(5), -1, time.time_ns(), 0)
             running.poll(100)
 
+        def listed(seconds: float) -> dict[str, Any] | None:
+            rows = {row["topic"]: row for row in topic_list(NodeAddress(endpoint=endpoint), seconds=seconds)}
+            return rows if "sags/clock" in rows and rows["sags/clock"]["rate_hz"] else None
+
         with repeating(serve):
-            rows = {row["topic"]: row for row in topic_list(NodeAddress(endpoint=endpoint), seconds=1.5)}
+            rows = heard(listed, 1.5)
     assert set(rows) == {f"sags/{name}" for name in (*topics.BY_NAME, "clock")}
     assert rows["sags/clock"]["rate_hz"] > 0 and rows["sags/clock"]["type"] == topics.CLOCK
 

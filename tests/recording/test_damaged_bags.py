@@ -75,6 +75,11 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
         bag_info(tmp_path / "nowhere.mcap")
     with pytest.raises(UsageError, match=r"neither metadata\.yaml nor a \.mcap"):
         bag_info(tmp_path.parent)
+    for name in ("a_0.mcap", "a_1.mcap", "b_0.db3"):
+        (tmp_path / "two" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "two" / name).touch()
+    with pytest.raises(UsageError, match=r"holds 2 recordings .*: a, b; give one of its files"):
+        bag_info(tmp_path / "two")
     for text, said in [
         ("[", "not valid YAML"),
         ("a: 1", "rosbag2_bagfile_information"),

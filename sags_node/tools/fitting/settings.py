@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from sags_node.config.yaml_reader import parse_yaml
+from sags_node.config.yaml_reader import parse_word
 from sags_node.errors import UsageError
 from sags_node.field.decoder import Block, Tokens
 from sags_node.field.deformation import FieldRates
@@ -227,7 +227,7 @@ def with_changes(settings: FitSettings, changes: Sequence[str]) -> FitSettings:
             raise UsageError(
                 f"--set {change}: give KEY=VALUE with one of these keys: {', '.join(_keys(tree))}"
             )
-        branch[last] = parse_yaml(value, f"--set {change}")
+        branch[last] = parse_word(value, f"--set {change}")
     try:
         return TypeAdapter(FitSettings).validate_python(tree)
     except ValidationError as error:
