@@ -119,13 +119,11 @@ def test_every_topic_comes_byte_for_byte_with_its_schema(tmp_path: Path) -> None
                     for name in names
                 )
             )
-            kept = {
-                (name, m.stamp_ns): m.cdr()
-                for name in FRAME_TOPICS
-                for m in [beside.latest(name)]
-                if m is not None
-            }
-            time.sleep(0.3)  # what was just sent comes there too
+            until(lambda: all(beside.latest(name) is not None for name in FRAME_TOPICS))
+            newest = {name: beside.latest(name) for name in FRAME_TOPICS}
+            kept = {(name, m.stamp_ns): m.cdr() for name, m in newest.items() if m is not None}
+            # what was just sent comes there too, or something newer
+            until(lambda: all(joined.came[f"/sags/{name}"][-1][0] >= stamp for name, stamp in kept))
     assert joined.info["name"] == "SAGS sags" and joined.info["capabilities"] == []
     for topic in topics.TOPICS:
         channel = joined.channels[f"/sags/{topic.name}"]

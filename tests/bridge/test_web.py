@@ -246,6 +246,12 @@ def pixels(page: Any, canvas: str) -> np.ndarray:
     return np.array(data, np.uint8).reshape(height, width, 4)
 
 
+def all_drawn(page: Any) -> dict[str, np.ndarray] | None:
+    """All three canvases; None where the page stood still so long that it blanked one meanwhile."""
+    found = {canvas: pixels(page, canvas) for canvas in ("render", "depth", "marks")}
+    return found if all(each.any() for each in found.values()) else None
+
+
 def test_a_browser_draws_what_comes_and_goes_blank(page: Any, tmp_path: Path) -> None:
     result = anchored()
     with node_sockets(tmp_path) as running, bridged(run_web, options(tmp_path)) as port:
@@ -254,7 +260,7 @@ def test_a_browser_draws_what_comes_and_goes_blank(page: Any, tmp_path: Path) ->
             for thin in ("raw", "half"):
                 page.goto(f"http://127.0.0.1:{port}/?thin={thin}")
                 page.wait_for_function(ALL_DRAWN)
-                shown[thin] = {canvas: pixels(page, canvas) for canvas in ("render", "depth", "marks")}
+                shown[thin] = until(lambda: all_drawn(page))
             page.wait_for_function("() => Object.values(window.sags.drawn).every((count) => count > 20)")
         page.wait_for_function(EMPTY)
         assert "too old" in page.evaluate("() => Object.values(window.sags.reasons).join()")

@@ -14,8 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from click.testing import Result
 from command_line import RUN_HERE, figures_of, pure_json, refused, sags, start, stopped, wait_for
 from places import ROOT
+from waiting import heard, until
 
 from sags_node.clients.overlay import run as overlay
 from sags_node.config.launch_file import load_launch
@@ -116,28 +118,42 @@ def beside_node(node: Path, run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> d
 
 
 def test_a_topic_that_says_too_little(beside_node: dict[str, Any]) -> None:
-    listen = ("--seconds", "0.3")
-    refused(1, "topic", "hz", "parameters", *listen, said=("sags/parameters", "too few", "--seconds"))
-    refused(1, "topic", "hz", "clock", *listen, said=("no messages", "is the node running"))
+    def few(seconds: float) -> Result | None:
+        result = sags("topic", "hz", "parameters", "--seconds", seconds)
+        return result if "too few" in result.stderr else None
+
+    result = heard(few, 0.3)
+    assert result.exit_code == 1 and "sags/parameters" in result.stderr and "--seconds" in result.stderr
+    silent = ("topic", "hz", "clock", "--seconds", "0.3")
+    refused(1, *silent, said=("no messages", "is the node running"))
 
 
 def test_topic_tools_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
-    listen = ("--seconds", "1")
-    rows = {row["topic"]: row for row in pure_json(sags("topic", "list", "--seconds", "2", "--json").stdout)}
+    def listed(seconds: float) -> dict[str, Any] | None:
+        said = pure_json(sags("topic", "list", "--seconds", seconds, "--json").stdout)
+        rows = {row["topic"]: row for row in said}
+        all_came = rows["sags/left/render/depth"]["rate_hz"] and rows["sags/parameters"]["messages"]
+        return rows if all_came and rows["sags/right/camera_info"]["messages"] else None
+
+    rows = heard(listed, 2.0)
     assert rows["sags/left/render/depth"]["rate_hz"] > 0
     assert rows["sags/parameters"]["messages"] == 1 and rows["sags/parameters"]["rate_hz"] is None
     assert rows["sags/right/camera_info"]["messages"] > 0
-    assert "sags/left/depth" in sags("topic", "list", *listen).stdout
+    assert "sags/left/depth" in sags("topic", "list", "--seconds", "1").stdout
     for tool, key, unit in (
         ("hz", "average_rate", " Hz"),
         ("bw", "bytes_per_s", "B/s from"),
         ("delay", "min_s", " ms"),
     ):
-        command = ("topic", tool, "left/depth", *listen)
-        assert pure_json(sags(*command, "--json").stdout)[key] > 0
-        assert unit in sags(*command).stdout
-    two = pure_json(sags("topic", "hz", "left/depth", "tf", *listen, "--json").stdout)
+        assert pure_json(said_of("topic", tool, "left/depth", "--json"))[key] > 0
+        assert unit in said_of("topic", tool, "left/depth")
+    two = pure_json(said_of("topic", "hz", "left/depth", "tf", "--json"))
     assert min(two[name]["average_rate"] for name in ("left/depth", "tf")) > 0
+
+
+def said_of(*command: str) -> str:
+    """What a command that listens prints once it has heard enough."""
+    return heard(lambda seconds: sags(*command, "--seconds", seconds).stdout)
 
 
 def test_echo_in_words_and_in_json(beside_node: dict[str, Any]) -> None:
@@ -157,20 +173,32 @@ def test_a_part_of_a_message_is_printed_alone(beside_node: dict[str, Any]) -> No
 
 
 def test_info_says_what_a_topic_is(beside_node: dict[str, Any]) -> None:
-    said = figures_of("topic", "info", "/sags/left/depth", "--json")
+    info = ("topic", "info", "/sags/left/depth", "--json")
+    said = until(lambda: said if (said := figures_of(*info))["messages"] else None)
     assert said["type"] == "sensor_msgs/msg/Image" and "(m)" in said["content"]
-    assert said["publishers"] == 1 and said["messages"] > 0
+    assert said["publishers"] == 1
     assert "publishers: 0" in sags("topic", "info", "clock").stdout
     refused(2, "topic", "info", "left/dept", said=("did you mean 'left/depth'",))
 
 
+def drawn(text: str) -> dict[str, Any] | None:
+    summary: dict[str, Any] = pure_json(text)
+    return summary if summary["frames"] else None
+
+
 def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Path) -> None:
     still, video = tmp_path / "still.png", tmp_path / "video.mp4"
-    summary = pure_json(sags("overlay", "--seconds", "2", "--save", still, "--json").stdout)
-    assert summary["frames"] > 0 and summary["saved"] == str(still)
+    command = ("overlay", "--save", still, "--json")
+    summary = heard(lambda seconds: drawn(sags(*command, "--seconds", seconds).stdout), 2.0)
+    assert summary["saved"] == str(still)
     assert cv2.imread(str(still)).shape == (256, 320, 3)
-    assert "with the overlay" in sags("overlay", "--seconds", "1.5", "--save", video).stdout
-    assert cv2.VideoCapture(str(video)).read()[0]
+
+    def filmed(seconds: float) -> bool:
+        said = sags("overlay", "--seconds", seconds, "--save", video).stdout
+        assert "with the overlay" in said
+        return bool(cv2.VideoCapture(str(video)).read()[0])
+
+    assert heard(filmed, 1.5)
     refused(2, "overlay", "--pin", "5000", "3", said=("pin 5000 3", "320x256"))
 
 

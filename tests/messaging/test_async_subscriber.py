@@ -121,7 +121,7 @@ def test_a_cancelled_wait_leaves_the_others_alone(
                 assert None not in newest
                 woken: list[object] = []
                 monkeypatch.setattr(asyncio.get_running_loop(), "call_soon_threadsafe", woken.append)
-                until(lambda: subscriber.read(PICTURE).meta.seq > newest[0].meta.seq + 3)
+                until(lambda: subscriber.latest(PICTURE).meta.seq > newest[0].meta.seq + 3)
                 monkeypatch.undo()
             assert not woken  # nobody waits any more
 

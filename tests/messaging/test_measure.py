@@ -13,7 +13,7 @@ import pytest
 from command_line import pure_json, ran, refused
 from made_messages import message_of
 from synthetic import WIDTH, at_frame, plane_camera, plane_result, publisher, stream
-from waiting import until
+from waiting import heard, until
 
 from sags_node.cli.measure import follow
 from sags_node.confidence import confidence_of
@@ -175,7 +175,8 @@ def test_the_command_follows_a_node(tmp_path: Path) -> None:
                         stop.set()
             now[0] = "rest"
             node = ("--endpoint", address.endpoint)
-            (first, *_) = ran("measure", 2, 3, *node, "--seconds", 2, "--json")[1].splitlines()
+            measured = ("measure", 2, 3, *node, "--json")
+            (first, *_) = heard(lambda seconds: ran(*measured, "--seconds", seconds)[1].splitlines(), 2.0)
             missing = "there is no anchor 9; there are 1, 2, 3, 4"
             refused(1, "measure", 1, 9, *node, said=(missing, "sags anchor pin"))
     assert values == [

@@ -81,9 +81,10 @@ def test_a_connection_that_died_without_a_word_is_made_anew(
             with Subscriber(["tf"], endpoint=cable.endpoint) as subscriber:
                 assert subscriber.wait("tf", 30) is not None
                 cable.cut()
+                before = cable.connections
                 until(lambda: not subscriber.ok("tf"))
                 until(lambda: subscriber.ok("tf"))
-                assert cable.connections == 2
+                assert cable.connections > before
 
 
 class Cable:

@@ -322,7 +322,7 @@ def test_raw_connections_leave_no_descriptor(tmp_path: Path, said: bytes) -> Non
                     stranger.sendall(said)
         until(lambda: running.connections["data"]["refused"] == 100)
         until(lambda: running.connections["control"]["refused"] == 100)
-        until(lambda: descriptors() == before)
+        until(lambda: descriptors() <= before)
 
 
 def test_a_peer_of_the_old_protocol_is_no_subscriber(tmp_path: Path) -> None:
@@ -399,17 +399,21 @@ def test_a_secured_node_as_a_process_and_its_clients(
             lambda: json.loads(tf_rate(*listed).stdout or "{}")
         )  # a busy machine may send none at first
         assert good["average_rate"] > 0
-        unlisted = tf_rate(*where, "--key", f"{keys}/stranger.key", "--server-key", f"{keys}/node.pub")
-        assert unlisted.exit_code == 1 and "refuses this key" in unlisted.stderr
-        plain = tf_rate(*where)
-        assert plain.exit_code == 1 and "wants a key" in plain.stderr
+        stranger = [*where, "--key", f"{keys}/stranger.key", "--server-key", f"{keys}/node.pub"]
+        assert until(lambda: said_once(tf_rate(*stranger), "refuses this key")).exit_code == 1
+        assert until(lambda: said_once(tf_rate(*where), "wants a key")).exit_code == 1
         viewer = ClientKeys(read_key_pair(keys / "clients/viewer.key"))
         with ControlClient(run_dir=process.run_dir, keys=viewer) as asker:
             connections = asker.request("get_status")["connections"]
-        assert connections["data"]["unlisted_key"] == 1 and connections["data"]["refused"] >= 2
+        assert connections["data"]["unlisted_key"] >= 1 and connections["data"]["refused"] >= 2
     said = process.said()
     assert "Traceback" not in said
     assert read_key_pair(keys / "stranger.key").public.decode() in said.replace("\n", "").replace(" ", "")
+
+
+def said_once(result: Result, words: str) -> Result | None:
+    """The result, once it says these words: on a busy machine a refusal may come after the listening."""
+    return result if words in result.stderr else None
 
 
 def tf_rate(*options: str) -> Result:

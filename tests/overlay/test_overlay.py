@@ -238,7 +238,10 @@ def phantom_baseline(session: Path) -> float:
 @pytest.mark.usefixtures("node")
 def test_the_saved_video_is_whole_also_where_there_is_no_overlay(run_dir: Path, tmp_path: Path) -> None:
     video = tmp_path / "overlay.mp4"
-    summary = run_overlay(OverlayOptions(NodeAddress(run_dir=run_dir), save=video, seconds=2.0))
+    with overlay(run_dir, save=video) as (running, watcher):
+        until(lambda: watcher.status().get("state") == "running")
+        watcher.pictures(6, drawn=True)
+        summary = running.end()
     assert summary["frames"] == summary["overlay"] + sum(summary["blanked"].values()) > 5
     assert summary["blanked"]["being pinned"] > 0
     capture = cv2.VideoCapture(str(video))
@@ -251,7 +254,10 @@ def test_what_nobody_sees_is_not_counted_as_an_overlay(run_dir: Path, tmp_path: 
     """Its lowest edge begins 20 pixels above the picture; the phantom moves there by 13."""
     scene = tmp_path / "aside.yaml"
     scene.write_text("objects: [{shape: sphere, anchors: [{pixel: [160, 2], at: [0, -0.016, 0]}]}]")
-    summary = run_overlay(OverlayOptions(NodeAddress(run_dir=run_dir), scene=scene, seconds=3.0))
+    with overlay(run_dir, scene=scene) as (running, watcher):
+        until(lambda: watcher.status().get("reason") == UNSEEN)
+        watcher.pictures(6, drawn=False)
+        summary = running.end()
     assert summary["overlay"] == 0 and summary["objects"][0]["reason"] is None
     assert summary["blanked"][UNSEEN] > 5
 

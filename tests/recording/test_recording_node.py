@@ -144,7 +144,7 @@ def test_the_end_of_the_terminal_closes_the_file(node: Path, tmp_path: Path) -> 
     with killed(program) as process:
         os.close(theirs)
         until(lambda: b"recording: " in os.read(ours, 1000), START_SECONDS)
-        time.sleep(1)
+        frames_pass(node, 20)
         os.close(ours)
         process.wait(30)
     assert (tmp_path / "bag/metadata.yaml").exists()

@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,7 +16,7 @@ import pytest
 from command_line import sags, start, stopped, wait_for
 from recorded_plane import by_topic, record_plane
 from synthetic import HEIGHT, WIDTH, plane_result
-from waiting import beside, until
+from waiting import beside, heard, until
 
 from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 from sags_node.clients.recording.info import bag_info
@@ -142,7 +143,11 @@ def test_flags_of_play(plane_bag: Path, tmp_path: Path) -> None:
         outcome(topics=("left/dept",))
     with (
         playing(
-            plane_bag, tmp_path / "other", topics=("left/depth",), remap={"left/depth": "left/render/depth"}
+            plane_bag,
+            tmp_path / "other",
+            topics=("left/depth",),
+            remap={"left/depth": "left/render/depth"},
+            loop=True,
         ) as player,
         Subscriber(["left/render/depth", "left/depth"], run_dir=tmp_path / "other") as subscriber,
     ):
@@ -208,7 +213,7 @@ def test_a_clock_tells_the_moment_of_the_recording(plane_bag: Path, tmp_path: Pa
 
 def test_without_being_asked_there_is_no_clock(plane_bag: Path, tmp_path: Path) -> None:
     with (
-        playing(plane_bag, tmp_path / "run") as player,
+        playing(plane_bag, tmp_path / "run", loop=True) as player,
         Subscriber(["clock", "tf"], run_dir=tmp_path / "run") as sub,
     ):
         player.toggle_pause()
@@ -221,7 +226,7 @@ def test_the_clock_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
     command = ["bag", "play", plane_bag, "--loop", "--clock", "--endpoint", "tcp://127.0.0.1:*"]
     process = start(command, XDG_RUNTIME_DIR=tmp_path)
     wait_for(process, (tmp_path / "sags/sags.json").exists)
-    figures = topic_figures("hz", "clock", NodeAddress(run_dir=tmp_path / "sags"), 1.5)
+    figures = heard(partial(topic_figures, "hz", "clock", NodeAddress(run_dir=tmp_path / "sags")), 1.5)
     stopped(process)
     assert process.returncode == 0 and figures["window"] >= 2
     assert sags("bag", "play", plane_bag, "--clock", "0").exit_code == 2
