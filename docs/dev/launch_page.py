@@ -56,6 +56,7 @@ mapping:
 - `sags new RECORDING -o my_launch.yaml` writes one.
 - `sags param set key:=value` changes keys of a running node. They say so below.
 - `key:=value` on the command line wins over the file. Keys are written with dots, as in the tables below.
+  Values are YAML, but without comments: `source.left:='/data/Case #3'` is that folder.
   Values are YAML: `source.right:=null`, `'publish.data:=[tcp://*:5556]'`.
 - An unknown key is an error that names the nearest known one, or the key that replaced it. So is a wrong
   value. The exit code is 2.
