@@ -255,8 +255,10 @@ def test_what_nobody_sees_is_not_counted_as_an_overlay(run_dir: Path, tmp_path: 
     scene = tmp_path / "aside.yaml"
     scene.write_text("objects: [{shape: sphere, anchors: [{pixel: [160, 2], at: [0, -0.016, 0]}]}]")
     with overlay(run_dir, scene=scene) as (running, watcher):
-        until(lambda: watcher.status().get("reason") == UNSEEN)
-        watcher.pictures(6, drawn=False)
+        until(lambda: watcher.status().get("state") == "running")
+        last = None
+        for _ in range(20):
+            last = watcher.subscriber.wait(watcher.topics[0], 60, after=last)
         summary = running.end()
     assert summary["overlay"] == 0 and summary["objects"][0]["reason"] is None
     assert summary["blanked"][UNSEEN] > 5

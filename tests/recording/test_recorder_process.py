@@ -14,7 +14,7 @@ from waiting import until
 
 from benchmarks.node.processes import children
 from sags_node.errors import SagsError
-from sags_node.findings import by_stage
+from sags_node.findings import Finding, by_stage
 from sags_node.messaging.content import health_answer
 from sags_node.node import recorder as child
 from sags_node.node.recorder import RecorderProcess
@@ -82,21 +82,26 @@ def test_a_node_ends_beside_a_recorder_that_does_not(
 
 
 @pytest.mark.fault("process: the recorder is killed while a node records")
+def ended(recorder: RecorderProcess) -> list[Finding]:
+    """What it tells of a recording that ended by itself; on a busy machine one may also lose messages."""
+    return [told for told in recorder.findings() if told.code == "recording_ended"]
+
+
 def test_a_recording_that_has_ended_by_itself_is_told(recorder: RecorderProcess, tmp_path: Path) -> None:
     assert recorder.status() is None and not list(recorder.findings())
     recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
     until(lambda: (recorder.status() or {}).get("messages"))
-    assert recorder.status()["ended"] is None and not list(recorder.findings())
+    assert recorder.status()["ended"] is None and not ended(recorder)
     (process,) = recorders()
     os.kill(process, signal.SIGKILL)
-    (told,) = until(lambda: list(recorder.findings()))
-    assert told.code == "recording_ended" and f"sags bag recover {tmp_path / 'bag'}" in told.text
+    (told,) = until(lambda: ended(recorder))
+    assert f"sags bag recover {tmp_path / 'bag'}" in told.text
     health = NodeHealth("running", 30.0, {}, {}, {}, {}, 1, 1.0, {}, warnings=by_stage([told]))
     assert health_answer(health) == {"healthy": False, "state": "running", "warnings": ["recording_ended"]}
     with pytest.raises(SagsError, match="the recorder was ended; save what it wrote"):
         recorder.stop().result(ANSWER)
     recorder.start({"path": str(tmp_path / "next")}).result(ANSWER)
-    assert not list(recorder.findings())
+    assert not ended(recorder)
     recorder.stop().result(ANSWER)
     assert recorder.status() is None
 

@@ -230,8 +230,8 @@ class _Overlay:
 
     def _take(self, leading: Received) -> None:
         """Show the overlay of one frame, and count why there is none, or nothing of it to be seen."""
-        self._frames += 1
         rgba, reason = self._overlay(leading.stamp_ns)
+        self._frames += 1  # once it is known what became of it: Ctrl-C may come in between
         if reason is not None:
             self._blanked[reason] += 1
         if self._layers is not None:
