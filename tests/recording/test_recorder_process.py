@@ -81,12 +81,12 @@ def test_a_node_ends_beside_a_recorder_that_does_not(
     assert recorders() == []
 
 
-@pytest.mark.fault("process: the recorder is killed while a node records")
 def ended(recorder: RecorderProcess) -> list[Finding]:
     """What it tells of a recording that ended by itself; on a busy machine one may also lose messages."""
     return [told for told in recorder.findings() if told.code == "recording_ended"]
 
 
+@pytest.mark.fault("process: the recorder is killed while a node records")
 def test_a_recording_that_has_ended_by_itself_is_told(recorder: RecorderProcess, tmp_path: Path) -> None:
     assert recorder.status() is None and not list(recorder.findings())
     recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
