@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1675,
     "sags_node/tools/importing": 1110,
     "sags_node/vision": 5455,
-    "tests": 48068,
+    "tests": 48069,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

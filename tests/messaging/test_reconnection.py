@@ -80,8 +80,8 @@ def test_a_connection_that_died_without_a_word_is_made_anew(
         with Cable(running.connection.data[0]) as cable:
             with Subscriber(["tf"], endpoint=cable.endpoint) as subscriber:
                 assert subscriber.wait("tf", 30) is not None
-                cable.cut()
                 before = cable.connections
+                cable.cut()
                 until(lambda: not subscriber.ok("tf"))
                 until(lambda: subscriber.ok("tf"))
                 assert cable.connections > before
