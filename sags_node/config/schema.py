@@ -522,6 +522,9 @@ class PushRobot(RobotPoses, Guarded):
 
     kind: Literal["push"] = "push"
     endpoint: str = Field("tcp://127.0.0.1:5559", description="ROUTER socket that the node binds")
+    topic: str | None = Field(
+        None, description="of the scope's pose; default: that of the first pose that comes and is no tool's"
+    )
 
 
 class BagRobot(RobotPoses):

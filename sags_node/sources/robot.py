@@ -106,7 +106,9 @@ class _PushedPoses(Robot):
 
     def __init__(self, config: PushRobot) -> None:
         super().__init__(config)
-        self._scope: str | None = None  # the topic of its pose, which the first such message names
+        self._named = config.topic is not None
+        # The topic of the scope's pose; None: the first pose that is no tool's names it.
+        self._scope = None if config.topic is None else absolute(config.topic)
         self._inbox = Inbox(config.endpoint, config, "robot", self._take, about=self._pose_of)
         self.endpoint = self._inbox.endpoint
 
@@ -116,23 +118,25 @@ class _PushedPoses(Robot):
                 f"{message.topic}: {message.meta.type} is no pose; known: {', '.join(POSE_TYPES)}"
             )
         topic = self._topic_of(message)
-        if message.meta.type != TF and topic not in self.tools:
+        if topic not in {STATIC, *self.tools} and (self._named or message.meta.type != TF):
             if self._scope not in (None, topic):
                 listed = ", ".join(self.tools) or "none are listed"
                 raise SagsError(
                     f"{topic} is none of robot.tools ({listed}), and the scope's pose comes on "
-                    f"{self._scope}; list it there, or do not send it"
+                    f"{self._scope}; list it there, set robot.topic, or do not send it"
                 )
             self._scope = topic
         self.add(topic, message.cdr(), message.meta.type)
 
     def _topic_of(self, message: Message) -> str:
-        """Whose topic it is: a tool's, or as it came without the sender's namespace, which may have parts."""
-        sent = absolute(message.topic)
-        name = absolute(message.topic.partition("/")[2])
-        return next(
-            (tool for tool in self.tools if sent.endswith(tool)), STATIC if name.endswith(STATIC) else name
-        )
+        """Whose topic it is: a tool's or the scope's, or as it came without the sender's namespace."""
+        sent, name = absolute(message.topic), absolute(message.topic.partition("/")[2])
+        if self._scope is not None and self._scope in {sent, name}:
+            return self._scope
+        known = [
+            topic for topic in (STATIC, *self.tools) if sent.endswith(topic)
+        ]  # namespaces may have parts
+        return max(known, key=len, default=name)
 
     def _pose_of(self, message: Message) -> list[str]:
         """Transforms of a tree may come from several programs."""

@@ -148,10 +148,10 @@ def test_false_tips_of_the_picture_are_passed_over(seed: int) -> None:
 # ---- from the robot's messages ---------------------------------------------------------------------------
 
 
-def robot_of(folder: Path, *tools: RobotTool) -> PushRobot:
+def robot_of(folder: Path, *tools: RobotTool, topic: str | None = None) -> PushRobot:
     save_hand_eye(HandEye(moved(0.01, 0, 0)), folder, {})
     return PushRobot(
-        endpoint="tcp://127.0.0.1:*", hand_eye=folder / "hand_eye.yaml", offset_ms=0, tools=tools
+        endpoint="tcp://127.0.0.1:*", hand_eye=folder / "hand_eye.yaml", offset_ms=0, tools=tools, topic=topic
     )
 
 
@@ -244,5 +244,22 @@ def test_a_tool_is_handed_in_by_its_topic(tmp_path: Path) -> None:
             until(lambda: robot.track.newest_ns == S + 5)
         assert track.at(S + 1)[0, 3] == pytest.approx(0.1)
         assert robot.track.at(S + 1)[0, 3] == robot.track.at(S + 3)[0, 3] == 0
+    finally:
+        robot.close()
+
+
+@pytest.mark.live
+def test_a_named_topic_is_the_scopes_whoever_speaks_first(tmp_path: Path) -> None:
+    tool = RobotTool(topic="/pose")  # the scope's topic ends with it
+    robot = open_robot(LaunchConfig(robot=robot_of(tmp_path, tool, topic="ECM/pose")))
+    try:
+        with PoseSender(robot.endpoint, ns="dvrk") as sender:  # type: ignore[attr-defined]
+            sender.send(moved(0.2, 0, 0), S, "PSM2/measured_cp")  # nobody's
+            sender.send(moved(0.1, 0, 0), S)
+            for number in range(3):
+                sender.send(np.eye(4), S + number, "ECM/pose")
+            until(lambda: robot.track.newest_ns == S + 2 and robot.tools["/pose"].newest_ns == S)
+        assert robot.track.at(S)[0, 3] == 0
+        assert robot.tools["/pose"].at(S)[0, 3] == pytest.approx(0.1)
     finally:
         robot.close()
