@@ -30,6 +30,7 @@ from sags_node.tools.fitting import checkpoint, residuals, start
 from sags_node.tools.fitting.clip import Clip, read_clip
 from sags_node.tools.fitting.density import quarter
 from sags_node.tools.fitting.fit import Fit
+from sags_node.tools.fitting.midway import midway_frames
 from sags_node.tools.fitting.refined import RefinedModel
 from sags_node.tools.fitting.score import score, score_between, score_depth, score_tracks
 from sags_node.tools.fitting.settings import FieldShape, FitSettings, Growth, RowRates, Units, path_frames
@@ -224,6 +225,28 @@ def test_pictures_carried_along_the_motion_beat_their_mean(clip: Clip, refined: 
     assert score_between(refined.fit, clip.train, {}) is None
 
 
+def test_a_picture_half_way_shows_the_tissue_where_it_was(clip: Clip) -> None:
+    """Frame 3 from frames 0 and 6, between which the tissue moves by some pixels; the scope does not."""
+    truth, before, after = clip.test[0], clip.train[0], clip.train[5]
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = cv2.Rodrigues(np.array([0, 0.2, 0]))[0], (0.1, 0, 0)
+    start = before.camera.T_world_cam
+    moved = dataclasses.replace(after.camera, T_world_cam=start @ turn)
+    (found,) = midway_frames([before, dataclasses.replace(after, camera=moved)])
+    half = np.linalg.inv(start) @ found.camera.T_world_cam
+    np.testing.assert_allclose(cv2.Rodrigues(half[:3, :3])[0].ravel(), (0, 0.1, 0), atol=1e-9)
+    np.testing.assert_allclose(half[:3, 3], (0.05, 0, 0), atol=1e-9)
+    assert found.t_capture_ns == pytest.approx(truth.t_capture_ns, abs=1e6)
+    assert found.tissue[~before.tissue & ~after.tissue].mean() < 0.02  # of an instrument that stays
+    seen, of = found.tissue & truth.tissue, np.float32(255)
+    assert seen.sum() > 0.9 * truth.tissue.sum()
+    mean = np.mean([before.image, after.image], axis=0, dtype=np.float32)
+    shown, by_hand = (psnr(image / of, truth.image / of, seen) for image in (found.image, mean))
+    assert shown > by_hand + 1
+    known = seen & (found.depth > 0) & (truth.depth > 0)
+    assert np.median(np.abs(found.depth - truth.depth)[known]) < 5e-4  # m
+
+
 def test_an_iteration_of_several_frames_descends_on_all_of_them(clip: Clip) -> None:
     """The first step of Adam goes by the sign of the gradient: that of the frames' losses together."""
     settings = dataclasses.replace(PAPER, warm_up=0, iterations=1, batch_size=len(clip.train))
@@ -316,8 +339,9 @@ def test_four_for_one_have_its_place_and_its_colours(clip: Clip) -> None:
         dataclasses.replace(PAPER, tokens="nodes"),
         STEEP,
         dataclasses.replace(PAPER, slopes=True, color_softness=0.15, coarse=0.5),
+        dataclasses.replace(PAPER, midway=True),
     ],
-    ids=["self", "nodes", "slopes", "coarse"],
+    ids=["self", "nodes", "slopes", "coarse", "midway"],
 )
 def test_a_resumed_fit_gives_the_same_bits(clip: Clip, settings: FitSettings, tmp_path: Path) -> None:
     """Also where Gaussians were split, and where somebody asked how long the rest takes."""
@@ -343,6 +367,11 @@ def test_a_checkpoint_of_another_fit_is_refused(clip: Clip, tmp_path: Path) -> N
         checkpoint.load(Fit(clip, dataclasses.replace(settings, seed=1)), path)
     with pytest.raises(UsageError, match="other training frames"):
         checkpoint.load(Fit(Clip(clip.train[1:], clip.test), settings), path)
+    other = [dataclasses.replace(frame, image=frame.image[:, ::-1].copy()) for frame in clip.train[5:]]
+    with pytest.raises(UsageError, match=r"another recording: 5 of 10 .* first is frame 6"):
+        checkpoint.load(Fit(Clip([*clip.train[:5], *other], clip.test), settings), path)
+    dimmer = [dataclasses.replace(frame, image=frame.image - (frame.image > 2)) for frame in clip.train]
+    checkpoint.load(Fit(Clip(dimmer, clip.test), settings), path)  # as another decoder rounds
     whole = dict(np.load(path))
     np.savez(path, **{name: array for name, array in whole.items() if name != "cells"})
     with pytest.raises(SagsError, match=r"damaged .*cells"):
@@ -480,3 +509,18 @@ def test_a_clip_so_long_that_few_gaussians_have_room_is_told(
 def test_a_clip_too_long_for_its_memory_is_refused_at_once(clip: Clip) -> None:
     with pytest.raises(SagsError, match="max-gaussians"):
         fitted(clip, dataclasses.replace(SMALL, max_gaussians=5_000_000, pixels_each=0.0))
+
+
+@pytest.mark.fault("memory: the pictures of a clip have no room")
+def test_a_clip_whose_pictures_have_no_room_is_refused_before_they_are_made(
+    clip: Clip, phantom_session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = {"SC_PAGE_SIZE": 1, "SC_AVPHYS_PAGES": 10_000_000}
+    monkeypatch.setattr("os.sysconf", lambda name: free[name])
+    with pytest.raises(SagsError, match=r"source\.stride or a smaller vision\.width"):
+        read_clip(open_session(phantom_session, FRAMES[:2]), held_out)
+    free["SC_AVPHYS_PAGES"] = 12_000_000  # of 10 frames of 320x256 px, as half of it may be used
+    with pytest.raises(SagsError, match=r"10 frames take 0\.0 GB"):
+        Fit(clip, dataclasses.replace(PAPER, midway=True))
+    free["SC_AVPHYS_PAGES"] = 14_000_000
+    Fit(clip, dataclasses.replace(PAPER, midway=True))

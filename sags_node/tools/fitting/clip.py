@@ -129,7 +129,7 @@ def read_clip(
     test: list[ClipFrame] = []
     for frame in play(session, references=True, on_frame=on_frame):
         if not train and not test:
-            _check_memory(frame, session.source.frame_count)
+            check_memory(frame, session.source.frame_count)
         (test if held_out(frame.frame_id) else train).append(frame)
         progress(len(train) + len(test))
     if not train:
@@ -139,7 +139,12 @@ def read_clip(
     return Clip(train, test)
 
 
-def _check_memory(frame: ClipFrame, count: int | None) -> None:
+def check_memory(frame: ClipFrame, count: int | None) -> None:
+    """Look whether so many frames of this size have room; None: nobody knows how many there are.
+
+    Raises:
+        SagsError: they have none.
+    """
     needed = (count or 0) * (frame.image.nbytes + frame.tissue.nbytes + frame.depth.nbytes)
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > MEMORY_SHARE * free:

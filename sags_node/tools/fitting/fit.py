@@ -34,6 +34,7 @@ from sags_node.model.exposure import Exposure
 from sags_node.tools.fitting.clip import Clip, ClipFrame
 from sags_node.tools.fitting.density import Density, quarter
 from sags_node.tools.fitting.field import make_box, make_field, marked, row_rates, unit_row
+from sags_node.tools.fitting.midway import midway_frames
 from sags_node.tools.fitting.pictures import Pictures
 from sags_node.tools.fitting.refined import RefinedModel
 from sags_node.tools.fitting.residuals import Residuals
@@ -75,11 +76,12 @@ class Fit:
         self._rng = np.random.default_rng(settings.seed)
         self._order: list[int] = []
         self._decays = marked(settings.rates.decaying)
+        self._learnt = (*clip.train, *(midway_frames(clip.train) if settings.midway else ()))
         self._look()
 
     def _look(self) -> None:
         """Take up the pictures that this stage looks at."""
-        settings, frames = self.settings, self.clip.train
+        settings, frames = self.settings, list(self._learnt)
         self._cap = settings.max_gaussians
         if self.is_coarse:
             frames, self._cap = [frame.halved() for frame in frames], self._cap // 4
@@ -348,9 +350,9 @@ class Fit:
         return self.iteration - before, self.settings.iterations
 
     def _next_frame(self) -> ClipFrame:
-        """Every training frame once, in random order, then again."""
+        """All that is learnt once, in random order, then again."""
         if not self._order:
-            self._order = self._rng.permutation(len(self.clip.train)).tolist()
+            self._order = self._rng.permutation(len(self._learnt)).tolist()
         return self._pictures.frames[self._order.pop()]
 
     def _tensor(self, array: NDArray[Any]) -> Tensor:

@@ -20,7 +20,7 @@ class Pictures:
     """Frames of one size on a device.
 
     Attributes:
-        frames: in the order of their times.
+        frames: all that are learnt, the first one of them first.
         drawer: draws pictures of their size.
         pixel: m, how wide one is at the tissue's median depth in the first frame.
     """
@@ -39,14 +39,15 @@ class Pictures:
         self.pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
         unseen = ~np.any([frame.tissue for frame in frames], axis=0) | settings.smooth_everywhere
         self._unseen = unseen if device is None else self._tensor(unseen)
-        self._shown: dict[int, tuple[Tensor, ...]] = {}  # frames that are on the device already
+        self._shown: dict[int, tuple[Tensor, ...]] = {}  # by their times, those on the device already
 
     def compare(self, planes: Tensor, frame: ClipFrame) -> Compared:
         """The loss of a frame that was drawn as these planes [5, H, W]."""
-        if frame.frame_id not in self._shown:
-            self._shown[frame.frame_id] = tuple(map(self._tensor, (frame.image, frame.tissue, frame.depth)))
+        if frame.t_capture_ns not in self._shown:
+            shown = frame.image, frame.tissue, frame.depth
+            self._shown[frame.t_capture_ns] = tuple(map(self._tensor, shown))
         settings = self._settings
-        image, tissue, depth = self._shown[frame.frame_id]
+        image, tissue, depth = self._shown[frame.t_capture_ns]
         return compare(planes, image, tissue, depth, self._unseen, settings.weights, settings.color_softness)
 
     def _tensor(self, array: NDArray[np.generic]) -> Tensor:

@@ -112,6 +112,7 @@ class FitSettings:
     # MiniCPM, section 4); None: all along, by the same factor.
     stable: float | None = None
     growth: Growth = Growth()
+    midway: bool = False  # also learn pictures half way between training frames, see `fitting.midway`
     batch_size: int = 1  # frames of an iteration, whose losses are added; only with schedule = paper
     weights: LossWeights = STEREO  # only with schedule = paper
     color_softness: float = 0.0  # of RGB 0..1, see `field.losses.compare`; only with schedule = paper
@@ -171,6 +172,7 @@ PAPER = FitSettings(
     decay=0.03,
     stable=0.7,
     growth=Growth(first=None, opacity=0.9, scale=0.6, share=0.15),
+    midway=True,
     batch_size=2,
     color_softness=0.15,  # more than most differences
     slopes=True,

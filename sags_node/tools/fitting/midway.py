@@ -1,0 +1,61 @@
+"""Pictures half way between training frames, by optical flow: they teach the model what moves in between."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from sags_node.tools.fitting.clip import ClipFrame, check_memory
+from sags_node.types import F64
+
+SMOOTH = 1.5  # px of standard deviation, of the flow: OpenCV's is restless from patch to patch
+
+
+def midway_frames(frames: Sequence[ClipFrame]) -> list[ClipFrame]:
+    """A frame for each two that follow each other, at the time in their middle.
+
+    Its colours and depth are the means of what both show of the same tissue, which moves in a straight line.
+    Optical flow finds it (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016, as in
+    OpenCV). Where one of both shows no tissue, there is none.
+
+    Raises:
+        SagsError: they do not fit into memory.
+    """
+    check_memory(frames[0], len(frames))
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return [_midway(before, after, flow) for before, after in pairwise(frames)]
+
+
+def _midway(before: ClipFrame, after: ClipFrame, flow: cv2.DISOpticalFlow) -> ClipFrame:
+    height, width = before.tissue.shape
+    here = np.moveaxis(np.indices((height, width), np.float32)[::-1], 0, -1)
+    grays = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (before, after)]
+    images, tissue, depths = [], np.ones((height, width), np.bool_), []
+    for near, grey, other in zip((before, after), grays, grays[::-1], strict=True):
+        # The flow of the other picture to this one begins in the other: half of it, a little beside.
+        there = here + cv2.GaussianBlur(flow.calc(other, grey, None), (0, 0), SMOOTH) / 2
+        images.append(cv2.remap(near.image, there, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        tissue &= cv2.remap(near.tissue.view(np.uint8), there, None, cv2.INTER_NEAREST) > 0
+        depths.append(cv2.remap(near.depth, there, None, cv2.INTER_NEAREST))
+    known = (depths[0] > 0) & (depths[1] > 0)
+    return ClipFrame(
+        before.frame_id,
+        (before.t_capture_ns + after.t_capture_ns) // 2,
+        replace(before.camera, T_world_cam=_pose_midway(before.camera.T_world_cam, after.camera.T_world_cam)),
+        cv2.addWeighted(images[0], 0.5, images[1], 0.5, 0),
+        tissue,
+        np.where(known, (depths[0] + depths[1]) / 2, np.float32(0)),
+        None,
+    )
+
+
+def _pose_midway(before: F64, after: F64) -> F64:
+    """The pose half way, [4, 4]: half the turn, half the way."""
+    middle = (before + after) / 2
+    turn, _ = cv2.Rodrigues(before[:3, :3].T @ after[:3, :3])
+    middle[:3, :3] = before[:3, :3] @ cv2.Rodrigues(turn / 2)[0]
+    return middle
