@@ -285,14 +285,54 @@ def test_a_recording_of_the_same_name_is_another_one(tmp_path: Path) -> None:
     refused(2, "export", second, *into, said=("holds another sequence", "--force"))
 
 
+@pytest.mark.parametrize("changed", ["launch.yaml", "calib/left.yaml"])
+def test_what_the_frames_are_made_from_is_another_when_a_file_was_changed(
+    tmp_path: Path, changed: str
+) -> None:
+    recording = tmp_path / "clip"
+    write_tiny_session(recording, seed=0)
+    command = ("export", recording, "source.frames:=2", "--sequence", tmp_path / "out")
+    first = tmp_path / "out/frame_00000.ply"
+    assert sags(*command).exit_code == 0
+    before = first.stat().st_mtime_ns, first.read_bytes()
+    assert sags(*command).exit_code == 0  # the same again goes on
+    assert (first.stat().st_mtime_ns, first.read_bytes()) == before
+    file = recording / changed
+    if changed == "launch.yaml":
+        file.write_text(file.read_text() + "mapping: {max_gaussians: 500}\n")
+    else:
+        rig = read_rig(recording / "calib")
+        file.write_text(file.read_text().replace(f"{rig.left.P[0, 2]}", f"{rig.left.P[0, 2] + 8}"))
+    refused(2, *command, said=("another launch file, calibration or fit", "--force"))
+    assert sags(*command, "--force").exit_code == 0
+    assert first.read_bytes() != before[1]
+
+
+def test_the_state_of_a_sequence_tells_one_fit_from_the_next(tmp_path: Path) -> None:
+    write_tiny_session(tmp_path / "clip", seed=0)
+    session = open_session(tmp_path / "clip", ["source.pace:=step"])
+    with pytest.raises(UsageError, match=r"there is no .*checkpoint\.npz"):
+        sequence.state_of(session, tmp_path)
+    states = []
+    for name in ("checkpoint.npz", "figures.json"):
+        (tmp_path / name).write_text("first")
+    for said in ("first", "first", "second"):
+        (tmp_path / "checkpoint.npz").write_text(said)
+        states.append(sequence.state_of(session, tmp_path))
+    assert states[0] == states[1] != states[2]
+    session.source.stop()
+
+
 def test_files_of_something_else_stay_unless_forced(tmp_path: Path) -> None:
     sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
     written(tmp_path)
     with pytest.raises(UsageError, match="another sequence"):
         sequence.check_sequence(tmp_path, {"session": "b"}, force=False)
     assert (tmp_path / "frame_00001.ply").exists()
-    sequence.check_sequence(tmp_path, {"session": "b"}, force=True)
-    assert not (tmp_path / "frame_00001.ply").exists()
+    for about in ({"session": "b"}, {"session": "b"}):  # of the same state, too
+        sequence.check_sequence(tmp_path, about, force=True)
+        assert not (tmp_path / "frame_00001.ply").exists()
+        written(tmp_path)
     foreign = tmp_path / "theirs"
     foreign.mkdir()
     (foreign / "note.txt").write_text("mine")
