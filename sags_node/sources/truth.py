@@ -67,9 +67,11 @@ class References:
         self._config = config
         self._depth_files = {} if config.depth is None else _by_frame_number(config.depth)
         self._points = self._visible = None
+        self._rows: dict[int, int] = {}
         if config.tracks is not None:
             self._points = load_array(config.tracks, "points", (None, None, 3)).astype(np.float64)
             self._visible = load_array(config.tracks, "visible", self._points.shape[:2]).astype(np.bool_)
+            self._rows = _rows_by_frame_number(config.tracks, len(self._points))
 
     def at(self, index: int) -> Reference | None:
         """Return what is known of one frame of the recording, None when that is nothing.
@@ -79,8 +81,9 @@ class References:
         """
         depth_file = self._depth_files.get(index)
         points = visible = None
-        if self._points is not None and self._visible is not None and index < len(self._points):
-            points, visible = self._points[index], self._visible[index]
+        row = self._rows.get(index)
+        if self._points is not None and self._visible is not None and row is not None:
+            points, visible = self._points[row], self._visible[row]
         if depth_file is None and points is None:
             return None
         depth = None if depth_file is None else self._read_depth(depth_file)
@@ -99,6 +102,20 @@ def _by_frame_number(folder: Path) -> dict[int, Path]:
         if not file.stem.isdecimal():
             raise UsageError(f"{file}: reference depth files are named by frame number, e.g. 0010.png")
     return {int(file.stem): file for file in files}
+
+
+def _rows_by_frame_number(file: Path, count: int) -> dict[int, int]:
+    """Of tracks: as their `frames` [T] says, without it one row for each frame from the first on."""
+    with zipfile.ZipFile(file) as archive:
+        if "frames.npy" not in archive.namelist():
+            return {row: row for row in range(count)}
+    frames = load_array(file, "frames", (count,))
+    rows = {int(frame): row for row, frame in enumerate(frames.tolist())} if frames.dtype.kind in "iu" else {}
+    if len(rows) < count or min(rows, default=0) < 0:
+        raise UsageError(
+            f"{file}: 'frames' must hold the frame number of each row, from 0, none of them twice"
+        )
+    return rows
 
 
 def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[np.generic]:

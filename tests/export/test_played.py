@@ -17,10 +17,12 @@ from tiny_archive import TINY_FRAMES, write_tiny_session
 from sags_lab.lerobot.dataset import merge
 from sags_lab.lerobot.form import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, TISSUE, Version
 from sags_lab.lerobot.stats import Sums, merged
+from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import open_session
 from sags_node.rig import read_rig
+from sags_node.sources.source import open_source
 from sags_node.tools.export import sequence
 from sags_node.tools.export.played import DEPTH_UNIT, TRACKS
 from sags_node.tools.export.scene import Scene
@@ -97,6 +99,25 @@ def test_points_stay_on_the_surface_and_sags_eval_reads_them(exported: Path) -> 
         ).stdout
     )
     assert said["track"]["median_px"] < 2  # both follow the same tissue
+
+
+def test_what_is_exported_of_some_frames_is_read_back_for_the_same(exported: Path, tmp_path: Path) -> None:
+    """Files and rows are numbered by the recording's own frames, whichever of them are played."""
+    playing = ("source.stride:=2", "source.start:=0.2")
+    into = ("--depth", tmp_path / "depth", "--tracks", tmp_path / "tracks.npz")
+    assert sags("export", exported / "session0", *playing, "mapping.iterations:=1", *into).exit_code == 0
+    assert sorted(file.stem for file in (tmp_path / "depth").iterdir()) == ["00002", "00004"]
+    config = open_session(exported / "session0", ["source.pace:=step"]).config.source
+    reference = ReferenceConfig(depth=tmp_path / "depth", tracks=tmp_path / "tracks.npz")
+    with open_source(config.model_copy(update={"reference": reference})) as source:
+        found = {frame.frame_id: frame.reference for frame in source if frame.reference is not None}
+    assert list(found) == [2, 4]
+    with np.load(tmp_path / "tracks.npz") as tracks:
+        assert tracks["frames"].tolist() == [2, 4]
+        for row, (number, each) in enumerate(found.items()):
+            counts = cv2.imread(str(tmp_path / f"depth/{number:05d}.png"), cv2.IMREAD_UNCHANGED)
+            assert each.depth is not None and np.allclose(each.depth, counts * DEPTH_UNIT)
+            assert np.array_equal(each.points, tracks["points"][row], equal_nan=True)
 
 
 def test_the_video_has_every_frame(exported: Path) -> None:

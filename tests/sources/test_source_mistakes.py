@@ -49,6 +49,11 @@ def posed(folder: Path, **arrays: np.ndarray) -> Recording:
     return folders_of(folder, poses=folder / "poses.npz")
 
 
+def tracked(folder: Path, frames: list[float]) -> Recording:
+    np.savez(folder / "tracks.npz", points=np.zeros((3, 5, 3)), visible=np.ones((3, 5)), frames=frames)
+    return folders_of(folder, reference=cfg.ReferenceConfig(tracks=folder / "tracks.npz"))
+
+
 def torn_poses(folder: Path) -> Recording:
     config = posed(folder, T_world_cam=np.tile(np.eye(4), (8, 1, 1)))
     data = (folder / "poses.npz").read_bytes()
@@ -99,6 +104,10 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: write_png(at / "depth/first.png", picture(0))
      or folders_of(at, reference=cfg.ReferenceConfig(depth=at / "depth")),
      "first.png: reference depth files are named by frame number"),
+    (lambda at: tracked(at, [0, 1, 1]), "'frames' must hold the frame number of each row, from 0"),
+    (lambda at: tracked(at, [0.0, 0.5, 1.0]), "'frames' must hold the frame number of each row"),
+    (lambda at: tracked(at, [-1, 0, 1]), "'frames' must hold the frame number of each row"),
+    (lambda at: tracked(at, [0, 1]), r"'frames' is int64 \[2\], wanted numbers \[3\]"),
 ]  # fmt: skip
 DAMAGED: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: write_png(at / "r/000.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8)) or folders_of(at),
