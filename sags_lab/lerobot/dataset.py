@@ -86,7 +86,7 @@ class LeRobot:
             path.parent.mkdir(parents=True)
             self._videos[eye] = VideoFile(path, self._fps, size)
 
-    def add(self, result: FrameResult, anchors: AnchorStates) -> None:
+    def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
         pair = result.pair
         if self._count == 0:
             self._open(pair)

@@ -136,7 +136,7 @@ def export(
         fitted = None if fit is None else str(fit.resolve())
         recording = None if path is None else str(Path(path).resolve())
         about = {"session": opened.name, "recording": recording, "overrides": changed, "fit": fitted}
-        many.check_sequence(sequence, about, force)
+        many.check_sequence(sequence, about | many.state_of(opened, fit), force)
         with progress("exporting") as advance:
             if fit is None:
                 scenes = source.scenes_of_session(opened)

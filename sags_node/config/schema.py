@@ -91,12 +91,16 @@ class Section(BaseModel):
 class ReferenceConfig(Section):
     """Where a recording keeps what is known to be true. Used by `sags eval` only."""
 
-    depth: Path | None = Field(None, description="folder of 16-bit PNGs named by frame number")
+    depth: Path | None = Field(None, description="folder of 16-bit PNGs named by frame number, from 0")
     depth_unit: DepthUnit = Field(1e-5, description="metres per count")
     depth_kind: Literal["exact", "structured_light", "ct", "stereo_network"] = Field(
         "exact", description="how the depth became known; reports name it"
     )
-    tracks: Path | None = Field(None, description="npz with points [T, P, 3] (m) and visible [T, P]")
+    tracks: Path | None = Field(
+        None,
+        description="npz with points [T, P, 3] (m), visible [T, P] and, where some frames are left out, the "
+        "numbers of the others, frames [T]",
+    )
 
 
 class RecordedSource(Section):

@@ -70,7 +70,7 @@ class Replay:
 
     Raises:
         UsageError: files are missing or do not fit each other, pairs are missing before `frames`, or `start`
-            lies behind the end.
+            lies behind the end, or a reference is of a frame that is not there.
     """
 
     def __init__(
@@ -91,6 +91,12 @@ class Replay:
         self._poses = None if config.poses is None else Poses(config.poses)
         self._references = References(config.reference) if references else None
         self.pairs = open_pairs(config, references)
+        if self._references is not None and (beyond := self._references.beyond(self.pairs.count)):
+            self.pairs.close()
+            raise UsageError(beyond)
+        if self._references is not None and isinstance(self.pairs, FolderPairs) and not quiet:
+            if misnamed := self._references.misnamed(self.pairs.files):
+                say(misnamed)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
         self.assumed = "" if "rate" in config.model_fields_set or self.pairs.rate else ASSUMED
@@ -186,7 +192,7 @@ class Replay:
                 pose = pair.T_world_cam if self._poses is None else self._poses.at(index * stride)
                 reference = pair.reference
                 if reference is None and self._references is not None:
-                    reference = self._references.at(index * stride)
+                    reference = self._references.at(index * stride, pair.left.shape[1::-1])
                 stamp = self._wait_for_turn(frame_id)
                 if self._stopped.is_set():
                     return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -16,7 +16,7 @@ from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.geometry import is_rotation
-from sags_node.sources.pictures import list_pictures, read_picture
+from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.types import F32, F64, Reference
 
 _LARGEST = 2**31  # bytes
@@ -67,29 +67,68 @@ class References:
         self._config = config
         self._depth_files = {} if config.depth is None else _by_frame_number(config.depth)
         self._points = self._visible = None
+        self._rows: dict[int, int] | None = None  # of tracks by frame number; None: each frame has its row
         if config.tracks is not None:
             self._points = load_array(config.tracks, "points", (None, None, 3)).astype(np.float64)
             self._visible = load_array(config.tracks, "visible", self._points.shape[:2]).astype(np.bool_)
+            self._rows = _rows_by_frame_number(config.tracks, len(self._points))
 
-    def at(self, index: int) -> Reference | None:
+    def beyond(self, count: int) -> str:
+        """What is wrong where a number is that of no frame of the recording's `count`, as when they begin
+        at 1; "": nothing."""
+        config = self._config
+        for where, numbers in ((config.depth, self._depth_files), (config.tracks, self._rows or ())):
+            if (last := max(numbers, default=-1)) >= count:
+                return (
+                    f"{where} knows frame {last}, but the recording's {count} frames are numbered from 0 to "
+                    f"{count - 1}; number the reference alike, and remove what is of no frame"
+                )
+        return ""
+
+    def misnamed(self, pictures: Sequence[Path]) -> str:
+        """What is to be said where depth has the name of another picture than its own; "": nothing.
+
+        Args:
+            pictures: of all frames, in order.
+        """
+        places = {file.stem: place for place, file in enumerate(pictures)}
+        for number, file in self._depth_files.items():
+            if places.get(file.stem, number) != number:
+                return (
+                    f"{file} is taken for the depth of {pictures[number].name}: frame numbers begin at 0; "
+                    "if it is that of the picture of its name, number the reference from 0"
+                )
+        return ""
+
+    def at(self, index: int, size: tuple[int, int]) -> Reference | None:
         """Return what is known of one frame of the recording, None when that is nothing.
 
+        Args:
+            size: width and height of its picture, px.
+
         Raises:
-            SagsError: the depth picture is damaged or not 16 bit.
+            SagsError: the depth picture is damaged, not 16 bit, or of another shape than the frame's.
         """
         depth_file = self._depth_files.get(index)
         points = visible = None
-        if self._points is not None and self._visible is not None and index < len(self._points):
-            points, visible = self._points[index], self._visible[index]
+        row = index if self._rows is None else self._rows.get(index)
+        if self._points is not None and self._visible is not None and row in range(len(self._points)):
+            points, visible = self._points[row], self._visible[row]
         if depth_file is None and points is None:
             return None
-        depth = None if depth_file is None else self._read_depth(depth_file)
+        depth = None if depth_file is None else self._read_depth(depth_file, size)
         return Reference(depth, self._config.depth_kind, points, visible)
 
-    def _read_depth(self, file: Path) -> F32:
+    def _read_depth(self, file: Path, size: tuple[int, int]) -> F32:
         counts = read_picture(file, cv2.IMREAD_UNCHANGED)
         if counts.dtype != np.uint16 or counts.ndim != 2:
             raise SagsError(f"{file} is not a 16-bit grey PNG; reference depth must be one")
+        (height, width), (wide, high) = counts.shape, size
+        if abs(width * high - height * wide) >= max(size):  # by a whole pixel
+            raise SagsError(
+                f"{file} is {size_text(width, height)} px, of another shape than the pictures "
+                f"({size_text(wide, high)}); reference depth must show what they show, cropped as they are"
+            )
         return counts * np.float32(self._config.depth_unit)
 
 
@@ -99,6 +138,20 @@ def _by_frame_number(folder: Path) -> dict[int, Path]:
         if not file.stem.isdecimal():
             raise UsageError(f"{file}: reference depth files are named by frame number, e.g. 0010.png")
     return {int(file.stem): file for file in files}
+
+
+def _rows_by_frame_number(file: Path, count: int) -> dict[int, int] | None:
+    """Of tracks: as their `frames` [T] says; None where there is none."""
+    with zipfile.ZipFile(file) as archive:
+        if "frames.npy" not in archive.namelist():
+            return None
+    frames = load_array(file, "frames", (count,))
+    rows = {int(frame): row for row, frame in enumerate(frames.tolist())} if frames.dtype.kind in "iu" else {}
+    if len(rows) < count or min(rows, default=0) < 0:
+        raise UsageError(
+            f"{file}: 'frames' must hold the frame number of each row, from 0, none of them twice"
+        )
+    return rows
 
 
 def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[np.generic]:

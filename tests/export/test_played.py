@@ -17,10 +17,12 @@ from tiny_archive import TINY_FRAMES, write_tiny_session
 from sags_lab.lerobot.dataset import merge
 from sags_lab.lerobot.form import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, TISSUE, Version
 from sags_lab.lerobot.stats import Sums, merged
+from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import open_session
 from sags_node.rig import read_rig
+from sags_node.sources.source import open_source
 from sags_node.tools.export import sequence
 from sags_node.tools.export.played import DEPTH_UNIT, TRACKS
 from sags_node.tools.export.scene import Scene
@@ -97,6 +99,25 @@ def test_points_stay_on_the_surface_and_sags_eval_reads_them(exported: Path) -> 
         ).stdout
     )
     assert said["track"]["median_px"] < 2  # both follow the same tissue
+
+
+def test_what_is_exported_of_some_frames_is_read_back_for_the_same(exported: Path, tmp_path: Path) -> None:
+    """Files and rows are numbered by the recording's own frames, whichever of them are played."""
+    playing = ("source.stride:=2", "source.start:=0.2")
+    into = ("--depth", tmp_path / "depth", "--tracks", tmp_path / "tracks.npz")
+    assert sags("export", exported / "session0", *playing, "mapping.iterations:=1", *into).exit_code == 0
+    assert sorted(file.stem for file in (tmp_path / "depth").iterdir()) == ["00002", "00004"]
+    config = open_session(exported / "session0", ["source.pace:=step"]).config.source
+    reference = ReferenceConfig(depth=tmp_path / "depth", tracks=tmp_path / "tracks.npz")
+    with open_source(config.model_copy(update={"reference": reference})) as source:
+        found = {frame.frame_id: frame.reference for frame in source if frame.reference is not None}
+    assert list(found) == [2, 4]
+    with np.load(tmp_path / "tracks.npz") as tracks:
+        assert tracks["frames"].tolist() == [2, 4]
+        for row, (number, each) in enumerate(found.items()):
+            counts = cv2.imread(str(tmp_path / f"depth/{number:05d}.png"), cv2.IMREAD_UNCHANGED)
+            assert each.depth is not None and np.allclose(each.depth, counts * DEPTH_UNIT)
+            assert np.array_equal(each.points, tracks["points"][row], equal_nan=True)
 
 
 def test_the_video_has_every_frame(exported: Path) -> None:
@@ -285,14 +306,54 @@ def test_a_recording_of_the_same_name_is_another_one(tmp_path: Path) -> None:
     refused(2, "export", second, *into, said=("holds another sequence", "--force"))
 
 
+@pytest.mark.parametrize("changed", ["launch.yaml", "calib/left.yaml"])
+def test_what_the_frames_are_made_from_is_another_when_a_file_was_changed(
+    tmp_path: Path, changed: str
+) -> None:
+    recording = tmp_path / "clip"
+    write_tiny_session(recording, seed=0)
+    command = ("export", recording, "source.frames:=2", "--sequence", tmp_path / "out")
+    first = tmp_path / "out/frame_00000.ply"
+    assert sags(*command).exit_code == 0
+    before = first.stat().st_mtime_ns, first.read_bytes()
+    assert sags(*command).exit_code == 0  # the same again goes on
+    assert (first.stat().st_mtime_ns, first.read_bytes()) == before
+    file = recording / changed
+    if changed == "launch.yaml":
+        file.write_text(file.read_text() + "mapping: {max_gaussians: 500}\n")
+    else:
+        rig = read_rig(recording / "calib")
+        file.write_text(file.read_text().replace(f"{rig.left.P[0, 2]}", f"{rig.left.P[0, 2] + 8}"))
+    refused(2, *command, said=("another launch file, calibration or fit", "--force"))
+    assert sags(*command, "--force").exit_code == 0
+    assert first.read_bytes() != before[1]
+
+
+def test_the_state_of_a_sequence_tells_one_fit_from_the_next(tmp_path: Path) -> None:
+    write_tiny_session(tmp_path / "clip", seed=0)
+    session = open_session(tmp_path / "clip", ["source.pace:=step"])
+    with pytest.raises(UsageError, match=r"there is no .*checkpoint\.npz"):
+        sequence.state_of(session, tmp_path)
+    states = []
+    for name in ("checkpoint.npz", "figures.json"):
+        (tmp_path / name).write_text("first")
+    for said in ("first", "first", "second"):
+        (tmp_path / "checkpoint.npz").write_text(said)
+        states.append(sequence.state_of(session, tmp_path))
+    assert states[0] == states[1] != states[2]
+    session.source.stop()
+
+
 def test_files_of_something_else_stay_unless_forced(tmp_path: Path) -> None:
     sequence.check_sequence(tmp_path, {"session": "a"}, force=False)
     written(tmp_path)
     with pytest.raises(UsageError, match="another sequence"):
         sequence.check_sequence(tmp_path, {"session": "b"}, force=False)
     assert (tmp_path / "frame_00001.ply").exists()
-    sequence.check_sequence(tmp_path, {"session": "b"}, force=True)
-    assert not (tmp_path / "frame_00001.ply").exists()
+    for about in ({"session": "b"}, {"session": "b"}):  # of the same state, too
+        sequence.check_sequence(tmp_path, about, force=True)
+        assert not (tmp_path / "frame_00001.ply").exists()
+        written(tmp_path)
     foreign = tmp_path / "theirs"
     foreign.mkdir()
     (foreign / "note.txt").write_text("mine")

@@ -18,7 +18,7 @@ from numbered_pictures import write_video
 from places import SESSION
 from stamped_videos import write
 
-from sags_node.checks import Finding
+from sags_node.checks import Finding, parted
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
@@ -262,6 +262,27 @@ def test_one_broken_file_is_said_once(tmp_path: Path) -> None:
     assert check_folder(folder)[-1].what == f"to play it: when that is fixed: sags run {folder}"
     shutil.copy(folder / "left/001.bmp", folder / "left/000.bmp")
     assert overrides_of(folder)[-1] == f"rig:={folder / 'calib'}"
+
+
+def test_a_semicolon_in_a_name_does_not_part_a_message(tmp_path: Path) -> None:
+    folder = made(tmp_path / "case; old")
+    (folder / "left/000.bmp").rename(folder / "left/000; cut.bmp")
+    (folder / "left/000; cut.bmp").write_bytes(b"")
+    (error,) = [each for each in check_folder(folder) if each.level == "error"]
+    assert str(folder / "left/000; cut.bmp") in error.what
+    assert error.fix == "replace or remove the pair"
+    there = folder / "left"
+    for message, what, fix in (
+        (
+            f"{there}: 2 gaps; look at '{there}'; fill them",
+            f"{there}: 2 gaps",
+            f"look at '{there}'; fill them",
+        ),
+        (f"cannot read {there}", f"cannot read {there}", ""),
+        (f"pictures of {there} are odd; {there.parent}", f"pictures of {there} are odd", str(there.parent)),
+        ("one; two; three", "one", "two; three"),
+    ):
+        assert parted("error", message) == Finding("error", what, fix)
 
 
 def test_what_macos_writes_beside_files_is_passed_over(tmp_path: Path) -> None:

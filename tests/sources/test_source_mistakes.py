@@ -49,6 +49,20 @@ def posed(folder: Path, **arrays: np.ndarray) -> Recording:
     return folders_of(folder, poses=folder / "poses.npz")
 
 
+def write_depth(file: Path, width: int = WIDTH, height: int = HEIGHT) -> None:
+    file.parent.mkdir(exist_ok=True)
+    assert cv2.imwrite(str(file), np.full((height, width), 5000, np.uint16))
+
+
+def measured(folder: Path) -> Recording:
+    return folders_of(folder, reference=cfg.ReferenceConfig(depth=folder / "depth"))
+
+
+def tracked(folder: Path, frames: list[float]) -> Recording:
+    np.savez(folder / "tracks.npz", points=np.zeros((3, 5, 3)), visible=np.ones((3, 5)), frames=frames)
+    return folders_of(folder, reference=cfg.ReferenceConfig(tracks=folder / "tracks.npz"))
+
+
 def torn_poses(folder: Path) -> Recording:
     config = posed(folder, T_world_cam=np.tile(np.eye(4), (8, 1, 1)))
     data = (folder / "poses.npz").read_bytes()
@@ -97,8 +111,15 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: posed(at, T_world_cam=np.full((8, 4, 4), {}, dtype=object)), "'T_world_cam' is object"),
     (torn_poses, "poses.npz is not a readable npz file"),
     (lambda at: write_png(at / "depth/first.png", picture(0))
-     or folders_of(at, reference=cfg.ReferenceConfig(depth=at / "depth")),
+     or measured(at),
      "first.png: reference depth files are named by frame number"),
+    (lambda at: [write_depth(at / f"depth/{n:03d}.png") for n in range(1, 9)] and measured(at),
+     "depth knows frame 8, but the recording's 8 frames are numbered from 0 to 7; number the"),
+    (lambda at: tracked(at, [1, 4, 8]), "tracks.npz knows frame 8, but the recording's 8 frames"),
+    (lambda at: tracked(at, [0, 1, 1]), "'frames' must hold the frame number of each row, from 0"),
+    (lambda at: tracked(at, [0.0, 0.5, 1.0]), "'frames' must hold the frame number of each row"),
+    (lambda at: tracked(at, [-1, 0, 1]), "'frames' must hold the frame number of each row"),
+    (lambda at: tracked(at, [0, 1]), r"'frames' is int64 \[2\], wanted numbers \[3\]"),
 ]  # fmt: skip
 DAMAGED: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: write_png(at / "r/000.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8)) or folders_of(at),
@@ -128,7 +149,34 @@ def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path)
         open_source(folders_of(tmp_path, poses=tmp_path / "poses.npz"))
 
 
+def test_depth_that_has_another_pictures_name_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Every third frame, counted from 1, has numbers that are all there."""
+    recordings(tmp_path)
+    for number in range(8, 0, -1):
+        for eye in "lr":
+            (tmp_path / f"{eye}/{number - 1:03d}.png").rename(tmp_path / f"{eye}/{number:03d}.png")
+    for number in (3, 6):
+        write_depth(tmp_path / f"depth/{number:03d}.png")
+    open_source(measured(tmp_path))
+    assert "003.png is taken for the depth of 004.png: frame numbers begin at 0" in caplog.text
+
+
 # ---- on the way ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("width", "height"), [(WIDTH, WIDTH), (HEIGHT, WIDTH), (WIDTH + 2, HEIGHT)])
+def test_reference_depth_of_another_shape_is_refused(tmp_path: Path, width: int, height: int) -> None:
+    recordings(tmp_path)
+    write_depth(tmp_path / "depth/000.png", WIDTH // 2, HEIGHT // 2)  # smaller: the same view
+    write_depth(tmp_path / "depth/001.png", width, height)
+    with open_source(measured(tmp_path)) as source:
+        frames = iter(source)
+        first = next(frames).reference
+        assert first is not None and first.depth is not None
+        with pytest.raises(SagsError, match=f"001.png is {width}x{height} px, of another shape .*32x24"):
+            next(frames)
 
 
 @pytest.mark.fault("file: a picture is cut off")

@@ -202,6 +202,20 @@ def test_truth_follows_the_recording_through_a_loop(folders: cfg.FoldersSource, 
     assert frame.reference is None and frame.T_world_cam is not None and frame.tissue is not None
 
 
+def test_tracks_of_some_frames_go_by_their_numbers(folders: cfg.FoldersSource, tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(3, 5, 3))
+    rows = {9: 0, 3: 1, 6: 2}
+    np.savez(tmp_path / "t.npz", points=points, visible=np.ones((3, 5), bool), frames=list(rows))
+    update = {"reference": cfg.ReferenceConfig(tracks=tmp_path / "t.npz"), "stride": 3}
+    with open_source(folders.model_copy(update=update)) as source:
+        for frame, number in zip(source, (0, 3, 6, 9), strict=True):
+            if number == 0:
+                assert frame.reference is None
+                continue
+            assert frame.reference is not None
+            assert np.array_equal(frame.reference.points, points[rows[number]])
+
+
 def test_phantom_session_is_played_as_this_launch_file_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

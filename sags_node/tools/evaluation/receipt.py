@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sags_node.tools.evaluation.lpips import BACKBONE
 from sags_node.types import Bool, StereoFrame, StereoRig
@@ -25,11 +24,7 @@ class Receipt:
             rig: that the pictures were rectified by.
             size: width and height at which they were compared, px.
         """
-        eyes = (rig.left, rig.right)
-        numbers = [
-            np.asarray(part, np.float64) for eye in eyes for part in (eye.K, eye.distortion, eye.R, eye.P)
-        ]
-        self._calibration = _digest(*numbers)
+        self._calibration = rig_digest(rig)
         self._raw, self._size = (rig.left.width, rig.left.height), size
         self._weights = lpips_weights
         self._ids: list[int] = []
@@ -62,20 +57,25 @@ class Receipt:
             "values": "RGB of 8 bits, divided by 255; drawn colours were clipped to 0..1 before",
             "lpips": None
             if self._weights is None
-            else {"network": BACKBONE, "weights": _short(hashlib.sha256(self._weights.read_bytes()))},
+            else {"network": BACKBONE, "weights": digest(self._weights.read_bytes())},
             "calibration": self._calibration,
         }
 
 
-def _short(digest: Any) -> str:
-    return str(digest.hexdigest())[:DIGITS]
+def rig_digest(rig: StereoRig) -> str:
+    """The digest of a calibration's numbers."""
+    eyes = (rig.left, rig.right)
+    numbers = [np.asarray(part, np.float64) for eye in eyes for part in (eye.K, eye.distortion, eye.R, eye.P)]
+    return digest(*(part.tobytes() for part in numbers))
 
 
-def _digest(*arrays: NDArray[Any]) -> str:
-    found = hashlib.sha256()
-    for array in arrays:
-        found.update(array.tobytes())
-    return _short(found)
+def digest(*parts: bytes) -> str:
+    """The first sixteen hex digits of the SHA-256 of all parts together."""
+    return _short(hashlib.sha256(b"".join(parts)))
+
+
+def _short(found: Any) -> str:
+    return str(found.hexdigest())[:DIGITS]
 
 
 def _spans(ids: list[int]) -> str:

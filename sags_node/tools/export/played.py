@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import cv2
 import numpy as np
 
+from sags_node.config.schema import RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder, whole, writing
 from sags_node.kernels.threads import configure_threads
@@ -29,7 +30,8 @@ SEEN = 0.5  # visibility from which on a point counts as seen
 class Product(Protocol):
     """Takes one frame after the other. Both methods may raise `OSError`."""
 
-    def add(self, result: FrameResult, anchors: AnchorStates) -> None: ...
+    def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
+        """`number`: the frame's in the recording, from 0, whatever its stride."""
 
     def finish(self) -> int:
         """Complete the file or folder; how much is in it."""
@@ -60,6 +62,8 @@ def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance)
         SagsError: it cannot be read, or a file cannot be written.
     """
     count, done, rows = session.source.frame_count, 0, []
+    played = session.config.source
+    assert isinstance(played, RecordedSource)
     with ExitStack() as stack:
         partial = {kind: stack.enter_context(whole(path)) for kind, path in wanted.items()}
         products = {}
@@ -69,7 +73,7 @@ def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance)
         for done, (result, anchors) in enumerate(_played(session), 1):
             for kind, product in products.items():
                 with writing(wanted[kind]):
-                    product.add(result, anchors)
+                    product.add(result.pair.frame_id * played.stride, result, anchors)
             advance(done, count, "playing")
         if done == 0:
             raise SagsError("no frame was played; check source.start, source.frames and source.warm_up")
@@ -141,10 +145,10 @@ class DepthMaps:
         self._folder = folder
         self._holds = 0
 
-    def add(self, result: FrameResult, anchors: AnchorStates) -> None:
+    def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
         depth = depth_of(result)
         counts = np.where(depth < MOST_DEPTH, np.round(depth / DEPTH_UNIT), 0).astype(np.uint16)
-        path = self._folder / f"{result.pair.frame_id:05d}.png"
+        path = self._folder / f"{number:05d}.png"
         path.write_bytes(cv2.imencode(".png", counts)[1].tobytes())
         self._holds += 1
 
@@ -161,11 +165,11 @@ class Tracks:
         self._visible: list[F32] = []
         self._frames: list[int] = []
 
-    def add(self, result: FrameResult, anchors: AnchorStates) -> None:
+    def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
         points, visibility = points_of(anchors)
         self._points.append(points)
         self._visible.append(visibility)
-        self._frames.append(result.pair.frame_id)
+        self._frames.append(number)
 
     def finish(self) -> int:
         points, seen = np.stack(self._points), np.stack(self._visible) >= SEEN
@@ -182,7 +186,7 @@ class Renders:
         self._video = VideoFile(file, rate, size)
         self._holds = 0
 
-    def add(self, result: FrameResult, anchors: AnchorStates) -> None:
+    def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
         pair, view = result.pair, result.views["left"]
         shown = published.alpha(pair, view)[..., None] > 0
         self._video.add(published.colours(pair, view) * shown * np.uint8(not result.held))

@@ -157,12 +157,22 @@ def scenes_of_fit(folder: Path, session: Session, advance: Advance) -> Iterator[
         yield Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns)
 
 
-def _read_fit(folder: Path, session: Session, advance: Advance) -> tuple[Fit, list[ClipFrame]]:
-    """A fit, and all frames of its recording in order; as `from_fit`."""
+def files_of_fit(folder: Path) -> tuple[Path, Path]:
+    """The checkpoint and the figures that `sags fit` left.
+
+    Raises:
+        UsageError: one is missing.
+    """
     stored, figures = folder / "checkpoint.npz", folder / "figures.json"
     for file in (stored, figures):
         if not file.is_file():
             raise UsageError(f"there is no {file}; name the folder of a finished sags fit")
+    return stored, figures
+
+
+def _read_fit(folder: Path, session: Session, advance: Advance) -> tuple[Fit, list[ClipFrame]]:
+    """A fit, and all frames of its recording in order; as `from_fit`."""
+    stored, figures = files_of_fit(folder)
     try:
         with np.load(stored, allow_pickle=False) as arrays:
             about = json.loads(str(arrays["about"]))

@@ -19,8 +19,10 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder, whole, writing
 from sags_node.media.video_file import VideoFile
 from sags_node.model.ply import write_ply
+from sags_node.pipeline.session import Session
+from sags_node.tools.evaluation.receipt import digest, rig_digest
 from sags_node.tools.export.orbit import picture_of
-from sags_node.tools.export.scene import Advance, Scene
+from sags_node.tools.export.scene import Advance, Scene, files_of_fit
 
 ABOUT = "sequence.json"
 LOOP = "loop.mp4"
@@ -28,12 +30,25 @@ FRAME = "frame_{:05d}.ply"
 QUALITY = 98  # of the pictures kept for the way back, JPEG
 
 
+def state_of(session: Session, fit: Path | None) -> dict[str, str | None]:
+    """Digests of what the frames are made from: a file whose path is the same may hold something else now.
+
+    Raises:
+        UsageError: `fit` is no folder of a finished `sags fit`.
+    """
+    return {
+        "configuration": digest(session.config.model_dump_json().encode()),
+        "calibration": rig_digest(session.rig),
+        "checkpoint": None if fit is None else digest(files_of_fit(fit)[0].read_bytes()),
+    }
+
+
 def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
     """Before any work: is the folder new, or that of the same export?
 
     Args:
-        about: what is exported, as JSON.
-        force: files of another export may be replaced; they are removed.
+        about: what is exported, as JSON; `state_of` it, too.
+        force: begin anew: files of an earlier export are removed.
 
     Raises:
         UsageError: the folder holds something else.
@@ -41,18 +56,21 @@ def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
     """
     check_folder(folder)
     stored = folder / ABOUT
-    if stored.is_file():
+    if force:
+        with writing(folder):
+            for file in (*folder.glob("frame_[0-9]*.ply"), folder / LOOP, stored):
+                file.unlink(missing_ok=True)
+    elif stored.is_file():
         try:
             same = json.loads(stored.read_text(encoding="utf-8")) == about
         except (OSError, ValueError):
             same = False
-        if not same and not force:
-            raise UsageError(f"{folder} holds another sequence; choose another folder, or add --force")
         if not same:
-            with writing(folder):
-                for file in (*folder.glob("frame_*.ply"), folder / LOOP, stored):
-                    file.unlink(missing_ok=True)
-    elif any(folder.iterdir()) and not force:
+            raise UsageError(
+                f"{folder} holds another sequence, or one of another launch file, calibration or fit; choose "
+                "another folder, or add --force"
+            )
+    elif any(folder.iterdir()):
         raise UsageError(f"{folder} is not empty; choose another folder, or add --force")
     with whole(stored) as partial:
         partial.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
@@ -87,7 +105,7 @@ def write_sequence(
                 try:
                     write_ply(path, scene.gaussians)
                 except SagsError as error:
-                    said = f"{written + kept} frames are there; the same command goes on with the others"
+                    said = f"{written + kept} frames are there; the same command goes on, without --force"
                     raise SagsError(f"{error}: {said}") from None
                 written += 1
             size += path.stat().st_size
