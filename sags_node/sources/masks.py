@@ -50,6 +50,10 @@ class Masks:
         self, folder: Path, some: Iterable[tuple[Path, NDArray[Any]]], instruments: Instruments = "white"
     ) -> None:
         self._instruments = instruments
+        listed = [] if isinstance(instruments, str) else [*map(_colour_of, instruments)]
+        # White is a colour too: where a mask has no other one it is read as grey.
+        self._greys = [int(name[1:3], 16) for name in listed if 3 * name[1:3] == name[1:]]
+        self._colours = [] if all(isinstance(value, int) for value in instruments) else listed
         self._values: set[int] = set()
         looked_at = [(file, _eight_bits(mask, file)) for file, mask in some]
         # What an opaque mask of one colour is, others tell: all of it can be seen, or none is an instrument.
@@ -83,8 +87,7 @@ class Masks:
         if grey.ndim == 3:
             return self._of_colours(grey, file)
         if not isinstance(self._instruments, str):
-            listed = np.array([value for value in self._instruments if isinstance(value, int)])
-            away = np.abs(np.arange(256)[:, None] - listed).min(axis=1, initial=256)
+            away = np.abs(np.arange(256)[:, None] - np.array(self._greys)).min(axis=1, initial=256)
             tissue: Bool = (away > NEAR * lossy)[grey]
             return tissue
         self._look(grey, file, lossy)
@@ -109,7 +112,7 @@ class Masks:
         """The same of a mask [H, W, 3]."""
         blue, green, red = (plane.astype(np.int32) for plane in cv2.split(mask))
         codes = blue + (green << 8) + (red << 16)
-        listed = [value for value in self._instruments if isinstance(value, str) and value[0] == "#"]
+        listed = self._colours
         if not listed:
             found, counts = np.unique(codes[_alike(codes)], return_counts=True)
             there = [f"#{code:06x}" for code in found[counts > SMALLEST_AREA * codes.size]]
@@ -118,6 +121,10 @@ class Masks:
             listed = [*ENDOVIS]
         tissue: Bool = np.logical_and.reduce([codes != int(name[1:], 16) for name in listed])
         return tissue
+
+
+def _colour_of(value: int | str) -> str:
+    return "#" + 3 * f"{value:02x}" if isinstance(value, int) else value
 
 
 def _question(

@@ -167,6 +167,21 @@ def test_a_label_that_comes_late_is_asked_about_there(tmp_path: Path) -> None:
     assert tissue is not None and (tissue == ~TOOL).all()
 
 
+@pytest.mark.parametrize("instruments", [("#ffffff", "#ff0000"), (255, "#ff0000")])
+def test_a_grey_that_is_listed_counts_with_other_colours_and_without(
+    instruments: tuple[int | str, ...], tmp_path: Path
+) -> None:
+    """The white shaft is in each frame, the red tip in every other one."""
+    config = with_masks(tmp_path, coloured((SHAFT, "#ffffff"))).model_copy(
+        update={"instruments": instruments}
+    )
+    for number in range(0, COUNT, 2):
+        mask = coloured((SHAFT, "#ffffff"), (TIP, "#ff0000"), (RIM, "#808080"))
+        cv2.imwrite(str(tmp_path / f"masks/{number}.png"), mask)
+    for number, frame in enumerate(played(config)):
+        assert frame.tissue is not None and (frame.tissue == (~SHAFT if number % 2 else ~TOOL)).all()
+
+
 @pytest.mark.parametrize("value", ["[]", "[256]", "[-1]", "grey", "[red]", "85"])
 def test_values_of_masks_are_checked(value: str) -> None:
     with pytest.raises(UsageError, match="should be white, black, or a list of values"):
