@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Self
 
 import cv2
@@ -19,7 +20,7 @@ from sags_node.sources.endonerf import EndoNerfPairs
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import FolderPairs, Pairs, say
 from sags_node.sources.scared import ScaredPairs
-from sags_node.sources.truth import Poses, References
+from sags_node.sources.truth import Poses, References, load_array
 from sags_node.sources.videos import OneVideoPairs, VideoPairs
 from sags_node.types import U8, StereoFrame
 
@@ -91,6 +92,8 @@ class Replay:
         self._poses = None if config.poses is None else Poses(config.poses)
         self._references = References(config.reference) if references else None
         self.pairs = open_pairs(config, references)
+        if config.poses is not None:
+            self._compare_poses(config.poses)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
         self.assumed = "" if "rate" in config.model_fields_set or self.pairs.rate else ASSUMED
@@ -115,6 +118,17 @@ class Replay:
             if config.frames is None or config.frames > there:
                 self.pairs.close()
                 raise UsageError(f"{self.pairs.cut_off}, or play what is there with source.frames:={there}")
+
+    def _compare_poses(self, file: Path) -> None:
+        there, lefts = len(load_array(file, "T_world_cam", (None, 4, 4))), self.pairs.left_count
+        lefts = self.pairs.count if lefts is None else lefts
+        if there == lefts or (self.pairs.cut_off and there > lefts):  # the pictures that it lost have poses
+            return
+        self.pairs.close()
+        raise UsageError(
+            f"{file} holds {there} poses, the recording {lefts} pictures of the left eye; T_world_cam must "
+            "hold one for each of them, in their order, also for those that are not played"
+        )
 
     def frame_at(self, start: float) -> int:
         """Number of the frame that this `source.start` begins with."""
@@ -183,10 +197,12 @@ class Replay:
                 self._dropped_in_a_row += 1
             else:
                 self._dropped_in_a_row = 0
-                pose = pair.T_world_cam if self._poses is None else self._poses.at(index * stride)
+                numbers = self.pairs.left_numbers
+                number = index * stride if numbers is None else int(numbers[index * stride])
+                pose = pair.T_world_cam if self._poses is None else self._poses.at(number)
                 reference = pair.reference
                 if reference is None and self._references is not None:
-                    reference = self._references.at(index * stride)
+                    reference = self._references.at(number)
                 stamp = self._wait_for_turn(frame_id)
                 if self._stopped.is_set():
                     return
