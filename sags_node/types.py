@@ -100,6 +100,8 @@ class StereoRig:
     path: Path | str = field(default="PATH", kw_only=True)
     # False: guessed, so that lengths are right up to a factor that nobody knows.
     metric: bool = field(default=True, kw_only=True)
+    # Its files do not say the unit of lengths; this one is usual of their form, and was taken.
+    unit: str = field(default="m", kw_only=True)
 
     @property
     def baseline(self) -> float:
