@@ -100,6 +100,8 @@ class StereoRig:
     path: Path | str = field(default="PATH", kw_only=True)
     # False: guessed, so that lengths are right up to a factor that nobody knows.
     metric: bool = field(default=True, kw_only=True)
+    # Its files do not say the unit of lengths; this one is usual of their form, and was taken.
+    unit: str = field(default="m", kw_only=True)
 
     @property
     def baseline(self) -> float:
@@ -156,6 +158,7 @@ class StereoFrame:
     tools: tuple[ToolPose, ...] = ()  # where a robot says that its tools are
     warm_up: bool = False  # the model learns from it, and nothing of it is shown or counted
     recorded_s: float | None = None  # its place in the recording, from 0 again when that loops; None: live
+    recorded_number: int = -1  # of its left picture among all of the recording, from 0; -1: live
 
 
 @dataclass(frozen=True, slots=True)

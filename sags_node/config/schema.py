@@ -121,7 +121,9 @@ class RecordedSource(Section):
         "nothing of them is published, measured, exported or fitted",
     )
     stride: FrameNumber = Field(1, ge=1, description="play only each stride-th frame")
-    poses: Path | None = Field(None, description="npz with T_world_cam [T, 4, 4] (m)")
+    poses: Path | None = Field(
+        None, description="npz with T_world_cam [T, 4, 4] (m), one of each picture of the left eye"
+    )
     reference: ReferenceConfig = ReferenceConfig()
 
 

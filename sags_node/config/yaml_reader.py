@@ -2,11 +2,13 @@
 
 It gives what `yaml.safe_load` gives, and refuses what that takes in silence: keys that are given twice;
 aliases that contain themselves or unfold to far more than was written; zero characters, which no file name
-can hold, and names that cannot be told to anybody.
+can hold, and names that cannot be told to anybody. Numbers with zeros in front stay as they were written: of
+000100 and 000180 that makes 64 and a text.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,8 @@ from sags_node.files import NO_TEXT, is_text, near, read_file
 LARGEST_FILE = 1 << 20  # bytes
 MOST_VALUES = 100_000  # with all aliases unfolded
 LONGEST = 200  # characters of what PyYAML says
+_INT, _TEXT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:str"
+_OCTAL = re.compile("[-+]?0[0_]*[1-7][0-7_]+")  # another number than in decimal digits
 EMPTY = {"", "~", "null", "Null", "NULL"}  # as YAML writes None
 
 
@@ -123,6 +127,8 @@ class _Loader(yaml.SafeLoader):
             raise _RefusedError(node, "a text holds a zero character")
         elif not is_text(node.value):
             raise _RefusedError(node, f"{brief(node.value)} {NO_TEXT}")
+        elif node.tag == _INT and _OCTAL.fullmatch(node.value):
+            node.tag = _TEXT  # a number where one is wanted: of decimal digits
         self._sizes[node] = 1 + sum(self._sizes[part] for part in parts)
         if self._sizes[node] > MOST_VALUES:
             raise _RefusedError(node, f"it holds more than {MOST_VALUES} values, with its aliases unfolded")

@@ -238,14 +238,18 @@ def _check_order(rig: StereoRig) -> list[Finding]:
 
 def _check_baseline(rig: StereoRig) -> list[Finding]:
     baseline = rig.baseline
-    units = fitting_units(baseline, *ENDOSCOPE_BASELINE)
-    in_unit = in_metres(units, rig.path) if units else ""
+    units = fitting_units(baseline, *ENDOSCOPE_BASELINE, rig.unit)
+    in_unit = in_metres(units, rig.path, rig.unit) if units else ""
+    names = " or ".join(NAMES[unit] for unit in units)
     if baseline > LARGEST_BASELINE:
-        looks = f"looks like {' or '.join(NAMES[unit] for unit in units)}" if units else "is too large"
+        looks = f"looks like {names}" if units else "is too large"
         fix = in_unit or f"is the side of the board's squares right? {RECALIBRATE}"
         return [Finding("error", f"the baseline of {baseline:g} m {looks}", fix)]
     if baseline < SMALLEST_BASELINE:
-        what = f"a baseline of {baseline * 1e3:.3g} mm is too small: projection_matrix[3] is -fx * baseline"
+        what = f"a baseline of {baseline * 1e3:.3g} mm is too small"
+        if in_unit:
+            return [Finding("error", f"{what}: the files' looks like {names}", in_unit)]
+        what += ": projection_matrix[3] is -fx * baseline"
         fix = f"multiply it in right.yaml by fx, {rig.right.P[0, 0]:g}, if it holds the baseline itself"
         return [Finding("error", what, fix)]
     if not ENDOSCOPE_BASELINE[0] <= baseline <= ENDOSCOPE_BASELINE[1]:

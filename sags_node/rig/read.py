@@ -203,7 +203,8 @@ def read_text_folder(folder: Path, size: tuple[int, int] | None, metres: float |
     l2r = _text_matrix(folder, "l2r").reshape(4, 4)
     T = l2r[:3, 3] * (metres or MILLIMETRE)
     matrix = partial(_text_matrix, folder)
-    return _rig(matrix, folder.resolve().name, str(folder), size, l2r[:3, :3], T)
+    rig = _rig(matrix, folder.resolve().name, str(folder), size, l2r[:3, :3], T)
+    return rig if metres else replace(rig, unit="mm")
 
 
 def _text_matrix(folder: Path, key: str) -> F64:

@@ -110,6 +110,9 @@ class BagPairs(Pairs):
         left, right = (contents.pictures[name].keys for name in self._eyes)
         self._keys, self.stamps = pair_messages(config, left, right)
         self.count = len(self._keys)
+        numbers = {key: number for number, key in enumerate(left)}
+        self.left_count = len(left)
+        self.left_numbers = np.array([numbers[key] for key, _ in self._keys], np.int64)
         steps = np.diff(self.stamps[:, 0])
         self.rate = float(1e9 / np.median(steps)) if len(steps) and np.median(steps) > 0 else None
         self.judged = judge_stamps(self._keys, self.stamps, self.rate, (left, right))

@@ -26,7 +26,9 @@ from sags_node.types import F32, F64, StereoRig
 # Of a frame's known depths: what lies outside is drawn to them, as EndoGaussian's loader does.
 UNKNOWN = 65535  # counts, as many programs write it
 DEPTH_PERCENTILES = (3.0, 99.8)
-PLAUSIBLE_DEPTH = (0.01, 1.0)  # m, the median of a frame: in an endoscope's view
+ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median of a frame: in an endoscope's view
+FARTHEST_DEPTH = 1.0  # m: what is said to lie farther away is refused
+DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0, 1e-3 / 256)  # m per count, the usual ones first; SERV-CT's last
 PUBLISHED = (640, 512, 569.4682)  # px: width, height and focal length of the clips of EndoNeRF
 PUBLISHED_BASELINE = 4.324e-3  # m, which their author states
 NOMINAL_BASELINE = 0.005  # m; without a right picture nothing depends on it
@@ -135,18 +137,35 @@ class EndoNerfPairs(FolderPairs):
         known = depth[depth > 0]
         if known.size == 0:
             return
-        median = float(np.median(known))
-        if not PLAUSIBLE_DEPTH[0] <= median <= PLAUSIBLE_DEPTH[1]:
+        median, unit = float(np.median(known)), self._config.depth_unit
+        if not ENDOSCOPE_DEPTH[0] <= median <= FARTHEST_DEPTH:
             raise UsageError(
                 f"{file}: the median depth would be {median:.3g} m, but an endoscope sees "
-                f"{PLAUSIBLE_DEPTH[0]:g} to {PLAUSIBLE_DEPTH[1]:g} m; set source.depth_unit (m per count, "
-                f"now {self._config.depth_unit:g})"
+                f"{ENDOSCOPE_DEPTH[0]:g} to {ENDOSCOPE_DEPTH[1]:g} m; set source.depth_unit (m per count, "
+                f"now {unit:g}){_units_that_fit(median / unit)}"
             )
-        if read_picture(file, cv2.IMREAD_UNCHANGED).dtype == np.uint8 and not is_published(self._config):
+        said = f"{file.parent}: {median * 1e3:.0f} mm (median) with {unit:g} m per count"
+        if median > ENDOSCOPE_DEPTH[1]:
             self.oddities.append(
-                f"{file.parent}: {median * 1e3:.0f} mm (median) with {self._config.depth_unit:g} m per "
-                "count, of only 8 bit; the files do not say that unit: ask who made them"
+                f"{said}, and an endoscope sees {ENDOSCOPE_DEPTH[0]:g} to {ENDOSCOPE_DEPTH[1]:g} m; ask who "
+                f"made it which unit it has, and set source.depth_unit{_units_that_fit(median / unit)}"
             )
+        elif "depth_unit" not in self._config.model_fields_set and not is_published(self._config):
+            coarse = read_picture(file, cv2.IMREAD_UNCHANGED).dtype == np.uint8
+            self.oddities.append(
+                f"{said}{', of only 8 bit' * coarse}, which the files do not say; ask who made them, and set "
+                "source.depth_unit"
+            )
+
+
+def fitting_units(counts: float) -> list[float]:
+    """Units, m per count, in which so many counts (median) are a distance in an endoscope's view."""
+    return [unit for unit in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= counts * unit <= ENDOSCOPE_DEPTH[1]]
+
+
+def _units_that_fit(counts: float) -> str:
+    each = [f"{unit:g} makes {counts * unit * 1e3:.0f} mm" for unit in fitting_units(counts)]
+    return f" ({', '.join(each)})" if each else ""
 
 
 def read_llff(config: EndoNerfSource) -> Llff:

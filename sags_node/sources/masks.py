@@ -50,8 +50,15 @@ class Masks:
         self, folder: Path, some: Iterable[tuple[Path, NDArray[Any]]], instruments: Instruments = "white"
     ) -> None:
         self._instruments = instruments
+        listed = [] if isinstance(instruments, str) else [*map(_colour_of, instruments)]
+        # White is a colour too: where a mask has no other one it is read as grey.
+        self._greys = [int(name[1:3], 16) for name in listed if 3 * name[1:3] == name[1:]]
+        self._colours = [] if all(isinstance(value, int) for value in instruments) else listed
         self._values: set[int] = set()
-        shares = [float(np.mean(~self.tissue(mask, file))) for file, mask in some]
+        looked_at = [(file, _eight_bits(mask, file)) for file, mask in some]
+        # What an opaque mask of one colour is, others tell: all of it can be seen, or none is an instrument.
+        self._is_alpha = any(_shows_in_alpha(mask) for _, mask in looked_at)
+        shares = [float(np.mean(~self.tissue(mask, file))) for file, mask in looked_at]
         share = float(np.median(shares))
         self.oddities: list[str] = []
         if not any(shares):
@@ -73,12 +80,14 @@ class Masks:
             UsageError: the values, with those of the masks before, do not tell.
         """
         lossy = file.suffix.lower() in LOSSY
-        grey = _as_grey(mask, file, NEAR * lossy)
+        mask = _eight_bits(mask, file)
+        self._is_alpha = self._is_alpha or _shows_in_alpha(mask)
+        is_alpha = self._is_alpha and _is_of_one_colour(mask)
+        grey = mask[..., 3] if is_alpha else _as_grey(mask, NEAR * lossy)
         if grey.ndim == 3:
             return self._of_colours(grey, file)
         if not isinstance(self._instruments, str):
-            listed = np.array([value for value in self._instruments if isinstance(value, int)])
-            away = np.abs(np.arange(256)[:, None] - listed).min(axis=1, initial=256)
+            away = np.abs(np.arange(256)[:, None] - np.array(self._greys)).min(axis=1, initial=256)
             tissue: Bool = (away > NEAR * lossy)[grey]
             return tissue
         self._look(grey, file, lossy)
@@ -103,7 +112,7 @@ class Masks:
         """The same of a mask [H, W, 3]."""
         blue, green, red = (plane.astype(np.int32) for plane in cv2.split(mask))
         codes = blue + (green << 8) + (red << 16)
-        listed = [value for value in self._instruments if isinstance(value, str) and value[0] == "#"]
+        listed = self._colours
         if not listed:
             found, counts = np.unique(codes[_alike(codes)], return_counts=True)
             there = [f"#{code:06x}" for code in found[counts > SMALLEST_AREA * codes.size]]
@@ -112,6 +121,10 @@ class Masks:
             listed = [*ENDOVIS]
         tissue: Bool = np.logical_and.reduce([codes != int(name[1:], 16) for name in listed])
         return tissue
+
+
+def _colour_of(value: int | str) -> str:
+    return "#" + 3 * f"{value:02x}" if isinstance(value, int) else value
 
 
 def _question(
@@ -126,20 +139,30 @@ def _question(
     )
 
 
-def _as_grey(mask: NDArray[Any], file: Path, near: int) -> U8:
-    """Eight bit [H, W]; [H, W, 3] BGR where there are colours."""
+def _eight_bits(mask: NDArray[Any], file: Path) -> U8:
     if mask.dtype == np.uint16:
         mask = mask >> 8 if mask.max() > 255 else mask
     elif mask.dtype != np.uint8:
         raise UsageError(f"{file} holds {mask.dtype}, which is no mask; save it as PNG of 8 bit")
-    eight: U8 = mask.astype(np.uint8)
-    if eight.ndim == 2:
-        return eight
-    planes: list[U8] = [np.asarray(plane, np.uint8) for plane in cv2.split(eight)]
-    if len(planes) == 4 and all(plane.min() == plane.max() for plane in planes[:3]):
-        return planes[3]  # the mask is what can be seen through
+    return mask.astype(np.uint8)
+
+
+def _is_of_one_colour(mask: U8) -> bool:
+    """Tell whether what differs in a mask [H, W, 4], if anything does, is how far it can be seen through."""
+    return mask.ndim == 3 and mask.shape[2] == 4 and not np.ptp(mask[..., :3], axis=(0, 1)).any()
+
+
+def _shows_in_alpha(mask: U8) -> bool:
+    return _is_of_one_colour(mask) and bool(mask[..., 3].min() < 255)
+
+
+def _as_grey(mask: U8, near: int) -> U8:
+    """[H, W]; [H, W, 3] BGR where there are colours."""
+    if mask.ndim == 2:
+        return mask
+    planes: list[U8] = [np.asarray(plane, np.uint8) for plane in cv2.split(mask)]
     spread = max(cv2.absdiff(planes[1], planes[at]).max() for at in (0, 2))
-    return eight[..., :3] if spread > near else planes[1]
+    return mask[..., :3] if spread > near else planes[1]
 
 
 def _areas(mask: U8, near: int) -> set[int]:

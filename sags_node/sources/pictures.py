@@ -62,9 +62,13 @@ class Pairs:
         cut_off: why pairs are missing at its end, with a remedy after a semicolon; "": none are.
         reach: how many pairs are there, also of the right eye, where some are missing.
         judged: what is odd about its stamps or poses.
+        left_count: pictures of the left eye, also those without a partner; None: all have one.
+        left_numbers: [count] of each pair's left picture among these: poses and references go by them.
     """
 
     count: int
+    left_count: int | None = None
+    left_numbers: I64 | None = None
     rate: float | None = None
     stamps: I64 | None = None
     pixel_aspect = 1.0

@@ -91,12 +91,11 @@ class Replay:
         self._poses = None if config.poses is None else Poses(config.poses)
         self._references = References(config.reference) if references else None
         self.pairs = open_pairs(config, references)
-        if self._references is not None and (beyond := self._references.beyond(self.pairs.count)):
-            self.pairs.close()
-            raise UsageError(beyond)
-        if self._references is not None and isinstance(self.pairs, FolderPairs) and not quiet:
-            if misnamed := self._references.misnamed(self.pairs.files):
-                say(misnamed)
+        lefts = self.pairs.count if self.pairs.left_count is None else self.pairs.left_count
+        if self._poses is not None:
+            self._compare_poses(self._poses, lefts)
+        if self._references is not None:
+            self._compare_references(self._references, lefts)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
         self.rate = (config.rate or self.pairs.rate or DEFAULT_RATE) / config.stride
         self.assumed = "" if "rate" in config.model_fields_set or self.pairs.rate else ASSUMED
@@ -121,6 +120,24 @@ class Replay:
             if config.frames is None or config.frames > there:
                 self.pairs.close()
                 raise UsageError(f"{self.pairs.cut_off}, or play what is there with source.frames:={there}")
+
+    def _compare_poses(self, poses: Poses, lefts: int) -> None:
+        there = len(poses)
+        if there == lefts or (self.pairs.cut_off and there > lefts):  # the pictures that it lost have poses
+            return
+        self.pairs.close()
+        raise UsageError(
+            f"{self._config.poses} holds {there} poses, the recording {lefts} pictures of the left eye; T_world_cam must "
+            "hold one for each of them, in their order, also for those that are not played"
+        )
+
+    def _compare_references(self, references: References, lefts: int) -> None:
+        if not self.pairs.cut_off and (beyond := references.beyond(lefts)):
+            self.pairs.close()
+            raise UsageError(beyond)
+        if isinstance(self.pairs, FolderPairs) and not self._quiet:
+            if misnamed := references.misnamed(self.pairs.files):
+                say(misnamed)
 
     def frame_at(self, start: float) -> int:
         """Number of the frame that this `source.start` begins with."""
@@ -189,10 +206,12 @@ class Replay:
                 self._dropped_in_a_row += 1
             else:
                 self._dropped_in_a_row = 0
-                pose = pair.T_world_cam if self._poses is None else self._poses.at(index * stride)
+                numbers = self.pairs.left_numbers
+                number = index * stride if numbers is None else int(numbers[index * stride])
+                pose = pair.T_world_cam if self._poses is None else self._poses.at(number)
                 reference = pair.reference
                 if reference is None and self._references is not None:
-                    reference = self._references.at(index * stride, pair.left.shape[1::-1])
+                    reference = self._references.at(number, pair.left.shape[1::-1])
                 stamp = self._wait_for_turn(frame_id)
                 if self._stopped.is_set():
                     return
@@ -214,6 +233,7 @@ class Replay:
                     t_device_ns=0 if self._recorded is None else int(self._recorded[index]),
                     warm_up=frame_id < self.first + self._config.warm_up,
                     recorded_s=self.seconds_of(index),
+                    recorded_number=number,
                 )
             for _ in range(stride - 1):
                 self.pairs.skip()

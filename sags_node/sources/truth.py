@@ -48,6 +48,9 @@ class Poses:
                 "translations are in metres: of millimetres divide them by 1000"
             )
 
+    def __len__(self) -> int:
+        return len(self._poses)
+
     def at(self, index: int) -> F64:
         """`T_world_cam` [4, 4] of one frame of the recording, metres."""
         if index >= len(self._poses):

@@ -60,6 +60,7 @@ class VideoPairs(Pairs):
         self.by_number = numbers is None
         self._numbers = np.arange(self.left.count)[:, None].repeat(2, axis=1) if numbers is None else numbers
         self.count = len(self._numbers)
+        self.left_count, self.left_numbers = self.left.count, self._numbers[:, 0]
         self.stamps = self._find_stamps()
         self.pixel_aspect = layout.pixel_aspect(*self.left.size, self.left.pixel_aspect)
         self.cut_off = next((_cut_off(each) for each in self._videos if each.cut_off), "")
@@ -210,11 +211,17 @@ class OneVideoPairs(Pairs):
             raise
         in_turn = 2 if layout.is_sequential else 1
         self.rate = None if video.rate is None else video.rate / in_turn
-        self._numbers = _turns(video) if layout.is_sequential else np.arange(video.count)[:, None]
+        self._numbers = np.arange(video.count)[:, None]
+        left = 0
+        if layout.is_sequential:
+            turns, left = _turns(video), layout.order.index("left")
+            seconds = 1 + np.flatnonzero((turns[1:] % 2 == 1) & (np.diff(turns) == 1))
+            self._numbers = np.stack([seconds - 1, seconds], axis=1)
+            lefts = np.cumsum(turns % 2 == left)
+            self.left_count, self.left_numbers = int(lefts[-1]), lefts[self._numbers[:, left]] - 1
         self.count = len(self._numbers)
         if video.stamps is not None and not video.is_even:
             of_eyes = video.stamps[self._numbers]
-            left = layout.order.index("left") if layout.is_sequential else 0
             self.stamps = np.stack([of_eyes[:, left], of_eyes[:, -1 - left]], axis=1)
         self.pixel_aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
         self.cut_off = _cut_off(video) if video.cut_off else ""
@@ -253,14 +260,13 @@ def _cut_off(video: Video) -> str:
 
 
 def _turns(video: Video) -> I64:
-    """Numbers of first and second pictures [N, 2], where the eyes come in turn. The time between two pictures
-    says how many were lost, so the eyes are not exchanged by one."""
+    """The turn of each picture [N], where the eyes come in turn; even: the first eye's. The time between two
+    pictures says how many were lost, so the eyes are not exchanged by one."""
     turns = np.arange(video.count)
     if video.stamps is not None and video.rate is not None:
         steps = np.maximum(1, np.rint(np.diff(video.stamps) * (video.rate * 1e-9))).astype(np.int64)
         turns = np.concatenate([[0], np.cumsum(steps)])
-    seconds = 1 + np.flatnonzero((turns[1:] % 2 == 1) & (np.diff(turns) == 1))
-    return np.stack([seconds - 1, seconds], axis=1)
+    return turns
 
 
 def _unpainted(painted: U8, left: U8) -> Bool:

@@ -382,6 +382,19 @@ def test_text_matrices_are_millimetres(tmp_path: Path, prefix: str, plural: str,
     assert_same(read_rig(folder, SIZE), make_rig())
 
 
+@pytest.mark.parametrize("unit", ["m", "cm", "um", "inch"])
+def test_text_matrices_in_another_unit_say_which_one_and_how(tmp_path: Path, unit: str) -> None:
+    folder = write_text(tmp_path / "rig")
+    transform = np.loadtxt(folder / "calib.l2r.txt")
+    transform[:3, 3] *= 1e-3 / UNITS[unit]
+    np.savetxt(folder / "calib.l2r.txt", transform)
+    (odd,) = [each for each in check_rig(read_rig(folder, SIZE)) if each.level != "ok"]
+    assert re.findall(r"--unit (\w+)", odd.fix) == [unit] and "millimetres are usual" in odd.fix
+    assert (odd.level == "error") == (unit in ("m", "um"))  # 0.5 and 0.2 mm may be
+    right = check_rig(read_rig(folder, SIZE, UNITS[unit]), UNITS[unit])
+    assert {each.level for each in right} == {"ok"}
+
+
 def test_text_matrices_that_are_refused(tmp_path: Path) -> None:
     folder = write_text(tmp_path / "rig")
     for unsized in (folder, write_pair(tmp_path / "pair", ".yml", PLUMB_BOB, T)):

@@ -13,7 +13,7 @@ from places import ROOT
 
 from sags_node.bags.bag import storage_files
 from sags_node.config.launch_file import load_launch
-from sags_node.config.yaml_reader import MOST_VALUES, parse_yaml, read_yaml
+from sags_node.config.yaml_reader import MOST_VALUES, parse_word, parse_yaml, read_yaml
 from sags_node.errors import UsageError
 from sags_node.rig import load_rig, read_rig
 
@@ -80,6 +80,31 @@ def test_what_is_refused(text: str | bytes, said: str) -> None:
 )
 def test_everything_else_is_what_pyyaml_reads(text: str) -> None:
     assert parse_yaml(text, "file") == yaml.safe_load(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        *((text, text) for text in ("000100", "000180", "-010", "0_20")),
+        *(("007", 7), ("00", 0), ("0x10", 16), ("1:30", 90), ("010.5", 10.5)),
+    ],
+)
+def test_numbers_with_zeros_in_front_are_not_octal(text: str, value: object) -> None:
+    assert parse_yaml(f"{{{text}: [{text}]}}", "file") == {value: [value]}
+    assert parse_word(text, "word") == value
+
+
+def test_zeros_in_front_do_not_change_numbers_of_a_launch_file(tmp_path: Path) -> None:
+    """A folder of such a name is found, too."""
+    config: Any = as_launch(
+        "source: {kind: folders, left: '0', right: 0100, start: 010, frames: 0100}\n"
+        "segments: {pull: [000100, 000180]}\n",
+        tmp_path,
+    )
+    assert config.segments == {"pull": (100, 180)}
+    assert (config.source.start, config.source.frames) == (10, 100)
+    assert config.source.right == tmp_path / "0100"
+    assert load_launch(tmp_path, ["source.frames:=0200"]).source.frames == 200  # type: ignore[union-attr]
 
 
 def test_parts_are_not_shared() -> None:

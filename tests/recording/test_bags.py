@@ -302,6 +302,17 @@ def test_a_picture_without_partner_is_left_out(tmp_path: Path) -> None:
     assert_frames(play(files.write_rosbag2(tmp_path / "bag", rows)), [0, 1, 4, 5, 6, 7, 8, 9])
 
 
+def test_poses_of_a_bag_are_of_its_left_pictures(tmp_path: Path) -> None:
+    rows = files.stereo_rows(ROS2, infos=False)
+    del rows[7], rows[4]
+    bag = files.write_rosbag2(tmp_path / "bag", rows)
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, 0, 3] = np.array([0, 1, 3, 4, 5, 6, 7, 8, 9]) * 1e-3  # of the left pictures that are there
+    np.savez(tmp_path / "poses.npz", T_world_cam=poses)
+    came = [frame.T_world_cam[0, 3] for frame in play(bag, poses=tmp_path / "poses.npz")]  # type: ignore[index]
+    np.testing.assert_allclose(came, np.array([0, 1, 4, 5, 6, 7, 8, 9]) * 1e-3)
+
+
 def test_nothing_pairs(tmp_path: Path) -> None:
     path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, skew_ms=17.0))
     with pytest.raises(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ from sags_node.errors import UsageError
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.sources.replay import Replay
 from sags_node.sources.source import findings_of, open_source
 from sags_node.tools.importing.check import check_folder
 from sags_node.types import U8, StereoFrame
@@ -294,6 +296,30 @@ def label_masks(clip: Path) -> None:
 def depth_in_micrometres(clip: Path) -> None:
     for number in range(FRAMES):
         depth(clip, depth_counts(number).astype(np.uint16) * 500, number)
+
+
+@pytest.mark.parametrize(
+    ("factor", "dtype", "unit", "said"),
+    [
+        (1, np.uint8, None, ["with 0.001 m per count, of only 8 bit, which the files do not say"]),
+        (1, np.uint16, None, ["with 0.001 m per count, which the files do not say"]),
+        (1, np.uint16, 1e-3, []),
+        (10, np.uint16, None, [r"700 mm .*an endoscope sees 0.01 to 0.3 m; .*\(0.0001 makes 70 mm\)"]),
+        (10, np.uint16, 1e-3, [r"700 mm .*an endoscope sees 0.01 to 0.3 m; .*\(0.0001 makes 70 mm\)"]),
+        (10, np.uint16, 1e-4, []),
+    ],
+)
+def test_a_unit_that_nobody_said_is_told_and_one_that_does_not_fit(
+    clip: Path, factor: int, dtype: type, unit: float | None, said: list[str]
+) -> None:
+    for number in range(FRAMES):
+        depth(clip, (depth_counts(number) * dtype(factor)).astype(dtype), number)
+    options = {} if unit is None else {"depth_unit": unit}
+    with open_source(cfg.EndoNerfSource(folder=clip, pace="step", **options)) as source:  # type: ignore[arg-type]
+        assert isinstance(source, Replay)
+        found = [f"{each.what}; {each.fix}" for each in source.pairs.findings]
+    assert len(found) == len(said)
+    assert all(re.search(one, other) for one, other in zip(said, found, strict=True))
 
 
 def torn_poses(clip: Path) -> None:

@@ -95,6 +95,42 @@ def test_masks_that_tell_instruments_from_tissue(name: str, tmp_path: Path) -> N
         assert frame.tissue is not None and (frame.tissue == ~TOOL)[sure].all()
 
 
+CLEAR = grey((np.ones_like(TOOL), 255))
+EMPTY = {
+    "opaque": (np.dstack([grey((TOOL, 255))] * 3 + [CLEAR]), np.dstack([grey()] * 3 + [CLEAR]), "white"),
+    "opaque, of 16 bit": (
+        np.dstack([grey((TOOL, 255))] * 3 + [CLEAR]).astype(np.uint16) * 257,
+        np.dstack([grey()] * 3 + [CLEAR]).astype(np.uint16) * 257,
+        "white",
+    ),
+    "instruments can be seen": (
+        np.dstack([grey()] * 3 + [grey((TOOL, 255))]),
+        np.dstack([grey()] * 4),
+        "white",
+    ),
+    "tissue can be seen": (
+        np.dstack([grey()] * 3 + [CLEAR - grey((TOOL, 255))]),
+        np.dstack([grey()] * 3 + [CLEAR]),
+        "black",
+    ),
+}
+
+
+@pytest.mark.fault("file: masks with an alpha channel, and frames without an instrument")
+@pytest.mark.parametrize("tools_in", [{0, 3, 6, 9}, set(range(1, COUNT))])
+@pytest.mark.parametrize("name", EMPTY)
+def test_masks_with_alpha_of_frames_without_an_instrument(
+    name: str, tools_in: set[int], tmp_path: Path
+) -> None:
+    """An opaque mask is no instrument from edge to edge, and one that is all clear is no tissue."""
+    tool, none, instruments = EMPTY[name]
+    config = with_masks(tmp_path, tool).model_copy(update={"instruments": instruments})
+    for number in set(range(COUNT)) - tools_in:
+        cv2.imwrite(str(tmp_path / f"masks/{number}.png"), none)
+    for number, frame in enumerate(played(config)):
+        assert frame.tissue is not None and (frame.tissue == (~TOOL | (number not in tools_in))).all()
+
+
 ASKED = {
     "0 and 1": (grey((TOOL, 1)), "png", "0, 1"),
     "one label": (grey((TOOL, 100)), "png", "0, 100"),
@@ -129,6 +165,21 @@ def test_a_label_that_comes_late_is_asked_about_there(tmp_path: Path) -> None:
         assert len(list(source)) == 5
     tissue = played(config.model_copy(update={"instruments": (255, 85)}))[5].tissue
     assert tissue is not None and (tissue == ~TOOL).all()
+
+
+@pytest.mark.parametrize("instruments", [("#ffffff", "#ff0000"), (255, "#ff0000")])
+def test_a_grey_that_is_listed_counts_with_other_colours_and_without(
+    instruments: tuple[int | str, ...], tmp_path: Path
+) -> None:
+    """The white shaft is in each frame, the red tip in every other one."""
+    config = with_masks(tmp_path, coloured((SHAFT, "#ffffff"))).model_copy(
+        update={"instruments": instruments}
+    )
+    for number in range(0, COUNT, 2):
+        mask = coloured((SHAFT, "#ffffff"), (TIP, "#ff0000"), (RIM, "#808080"))
+        cv2.imwrite(str(tmp_path / f"masks/{number}.png"), mask)
+    for number, frame in enumerate(played(config)):
+        assert frame.tissue is not None and (frame.tissue == (~SHAFT if number % 2 else ~TOOL)).all()
 
 
 @pytest.mark.parametrize("value", ["[]", "[256]", "[-1]", "grey", "[red]", "85"])

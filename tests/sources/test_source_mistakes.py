@@ -212,11 +212,15 @@ def test_shorter_right_video_says_where_it_ends(tmp_path: Path) -> None:
         assert len(list(source)) == 6
 
 
-def test_too_few_poses_say_for_which_frame(folders: cfg.FoldersSource, tmp_path: Path) -> None:
-    np.savez(tmp_path / "poses.npz", T_world_cam=np.tile(np.eye(4), (4, 1, 1)))
-    frames, message = frames_until_error(folders.model_copy(update={"poses": tmp_path / "poses.npz"}))
-    assert len(frames) == 4
-    assert "poses.npz holds 4 poses, none for frame 4" in message
+@pytest.mark.parametrize(("count", "stride"), [(4, 1), (48, 1), (11, 1), (13, 1), (6, 2)])
+def test_poses_of_other_pictures_are_refused(
+    folders: cfg.FoldersSource, tmp_path: Path, count: int, stride: int
+) -> None:
+    np.savez(tmp_path / "poses.npz", T_world_cam=np.tile(np.eye(4), (count, 1, 1)))
+    config = folders.model_copy(update={"poses": tmp_path / "poses.npz", "stride": stride})
+    refused_at_opening(
+        lambda: config, rf"poses.npz holds {count} poses, the recording 12 pictures of the left"
+    )
 
 
 @pytest.mark.parametrize(

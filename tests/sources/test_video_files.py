@@ -123,6 +123,45 @@ def test_pictures_of_one_moment_are_a_pair(
     assert np.abs(since - true).max() < 0.0131  # jitter of two pictures, and whole milliseconds
 
 
+def with_truth(folder: Path, lefts: list[int]) -> dict[str, object]:
+    """Poses and tracks of each picture of the left eye, which tell the picture's number."""
+    T_world_cam = np.tile(np.eye(4), (len(lefts), 1, 1))
+    T_world_cam[:, 0, 3] = np.array(lefts) * 1e-3
+    np.savez(folder / "poses.npz", T_world_cam=T_world_cam)
+    points = np.zeros((len(lefts), 1, 3)) + np.reshape(lefts, (-1, 1, 1))
+    np.savez(folder / "tracks.npz", points=points, visible=np.ones((len(lefts), 1), np.bool_))
+    reference = cfg.ReferenceConfig(tracks=folder / "tracks.npz")
+    return {"poses": folder / "poses.npz", "reference": reference}
+
+
+def check_truth(frames: list[StereoFrame], numbers: list[int]) -> None:
+    assert [round(float(frame.T_world_cam[0, 3]) * 1e3) for frame in frames] == numbers  # type: ignore[index]
+    assert [int(frame.reference.points[0, 0]) for frame in frames] == numbers  # type: ignore[union-attr, index]
+
+
+@pytest.mark.fault(
+    "file: one eye's pictures were lost while recording, and poses are of all of the other eye's"
+)
+def test_poses_and_references_go_by_the_picture_of_the_left_eye(tmp_path: Path) -> None:
+    left, right = eye(tmp_path / "l.mkv", without(9)), eye(tmp_path / "r.mkv", without(20, 21))
+    config = pair_of(tmp_path, left, right).model_copy(update=with_truth(tmp_path, without(9)))
+    check_truth(played(config), without(9, 20, 21))
+    check_truth(played(config.model_copy(update={"start": 1.0})), [n for n in ALL if n >= 30])
+
+
+@pytest.mark.parametrize(("first", "lefts"), [("left", range(0, COUNT, 2)), ("right", range(1, COUNT, 2))])
+def test_poses_go_by_the_picture_of_the_left_eye_where_eyes_come_in_turn(
+    first: str, lefts: range, tmp_path: Path
+) -> None:
+    """Each eye loses a picture, whose partner is left out."""
+    scope = eye(tmp_path / "scope.mkv", without(16, 31))
+    there = [number for number in lefts if number not in (16, 31)]
+    config = pair_of(tmp_path, scope, None, layout="frame_sequential", first=first)
+    frames = played(config.model_copy(update=with_truth(tmp_path, there)))
+    check_truth(frames, [number for number in lefts if number // 2 not in (8, 15)])
+    assert [number_in(frame.left) for frame in frames] == [n for n in lefts if n // 2 not in (8, 15)]
+
+
 def test_files_of_other_rates_are_refused_also_with_gaps(tmp_path: Path) -> None:
     left, right = eye(tmp_path / "l.mp4", without(9)), eye(tmp_path / "r.mp4", ALL, rate=25)
     with pytest.raises(UsageError, match=r"30.0 frames/s but .*25.0; .*ffmpeg -i \S+/r.mp4 -r 30 NEW"):

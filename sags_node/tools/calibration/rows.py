@@ -308,8 +308,8 @@ def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
     figures = _figures(rows) | {"depth_median_m": round(depth, 4)}
     if not PLAUSIBLE_DEPTH[0] <= depth <= PLAUSIBLE_DEPTH[1]:
         what = f"points would lie at {depth:.3g} m (median); an endoscope sees 0.005 to 1 m"
-        units = fitting_units(_signed_baseline(rig), *ENDOSCOPE_BASELINE)
-        fix = in_metres(units, rig.path) if units else RECALIBRATE
+        units = fitting_units(_signed_baseline(rig), *ENDOSCOPE_BASELINE, rig.unit)
+        fix = in_metres(units, rig.path, rig.unit) if units else RECALIBRATE
         return [Finding("error", what, fix, figures)]
     per_pixel = depth**2 / (rig.left.P[0, 0] * _signed_baseline(rig))
     what = (

@@ -1,4 +1,4 @@
 """`sags export`: the model at one moment, or all frames of a recording, as files that other programs open.
 
-Imports config, engine, evaluation, fitting, kernels, media, messaging, model and pipeline.
+Imports engine, evaluation, fitting, kernels, media, messaging, model and pipeline.
 """

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Protocol
 import cv2
 import numpy as np
 
-from sags_node.config.schema import RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder, whole, writing
 from sags_node.kernels.threads import configure_threads
@@ -31,7 +30,7 @@ class Product(Protocol):
     """Takes one frame after the other. Both methods may raise `OSError`."""
 
     def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
-        """`number`: the frame's in the recording, from 0, whatever its stride."""
+        """`number`: `StereoFrame.recorded_number`."""
 
     def finish(self) -> int:
         """Complete the file or folder; how much is in it."""
@@ -62,18 +61,16 @@ def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance)
         SagsError: it cannot be read, or a file cannot be written.
     """
     count, done, rows = session.source.frame_count, 0, []
-    played = session.config.source
-    assert isinstance(played, RecordedSource)
     with ExitStack() as stack:
         partial = {kind: stack.enter_context(whole(path)) for kind, path in wanted.items()}
         products = {}
         for kind, path in wanted.items():
             with writing(path):
                 products[kind] = KINDS[kind].make(partial[kind], session.source.rate, session.published_size)
-        for done, (result, anchors) in enumerate(_played(session), 1):
+        for done, (number, result, anchors) in enumerate(_played(session), 1):
             for kind, product in products.items():
                 with writing(wanted[kind]):
-                    product.add(result.pair.frame_id * played.stride, result, anchors)
+                    product.add(number, result, anchors)
             advance(done, count, "playing")
         if done == 0:
             raise SagsError("no frame was played; check source.start, source.frames and source.warm_up")
@@ -90,7 +87,8 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
 
 
-def _played(session: Session) -> Iterator[tuple[FrameResult, AnchorStates]]:
+def _played(session: Session) -> Iterator[tuple[int, FrameResult, AnchorStates]]:
+    """Numbers of frames in the recording, as `Product.add` takes them, and what came of them."""
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
     budget = pipeline.make_budget()
@@ -101,9 +99,9 @@ def _played(session: Session) -> Iterator[tuple[FrameResult, AnchorStates]]:
                 continue
             if len(pipeline.anchors) == 0 and not result.held:
                 _pin(pipeline, result)
-                yield result, pipeline.anchors.states()
+                yield frame.recorded_number, result, pipeline.anchors.states()
             else:
-                yield result, result.anchors
+                yield frame.recorded_number, result, result.anchors
 
 
 def _pin(pipeline: Pipeline, result: FrameResult) -> None:

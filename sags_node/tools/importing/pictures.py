@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from sags_node.checks import Finding
+from sags_node.sources.endonerf import fitting_units
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.tools.calibration.matches import match_eyes
 from sags_node.types import U8, Bool
@@ -19,8 +20,6 @@ COMB_SHARE = 0.02  # of the pixels, and
 COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direction
 DARK = 12  # grey level of a border
 NARROWEST_BORDER = 4  # px
-ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median
-DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0, 1e-3 / 256)  # m per count, the usual ones first; SERV-CT's last
 FEWEST_MATCHES = 30
 RIGHT_FIRST = "source.geometry.first:=right"
 
@@ -133,7 +132,7 @@ def check_depth(
     if not medians:
         return [Finding("error", "depth: no picture knows a pixel", "export it again")]
     median = float(np.median(medians))
-    fitting = [one for one in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= median * one <= ENDOSCOPE_DEPTH[1]]
+    fitting = fitting_units(median)
     ask = "the files do not say it: ask who made them"
     if unit is not None and unit in fitting:
         said = f"depth: {median * unit * 1e3:.0f} mm (median) with {unit:g} m per count"
