@@ -10,7 +10,7 @@ import numpy as np
 
 from sags_node.checks import Finding, is_wrong
 from sags_node.config.launch_file import known_recording, leaves, load_launch
-from sags_node.config.schema import EndoNerfSource, FoldersSource, LaunchConfig, LiveSource
+from sags_node.config.schema import EndoNerfSource, FoldersSource, GeometryConfig, LaunchConfig, LiveSource
 from sags_node.errors import UsageError
 from sags_node.sources.pictures import size_text
 from sags_node.tools.calibration.eyes import look
@@ -109,7 +109,9 @@ def _opened(config: LaunchConfig) -> list[Finding]:
 def _looked_at(config: LaunchConfig) -> list[Finding]:
     """Return what some of its pictures show, spread over it."""
     pairs, _ = pairs_of_session(config)
-    return pictures.check_both(*zip(*pairs, strict=True))
+    left, right = zip(*pairs, strict=True)
+    geometry: GeometryConfig | None = getattr(config.source, "geometry", None)
+    return pictures.check_both(left, right, geometry=geometry)
 
 
 def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str, str]]:
