@@ -90,6 +90,15 @@ def test_borders_within_a_crop_are_those_of_the_whole_picture(flip: str, tmp_pat
     assert abs(x - 32) <= 2 and abs(x + width - (320 - 32)) <= 2 and (y, height) == (10, 240)
 
 
+def test_borders_stay_where_the_calibration_is_of_whole_pictures(tmp_path: Path) -> None:
+    both = videos(tmp_path, framed(12, 12, LEFT), framed(12, 12, RIGHT))
+    found = propose(both, [f"rig:={SESSION / 'calib'}"])
+    assert "source.geometry.crop" not in set_by(found.launch)
+    stay = [each for each in found.findings if "borders; the picture" in each.what]
+    assert {(each.level, each.fix.partition(":")[0]) for each in stay} == {("ok", "the borders stay")}
+    assert not [each for each in found.findings if each.level == "error"]
+
+
 def test_the_file_plays_from_wherever_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also without a terminal; the calibration is compared."""
     videos(tmp_path / "case", LEFT, RIGHT)
