@@ -127,8 +127,8 @@ class Replay:
             return
         self.pairs.close()
         raise UsageError(
-            f"{self._config.poses} holds {there} poses, the recording {lefts} pictures of the left eye; T_world_cam must "
-            "hold one for each of them, in their order, also for those that are not played"
+            f"{self._config.poses} holds {there} poses, the recording {lefts} pictures of the left eye; "
+            "T_world_cam must hold one for each of them, in their order, also for those that are not played"
         )
 
     def _compare_references(self, references: References, lefts: int) -> None:

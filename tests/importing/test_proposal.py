@@ -65,6 +65,40 @@ def test_black_borders_are_cut_off(tmp_path: Path) -> None:
     assert abs(width - LEFT[0].shape[1]) <= 4 and abs(height - LEFT[0].shape[0]) <= 4
 
 
+def framed(left: int, right: int, eye: list[U8]) -> list[U8]:
+    """Pictures with black borders of so many columns, of the same size."""
+    pictures = [picture.copy() for picture in eye]
+    for picture in pictures:
+        picture[:, :left] = picture[:, picture.shape[1] - right :] = 0
+    return pictures
+
+
+def test_borders_that_differ_between_the_eyes_give_one_crop(tmp_path: Path) -> None:
+    both = videos(tmp_path, framed(16, 0, LEFT), framed(0, 24, RIGHT))
+    found = propose(both)
+    x, _, width, _ = yaml.safe_load(set_by(found.launch)["source.geometry.crop"])
+    assert abs(x - 16) <= 2 and abs(x + width - (320 - 24)) <= 2
+    assert not [each for each in found.findings if "borders; the picture" in each.what and each.level != "ok"]
+
+
+@pytest.mark.parametrize("flip", ["none", "horizontal", "both"])
+def test_borders_within_a_crop_are_those_of_the_whole_picture(flip: str, tmp_path: Path) -> None:
+    both = videos(tmp_path, framed(32, 32, LEFT), framed(32, 32, RIGHT))
+    crop = "source.geometry.crop:=[20,10,290,240]"
+    found = propose(both, [crop, f"source.geometry.flip:={flip}"])
+    x, y, width, height = yaml.safe_load(set_by(found.launch)["source.geometry.crop"])
+    assert abs(x - 32) <= 2 and abs(x + width - (320 - 32)) <= 2 and (y, height) == (10, 240)
+
+
+def test_borders_stay_where_the_calibration_is_of_whole_pictures(tmp_path: Path) -> None:
+    both = videos(tmp_path, framed(12, 12, LEFT), framed(12, 12, RIGHT))
+    found = propose(both, [f"rig:={SESSION / 'calib'}"])
+    assert "source.geometry.crop" not in set_by(found.launch)
+    stay = [each for each in found.findings if "borders; the picture" in each.what]
+    assert {(each.level, each.fix.partition(":")[0]) for each in stay} == {("ok", "the borders stay")}
+    assert not [each for each in found.findings if each.level == "error"]
+
+
 def test_the_file_plays_from_wherever_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also without a terminal; the calibration is compared."""
     videos(tmp_path / "case", LEFT, RIGHT)

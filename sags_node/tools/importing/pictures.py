@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from sags_node.checks import Finding
+from sags_node.config.schema import GeometryConfig
 from sags_node.sources.endonerf import fitting_units
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.tools.calibration.matches import match_eyes
@@ -22,6 +23,9 @@ DARK = 12  # grey level of a border
 NARROWEST_BORDER = 4  # px
 FEWEST_MATCHES = 30
 RIGHT_FIRST = "source.geometry.first:=right"
+CROP = "source.geometry.crop:="
+
+Box = tuple[int, int, int, int]  # x, y, width, height, px
 
 
 def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path, U8]:
@@ -37,8 +41,12 @@ def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path
     return {file: read_picture(file, flags) for file in files if file in chosen}
 
 
-def check_eye(what: str, pictures: Collection[U8]) -> list[Finding]:
-    """Look at one eye's pictures [H, W, 3] RGB: sizes, black borders, interlacing."""
+def check_eye(what: str, pictures: Collection[U8], keep: Box | None = None) -> list[Finding]:
+    """Look at one eye's pictures [H, W, 3] RGB: sizes, black borders, interlacing.
+
+    Args:
+        keep: what is to be kept where there are borders; None: what is lit of this eye.
+    """
     sizes = {picture.shape[1::-1] for picture in pictures}
     if len(sizes) > 1:
         said = " and ".join(size_text(*size) for size in sorted(sizes))
@@ -47,8 +55,11 @@ def check_eye(what: str, pictures: Collection[U8]) -> list[Finding]:
     found = []
     x, y, width, height = lit_box(np.max(gray, axis=0))
     if (width, height) != gray[0].shape[::-1]:
-        crop = f"source.geometry.crop:=[{x},{y},{width},{height}]"
-        fix = f"set {crop} (videos, cameras) or cut both eyes alike"
+        crop = CROP + str([*(keep or (x, y, width, height))]).replace(" ", "")
+        fix = (
+            f"set {crop} (videos, cameras) or cut both eyes alike, and calibrate such pictures; a "
+            "calibration of whole ones needs the borders"
+        )
         what_is = f"{what}: black borders; the picture is {size_text(width, height)} px at {x},{y}"
         said = f"{what_is}, of {size_text(*gray[0].shape[::-1])}"
         found.append(Finding("warning", said, fix, launch=(crop,)))
@@ -70,7 +81,32 @@ def combing(gray: U8) -> float:
     return float(np.mean((np.minimum(above, below) > COMB_STEP) | (np.maximum(above, below) < -COMB_STEP)))
 
 
-def lit_box(brightest: U8) -> tuple[int, int, int, int]:
+def lit_in_both(left: Collection[U8], right: Collection[U8], geometry: GeometryConfig | None) -> Box | None:
+    """The box of each eye's picture, before `geometry` cut and turned it, that no black border of either eye
+    reaches into; None: their sizes differ, or there is none."""
+    if len({picture.shape for picture in (*left, *right)}) != 1:
+        return None
+    boxes = [
+        lit_box(np.max([cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in eye], 0)) for eye in (left, right)
+    ]
+    (x, y), far = (
+        np.max([box[:2] for box in boxes], 0),
+        np.min([np.add(box[:2], box[2:]) for box in boxes], 0),
+    )
+    width, height = far[0] - x, far[1] - y
+    if min(width, height) < 1:
+        return None
+    if geometry is not None:
+        across, down = next(iter(left)).shape[1::-1]
+        if geometry.flip in ("horizontal", "both"):
+            x = across - x - width
+        if geometry.flip in ("vertical", "both"):
+            y = down - y - height
+        x, y = np.add((x, y), geometry.crop[:2] if geometry.crop else 0)
+    return int(x), int(y), int(width), int(height)
+
+
+def lit_box(brightest: U8) -> Box:
     """x, y, width and height of what is not a black border; all of it where all is dark."""
     columns, rows = (np.flatnonzero(np.percentile(brightest, 99, axis=axis) > DARK) for axis in (0, 1))
     height, width = brightest.shape
@@ -105,9 +141,12 @@ def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
     return [Finding("ok" if aligned else "warning", what, fix, figures)]
 
 
-def check_both(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
-    """Look at each eye, and at how they belong together."""
-    return [*check_eye("left", left), *check_eye("right", right), *check_eyes(left, right)]
+def check_both(
+    left: Collection[U8], right: Collection[U8], *, geometry: GeometryConfig | None = None
+) -> list[Finding]:
+    """Look at each eye, and at how they belong together; `geometry`: by which the pictures came."""
+    keep = lit_in_both(left, right, geometry)
+    return [*check_eye("left", left, keep), *check_eye("right", right, keep), *check_eyes(left, right)]
 
 
 def check_shares(shares: Sequence[float]) -> list[Finding]:

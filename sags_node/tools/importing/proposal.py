@@ -10,9 +10,12 @@ import numpy as np
 
 from sags_node.checks import Finding, is_wrong
 from sags_node.config.launch_file import known_recording, leaves, load_launch
-from sags_node.config.schema import EndoNerfSource, FoldersSource, LaunchConfig, LiveSource
+from sags_node.config.schema import EndoNerfSource, FoldersSource, GeometryConfig, LaunchConfig, LiveSource
 from sags_node.errors import UsageError
+from sags_node.pipeline.session import lacks_rig
+from sags_node.rig import read_rig
 from sags_node.sources.pictures import size_text
+from sags_node.sources.source import recorded_rig
 from sags_node.tools.calibration.eyes import look
 from sags_node.tools.calibration.pictures import pairs_of_session
 from sags_node.tools.importing import pictures, videos
@@ -109,7 +112,28 @@ def _opened(config: LaunchConfig) -> list[Finding]:
 def _looked_at(config: LaunchConfig) -> list[Finding]:
     """Return what some of its pictures show, spread over it."""
     pairs, _ = pairs_of_session(config)
-    return pictures.check_both(*zip(*pairs, strict=True))
+    left, right = zip(*pairs, strict=True)
+    geometry: GeometryConfig | None = getattr(config.source, "geometry", None)
+    found = pictures.check_both(left, right, geometry=geometry)
+    why = _needs_borders(config, geometry, left[0].shape[1::-1])
+    return [_with_borders(each, why) for each in found] if why else found
+
+
+def _needs_borders(config: LaunchConfig, geometry: GeometryConfig | None, size: tuple[int, int]) -> str:
+    """Why black borders of pictures that are so large must stay; "": they need not."""
+    if geometry is not None and geometry.crop_right is not None:
+        return "each eye has a box of its own"
+    if lacks_rig(config):
+        return ""
+    rig = recorded_rig(config.source, judged=False) if config.rig is None else read_rig(config.rig, size)
+    fits = rig is not None and (rig.left.width, rig.left.height) == size
+    return "the calibration is of whole pictures" if fits else ""
+
+
+def _with_borders(finding: Finding, why: str) -> Finding:
+    if not any(fix.startswith(pictures.CROP) for fix in finding.launch):
+        return finding
+    return replace(finding, level="ok", fix=f"the borders stay: {why}", launch=())
 
 
 def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str, str]]:
