@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sags_node.types import F32, F64, Camera
 
@@ -11,12 +11,17 @@ Array = NDArray[np.floating]
 ROTATION_TOLERANCE = 1e-3  # of the elements of R R^T
 
 
+def rigid(R: Array, t: ArrayLike) -> F64:
+    """The rigid transform [4, 4] that turns by `R` [3, 3] and then moves by `t` [3]."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
 def invert(T: F64) -> F64:
     """Inverse of a rigid transform [4, 4]."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = T[:3, :3].T
-    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
-    return inverse
+    R = T[:3, :3].T
+    return rigid(R, -R @ T[:3, 3])
 
 
 def transform(T: F64, points: Array) -> Array:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
+from sags_node.clients.overlay.deform import filled
 from sags_node.phantom.rig import raw_rays
 from sags_node.types import F32, Eye, StereoRig
 
@@ -116,10 +117,4 @@ def _raw_pixels(eye: Eye, rays: F32) -> F32:
 def _filled(depth: F32, size: tuple[int, int]) -> F32:
     """At the calibration's size; what is unknown is as far as what is known nearest in the picture."""
     depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
-    known = depth > 0
-    labels = cv2.distanceTransformWithLabels(
-        (~known).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )[1]
-    values = np.zeros(int(labels.max()) + 1, np.float32)
-    values[labels[known]] = depth[known]
-    return np.asarray(values[labels])
+    return filled(depth, depth > 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -55,14 +56,10 @@ def check(measure: Callable[[], Table], kept: Table, tolerance: float) -> list[C
     best: dict[str, Compared] = {}
     for _ in range(TRIES):
         for found in compare(measure(), kept):
-            best[found.kernel] = min(found, best.get(found.kernel, found), key=_ratio)
+            best[found.kernel] = min(found, best.get(found.kernel, found), key=attrgetter("ratio"))
         if all(found.ratio <= tolerance for found in best.values()):
             break
-    return sorted(best.values(), key=_ratio, reverse=True)
-
-
-def _ratio(compared: Compared) -> float:
-    return compared.ratio
+    return sorted(best.values(), key=attrgetter("ratio"), reverse=True)
 
 
 def compare(now: Table, kept: Table) -> list[Compared]:
@@ -81,7 +78,7 @@ def compare(now: Table, kept: Table) -> list[Compared]:
             found.append(Compared(_name(kernel), ms, kept_ms, ratio))
     if not found:
         raise UsageError("the kept table and this run have no kernel in common; run with the same sizes")
-    return sorted(found, key=_ratio, reverse=True)
+    return sorted(found, key=attrgetter("ratio"), reverse=True)
 
 
 def _kernels(table: Table) -> Iterator[tuple[Kernel, Mapping[str, Any]]]:

@@ -126,10 +126,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
 def _seen(
     observer: Subscriber, seconds: float, node: subprocess.Popen[bytes], advance: Advance, what: str
 ) -> list[dict[str, Any]]:
-    seen: list[dict[str, Any]] = []
-    for status in watched(observer, seconds, node):
-        seen.append(status)
-        advance(len(seen), None, what)
+    seen = watched(observer, seconds, node, advance, what)
     if len(seen) < 3:
         raise SagsError("too little was heard of the node; measure longer")
     return seen

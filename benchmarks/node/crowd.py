@@ -68,10 +68,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
                 ("alone again", alone, {}),
             ):
                 with _peers(Path(folder), work) as stop:
-                    seen = []
-                    for status in watched(observer, seconds, node):
-                        seen.append(status)
-                        advance(len(seen), None, name)
+                    seen = watched(observer, seconds, node, advance, name)
                     peers = stop()
                 phases.append({"phase": name, **_figures(seen), "peers": peers})
     return {"launch": list(launch), "many": many, "phases": phases}
@@ -97,8 +94,11 @@ def node_beside(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Pope
             end(node, grace=STOPPING)
 
 
-def watched(observer: Subscriber, seconds: float, node: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
+def watched(
+    observer: Subscriber, seconds: float, node: subprocess.Popen[bytes], advance: Advance, what: str
+) -> list[dict[str, Any]]:
     """The node's own status, once a second, without that of the first seconds."""
+    seen: list[dict[str, Any]] = []
     begun = time.monotonic()
     newest: ReceivedText | None = None
     while (passed := time.monotonic() - begun) < WARM_UP + seconds:
@@ -106,7 +106,9 @@ def watched(observer: Subscriber, seconds: float, node: subprocess.Popen[bytes])
             raise SagsError("the node ended before its time")
         newest = observer.wait(STATUS, timeout=5.0, after=newest) or newest
         if newest is not None and passed > WARM_UP:
-            yield json.loads(newest.text)
+            seen.append(json.loads(newest.text))
+            advance(len(seen), None, what)
+    return seen
 
 
 def _crowd(many: int) -> dict[str, Work]:

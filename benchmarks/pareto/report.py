@@ -81,25 +81,21 @@ def _hosts(session: Row) -> Table:
             row["name"],
             _number(row["share_after_first_second"], ".1%"),
             _number(row["first_render_ms"], ".0f"),
-            *(
-                _number(row[key][place], ".1f")
-                for key in ("frame_ms", "latency_ms")
-                for place in ("p50", "p99")
-            ),
+            *_times(row),
             "x".join(map(str, row["size"])),
             _decibels(row["online_at_full_size"], list(session["segments"])),
             _number(row["gaussians"]["mean"], ",.0f"),
         )
         if "unread" in row:  # by its own account: nobody saw a picture
-            times = [
-                _number(row["unread"][key][place], ".1f")
-                for key in ("frame_ms", "latency_ms")
-                for place in ("p50", "p99")
-            ]
-            made.add_row(
-                "alone, nobody reads", "-", "-", *times, "-", "-", _number(row["unread"]["gaussians"], ",.0f")
-            )
+            unread = row["unread"]
+            gaussians = _number(unread["gaussians"], ",.0f")
+            made.add_row("alone, nobody reads", "-", "-", *_times(unread), "-", "-", gaussians)
     return made
+
+
+def _times(row: Row) -> list[str]:
+    """The median and p99 of a frame's time, then of its latency."""
+    return [_number(row[key][place], ".1f") for key in ("frame_ms", "latency_ms") for place in ("p50", "p99")]
 
 
 def _figures(row: Row, segments: Sequence[str]) -> list[str]:

@@ -23,6 +23,7 @@ from sags_node.geometry import scale_intrinsics
 from sags_node.kernels.threads import configure_threads
 from sags_node.pipeline.session import Session
 from sags_node.quality import metrics
+from sags_node.terminal.text import table
 from sags_node.tools.evaluation.lpips import Lpips
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.provenance import machine_name
@@ -238,14 +239,14 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     headings = (
         "", "PSNR* held-out", "train", "half size", "quarter", "SSIM", "ahead", "track mm", "N", "ms/it",
     )  # fmt: skip
-    made = _table(headings)
+    made = table(*headings)
     for name, rows in measured["variants"].items():
         columns: list[list[float | None]] = [[figure(row) for row in rows] for figure in FIGURES.values()]
         columns += [[row["heldout"]["ssim"] for row in rows], [row["ahead"]["psnr"] for row in rows]]
         columns += [[(row["track"] or {}).get("median_mm") for row in rows]]
         columns += [[row[key] for row in rows] for key in ("gaussians", "ms_per_iteration")]
         made.add_row(name, *(_spread(column) for column in columns))
-    parts = _table(("dB", "held-out", "lowest to highest", "train", "half size", "quarter", "paper"))
+    parts = table("dB", "held-out", "lowest to highest", "train", "half size", "quarter", "paper")
     for name, part in measured["parts"].items():
         held, claim = part["heldout"], part["paper_db"]
         parts.add_row(
@@ -256,10 +257,6 @@ def tables(measured: dict[str, Any]) -> list[Table]:
             "–" if claim is None else f"{claim:+.2f}",
         )
     return [made, parts]
-
-
-def _table(headings: tuple[str, ...]) -> Table:
-    return Table(*headings, box=None, padding=(0, 3, 0, 0), pad_edge=False)
 
 
 def _spread(values: Sequence[float | None]) -> str:

@@ -12,7 +12,6 @@ from rich.table import Table
 from benchmarks.kernels.report import new_table
 from benchmarks.quality.disturbances import Shot
 from sags_node.quality.gallery import Picture, depth_range, depth_tile, shrunk
-from sags_node.types import U8
 
 _COLUMNS = {
     "PSNR* before": "psnr_before", "during": "psnr_during", "after, dB": "psnr_after",
@@ -45,7 +44,7 @@ def _cell(key: str, value: float | None) -> str:
 def strip(shots: Sequence[Shot]) -> bytes:
     """A PNG: a line each of before, middle and after; what came to the left and the right eye, the model's
     picture, and its depth, grey where none is published on tissue."""
-    shown = [Picture(shot.view.frame_id, 0.0, shot.left, _levels(shot), shot.view.depth, shot.tissue)
+    shown = [Picture(shot.view.frame_id, 0.0, shot.left, shot.view.rgb, shot.view.depth, shot.tissue)
              for shot in shots]  # fmt: skip
     near, far = depth_range(shown[::2])  # those that nothing is wrong with
     lines = [
@@ -53,7 +52,3 @@ def strip(shots: Sequence[Shot]) -> bytes:
         for shot, each in zip(shots, shown, strict=True)
     ]
     return cv2.imencode(".png", np.vstack(lines)[..., ::-1])[1].tobytes()
-
-
-def _levels(shot: Shot) -> U8:
-    return shot.view.rgb

@@ -13,6 +13,7 @@ from benchmarks.quality.depth import Advance, rounded, spread
 from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, off
 from sags_node.confidence import SURE, error_of
 from sags_node.config.schema import LaunchConfig
+from sags_node.geometry import rigid
 from sags_node.instruments.instruments import Instruments
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.instruments import NOTHING, joined
@@ -94,20 +95,15 @@ def _error(rng: np.random.Generator, tool: F64) -> F64:
     way, turn = rng.normal(size=(2, 3))
     turn = np.cross(tool, turn)
     way, turn = way / np.linalg.norm(way), turn / np.linalg.norm(turn)
-    E = np.eye(4)
-    E[:3, :3] = cv2.Rodrigues(TURN * turn)[0]
-    E[:3, 3] = MIDDLE - E[:3, :3] @ MIDDLE + SHIFT * way
-    return E
+    R = cv2.Rodrigues(TURN * turn)[0]
+    return rigid(R, MIDDLE - R @ MIDDLE + SHIFT * way)
 
 
 def _pose(tool: Tool) -> F64:
     """What exact kinematics say [4, 4]: the tip, out of which z points."""
     x = np.cross(tool.axis, [0.0, 1.0, 0.0])
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(tool.axis, x), tool.axis], -1)
-    T[:3, 3] = tool.tip
-    return T
+    return rigid(np.stack([x, np.cross(tool.axis, x), tool.axis], -1), tool.tip)
 
 
 def _compared(tool: Tool, states: InstrumentStates) -> dict[str, Any]:

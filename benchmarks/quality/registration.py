@@ -20,7 +20,7 @@ from sags_node.clients.registration.register import Registration, Verdict, regis
 from sags_node.clients.registration.rigid import kabsch
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.config.schema import LaunchConfig
-from sags_node.geometry import invert, project, transform
+from sags_node.geometry import invert, project, rigid, transform
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
@@ -28,7 +28,6 @@ from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I32, I64, Camera, StereoFrame
 
-SEEDS = 20
 PAIRS, TARGETS = 5, 5
 PICKED = 1e-3  # m, standard deviation of a picked point along each axis
 BELOW = 0.020  # m under the surface, along the line of sight
@@ -50,8 +49,7 @@ class Case:
     """
 
     def __init__(self, rng: np.random.Generator, vertices: F64, triangles: I32) -> None:
-        away = np.eye(4)
-        away[:3, :3], away[:3, 3] = cv2.Rodrigues(rng.normal(size=3))[0], rng.normal(0, 0.1, 3)
+        away = rigid(cv2.Rodrigues(rng.normal(size=3))[0], rng.normal(0, 0.1, 3))
         self.truth = invert(away)
         picked = _far_apart(rng, vertices)
         seen = vertices[rng.choice(len(vertices), TARGETS)]

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
-from sags_node.geometry import project
+from sags_node.geometry import project, rigid
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import fit_pose
 from sags_node.phantom.motion import BREATH
@@ -56,15 +56,9 @@ class Robot:
         """[4, 4] for the true pose after so many seconds."""
         gone = seconds / WANDERS
         trembles = self._rng.normal(size=(2, 3))
-        base = _rigid(gone * WANDERED, gone * TURNED)
-        hand = _rigid(JITTER * trembles[0], HAND_EYE + JITTER_TURN * trembles[1])
-        return np.asarray(base @ T_world_cam @ hand)
-
-
-def _rigid(place: F64, turn: F64) -> F64:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(turn)[0], place
-    return T
+        base = rigid(cv2.Rodrigues(gone * TURNED)[0], gone * WANDERED)
+        turn = cv2.Rodrigues(HAND_EYE + JITTER_TURN * trembles[1])[0]
+        return np.asarray(base @ T_world_cam @ rigid(turn, JITTER * trembles[0]))
 
 
 @dataclass(slots=True)

@@ -45,7 +45,6 @@ class Tally:
     running: int = 0
     retried: int = 0
     frames: int = 0
-    work_seconds: float = 0.0
     hosts: Counter[str] = field(default_factory=Counter)
     waits: str = ""
     stopping: threading.Event = field(default_factory=threading.Event)
@@ -250,7 +249,6 @@ def _outcome(ray: Any, reference: Any, recording: Recording) -> Outcome:
 def _count(tally: Tally, outcome: Outcome) -> None:
     tally.done += 1
     tally.frames += outcome.frames
-    tally.work_seconds += outcome.seconds
     tally.hosts[outcome.host] += 1
 
 

@@ -136,7 +136,8 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) ->
         said = command(plan.job, _said(place, rig, recording, plan), plan.options, out)
         cores = needs(plan, recording).cores
         ended = run_limited([*program, *said], cores, plan.limits, out / FIGURES, out / LOG)
-        if NO_SPACE in _tail(out / LOG) or _is_full(out):  # not all that writes pictures and videos says so
+        is_full = shutil.disk_usage(out).free < LEAST_FREE  # not all that writes pictures and videos says so
+        if is_full or NO_SPACE in _tail(out / LOG):
             raise _FailedError("no space", NO_SPACE)
         if ended != Ended(0):
             store.write(f"{FAILED}/{recording.id}.log", _tail(out / LOG).encode())
@@ -199,7 +200,3 @@ def _tail(log: Path) -> str:
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - TAIL))
         return file.read().decode("utf-8", errors="replace")
-
-
-def _is_full(folder: Path) -> bool:
-    return shutil.disk_usage(folder).free < LEAST_FREE

@@ -27,6 +27,7 @@ from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.errors import SagsError
+from sags_node.geometry import rigid
 from sags_node.media.video import Video
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_posed, rig_of
@@ -165,8 +166,7 @@ def _way(
     """Estimated and known poses [4, 4] of the frames of one range whose pose is known."""
     stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
     pipeline = Pipeline(config, sequence.rig)
-    budget, T_rectified_raw = pipeline.make_budget(), np.eye(4)
-    T_rectified_raw[:3, :3] = sequence.rig.left.R
+    budget, T_rectified_raw = pipeline.make_budget(), rigid(sequence.rig.left.R, np.zeros(3))
     known_at = dict(zip(sequence.frames, sequence.poses, strict=True))
     estimated, known = [], []
     with open_posed(config, sequence.rig, references=False) as played:

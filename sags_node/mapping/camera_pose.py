@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.geometry import disparity_to_depth, invert
+from sags_node.geometry import disparity_to_depth, invert, rigid
 from sags_node.kernels.jit import inlined, kernel
 from sags_node.types import F32, F64, Camera, Observation
 
@@ -86,10 +86,7 @@ def disparities_at(observation: Observation, pixels: F32) -> F32:
 
 def exponential(twist: F64) -> F64:
     """Rigid transform [4, 4] of a small motion [6]: translation (m), then rotation vector (rad)."""
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(twist[3:])[0]
-    T[:3, 3] = twist[:3]
-    return T
+    return rigid(cv2.Rodrigues(twist[3:])[0], twist[:3])
 
 
 def towards(start: F64, end: F64, share: float) -> F64:

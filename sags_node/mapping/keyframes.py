@@ -8,7 +8,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from sags_node.geometry import invert, project, unproject
+from sags_node.geometry import invert, project, rigid, unproject
 from sags_node.mapping.pose_agreement import Agreement, Small, agreement, shrunk, small_frame
 from sags_node.types import F32, F64, U8, Bool, Camera, Observation, RenderedView
 from sags_node.vision.features import Features, features_in, matched
@@ -132,9 +132,7 @@ def _pose_from(keyframe: _Keyframe, features: Features, camera: Camera) -> tuple
     )  # fmt: skip
     if not found or inliers is None or len(inliers) < LEAST_MATCHES:
         return None
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return len(inliers), invert(view)
+    return len(inliers), invert(rigid(cv2.Rodrigues(rotation)[0], translation[:, 0]))
 
 
 def _features(gray: U8, where: Bool) -> Features:

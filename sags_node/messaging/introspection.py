@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.errors import SagsError
-from sags_node.messaging import topics, wire
+from sags_node.messaging import topics
 from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.freezes import freezes_of
 from sags_node.messaging.node_clock import NodeClock
@@ -201,7 +201,8 @@ def _heard(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str,
         if arrived is not None:
             message, arrival_ns = arrived
             key = (message.meta.session, message.meta.seq)
-            sample = _Sample(arrival_ns, message.meta.stamp_ns, _size(message))
+            size = sum(memoryview(part).nbytes for part in message.parts)
+            sample = _Sample(arrival_ns, message.meta.stamp_ns, size)
             heard[message.topic].setdefault(key, sample)
     return {topic: list(samples.values()) for topic, samples in heard.items()}
 
@@ -210,10 +211,6 @@ def _without_resent(name: str, samples: list[_Sample]) -> list[_Sample]:
     """The last value that a cached topic sends again to a new subscriber says nothing of its rate."""
     topic = topics.find(name)
     return samples[1:] if topic is not None and topic.cached else samples
-
-
-def _size(message: wire.Message) -> int:
-    return sum(memoryview(part).nbytes for part in message.parts)
 
 
 def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:

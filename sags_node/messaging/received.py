@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sags_node.errors import UsageError
-from sags_node.geometry import quat_to_matrix
+from sags_node.geometry import quat_to_matrix, rigid
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.stream import check_topic
 from sags_node.messaging.wire import Buffer, Message, Meta, WireError
@@ -125,10 +125,8 @@ class ReceivedRos(Received):
         if len(transforms) != 1:
             raise WireError(f"{self.topic}: {len(transforms)} transforms, expected one")
         moved = transforms[0].transform
-        T = np.eye(4)
-        T[:3, :3] = quat_to_matrix(np.array([getattr(moved.rotation, axis) for axis in "wxyz"]))
-        T[:3, 3] = [getattr(moved.translation, axis) for axis in "xyz"]
-        return T
+        R = quat_to_matrix(np.array([getattr(moved.rotation, axis) for axis in "wxyz"]))
+        return rigid(R, [getattr(moved.translation, axis) for axis in "xyz"])
 
 
 R = TypeVar("R", bound=Received)

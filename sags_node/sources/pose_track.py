@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sags_node.errors import SagsError
-from sags_node.geometry import invert, quat_to_matrix
+from sags_node.geometry import invert, quat_to_matrix, rigid
 from sags_node.messaging import cdr, topics
 from sags_node.types import F64, Finding
 
@@ -234,10 +234,7 @@ class PoseTrack:
 
 
 def to_matrix(sample: Sample) -> F64:
-    T = np.eye(4)
-    T[:3, :3] = quat_to_matrix(sample.quat)
-    T[:3, 3] = sample.position
-    return T
+    return rigid(quat_to_matrix(sample.quat), sample.position)
 
 
 def between(one: Sample, other: Sample, share: float) -> F64:

@@ -51,9 +51,7 @@ class Rectification:
     @property
     def T_rectified_raw(self) -> F64:
         """Left raw camera to left rectified camera, [4, 4]."""
-        T = np.eye(4)
-        T[:3, :3] = self.R[0]
-        return T
+        return geometry.rigid(self.R[0], np.zeros(3))
 
 
 class ScaredPairs(Pairs):

@@ -27,7 +27,7 @@ from sags_node.errors import UsageError
 from sags_node.messaging import cdr, content, topics
 from sags_node.messaging.received import Frame, Received, ReceivedCloud, ReceivedRos
 from sags_node.messaging.topics import VIEW_NAME
-from sags_node.ros.endpoints import Delivery, Writer
+from sags_node.ros.endpoints import Delivery
 from sags_node.ros.graph import Graph, kernel_buffer
 
 ALL_POINTS = "/all"
@@ -166,7 +166,9 @@ class Ros2(Outlet):
         self._ns = ns = options.node.ns
         self._senders = {each.ns: each for each in (options.node, options.overlay)}
         self._offers = {offer.output.name: offer for offer in offered}
-        self._writers = {name: self._writer(name, offer) for name, offer in self._offers.items()}
+        self._writers = {
+            name: self.graph.writer(name, offer.kind, offer.delivery) for name, offer in self._offers.items()
+        }
         self._diagnostics = self._writers[GLOBAL["diagnostics"]]
         self._pace = Pace()
         self._read: frozenset[str] = frozenset()  # by somebody
@@ -182,9 +184,6 @@ class Ros2(Outlet):
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._attend, name="sags-bridge-ros2")
         self._thread.start()
-
-    def _writer(self, name: str, offer: Offer) -> Writer:
-        return self.graph.writer(name, offer.kind, offer.delivery)
 
     def close(self) -> None:
         self._stopping.set()

@@ -13,6 +13,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
@@ -168,10 +169,8 @@ class Peer(Outlet):
         """Hear what it wants and send it, until it goes or `stop` is set."""
         try:
             while not stop.is_set():
-                try:
+                with suppress(TimeoutError):
                     self._hear(self._connection.recv(timeout=LOOK if self._relay is None else 0))
-                except TimeoutError:
-                    pass
                 if self._relay is not None:
                     self._relay.step()
                     self._relay.wait()

@@ -26,7 +26,7 @@ from sags_node.clients.registration.surfaces import NINE_OF_TEN
 from sags_node.confidence import SURE, SURE_OF_ANCHOR, error_of
 from sags_node.errors import SagsError
 from sags_node.geometry import Array, invert, project, transform
-from sags_node.types import F32, F64, I64
+from sags_node.types import F32, F64, I64, Bool
 
 FOLLOWERS = 64  # a quarter of a node's anchors; 32 leave twice the error on the phantom
 LEAST_FOLLOWERS = 3
@@ -146,7 +146,9 @@ def _field(vertices: F64, depth: float, frame: TissueFrame, T: F64) -> _Field:
     apart = np.sort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)[:, 1]
     pixels, z = project(frame.camera, transform(T, vertices))
     columns, rows = np.clip(np.rint(np.nan_to_num(pixels)), 0, np.subtract(frame.depth.shape[::-1], 1)).T
-    surface = _filled(frame)[rows.astype(np.intp), columns.astype(np.intp)]
+    surface = filled(frame.depth, (frame.depth > 0) & frame.tissue)[
+        rows.astype(np.intp), columns.astype(np.intp)
+    ]
     near = np.flatnonzero((z > 0) & (z - surface < depth))
     z, surface = z[near], surface[near]
     eye = transform(invert(T), frame.camera.T_world_cam[:3, 3])
@@ -156,14 +158,14 @@ def _field(vertices: F64, depth: float, frame: TissueFrame, T: F64) -> _Field:
     return _Field(points, reach, near, carried.astype(np.float32))
 
 
-def _filled(frame: TissueFrame) -> F32:
-    """The depth [H, W] (m) of the tissue, and of its nearest pixel where there is an instrument or a hole."""
-    unknown = ~((frame.depth > 0) & frame.tissue)
+def filled(depth: F32, known: Bool) -> F32:
+    """The depth [H, W] (m) where it is known, elsewhere that of the nearest pixel that has one."""
+    unknown = ~known
     _, nearest = cv2.distanceTransformWithLabels(
         unknown.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     depths = np.zeros(nearest.max() + 1, np.float32)
-    depths[nearest[~unknown]] = frame.depth[~unknown]
+    depths[nearest[known]] = depth[known]
     found: F32 = depths[nearest]
     return found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sags_node.clients.overlay.frame import TissueFrame
-from sags_node.geometry import invert, transform
+from sags_node.geometry import invert, rigid, transform
 from sags_node.types import F64
 
 PATCH = 8  # px around an anchor whose depth gives the normal
@@ -20,10 +20,8 @@ def on_surface(place: F64, at: F64, normal: F64, right: F64) -> F64:
     if np.linalg.norm(across) < 1e-3:  # the surface is seen edge on
         across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     across /= np.linalg.norm(across)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([across, np.cross(normal, across), normal], axis=1)
-    T[:3, 3] = place - T[:3, :3] @ at
-    return T
+    R = np.stack([across, np.cross(normal, across), normal], axis=1)
+    return rigid(R, place - R @ at)
 
 
 def surface_normal(frame: TissueFrame, place: F64) -> F64 | None:

@@ -19,7 +19,7 @@ from sags_node.clients.overlay.mesh import rod
 from sags_node.clients.overlay.scene import ALARM, ObjectSpec, SceneSpec
 from sags_node.clients.registration.surfaces import Shape
 from sags_node.confidence import SURE, confidence_of, error_of
-from sags_node.geometry import invert, transform
+from sags_node.geometry import invert, rigid, transform
 from sags_node.messaging.received import ReceivedCloud, TopicName
 from sags_node.types import F32, F64
 
@@ -246,8 +246,7 @@ def _line(near: Near) -> list[Placed]:
     if not np.isfinite(near.place).all():
         return []
     color = ALARM if near.is_too_near else LINE
-    at_place = np.eye(4)
-    at_place[:3, 3] = near.place
+    at_place = rigid(np.eye(3), near.place)
     drawn = [Placed(Body(None, 1.0, f"{1e3 * near.distance:.0f} mm"), at_place, near.is_sure)]
     if near.distance > SHORTEST:
         drawn.append(Placed(Body(rod(near.tip, near.place, color), 1.0, None), np.eye(4), near.is_sure))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sags_node.geometry import transform
+from sags_node.geometry import rigid, transform
 from sags_node.types import F64
 
 ROUNDS = 8  # of reweighting
@@ -21,10 +21,8 @@ def kabsch(model: F64, places: F64, weights: F64) -> F64:
     middle, goal = weights @ model, weights @ places
     U, _, Vt = np.linalg.svd(((model - middle) * weights[:, None]).T @ (places - goal))
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    T = np.eye(4)
-    T[:3, :3] = Vt.T @ flip @ U.T
-    T[:3, 3] = goal - T[:3, :3] @ middle
-    return T
+    R = Vt.T @ flip @ U.T
+    return rigid(R, goal - R @ middle)
 
 
 def rigid_fit(model: F64, places: F64, weights: F64) -> tuple[F64, float]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from sags_node.clients.registration.certainty import motion_rows, of_pairs
 from sags_node.clients.registration.surfaces import Shape, Surface
-from sags_node.geometry import invert, transform
+from sags_node.geometry import invert, rigid, transform
 from sags_node.types import F64, I64
 
 GATES = (0.010, 0.005, 0.003)  # m, one after the other: what lies farther from the model is no part of it
@@ -79,10 +79,8 @@ def fit_surface(
             pull += counted.rows.T @ (counted.weights * counted.off)
             seen = counted.rows.T @ (counted.weights[:, None] * counted.rows)
             twist = np.linalg.solve(seen + of_pairs(there - centre, picked), pull)
-            motion = np.eye(4)
-            motion[:3, :3] = cv2.Rodrigues(twist[:3])[0]
-            motion[:3, 3] = centre + twist[3:] - motion[:3, :3] @ centre
-            T = motion @ T
+            R = cv2.Rodrigues(twist[:3])[0]
+            T = rigid(R, centre + twist[3:] - R @ centre) @ T
             if np.abs(twist).max() < STILL:
                 break
     assert counted is not None  # there are gates

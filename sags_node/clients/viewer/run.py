@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 
 import viser
 
@@ -98,7 +98,5 @@ def _await(client: viser.ClientHandle) -> None:
 
     Without this a slow browser piles up updates: viser has no other sign of life.
     """
-    try:
+    with suppress(TimeoutError, RuntimeError):  # too slow, gone, or without storage: it has had its time
         client.local_storage.get_item("sags-view", timeout=BROWSER_TIME)
-    except (TimeoutError, RuntimeError):  # too slow, gone, or a browser without storage: it has had its time
-        pass

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from sags_node.errors import SagsError
-from sags_node.geometry import invert
+from sags_node.geometry import invert, rigid
 from sags_node.rig.hand_eye import HandEye
 from sags_node.tools.calibration.boards import StereoView
 from sags_node.types import F32, F64, I64, StereoRig
@@ -179,11 +179,9 @@ def _linear(hands: F64, boards: F64) -> F64:
     """A first hand-eye transform [4, 4]: A X = X B for the motions A of the hand and B of the camera."""
     first, second = _pairs(len(hands))
     A, B = np.linalg.inv(hands[first]) @ hands[second], boards[first] @ np.linalg.inv(boards[second])
-    X = np.eye(4)
-    X[:3, :3] = _rotation(*_turns(hands, boards))
-    right = B[:, :3, 3] @ X[:3, :3].T - A[:, :3, 3]
-    X[:3, 3] = np.linalg.lstsq((A[:, :3, :3] - np.eye(3)).reshape(-1, 3), right.ravel(), rcond=None)[0]
-    return X
+    R = _rotation(*_turns(hands, boards))
+    right = B[:, :3, 3] @ R.T - A[:, :3, 3]
+    return rigid(R, np.linalg.lstsq((A[:, :3, :3] - np.eye(3)).reshape(-1, 3), right.ravel(), rcond=None)[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +252,4 @@ def _least_squares(residuals: _Residuals) -> tuple[F64, F64, float]:
 
 def _rigid(parameters: F64) -> F64:
     """[4, 4] of a rotation vector and a translation [6]."""
-    T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(parameters[:3])[0]
-    T[:3, 3] = parameters[3:6]
-    return T
+    return rigid(cv2.Rodrigues(parameters[:3])[0], parameters[3:6])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sags_node.config.launch_file import VIDEO_SUFFIXES
@@ -34,10 +34,12 @@ def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
             files += [(pair[0], pair[1]) for pair in pair_files((left, right))]
         else:
             files.append((left, right))
-    pairs = [(read_picture(left), read_picture(right)) for left, right in _spread(files)]
+    spread = files[:: max(1, -(-len(files) // PAIRS))]
+    pairs = [(read_picture(left), read_picture(right)) for left, right in spread]
     sizes = {picture.shape[1::-1] for pair in pairs for picture in pair}
     if len(sizes) > 1:
-        raise SagsError(f"pictures of {_sizes(sizes)} px: give those of one rig, all of one size")
+        said = " and ".join(size_text(*size) for size in sorted(sizes))
+        raise SagsError(f"pictures of {said} px: give those of one rig, all of one size")
     return pairs
 
 
@@ -73,11 +75,3 @@ def pairs_of_session(
             if len(pairs) == PAIRS:
                 break
     return pairs, depths
-
-
-def _spread(files: list[tuple[Path, Path]]) -> Iterator[tuple[Path, Path]]:
-    return iter(files[:: max(1, -(-len(files) // PAIRS))])
-
-
-def _sizes(sizes: set[tuple[int, int]]) -> str:
-    return " and ".join(size_text(*size) for size in sorted(sizes))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sags_node.geometry import invert, unproject
+from sags_node.geometry import invert, rigid, unproject
 from sags_node.types import F32, F64, U8, Bool, Camera
 
 CORNERS = 500
@@ -87,6 +87,4 @@ def _motion(before: U8, depth: F32, tissue: Bool, after: U8, tissue_after: Bool,
     )
     if not solved or inliers is None or len(inliers) < LEAST_POINTS:
         return np.eye(4)
-    view = np.eye(4)
-    view[:3, :3], view[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return invert(view)
+    return invert(rigid(cv2.Rodrigues(rotation)[0], translation[:, 0]))

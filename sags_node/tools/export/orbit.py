@@ -13,6 +13,7 @@ from sags_node.engine.interface import Rasterizer
 from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
 from sags_node.errors import SagsError
 from sags_node.files import whole
+from sags_node.geometry import rigid
 from sags_node.media.video_file import VideoFile
 from sags_node.tools.export.scene import Advance, Scene
 from sags_node.types import F32, U8, Camera, Gaussians
@@ -27,9 +28,8 @@ def orbit(camera: Camera, distance: float, degrees: float, count: int) -> Iterat
     middle = np.array([0.0, 0.0, distance])
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         axis = np.deg2rad(degrees) * np.array([np.cos(angle), np.sin(angle), 0.0])
-        T = np.eye(4)
-        T[:3, :3] = cv2.Rodrigues(axis)[0]
-        T[:3, 3] = middle - T[:3, :3] @ middle
+        R = cv2.Rodrigues(axis)[0]
+        T = rigid(R, middle - R @ middle)
         yield replace(camera, T_world_cam=camera.T_world_cam @ T)
 
 
