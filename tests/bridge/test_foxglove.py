@@ -9,12 +9,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bridging import anchored_at, bridged, plane_bridged, senders, sockets
+from bridging import anchored_at, bridged, options_of, plane_bridged, sockets
 from places import ROOT
 from ports import free_port, is_free
 from synthetic import HEIGHT, WIDTH, plane_result, stream
@@ -40,6 +41,7 @@ MESSAGE_DATA = 1  # opcode
 SEQUENCE_PARAMETERS = 7  # type of the H.264 unit that a key picture begins with here
 KEY_EVERY = 30  # pictures
 FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
+options = partial(options_of, FoxgloveOptions, port=0)
 
 
 class Client(Closes):
@@ -96,11 +98,6 @@ class Client(Closes):
         self.reading.set()
         self._socket.close()
         self._thread.join(60)
-
-
-def options(run_dir: Path, **changes: Any) -> FoxgloveOptions:
-    settings = {**senders(run_dir), "port": 0}
-    return FoxgloveOptions(**{**settings, **changes})
 
 
 def ros(joined: Client, name: str, number: int = -1) -> Any:

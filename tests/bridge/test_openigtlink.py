@@ -7,12 +7,13 @@ import subprocess
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bridging import HIDDEN, LOST, SEEN, UNSURE, anchored_at, bridged, plane_bridged, senders, sockets
+from bridging import HIDDEN, LOST, SEEN, UNSURE, anchored_at, bridged, options_of, plane_bridged, sockets
 from igtl_peer import PEER, Peer, built
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, stream
 from waiting import until
@@ -37,16 +38,12 @@ EXAMPLE_SAYS = (
     *(f"anchor {SEEN}", "( -10.000000, -20.000000, 70.000000 )", "Status    : all is new"),
 )
 NO_ANCHOR = "none;0.0000;0.0000;0.0000;0;0"  # a point that cannot be seen
+options = partial(options_of, IgtlOptions, port=0)
 
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(PEER, tmp_path_factory.mktemp("peer"))
-
-
-def options(run_dir: Path, **changes: Any) -> IgtlOptions:
-    settings = {**senders(run_dir), "port": 0}
-    return IgtlOptions(**{**settings, **changes})
 
 
 def weighted(picture: np.ndarray) -> int:

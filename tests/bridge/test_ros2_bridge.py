@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import struct
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from bridging import anchored, anchored_at, bridged, plane_bridged, senders, sockets
+from bridging import anchored, anchored_at, bridged, options_of, plane_bridged, sockets
 from made_messages import message_of
 from ros_peers import DOMAIN, KEPT, Listener
 from synthetic import HEIGHT, WIDTH, plane_camera, plane_depth, stream
@@ -34,11 +35,7 @@ pytestmark = pytest.mark.live
 RARE = ("status", "diagnostics")
 FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
 TEXT, TF, ARRAY = topics.STRING, topics.TF, topics.DIAGNOSTICS
-
-
-def options(run_dir: Path, **changes: Any) -> Ros2Options:
-    settings = {**senders(run_dir), "graph": RosGraph(domain=DOMAIN)}
-    return Ros2Options(**{**settings, **changes})
+options = partial(options_of, Ros2Options, graph=RosGraph(domain=DOMAIN))
 
 
 def named(topic: str) -> str:
@@ -189,9 +186,8 @@ def test_points_are_thinned_and_pictures_are_small_files(tmp_path: Path) -> None
     assert depth.format == "32FC1; compressedDepth png"
     decoded = as_ros_decodes(depth.data)
     assert np.isnan(decoded[0]).all(), "what is not known"
-    assert (
-        np.abs(decoded[1:] - truth[1:]).max() < 0.02e-3 * (truth.max() / 0.1) ** 2
-    )  # half a count, and more
+    # Half a count, and more.
+    assert np.abs(decoded[1:] - truth[1:]).max() < 0.02e-3 * (truth.max() / 0.1) ** 2
 
 
 def as_ros_decodes(data: np.ndarray) -> np.ndarray:

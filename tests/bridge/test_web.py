@@ -15,11 +15,11 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from bridging import anchored, anchored_at, bridged, plane_bridged, senders, sockets
+from bridging import anchored, anchored_at, bridged, options_of, plane_bridged, sockets
 from browsers import new_page
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
@@ -38,12 +38,10 @@ from sags_node.messaging import content
 
 pytestmark = pytest.mark.live
 
+T = TypeVar("T", str, bytes)
+
 DEPTH, IMAGE = "sags/left/render/depth", "sags/left/render/image"
-
-
-def options(run_dir: Path, **changes: Any) -> WebOptions:
-    settings = {**senders(run_dir), "port": 0}
-    return WebOptions(**{**settings, **changes})
+options = partial(options_of, WebOptions, port=0)
 
 
 @contextmanager
@@ -66,25 +64,25 @@ def parts(message: bytes) -> tuple[dict[str, Any], list[bytes]]:
     return head, found
 
 
-def next_of(
-    joined: ClientConnection, topic: str, seconds: float = 60.0
-) -> tuple[dict[str, Any], list[bytes]]:
+def said_as(kind: type[T], joined: ClientConnection, seconds: float) -> Iterator[T]:
+    """The texts or the messages that come, for so long."""
     deadline = time.monotonic() + seconds
     while True:
         said = joined.recv(timeout=deadline - time.monotonic())
-        if isinstance(said, bytes):
-            head, found = parts(said)
-            if head["topic"] == topic:
-                return head, found
+        if isinstance(said, kind):
+            yield said
+
+
+def next_of(
+    joined: ClientConnection, topic: str, seconds: float = 60.0
+) -> tuple[dict[str, Any], list[bytes]]:
+    came = map(parts, said_as(bytes, joined, seconds))
+    return next((head, found) for head, found in came if head["topic"] == topic)
 
 
 def told(joined: ClientConnection, seconds: float = 60.0) -> dict[str, Any]:
     """The next text."""
-    deadline = time.monotonic() + seconds
-    while True:
-        said = joined.recv(timeout=deadline - time.monotonic())
-        if isinstance(said, str):
-            return json.loads(said)
+    return json.loads(next(said_as(str, joined, seconds)))
 
 
 def test_messages_are_the_nodes_own(tmp_path: Path) -> None:

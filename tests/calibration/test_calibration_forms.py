@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import io
 import re
 import tarfile
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import ran
+from packed import pack
 from places import ROOT
 from test_calibration import PLUMB_BOB, SIZE, K, R, T, make_rig
 
@@ -53,15 +53,6 @@ def write_pair(folder: Path, suffix: str, distortion: tuple[F64, F64], T_file: F
     write(folder / f"intrinsics{suffix}", dict(zip(names, values, strict=True)))
     write(folder / f"extrinsics{suffix}", {"R": R, "T": T_file[:, None]})
     return folder
-
-
-def archive(file: Path, members: dict[str, bytes]) -> Path:
-    with tarfile.open(file, "w:gz") as tar:
-        for name, content in members.items():
-            info = tarfile.TarInfo(name)
-            info.size = len(content)
-            tar.addfile(info, io.BytesIO(content))
-    return file
 
 
 def refusal(path: Path, size: tuple[int, int] | None = None) -> str:
@@ -142,7 +133,7 @@ def ros_files(tmp_path: Path) -> dict[str, bytes]:
 
 def test_archive_of_ros_camera_calibration(tmp_path: Path, ros_files: dict[str, bytes]) -> None:
     pictures = {f"left-{index:04d}.png": bytes(5000) for index in range(3)}
-    file = archive(tmp_path / "calibrationdata.tar.gz", pictures | ros_files | {"ost.txt": b"# oST"})
+    file = pack(tmp_path / "calibrationdata.tar.gz", pictures | ros_files | {"ost.txt": b"# oST"})
     for path in (file, tmp_path):  # the file, and the folder that holds it
         read = load_rig(path)
         assert_same(read, make_rig(), 0)
@@ -152,18 +143,18 @@ def test_archive_of_ros_camera_calibration(tmp_path: Path, ros_files: dict[str, 
 def test_an_archive_writes_nothing_outside(tmp_path: Path, ros_files: dict[str, bytes]) -> None:
     inside = tmp_path / "deep/er"
     inside.mkdir(parents=True)
-    file = archive(inside / "data.tgz", {f"../../{name}": text for name, text in ros_files.items()})
+    file = pack(inside / "data.tgz", {f"../../{name}": text for name, text in ros_files.items()})
     before = sorted(tmp_path.rglob("*"))
     assert_same(load_rig(file), make_rig(), 0)
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_archives_that_are_refused(tmp_path: Path, ros_files: dict[str, bytes]) -> None:
-    one_eye = archive(tmp_path / "one.tar.gz", {"left.yaml": ros_files["left.yaml"]})
+    one_eye = pack(tmp_path / "one.tar.gz", {"left.yaml": ros_files["left.yaml"]})
     assert "holds no right.yaml" in refusal(one_eye)
-    large = archive(tmp_path / "large.tar.gz", {"left.yaml": b" " * (2**20 + 1)})
+    large = pack(tmp_path / "large.tar.gz", {"left.yaml": b" " * (2**20 + 1)})
     assert "larger than" in refusal(large)
-    (tmp_path / "cut.tar.gz").write_bytes(archive(tmp_path / "whole.tar.gz", ros_files).read_bytes()[:200])
+    (tmp_path / "cut.tar.gz").write_bytes(pack(tmp_path / "whole.tar.gz", ros_files).read_bytes()[:200])
     assert "cut.tar.gz is not a readable tar.gz" in refusal(tmp_path / "cut.tar.gz")
     assert "is not a readable tar.gz" in refusal(tmp_path / "gone.tar.gz")
 
@@ -303,9 +294,8 @@ def test_the_size_as_a_sequence(tmp_path: Path) -> None:
 
 
 def test_a_rectification_in_the_files_is_kept(tmp_path: Path) -> None:
-    whole = cv2.stereoRectify(
-        K[0], PLUMB_BOB[0], K[1], PLUMB_BOB[1], SIZE, R, T[:, None] * 1000, alpha=1
-    )  # another one than is made here
+    # Another one than is made here.
+    whole = cv2.stereoRectify(K[0], PLUMB_BOB[0], K[1], PLUMB_BOB[1], SIZE, R, T[:, None] * 1000, alpha=1)
     names = "R1", "R2", "P1", "P2"
     matrices = MATRICES | {"T": T * 1000} | dict(zip(names, whole[:4], strict=True))
     file = write(tmp_path / "rig.yml", matrices)

@@ -223,11 +223,8 @@ def test_another_picture_size(subject: tuple[StereoRig, Pairs]) -> None:
         (cv2.resize(left, None, fx=2, fy=2), cv2.resize(right, None, fx=2, fy=2)) for left, right in pairs
     ]
     (finding,) = check_pictures(rig, double)
-    assert (
-        finding.level == "error"
-        and "2 times as large" in finding.what
-        and f"{rig.path} -o FOLDER --scale 2" in finding.fix
-    )
+    assert finding.level == "error" and "2 times as large" in finding.what
+    assert f"{rig.path} -o FOLDER --scale 2" in finding.fix
     (finding,) = check_pictures(rig, [(left[:-20], right[:-20]) for left, right in pairs])
     assert "cropped" in finding.fix
 
@@ -434,9 +431,8 @@ def test_distortion_that_turns_back(phantom: tuple[StereoRig, Pairs]) -> None:
     findings = check_rig(StereoRig("folded", folded, rig.right))
     (warned,) = [finding for finding in findings if finding.level == "warning"]
     radius = np.linspace(0, 1, 100_000)  # where the model's radius stops growing, by brute force
-    reached = (radius * (1 - 0.089 * radius**2 + 0.94 * radius**4 - 14.8 * radius**6)).max() * rig.left.K[
-        0, 0
-    ]
+    grown = radius * (1 - 0.089 * radius**2 + 0.94 * radius**4 - 14.8 * radius**6)
+    reached = grown.max() * rig.left.K[0, 0]
     assert f"left.yaml: the distortion turns back {reached:.0f} px" in warned.what
 
 
@@ -455,10 +451,8 @@ def test_check_of_a_session_against_itself(phantom_session: Path) -> None:
 
 
 def test_check_against_a_session_with_another_key(phantom_session: Path) -> None:
-    exchanged_source = [
-        f"source.left:={phantom_session / 'right'}",
-        f"source.right:={phantom_session / 'left'}",
-    ]
+    sides = ("left", "right"), ("right", "left")
+    exchanged_source = [f"source.{eye}:={phantom_session / other}" for eye, other in sides]
     code, out, err = sags(phantom_session / "calib", "--session", phantom_session, *exchanged_source)
     assert code == 1 and "the pictures are exchanged" in out and "cannot be used" in err
 

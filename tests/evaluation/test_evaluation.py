@@ -240,9 +240,8 @@ def test_the_right_eye_is_measured_where_it_is_shown(frames: list[StereoFrame]) 
     for row in measurer.rows:  # nothing is measured that no table shows
         assert all(figures.keys() <= set(MEANS[group]) for group, figures in row.figures.items())
     found = summary_of(measurer)["right"]
-    rounding = 10 * np.log10(
-        1 + 0.8**2
-    )  # dB: the truth is in steps of 8 bits, and so is 0.8 of what was shown
+    # dB: the truth is in steps of 8 bits, and so is 0.8 of what was shown
+    rounding = 10 * np.log10(1 + 0.8**2)
     assert found["psnr"] == pytest.approx(found["model_psnr"] - rounding, abs=0.2)
     assert found["psnr"] > 45 > max(found["warp_psnr"], found["copy_psnr"]) + 3
     assert 0.5 < found["coverage"] <= 1

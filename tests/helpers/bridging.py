@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from synthetic import at_frame, plane_result, stream
@@ -18,6 +18,8 @@ from sags_node.config.schema import PublishConfig
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.publisher import Publisher
 from sags_node.types import AnchorStates, FrameResult
+
+T = TypeVar("T")
 
 SEEN, HIDDEN, LOST, UNSURE = 3, 5, 8, 9  # numbers of the anchors in `anchored`
 
@@ -37,6 +39,10 @@ def sockets(
 def senders(run_dir: Path) -> dict[str, Any]:
     """The options of a bridge that say where `sockets` are, and an overlay."""
     return {"node": NodeAddress(run_dir=run_dir), "overlay": NodeAddress("overlay", run_dir=run_dir)}
+
+
+def options_of(kind: Callable[..., T], run_dir: Path, **said: Any) -> T:
+    return kind(**{**senders(run_dir), **said})
 
 
 def anchored(result: FrameResult | None = None) -> FrameResult:

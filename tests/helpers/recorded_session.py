@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 from places import SESSION
 
+from sags_node.findings import by_code
+from sags_node.mapping.budget import StepBudget
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.quality import metrics
 from sags_node.quality.metrics import as_float
@@ -24,6 +27,18 @@ def opened(*overrides: str) -> Session:
 def frames_of(session: Session) -> list[StereoFrame]:
     with session.source as source:
         return list(source)
+
+
+def play(
+    session: Session, frames: Iterable[StereoFrame], steps: int = 2
+) -> tuple[list[FrameResult], list[set[str]], Pipeline]:
+    """What a new pipeline makes of each frame, the codes of its warnings then, and the pipeline."""
+    pipeline = Pipeline(session.config, session.rig)
+    results, codes = [], []
+    for frame in frames:
+        results.append(pipeline.process(frame, StepBudget(steps)))
+        codes.append(set(by_code(pipeline.warnings)))
+    return results, codes, pipeline
 
 
 def both(frame: StereoFrame, change: Callable[[U8], np.ndarray]) -> StereoFrame:

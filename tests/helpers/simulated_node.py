@@ -254,10 +254,8 @@ class Run:
         self.fresh = {f"sags/{name}": Freshness(clock=self.world.monotonic) for name in ("tf", "anchors")}
         self.shown = Counter[str]()
         self._seen: dict[str, tuple[int, int, int, int]] = {}
-        self._state, self._refused = (
-            "starting",
-            0,
-        )  # as consumers know it, and the frames that they refuse for it
+        # As consumers know it, and the frames that they refuse for it.
+        self._state, self._refused = "starting", 0
         self._ended = False
 
     def play(self) -> None:

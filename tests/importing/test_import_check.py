@@ -432,9 +432,8 @@ def test_what_is_recognised_is_played(tmp_path: Path) -> None:
 
 
 def test_noise_is_no_comb_and_fields_are() -> None:
-    fine = np.random.default_rng(0).integers(
-        0, 255, (HEIGHT, WIDTH), np.uint8
-    )  # as much in columns as in rows
+    # As much in columns as in rows.
+    fine = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), np.uint8)
     assert combing(fine) == pytest.approx(combing(np.ascontiguousarray(fine.T)), rel=0.1)
     alternating = np.zeros((10, 10), np.uint8)
     alternating[1::2] = 100

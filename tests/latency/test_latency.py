@@ -165,9 +165,8 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
                 node.poll(0)
     assert found["read"] > 0 and found["read"] + found["lost"] == found["codes"]
     assert found["unknown"] == found["unreadable"] == found["clock_set"] == 0
-    assert found["parts_ms"]["captured"]["max"] == pytest.approx(
-        0, abs=0.1
-    )  # its stamp is that of the sending
+    # Its stamp is that of the sending.
+    assert found["parts_ms"]["captured"]["max"] == pytest.approx(0, abs=0.1)
     assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
     assert found["total_ms"]["p50"] >= 1e3 * HELD
     assert found["total_ms"]["max"] >= found["parts_ms"]["published"]["max"]

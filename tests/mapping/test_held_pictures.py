@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded_session import both, frames_of, opened, psnr
+from recorded_session import both, frames_of, opened, play, psnr
 
 from sags_node.confidence import HALVING, SURE
 from sags_node.errors import SagsError
-from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import OF_THE_MODEL, tells_of
 from sags_node.node.allowance import Allowance
@@ -62,15 +61,6 @@ FAULTS: dict[str, tuple[Spoil, str]] = {
     "picture_covered": (lambda f, i: both(f, bleeding), ""),
     "": (lambda f, i: both(f, lambda p: p * (3.0 if i % 2 else 1 / 3)), ""),  # flicker is no event
 }
-
-
-def play(session: Session, frames: list[StereoFrame]) -> tuple[list[FrameResult], list[set[str]], Pipeline]:
-    pipeline = Pipeline(session.config, session.rig)
-    results, codes = [], []
-    for frame in frames:
-        results.append(pipeline.process(frame, StepBudget(2)))
-        codes.append(set(by_code(pipeline.warnings)))
-    return results, codes, pipeline
 
 
 @pytest.fixture(scope="module")

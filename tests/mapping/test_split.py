@@ -182,9 +182,8 @@ def test_a_model_grows_by_splitting_to_what_it_may_have(
     monkeypatch.setattr(initialise, "INITIAL_SHARE", 0.2)
     (errors, results), (plain, others) = played(10_000, True), played(10_000, False)
     assert split.GROWN * 10_000 - 2 <= count(results) <= 10_000  # splits stop there; what appears may go on
-    assert (1 + 2 * split.GROWTH) ** len(errors) * count(others) > count(
-        results
-    )  # two more for each that is split
+    # Two more for each that is split.
+    assert (1 + 2 * split.GROWTH) ** len(errors) * count(others) > count(results)
     assert errors[-5:].mean() > plain[-5:].mean() + 0.2
 
 

@@ -40,9 +40,8 @@ def test_run_directory_and_connection_file_are_private(tmp_path: Path) -> None:
         assert said["pid"] == os.getpid() and said["protocol"] == "1.0" and said["ns"] == "sags"
         assert said["public_key"] is None and said["session"] == "session-1"
         assert said["data"] == running.connection.data
-        assert said["data"][0] == f"ipc://{run_dir}/sags.ipc" and said["control"].startswith(
-            "tcp://127.0.0.1:"
-        )
+        assert said["data"][0] == f"ipc://{run_dir}/sags.ipc"
+        assert said["control"].startswith("tcp://127.0.0.1:")
         assert read_connection("sags", run_dir) == running.connection
     assert not file.exists() and not (run_dir / "sags.ipc").exists()
     with pytest.raises(SagsError, match="sags run"):
@@ -158,9 +157,8 @@ def test_a_long_run_directory_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_control_socket(tmp_path: Path) -> None:
-    with Publisher(
-        PublishConfig(data=(), control=None, run_dir=tmp_path / "run"), "sags", "session-1"
-    ) as running:
+    config = PublishConfig(data=(), control=None, run_dir=tmp_path / "run")
+    with Publisher(config, "sags", "session-1") as running:
         assert running.connection.control is None and len(running.connection.data) == 1
         running.publish_health(health())
         assert running.poll(0) is False

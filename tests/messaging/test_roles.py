@@ -82,9 +82,8 @@ def test_each_role_may_do_its_own_and_what_those_before_it_may(
                         assert asker.request(op) == "done"
                     else:
                         refused += 1
-                        with pytest.raises(
-                            SagsError, match=f"takes the role '{least}'.*into the folder '{least}'"
-                        ):
+                        why = f"takes the role '{least}'.*into the folder '{least}'"
+                        with pytest.raises(SagsError, match=why):
                             asker.request(op)
         with one.subscriber("clients/listen/listen") as subscriber:
             assert subscriber.wait(TOPIC, 60) is not None

@@ -132,10 +132,8 @@ def test_keys_in_a_launch_file_are_relative_to_it(tmp_path: Path) -> None:
     file = tmp_path / "launch.yaml"
     file.write_text("publish: {key: node.key, allow: [clients, one.pub]}")
     publish = load_launch(file).publish
-    assert (publish.key, publish.allow) == (
-        tmp_path / "node.key",
-        (tmp_path / "clients", tmp_path / "one.pub"),
-    )
+    assert publish.key == tmp_path / "node.key"
+    assert publish.allow == (tmp_path / "clients", tmp_path / "one.pub")
     assert load_launch(None, ["publish.key:=a.key", "publish.allow:=b"]).publish.allow == (Path("b"),)
     with pytest.raises(UsageError, match="belong together"):
         load_launch(None, ["publish.key:=a.key"])
@@ -284,13 +282,8 @@ def test_random_bytes_on_both_ports_while_a_client_receives(
     tmp_path: Path, keys: Path, with_keys: bool
 ) -> None:
     rng = np.random.default_rng(9)
-    starts = (
-        b"",
-        b"\xff" + bytes(8) + b"\x7f",
-        b"\xff" + bytes(8) + b"\x7f\x03\x00NULL",
-        b"\x01\x00",
-        b"GET / ",
-    )
+    greeting = b"\xff" + bytes(8) + b"\x7f"
+    starts = (b"", greeting, greeting + b"\x03\x00NULL", b"\x01\x00", b"GET / ")
     with node(tmp_path / "run", keys if with_keys else None) as attacked:
         running, connection = attacked.running, attacked.running.connection
         with attacked.serves_on("clients/viewer"):
@@ -395,9 +388,8 @@ def test_a_secured_node_as_a_process_and_its_clients(
         port = process.data.rpartition(":")[2]
         where = ["--endpoint", f"tcp://127.0.0.1:{port}"]
         listed = [*where, "--key", f"{keys}/clients/viewer.key", "--server-key", f"{keys}/node.pub"]
-        good = until(
-            lambda: json.loads(tf_rate(*listed).stdout or "{}")
-        )  # a busy machine may send none at first
+        # A busy machine may send none at first.
+        good = until(lambda: json.loads(tf_rate(*listed).stdout or "{}"))
         assert good["average_rate"] > 0
         stranger = [*where, "--key", f"{keys}/stranger.key", "--server-key", f"{keys}/node.pub"]
         assert until(lambda: said_once(tf_rate(*stranger), "refuses this key")).exit_code == 1

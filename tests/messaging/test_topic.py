@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import figures_of
 from made_messages import MS, meta
 from synthetic import HEIGHT, WIDTH, health, publisher, stream
 from waiting import heard, repeating
 
-from sags_node.cli.main import main
 from sags_node.clients.overlay.draw import color_key
 from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.errors import SagsError, UsageError
@@ -113,10 +112,8 @@ def test_an_overlay_is_found_by_its_namespace_alone(
     wanted = {"overlay/left/overlay/image", "overlay/right/overlay/image", "overlay/status"}
 
     def listed(seconds: float) -> bool:
-        command = ["topic", "list", "--ns", ns, "--seconds", str(seconds), "--json"]
-        result = CliRunner().invoke(main, command)
-        assert result.exit_code == 0, result.output
-        return wanted <= {row["topic"] for row in json.loads(result.stdout) if row["messages"]}
+        rows = figures_of("topic", "list", "--ns", ns, "--seconds", seconds, "--json")
+        return wanted <= {row["topic"] for row in rows if row["messages"]}
 
     assert heard(listed, 2.0)
 

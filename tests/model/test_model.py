@@ -89,9 +89,8 @@ def test_tissue_that_turns_takes_places_and_orientations_along(monkeypatch: pyte
         return float(np.linalg.norm(model.means - there, axis=1)[inner].mean()), model.quats[inner]
 
     missed, turned = follow()
-    assert (
-        0.5 * angle < 2 * np.median(turned[:, 3]) < 1.02 * angle
-    )  # of what little is known a part is believed
+    # Of what little is known a part is believed.
+    assert 0.5 * angle < 2 * np.median(turned[:, 3]) < 1.02 * angle
     assert np.abs(turned[:, 1:3]).mean() < 0.1 * angle
     monkeypatch.setattr(deformation_module, "_LEAST_STIFFNESS", 1e6)  # the nodes' translations alone
     assert missed < 0.4 * follow()[0]

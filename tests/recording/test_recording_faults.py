@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -16,7 +15,7 @@ from independent_client import zmq_socket
 from made_messages import message_of
 from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher
-from waiting import until
+from waiting import beside, until
 
 from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
@@ -107,13 +106,10 @@ def test_lengths_without_a_unit_stay_so_in_a_bag_and_when_it_is_played(tmp_path:
         assert K == [False, True]
     config = PublishConfig(data=(), control=None, run_dir=run_dir)
     player = Player(tmp_path / "bag", PlayOptions(loop=True), config)
-    thread = threading.Thread(target=player.play)
-    thread.start()
-    until((run_dir / "sags.json").exists)
-    with Subscriber(["left/depth"], run_dir=run_dir) as subscriber:
-        until(lambda: (got := subscriber.wait("left/depth", 1)) is not None and not got.metric)
-    player.stop()
-    thread.join(60)
+    with beside(player.play, player.stop):
+        until((run_dir / "sags.json").exists)
+        with Subscriber(["left/depth"], run_dir=run_dir) as subscriber:
+            until(lambda: (got := subscriber.wait("left/depth", 1)) is not None and not got.metric)
 
 
 def test_what_a_person_should_know_of_a_recording() -> None:
@@ -136,16 +132,13 @@ def test_a_recorder_says_that_nothing_comes(tmp_path: Path, monkeypatch: pytest.
     endpoint, told = f"ipc://{tmp_path / 'data'}", []
     recorder = Recorder(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint)))
     monkeypatch.setattr(recorder_module, "TELL_PERIOD", 0.01)
-    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
-        thread = threading.Thread(target=recorder.run, args=(lambda said: None, told.append))
-        thread.start()
-        socket.recv()
-        socket.send_multipart(encode(text_message(1, "y" * 100_000)))
-        until(lambda: told and told[-1]["bytes"] > 0)
-    rate = told[-1]["mb_per_s"]
-    until(lambda: told[-1]["silent_s"] > 1)
-    recorder.stop()
-    thread.join(60)
+    with beside(lambda: recorder.run(lambda said: None, told.append), recorder.stop):
+        with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+            socket.recv()
+            socket.send_multipart(encode(text_message(1, "y" * 100_000)))
+            until(lambda: told and told[-1]["bytes"] > 0)
+        rate = told[-1]["mb_per_s"]
+        until(lambda: told[-1]["silent_s"] > 1)
     assert told[-1]["mb_per_s"] == rate
     assert "nothing came in the last" in str(recorded_table({**recorder.summary(), "silent_s": 12.3}).caption)
 

@@ -12,12 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from command_line import figures_of
+from command_line import figures_of, refused
 from frames import played
 from mistakes import frames_until_error, refused_at_opening
 
-from sags_node.cli.main import main
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import UsageError
@@ -407,9 +405,8 @@ def test_a_clip_is_measured_by_its_path_alone(clip: Path) -> None:
 
 
 def test_a_right_eye_that_is_not_there_cannot_be_published(clip: Path) -> None:
-    result = CliRunner().invoke(main, ["run", str(clip), "publish.right:=true"])
-    assert result.exit_code == 2
-    assert "publish.right: there is no right eye; set source.baseline" in result.stderr
+    said = ("publish.right: there is no right eye; set source.baseline",)
+    refused(2, "run", clip, "publish.right:=true", said=said)
 
 
 def test_it_is_measured_by_its_own_protocol(clip: Path) -> None:

@@ -23,7 +23,7 @@ from numbered_pictures import write_video
 from places import HELPERS, ROOT
 from pydantic import ValidationError
 from sending import sending
-from waiting import until
+from waiting import beside, until
 
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import GeometryConfig, GstSource, LaunchConfig
@@ -120,14 +120,10 @@ def test_a_pipeline_that_fails_is_started_again_and_it_is_told(
     config: GstSource, said: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     frames: list[StereoFrame] = []
-    with open_pipeline(config) as source:
-        taking = threading.Thread(target=lambda: frames.extend(source))
-        taking.start()
+    with open_pipeline(config) as source, beside(lambda: frames.extend(source), source.stop):
         until(lambda: "GStreamer is open again" in caplog.text)
         come = len(frames)
         until(lambda: len(frames) > come)
-        source.stop()
-        taking.join(60)
     assert re.search(said, caplog.text)
 
 
@@ -151,16 +147,13 @@ def test_network_cameras_over_rtsp() -> None:
     with ExitStack() as cameras:
         first = cameras.enter_context(sending(server))
         source = cameras.enter_context(open_pipeline(file.model_copy(update=streams)))
-        taking = threading.Thread(target=lambda: frames.extend(source))
-        taking.start()
+        cameras.enter_context(beside(lambda: frames.extend(source), source.stop))
         until(lambda: len(frames) > 30)
         first.kill()
         first.wait(5)
         cameras.enter_context(sending(server))
         killed = time.time_ns()
         until(lambda: frames[-1].t_capture_ns > killed + 100_000_000)
-        source.stop()
-        taking.join(60)
     assert all(a.t_capture_ns < b.t_capture_ns for a, b in pairwise(frames))
     eyes, stamps = [], []
     for frame in frames[10:]:  # the first ones come in a burst

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
 import numpy as np
 import pytest
+from waiting import beside
 
 from sags_node.sources.pairing import QUEUE_LENGTH, LivePairs, Picture
 from sags_node.types import Side, StereoFrame
@@ -98,8 +98,5 @@ def test_a_clock_that_is_set_is_seen(moments: tuple[int, ...], epochs: list[int]
 @pytest.mark.parametrize("end", [LivePairs.stop, LivePairs.end])
 def test_who_waits_for_pictures_is_told_of_the_end(end: Any) -> None:
     source = LivePairs(20)
-    waiting = threading.Thread(target=lambda: list(source))
-    waiting.start()
-    end(source)
-    waiting.join(60)
-    assert not waiting.is_alive()
+    with beside(lambda: list(source)):  # it has ended when this is left
+        end(source)

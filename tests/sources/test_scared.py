@@ -18,6 +18,7 @@ from command_line import figures_of
 from frames import played
 from mistakes import frames_until_error, refused_at_opening
 from numbered_pictures import write_video
+from packed import pack
 from stamped_videos import write
 
 from sags_node.config import schema as cfg
@@ -120,14 +121,6 @@ def write_calibration(file: Path, **changed: Any) -> None:
             lines.append(f"{key}: !!opencv-matrix\n   rows: {matrix.shape[0]}\n   cols: {matrix.shape[1]}")
             lines.append(f"   dt: d\n   data: [ {data} ]")
     file.write_text("\n".join(lines) + "\n")
-
-
-def pack(file: Path, members: dict[str, bytes]) -> None:
-    with tarfile.open(file, "w:gz") as archive:
-        for name, data in members.items():
-            member = tarfile.TarInfo(name)
-            member.size = len(data)
-            archive.addfile(member, io.BytesIO(data))
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 from bag_files import MS, START, picture
 from dvrk_files import frame_record, write_session
 from numbered_pictures import HEIGHT, WIDTH, numbers, recordings
+from waiting import beside
 
 from sags_node.cli.launching import split
 from sags_node.config import schema as cfg
@@ -148,11 +148,8 @@ def test_stop_ends_a_wait(folders: cfg.FoldersSource) -> None:
         frames: Iterator[StereoFrame] = iter(source)
         next(frames)
         rest: list[StereoFrame] = []
-        thread = threading.Thread(target=lambda: rest.extend(frames))
-        thread.start()
-        source.stop()
-        thread.join(30)
-        assert not thread.is_alive()
+        with beside(lambda: rest.extend(frames)):
+            source.stop()
     assert rest == []
 
 

@@ -8,12 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recorded_session import both, frames_of, opened
+from recorded_session import both, frames_of, opened, play
 
 from sags_node.findings import by_code
-from sags_node.mapping.budget import StepBudget
 from sags_node.media.video import Video
-from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
@@ -44,12 +42,9 @@ def test_a_folder_is_told_by_check_and_run_alike(eyes: str, tmp_path: Path) -> N
     said = [each for each in check_folder(folder) if "red and blue" in each.what]
     assert [each.level for each in said] == ["warning"] * (eyes == "exchanged")
     session = open_session(folder, [*overrides_of(folder), "source.pace:=step"], guess=guess_rig)
-    pipeline = Pipeline(session.config, session.rig)
-    codes = []
-    for frame in frames_of(session):
-        pipeline.process(frame, StepBudget(1))
-        codes.append(CODE in by_code(pipeline.warnings))
-    assert codes == [False] + [eyes == "exchanged"] * 5  # one frame tells nothing
+    _, codes, pipeline = play(session, frames_of(session), 1)
+    # One frame tells nothing.
+    assert [CODE in each for each in codes] == [False] + [eyes == "exchanged"] * 5
     if eyes == "exchanged":
         text = by_code(pipeline.warnings)[CODE]
         assert text == f"{said[0].what}; {said[0].fix}"

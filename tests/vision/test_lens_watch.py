@@ -8,12 +8,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from places import SESSION
+from recorded_session import both, frames_of, opened, play
 
-from sags_node.findings import by_code
-from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import Session, open_session
+from sags_node.pipeline.session import Session
 from sags_node.quality.metrics import as_float
 from sags_node.types import F32, U8, Bool, FrameResult, StereoFrame
 
@@ -25,13 +22,12 @@ CENTRE = 180, 130
 
 @pytest.fixture(scope="module")
 def session() -> Session:
-    return open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+    return opened("mapping.max_gaussians:=4000")
 
 
 @pytest.fixture(scope="module")
 def frames(session: Session) -> list[StereoFrame]:
-    with session.source as source:
-        return [frame for frame, _ in zip(source, range(FIRST + COUNT + AFTER), strict=False)]
+    return frames_of(session)[: FIRST + COUNT + AFTER]
 
 
 def _disc(shape: tuple[int, ...], radius: float) -> Bool:
@@ -49,12 +45,9 @@ def _wet(picture: U8 | None) -> U8:
 def _play(
     session: Session, frames: list[StereoFrame], spoil: Callable[[StereoFrame], StereoFrame]
 ) -> tuple[list[FrameResult], list[set[str]]]:
-    pipeline = Pipeline(session.config, session.rig)
-    results, codes = [], []
-    for number, frame in enumerate(frames):
-        given = spoil(frame) if FIRST <= number < FIRST + COUNT else frame
-        results.append(pipeline.process(given, StepBudget(1)))
-        codes.append(set(by_code(pipeline.warnings)))
+    spoilt = range(FIRST, FIRST + COUNT)
+    given = [spoil(frame) if number in spoilt else frame for number, frame in enumerate(frames)]
+    results, codes, pipeline = play(session, given, 1)
     assert pipeline.map.restarts == 0
     return results, codes
 
@@ -132,9 +125,5 @@ def test_a_veil_over_one_lens_is_no_drop(
 def test_what_both_eyes_lose_is_no_drop(
     change: Callable[[U8], U8], session: Session, frames: list[StereoFrame]
 ) -> None:
-    def spoil(frame: StereoFrame) -> StereoFrame:
-        assert frame.right is not None
-        return replace(frame, left=change(frame.left), right=change(frame.right))
-
-    _, codes = _play(session, frames, spoil)
+    _, codes = _play(session, frames, lambda frame: both(frame, change))
     assert not {code for found in codes for code in found if code.endswith("drops")}

@@ -168,10 +168,8 @@ def test_exports_leave_the_warm_up_out(tiny_session: Path, tmp_path: Path) -> No
         assert tracks["frames"].tolist() == [3, 4]
         assert np.isfinite(tracks["points"][0]).all(-1).mean() > 0.5  # pinned in the first one that counts
     session = open_session(tiny_session, ["source.pace:=step", *said])
-    assert [frame.frame_id for frame in play(session, references=False)] == [
-        3,
-        4,
-    ]  # what sags fit learns from
+    # What sags fit learns from.
+    assert [frame.frame_id for frame in play(session, references=False)] == [3, 4]
 
 
 def test_an_archive_of_segments(tiny_session: Path, tmp_path: Path) -> None:

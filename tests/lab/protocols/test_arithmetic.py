@@ -57,9 +57,8 @@ def test_stir_of_2026() -> None:
         "occlusion_accuracy": 0.5,
     }
     on_the_line = arithmetic.stir_2026_figures(np.array([16.0]), np.ones(1, bool), np.ones(1, bool))
-    assert (
-        on_the_line["average_jaccard"] == on_the_line["average_tracking_accuracy"] == 1 / 5
-    )  # below it only
+    # Below it only.
+    assert on_the_line["average_jaccard"] == on_the_line["average_tracking_accuracy"] == 1 / 5
     hidden = arithmetic.stir_2026_figures(np.array([1.0]), np.zeros(1, bool), np.zeros(1, bool))
     assert list(hidden.values()) == [0, 0, 1]
 

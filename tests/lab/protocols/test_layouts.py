@@ -10,8 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from command_line import figures_of
+from command_line import figures_of, refused
 from numbered_pictures import write_video
 
 from sags_lab.protocols.layouts import (
@@ -22,7 +21,6 @@ from sags_lab.protocols.layouts import (
     stir_clips,
 )
 from sags_lab.protocols.point_tracker import raw_pair, to_raw, to_working
-from sags_node.cli.main import main
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
 from sags_node.rig import rectify_eyes
@@ -250,5 +248,4 @@ def test_tum_trajectories(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("protocol", ["d4d", "stir", "stereomis", "endonerf", "scared"])
 def test_another_folder_is_refused_in_one_line(protocol: str, tmp_path: Path) -> None:
-    result = CliRunner().invoke(main, ["eval", "--protocol", protocol, str(tmp_path)])
-    assert result.exit_code == 2 and str(tmp_path) in result.stderr
+    refused(2, "eval", "--protocol", protocol, tmp_path, said=(str(tmp_path),))

@@ -13,12 +13,11 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
+from command_line import figures_of
 from places import SESSION
 
 from sags_lab.protocols.point_tracker import PointTracker, raw_pair, to_raw
 from sags_lab.protocols.tracked_points import CONVERT, tracked_sequence
-from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import project
@@ -154,10 +153,7 @@ def test_stereomis_tracking_end_to_end(tracked: Path, frames: list[StereoFrame],
     np.testing.assert_array_equal(sequence.visible, seen)
     assert sequence.rig.baseline == pytest.approx(rig.baseline)
     np.testing.assert_array_equal(sequence.poses, np.tile(np.eye(4), (FRAMES, 1, 1)))
-    command = ["eval", "--protocol", "stereomis", str(tracked), "--iterations", "1", "--json"]
-    result = CliRunner().invoke(main, command)
-    assert result.exit_code == 0, result.output
-    found = yaml.safe_load(result.stdout)
+    found = figures_of("eval", "--protocol", "stereomis", tracked, "--iterations", "1", "--json")
     assert found["frames"] == FRAMES and found["points"] == len(pixels) and found["masks"] is True
     assert found["tracked"]["survival"] == 1 and found["tracked"]["delta"] >= found["unmoved"]["delta"] > 0
     assert found["tracked"]["mte_px"] < found["unmoved"]["mte_px"]
