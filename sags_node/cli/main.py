@@ -47,7 +47,7 @@ from sags_node.cli.register import register
 from sags_node.cli.topic import topic
 from sags_node.cli.view import view
 from sags_node.errors import SagsError, UsageError, install
-from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals
+from sags_node.terminal.console import console, interrupt, log_handler, progress, show, stop_signals, visible
 from sags_node.tools.evaluation.plots import check_plots
 
 if TYPE_CHECKING:
@@ -103,6 +103,10 @@ class Sags(click.Group):
     def _invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
+        except click.UsageError as error:
+            if (said := visible(error.format_message())) == error.format_message():
+                raise
+            raise click.UsageError(said, error.ctx) from None
         except SagsError as error:
             said, code = str(error), error.exit_code
         except ImportError as error:

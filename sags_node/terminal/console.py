@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import signal
 import sys
 import threading
@@ -18,6 +19,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 WIDE = 10_000  # columns of a table that goes to a file or another program, and so is not cut to a screen
 
@@ -30,7 +32,22 @@ _IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
 # the hook below, while it has a lost one sent again.
 _LOSING = {"__del__", "_raw_object_cache_notify", "_raw_object_cache_getbuffer", "unraisable"}
 
-console = Console(stderr=True, highlight=False, emoji=False)  # a name or a key may hold ":x:"
+_CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x80-\x9f]")  # all but the end of a line
+
+
+def visible(said: str) -> str:
+    r"""Spell control characters out, tab and ESC as `\t` and `\x1b`: names of files and topics may hold some,
+    and a terminal would obey them."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), said)
+
+
+class _Console(Console):
+    def render_str(self, text: str, **options: Any) -> Text:
+        """All text comes through here: lines, and the cells of tables."""
+        return super().render_str(visible(text), **options)
+
+
+console = _Console(stderr=True, highlight=False, emoji=False)  # a name or a key may hold ":x:"
 log = logging.getLogger(__name__)
 
 
@@ -94,7 +111,9 @@ def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[C
 
         def advance(done: int, total: int | None = None, description: str | None = None) -> None:
             nonlocal said, began, first, count
-            bar.update(task, completed=done, total=total, description=description or what, visible=True)
+            bar.update(
+                task, completed=done, total=total, description=visible(description or what), visible=True
+            )
             if console.is_terminal:
                 return
             moment, of = now(), total or 0
@@ -117,12 +136,13 @@ def time_text(seconds: float) -> str:
 def show(result: Table | str | dict[str, Any] | list[dict[str, Any]]) -> None:
     """Print a result: tables and text for people, anything else as JSON."""
     if isinstance(result, Table):
-        result = _drawn(result)
-    click.echo(result if isinstance(result, str) else json.dumps(result))
+        click.echo(_drawn(result))
+    else:
+        click.echo(visible(result) if isinstance(result, str) else json.dumps(result))
 
 
 def _drawn(table: Table) -> str:
-    screen = Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, markup=False, emoji=False)
+    screen = _Console(width=None if sys.stdout.isatty() else WIDE, highlight=False, markup=False, emoji=False)
     for column in table.columns:
         column.overflow = "fold"  # a path or a command that is cut off is of no use
     with screen.capture() as captured:

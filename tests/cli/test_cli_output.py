@@ -20,6 +20,7 @@ import click
 import pytest
 from command_line import pure_json, refused, sags
 from places import ROOT
+from rich.markup import escape
 from user_files import videos
 
 from sags_node.cli.main import main
@@ -339,6 +340,35 @@ def test_a_long_path_in_a_table_is_whole(capsys: pytest.CaptureFixture[str]) -> 
     table.add_row("report", path)
     terminal.show(table)
     assert path in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("control", ["\t", "\r", "\b", "\x1b[31m", "\x1b]0;title\a", "\x9b2J", "\0"])
+def test_a_name_cannot_steer_the_terminal(
+    capsys: pytest.CaptureFixture[str], control: str, tmp_path: Path
+) -> None:
+    """Whatever way it comes there; JSON holds it as it is."""
+    spelled = control.encode("unicode_escape").decode()
+    name = f"a{control}b"
+    table = text.table(name)
+    table.add_row(name)
+    for told in (table, text.rows_table([{"file": name}]), name):
+        terminal.show(told)
+    terminal.tell(name)
+    terminal.console.print(f"[bold]{escape(name)}[/]", soft_wrap=True)
+    file = name.replace("\0", "\x01")  # which no file's name holds
+    results = [sags("import", "--check", tmp_path / file), sags("calib", "check", ".", file)]
+    out, err = capsys.readouterr()
+    assert out.count(f"a{spelled}b") == 4 and err.count(f"a{spelled}b") == 2
+    for line in (
+        *out.split("\n"),
+        *err.split("\n"),
+        *(line for each in results for line in each.output.split("\n")),
+    ):
+        assert line.isprintable(), line
+    assert all(each.exit_code and "a\\" in each.output for each in results)
+
+    terminal.show({"name": name})
+    assert pure_json(capsys.readouterr().out) == {"name": name}
 
 
 def test_where_no_terminal_is_progress_is_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
