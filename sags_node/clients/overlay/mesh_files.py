@@ -41,11 +41,26 @@ def parse_mesh(file: Path, data: bytes) -> Shape:
     parse = {".ply": _ply, ".obj": _obj, ".stl": _stl, ".pcd": _pcd, ".xyz": _xyz}[file.suffix.lower()]
     try:
         points, faces = parse(data)
-        triangles = triangulate(points, faces)
+        points, triangles = _welded(points, triangulate(points, faces))
     except (ValueError, KeyError, IndexError, TypeError, OverflowError, struct.error) as error:
         why = str(error).partition("\n")[0][:100] or "it ends too early"
         raise UsageError(f"{file} is damaged: {why}; open it in a mesh viewer") from None
     return points, triangles
+
+
+def _welded(points: F64, triangles: I32) -> Shape:
+    """With one vertex for each place, as exporters split it at edges of their normals; without triangles that
+    have no area or come twice: what they enclose would be inside of nothing."""
+    if not len(triangles):
+        return points, triangles
+    points, numbers = np.unique(points, axis=0, return_inverse=True)
+    triangles = numbers.reshape(-1)[triangles].astype(np.int32)
+    corners = np.sort(triangles, axis=1)
+    triangles = triangles[np.all(np.diff(corners, axis=1) > 0, axis=1)]
+    if not len(triangles):
+        raise ValueError("none of its triangles has three different corners")
+    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+    return points, triangles[np.sort(first)]
 
 
 def _rows(lines: Sequence[bytes]) -> F64:
@@ -157,11 +172,9 @@ def _stl(data: bytes) -> tuple[F64, list[Face]]:
         corners = np.array([[float(word) for word in words[at + 1 : at + 4]] for at in places])
     else:
         corners = np.frombuffer(data, _STL_TRIANGLE, claimed, STL_START)["corners"].astype(np.float64)
-    corners = corners.reshape(-1, 3, 3)
-    # Each triangle brings its corners; those in the same place are one vertex.
-    points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    faces: list[Face] = list(numbers.reshape(-1, 3).tolist())
-    return points, faces
+    corners = corners.reshape(-1, 3)
+    faces: list[Face] = list(np.arange(len(corners)).reshape(-1, 3).tolist())
+    return corners, faces
 
 
 # ---- points ----------------------------------------------------------------------------------------------
