@@ -104,6 +104,8 @@ def test_faces_of_many_corners_and_numbers_from_the_end(tmp_path: Path) -> None:
         assert len(mesh.triangles) == 2
 
 
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.01 0 0\nvertex 0 0.01 0\nendloop\nendfacet\n"
+TEXT_STL = f"solid a\n{FACET}{FACET.replace('0.01 0', '0.02 0')}endsolid a\n"
 BAD_FILES = {
     "gone.ply": (None, "No such file"),
     "empty.ply": (b"", "no PLY header"),
@@ -122,6 +124,9 @@ BAD_FILES = {
     "index.obj": (b"v 0 0 0\nv 1 0 0\nf 1 2 3\n", "a vertex that is not there"),
     "zero.obj": (b"v 0 0 0\nv 1 0 0\nf 0 1 2\n", "the first one is 1"),
     "word.obj": (b"v 0 0 zero\n", "could not convert"),
+    "half.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 0 1", "a point has 2 numbers"),
+    **{f"before {cut}.stl": (TEXT_STL[: TEXT_STL.rindex(cut)], "it breaks off: ")
+       for cut in ("facet", "02 0", "1 0", "endfacet", "endsolid")},
     "half.stl": (b"solid a\nvertex 0 0 0\nvertex 1 0 0\n", "is damaged"),
     "less.pcd": (b"# .PCD\nFIELDS x y z\nPOINTS 2\nDATA ascii\n0 0 0\n", "1 points of 2"),
     "word.xyz": (b"0 0 0\n0 0 zero\n", "could not convert"),
@@ -142,6 +147,16 @@ def test_a_bad_mesh_is_one_clear_message(name: str, tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content.encode() if isinstance(content, str) else content)
     (tmp_path / "scene.yaml").write_text(f"objects: [{{file: {name}, anchors: [{{pixel: [1, 2]}}]}}]")
     scene_refused(tmp_path / "scene.yaml", name, said)
+
+
+@pytest.mark.parametrize(("rest", "warned"), [("", 1), ("\n", 0), (" 4", 0)])
+def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
+    rest: str, warned: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 0.01 0 0\nv 0 0.01 0\nv 0.01 0.01 0\nf 1 2 3{rest}")
+    assert mesh_of(ObjectSpec(file=tmp_path / "a.obj")) is not None
+    said = [each.getMessage() for each in caplog.records]
+    assert len(said) == warned and all("a.obj" in each and "1 of its 4 vertices" in each for each in said)
 
 
 @pytest.mark.parametrize(

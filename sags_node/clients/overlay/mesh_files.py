@@ -7,6 +7,7 @@ vertex 0 of OBJ as the last one. Here Python and numpy read every number, and al
 
 from __future__ import annotations
 
+import logging
 import re
 import struct
 from collections.abc import Sequence
@@ -31,6 +32,8 @@ _PLY_CORNERS = ("vertex_indices", "vertex_index")
 Shape = tuple[F64, I32]
 Face = Sequence[int]
 
+log = logging.getLogger(__name__)
+
 
 def parse_mesh(file: Path, data: bytes) -> Shape:
     """Points [V, 3] and triangles [T, 3], none of a cloud of points, in the content of a file.
@@ -41,11 +44,24 @@ def parse_mesh(file: Path, data: bytes) -> Shape:
     parse = {".ply": _ply, ".obj": _obj, ".stl": _stl, ".pcd": _pcd, ".xyz": _xyz}[file.suffix.lower()]
     try:
         points, faces = parse(data)
+        if parse is _obj and not data.endswith((b"\n", b"\r")):
+            _warn_of_the_rest(file, points, faces)
         points, triangles = _welded(points, triangulate(points, faces))
     except (ValueError, KeyError, IndexError, TypeError, OverflowError, struct.error) as error:
         why = str(error).partition("\n")[0][:100] or "it ends too early"
         raise UsageError(f"{file} is damaged: {why}; open it in a mesh viewer") from None
     return points, triangles
+
+
+def _warn_of_the_rest(file: Path, points: F64, faces: Sequence[Face]) -> None:
+    """OBJ has no mark at its end: one that broke off lacks a line break, and faces for its last vertices."""
+    free = len(points) - len({corner for face in faces for corner in face})
+    if free > 0:
+        log.warning(
+            "%s has no line break at its end, and %d of its %d vertices are in no face: if it broke off, "
+            "export it again",
+            *(file, free, len(points)),
+        )
 
 
 def _welded(points: F64, triangles: I32) -> Shape:
@@ -65,6 +81,9 @@ def _welded(points: F64, triangles: I32) -> Shape:
 
 def _rows(lines: Sequence[bytes]) -> F64:
     """Points [V, 3]: the first three words of each line."""
+    fewest = min((len(line.split()) for line in lines), default=3)
+    if fewest < 3:
+        raise ValueError(f"a point has {fewest} numbers, not x y z")
     return np.array([[float(word) for word in line.split()[:3]] for line in lines]).reshape(-1, 3)
 
 
@@ -164,11 +183,26 @@ def stl_triangles(start: bytes, size: int) -> int | None:
     return None if is_text else claimed
 
 
+def _stl_words(data: bytes) -> list[bytes]:
+    """All words of a text file, in small letters, but for the names of its solids, which may be any."""
+    words: list[bytes] = []
+    for line in data.lower().splitlines():
+        said = line.split()
+        words += said[:1] if said[:1] in ([b"solid"], [b"endsolid"]) else said
+    return words
+
+
 def _stl(data: bytes) -> tuple[F64, list[Face]]:
     claimed = stl_triangles(data[:STL_START], len(data))
     if claimed is None:
-        words = data.lower().split()
+        words = _stl_words(data)
         places = [number for number, word in enumerate(words) if word == b"vertex"]
+        facets, ended = words.count(b"facet"), words.count(b"endfacet")
+        if not len(places) == 3 * facets == 3 * ended or words[-1] != b"endsolid":
+            raise ValueError(
+                f"it breaks off: {facets} facet, {len(places)} vertex, {ended} endfacet, and its last word is "
+                f"{words[-1].decode('latin-1')}"
+            )
         corners = np.array([[float(word) for word in words[at + 1 : at + 4]] for at in places])
     else:
         corners = np.frombuffer(data, _STL_TRIANGLE, claimed, STL_START)["corners"].astype(np.float64)
