@@ -76,6 +76,31 @@ def binary_ply(*face: int) -> bytes:
     )
 
 
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.01 0 0\nvertex 0 0.01 0\nendloop\nendfacet\n"
+TEXT_STL = f"solid a\n{FACET}{FACET.replace('0.01 0', '0.02 0')}endsolid a\n"
+SOUND_FILES = {
+    "mark.obj": "\ufeffv 0 0 0\nv 0.01 0 0\nv 0 0.01 0\nv 0 0 0.01\nf 1 2 3\n",
+    "mark.stl": f"\ufeff{TEXT_STL}",
+    "umlaut.ply": ply().decode().replace("1.0", "1.0\ncomment K\u00f6rper", 1),
+    "named.stl": TEXT_STL.replace("solid a", "solid left vertex facet group"),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+@pytest.mark.parametrize("name", SOUND_FILES)
+def test_a_mark_or_a_name_in_a_mesh_changes_nothing(name: str, encoding: str, tmp_path: Path) -> None:
+    text = SOUND_FILES[name]
+    (tmp_path / name).write_bytes(text.encode("utf-8" if text[0] == "\ufeff" else encoding))
+    mesh = mesh_of(ObjectSpec(file=tmp_path / name))
+    assert mesh is not None
+    drawn = mesh.vertices[mesh.triangles[0]]
+    assert sorted(drawn.round(6).tolist()) == [
+        [0, 0, 0],
+        [0, pytest.approx(0.01), 0],
+        [pytest.approx(0.01), 0, 0],
+    ]
+
+
 @pytest.mark.parametrize("corners", [4, 5, 12, 64])
 def test_a_polygon_is_covered_once_by_its_triangles(corners: int) -> None:
     """Stars with every second corner pulled in, anywhere in space: their area is known."""
@@ -104,8 +129,6 @@ def test_faces_of_many_corners_and_numbers_from_the_end(tmp_path: Path) -> None:
         assert len(mesh.triangles) == 2
 
 
-FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.01 0 0\nvertex 0 0.01 0\nendloop\nendfacet\n"
-TEXT_STL = f"solid a\n{FACET}{FACET.replace('0.01 0', '0.02 0')}endsolid a\n"
 BAD_FILES = {
     "gone.ply": (None, "No such file"),
     "empty.ply": (b"", "no PLY header"),
@@ -127,6 +150,10 @@ BAD_FILES = {
     "half.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 0 1", "a point has 2 numbers"),
     **{f"before {cut}.stl": (TEXT_STL[: TEXT_STL.rindex(cut)], "it breaks off: ")
        for cut in ("facet", "02 0", "1 0", "endfacet", "endsolid")},
+    "columns.xyz": (b"0 0\n0 0.01\n0.01 0\n", "a point has 2 numbers"),
+    "counted.xyz": (b"1 0 0 0\n2 0 0.01 0\n3 0.01 0 0\n", "counts its lines; remove it"),
+    "strips.ply": (ply().replace(b"element face", b"element tristrips"), "its tristrips elements"),
+    "called.ply": (ply().replace(b"vertex_indices", b"corners"), "only faces with vertex_indices"),
     "half.stl": (b"solid a\nvertex 0 0 0\nvertex 1 0 0\n", "is damaged"),
     "less.pcd": (b"# .PCD\nFIELDS x y z\nPOINTS 2\nDATA ascii\n0 0 0\n", "1 points of 2"),
     "word.xyz": (b"0 0 0\n0 0 zero\n", "could not convert"),
