@@ -216,6 +216,10 @@ def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
         ("{tissue_margn: 0.005, objects: [{shape: target}]}", "did you mean 'tissue_margin'?"),
         ("{tissue_margin: .nan, objects: [{shape: target}]}", "tissue_margin: "),
         ("{color_key: [255, 90, 40], objects: [{shape: target, margin: 0.01}]}", "what a tip is too near to"),
+        ("objects: [{shape: target, color: [1.0, 0.0, 0.0]}]", "multiply 0..1 by 255"),
+        ("objects: [{shape: target, color: [0.2, 0.8, 1]}]", "objects.0.color: a colour is bytes of 0..255"),
+        ("{color_key: [0, 0, 1], objects: [{shape: target}]}", "color_key: a colour is bytes of 0..255"),
+        ("objects: [{shape: target, color: [9, 9, 9, 255]}]", "how opaque it is says `opacity:`"),
         ("objects: [{shape: target, color: red}]", "this should be a list, e.g. [40, 220, 255]"),
     ],
 )  # fmt: skip
