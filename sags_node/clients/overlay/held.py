@@ -17,7 +17,9 @@ from sags_node.clients.overlay.pinner import Pinner, Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
 from sags_node.clients.overlay.residual import Residual
 from sags_node.clients.overlay.scene import ObjectSpec
+from sags_node.clients.registration.misread import misread
 from sags_node.clients.registration.rigid import on_a_line, rigid_fit
+from sags_node.clients.registration.surfaces import Shape
 from sags_node.confidence import LEAST
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
@@ -84,6 +86,8 @@ class HeldObject:
         self._residual: Residual | None = None
         self._follow()
         self._refused: str | None = None  # for good
+        self._misread = self._misreadings()
+        self._doubt: str | None = None  # of its `at`, once their unit is known
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
@@ -259,7 +263,8 @@ class HeldObject:
         places = np.stack([state.place for state in states])
         if said and said[0] is not None:
             at = np.array(said, np.float64)
-            self._model = at * self._unit(at, places)
+            unit = self._unit(at, places)
+            self._model, self._doubt = at * unit, self._misread.get(unit)
         elif len(states) < LEAST_ANCHORS:
             self._model = np.zeros((1, 3))
         else:
@@ -275,6 +280,14 @@ class HeldObject:
                         f"are the file's coordinates those of the {self.spec.coordinates}? If not, say `at`"
                     )
             self._refused = f"it lies {1e3 * far:.3g} mm from its anchors: {hint}"
+
+    def _misreadings(self) -> dict[float, str | None]:
+        """What is wrong with its `at`, for either unit (m) that they may be in; asked before frames wait."""
+        said = [anchor.at for anchor in self.spec.anchors if anchor.at is not None]
+        if self.spec.file is None or self._body is None or len(said) < LEAST_ANCHORS:
+            return {}
+        shape, at = Shape(self._body.vertices, self._body.triangles), np.array(said, np.float64)
+        return {unit: misread(shape, unit * at) for unit in {1.0, self.spec.scale}}
 
     def _unit(self, at: F64, places: F64) -> float:
         """m for one of what every `at` [k, 3] is in, by what lies at the anchors (at [k, 3], m)."""
@@ -331,6 +344,8 @@ class HeldObject:
                 f"an anchor is {1e3 * off.max():.1f} mm from where its shape has it: check `at` and scale, "
                 "unless the tissue was bent"
             )
+        if self._doubt is not None:
+            self.is_sure, self.unsure = False, self._doubt
         return T, None
 
     def _on_surface(self, frame: TissueFrame, holding: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
