@@ -15,7 +15,7 @@ from synthetic import BASELINE, NORMAL, plane_depth, plane_result
 
 from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
-from sags_node.clients.overlay.held import AGAIN, GONE, HeldObject
+from sags_node.clients.overlay.held import AGAIN, ELSEWHERE, GONE, HeldObject
 from sags_node.clients.overlay.mesh import Mesh
 from sags_node.clients.overlay.pinner import Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
@@ -327,6 +327,17 @@ def test_points_that_lie_on_the_file_in_other_axes_only_are_unsure(
     thing = HeldObject(spec, "pin", FakePinner(), False, 0, Body(wall, 1.0, None))
     placed_at(thing, with_anchors(frame, places))
     assert thing.is_sure == (said is None) and str(said or None) in str(thing.unsure)
+
+
+@pytest.mark.fault("file: an object that was registered in another session of the node")
+@pytest.mark.parametrize(
+    ("registration", "sure"), [({"session": "s"}, True), ({"session": "t"}, False), ({}, True), (None, True)]
+)
+def test_what_was_registered_in_another_session_is_unsure(registration: Any, sure: bool) -> None:
+    """`s` is the session of the frame."""
+    thing, frame = of_file(1e3 * local_places(), 1e-3, at_units="file", registration=registration)
+    placed_at(thing, frame)
+    assert thing.is_sure == sure and thing.unsure == (None if sure else ELSEWHERE)
 
 
 def test_a_recording_that_loops_pins_again_where_it_was_pinned() -> None:

@@ -265,7 +265,7 @@ def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, 
     thing = read_scene(scene).objects[0]
     kept = thing.registration and thing.registration.model_dump()
     assert kept == {key: said[key] for key in said if key != "scene"}
-    assert said["verdict"] == "good" and said["share"] > 0.8
+    assert said["verdict"] == "good" and said["share"] > 0.8 and said["session"] and said["epoch"] >= 0
     places, at = (np.array([getattr(anchor, key) for anchor in thing.anchors]) for key in ("place", "at"))
     T, misfit = rigid_fit(thing.scale * at, places, np.ones(len(at)))
     off = np.linalg.norm(transform(T, organ.targets) - DEEP * organ.picks, axis=1)

@@ -29,6 +29,7 @@ LEAST_ANCHORS = 3  # for a rigid fit
 FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
 MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of ten are within half of it
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
+ELSEWHERE = "it was registered in another session of the node, whose world is another: register it again"
 AGAIN = "it comes back once recognised; else pin it again, by four anchors or more"
 GONE = f"the tissue at its anchors left the model; {AGAIN}"
 
@@ -87,7 +88,7 @@ class HeldObject:
         self._follow()
         self._refused: str | None = None  # for good
         self._misread = self._misreadings()
-        self._doubt: str | None = None  # of its `at`, once their unit is known
+        self._doubt: str | None = None  # of its `at`, once their unit is known, and of its places
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
@@ -270,6 +271,9 @@ class HeldObject:
         else:
             in_camera = self.spec.coordinates == "camera"
             self._model = np.asarray(transform(invert(T_world_cam), places)) if in_camera else places
+        stated = self.spec.registration
+        if stated is not None and stated.session not in (None, frame.session):
+            self._doubt = ELSEWHERE
         far = self._distance(self._model)
         if far > 0:
             hint = f"is `at` in the file's units, and is scale: {self.spec.scale:g} right?"

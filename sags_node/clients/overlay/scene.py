@@ -77,6 +77,7 @@ class Registered(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     residual_p90_mm: float | None = Field(None, ge=0)
     share: float = Field(1.0, gt=0, le=1)
+    session: str | None = Field(None, description="of the node, in whose world its places are")
 
 
 class ObjectSpec(Section):
