@@ -35,11 +35,11 @@ LINES = {
     "sags_node/bags": 915,
     "sags_node/cli": 3538,
     "sags_node/clients": 1,
-    "sags_node/clients/bridge": 2586,
+    "sags_node/clients/bridge": 2596,
     "sags_node/clients/latency": 431,
-    "sags_node/clients/overlay": 3057,
+    "sags_node/clients/overlay": 3167,
     "sags_node/clients/recording": 1403,
-    "sags_node/clients/registration": 479,
+    "sags_node/clients/registration": 536,
     "sags_node/clients/viewer": 1485,
     "sags_node/config": 1432,
     "sags_node/detail": 886,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1764,
     "sags_node/tools/importing": 1172,
     "sags_node/vision": 5455,
-    "tests": 48425,
+    "tests": 48570,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -15,7 +15,7 @@ from synthetic import BASELINE, NORMAL, plane_depth, plane_result
 
 from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
-from sags_node.clients.overlay.held import AGAIN, GONE, HeldObject
+from sags_node.clients.overlay.held import AGAIN, ELSEWHERE, GONE, HeldObject
 from sags_node.clients.overlay.mesh import Mesh
 from sags_node.clients.overlay.pinner import Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
@@ -242,8 +242,8 @@ def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any
         anchor["at"] = said
     spec = ObjectSpec.model_validate({"file": "tube.stl", "scale": scale, "anchors": anchors, **more})
     corners = np.array([[-0.015, -0.002, -0.002], [0.015, 0.002, 0.002]]) + (0 if around is None else around)
-    ends = Mesh(corners.astype(np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-    body = Body(ends, 1.0, None)
+    diagonal = Mesh(corners.astype(np.float32), np.array([[0, 0, 1]], np.int32), np.zeros((1, 3), np.float32))
+    body = Body(diagonal, 1.0, None)
     return HeldObject(spec, "pin", FakePinner(), False, 0, body), with_anchors(frame, places)
 
 
@@ -302,6 +302,42 @@ def test_what_does_not_fit_its_anchors_is_unsure_and_says_why(factor: float, sur
     placed_at(thing, frame)
     assert thing.is_sure == sure and thing.status()["sure"] == sure
     assert sure or "mm from where its shape has it: check `at`" in thing.status()["unsure"]
+
+
+@pytest.mark.parametrize(
+    ("factors", "under", "said"),
+    [
+        ((-1, -1, 1), 0.0, "as -x, -y, z (one is RAS, the other LPS)"), ((1, 1, 1), 0.0, None),
+        ((1, 1, 1), 0.02, None),  # m: what lies under the tissue is held by places over it
+    ],
+)  # fmt: skip
+def test_points_that_lie_on_the_file_in_other_axes_only_are_unsure(
+    factors: Any, under: float, said: str | None
+) -> None:
+    """A wall of 0.1 m through all anchors, and their points in Slicer's RAS."""
+    frame = plane_frame()
+    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
+    local = local_places() + np.array([0.03, 0.02, 0.05])
+    _, _, (along, across, _) = np.linalg.svd(local - local.mean(0))
+    ends = [local.mean(0) + a * along + b * across for a, b in ((-0.05, -0.05), (-0.05, 0.05), (0.1, 0))]
+    wall = Mesh(np.float32(ends), np.array([[0, 1, 2]], np.int32), np.zeros((1, 3), np.float32))
+    at = 1e3 * (local * factors - [0, 0, under])
+    anchors = [{"pixel": pixel, "at": each.tolist()} for pixel, each in zip(PIXELS, at, strict=True)]
+    spec = ObjectSpec.model_validate({"file": "a.stl", "scale": 1e-3, "anchors": anchors})
+    thing = HeldObject(spec, "pin", FakePinner(), False, 0, Body(wall, 1.0, None))
+    placed_at(thing, with_anchors(frame, places))
+    assert thing.is_sure == (said is None) and str(said or None) in str(thing.unsure)
+
+
+@pytest.mark.fault("file: an object that was registered in another session of the node")
+@pytest.mark.parametrize(
+    ("registration", "sure"), [({"session": "s"}, True), ({"session": "t"}, False), ({}, True), (None, True)]
+)
+def test_what_was_registered_in_another_session_is_unsure(registration: Any, sure: bool) -> None:
+    """`s` is the session of the frame."""
+    thing, frame = of_file(1e3 * local_places(), 1e-3, at_units="file", registration=registration)
+    placed_at(thing, frame)
+    assert thing.is_sure == sure and thing.unsure == (None if sure else ELSEWHERE)
 
 
 def test_a_recording_that_loops_pins_again_where_it_was_pinned() -> None:

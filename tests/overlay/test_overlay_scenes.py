@@ -76,6 +76,31 @@ def binary_ply(*face: int) -> bytes:
     )
 
 
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.01 0 0\nvertex 0 0.01 0\nendloop\nendfacet\n"
+TEXT_STL = f"solid a\n{FACET}{FACET.replace('0.01 0', '0.02 0')}endsolid a\n"
+SOUND_FILES = {
+    "mark.obj": "\ufeffv 0 0 0\nv 0.01 0 0\nv 0 0.01 0\nv 0 0 0.01\nf 1 2 3\n",
+    "mark.stl": f"\ufeff{TEXT_STL}",
+    "umlaut.ply": ply().decode().replace("1.0", "1.0\ncomment K\u00f6rper", 1),
+    "named.stl": TEXT_STL.replace("solid a", "solid left vertex facet group"),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+@pytest.mark.parametrize("name", SOUND_FILES)
+def test_a_mark_or_a_name_in_a_mesh_changes_nothing(name: str, encoding: str, tmp_path: Path) -> None:
+    text = SOUND_FILES[name]
+    (tmp_path / name).write_bytes(text.encode("utf-8" if text[0] == "\ufeff" else encoding))
+    mesh = mesh_of(ObjectSpec(file=tmp_path / name))
+    assert mesh is not None
+    drawn = mesh.vertices[mesh.triangles[0]]
+    assert sorted(drawn.round(6).tolist()) == [
+        [0, 0, 0],
+        [0, pytest.approx(0.01), 0],
+        [pytest.approx(0.01), 0, 0],
+    ]
+
+
 @pytest.mark.parametrize("corners", [4, 5, 12, 64])
 def test_a_polygon_is_covered_once_by_its_triangles(corners: int) -> None:
     """Stars with every second corner pulled in, anywhere in space: their area is known."""
@@ -122,6 +147,13 @@ BAD_FILES = {
     "index.obj": (b"v 0 0 0\nv 1 0 0\nf 1 2 3\n", "a vertex that is not there"),
     "zero.obj": (b"v 0 0 0\nv 1 0 0\nf 0 1 2\n", "the first one is 1"),
     "word.obj": (b"v 0 0 zero\n", "could not convert"),
+    "half.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 0 1", "a point has 2 numbers"),
+    **{f"before {cut}.stl": (TEXT_STL[: TEXT_STL.rindex(cut)], "it breaks off: ")
+       for cut in ("facet", "02 0", "1 0", "endfacet", "endsolid")},
+    "columns.xyz": (b"0 0\n0 0.01\n0.01 0\n", "a point has 2 numbers"),
+    "counted.xyz": (b"1 0 0 0\n2 0 0.01 0\n3 0.01 0 0\n", "counts its lines; remove it"),
+    "strips.ply": (ply().replace(b"element face", b"element tristrips"), "its tristrips elements"),
+    "called.ply": (ply().replace(b"vertex_indices", b"corners"), "only faces with vertex_indices"),
     "half.stl": (b"solid a\nvertex 0 0 0\nvertex 1 0 0\n", "is damaged"),
     "less.pcd": (b"# .PCD\nFIELDS x y z\nPOINTS 2\nDATA ascii\n0 0 0\n", "1 points of 2"),
     "word.xyz": (b"0 0 0\n0 0 zero\n", "could not convert"),
@@ -142,6 +174,16 @@ def test_a_bad_mesh_is_one_clear_message(name: str, tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content.encode() if isinstance(content, str) else content)
     (tmp_path / "scene.yaml").write_text(f"objects: [{{file: {name}, anchors: [{{pixel: [1, 2]}}]}}]")
     scene_refused(tmp_path / "scene.yaml", name, said)
+
+
+@pytest.mark.parametrize(("rest", "warned"), [("", 1), ("\n", 0), (" 4", 0)])
+def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
+    rest: str, warned: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 0.01 0 0\nv 0 0.01 0\nv 0.01 0.01 0\nf 1 2 3{rest}")
+    assert mesh_of(ObjectSpec(file=tmp_path / "a.obj")) is not None
+    said = [each.getMessage() for each in caplog.records]
+    assert len(said) == warned and all("a.obj" in each and "1 of its 4 vertices" in each for each in said)
 
 
 @pytest.mark.parametrize(
@@ -174,6 +216,10 @@ def test_a_bad_mesh_is_one_clear_message(name: str, tmp_path: Path) -> None:
         ("{tissue_margn: 0.005, objects: [{shape: target}]}", "did you mean 'tissue_margin'?"),
         ("{tissue_margin: .nan, objects: [{shape: target}]}", "tissue_margin: "),
         ("{color_key: [255, 90, 40], objects: [{shape: target, margin: 0.01}]}", "what a tip is too near to"),
+        ("objects: [{shape: target, color: [1.0, 0.0, 0.0]}]", "multiply 0..1 by 255"),
+        ("objects: [{shape: target, color: [0.2, 0.8, 1]}]", "objects.0.color: a colour is bytes of 0..255"),
+        ("{color_key: [0, 0, 1], objects: [{shape: target}]}", "color_key: a colour is bytes of 0..255"),
+        ("objects: [{shape: target, color: [9, 9, 9, 255]}]", "how opaque it is says `opacity:`"),
         ("objects: [{shape: target, color: red}]", "this should be a list, e.g. [40, 220, 255]"),
     ],
 )  # fmt: skip

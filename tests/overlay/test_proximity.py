@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from made_messages import meta
 from test_overlay_drawing import wall
 
 from sags_node.clients.overlay.draw import UNDER, Body, Placed, draw
-from sags_node.clients.overlay.mesh import Mesh
+from sags_node.clients.overlay.mesh import Mesh, mesh_of
 from sags_node.clients.overlay.proximity import FIELDS, HELD, MAX_AGE, TISSUE, UNKNOWN, Proximity
-from sags_node.clients.overlay.scene import ALARM, SceneSpec
+from sags_node.clients.overlay.scene import ALARM, ObjectSpec, SceneSpec
 from sags_node.confidence import SURE
 from sags_node.geometry import project, quat_to_matrix, transform
 from sags_node.messaging.content import INSTRUMENT_FIELDS
@@ -62,10 +63,11 @@ def looked(near: Proximity, said: ReceivedCloud, put: Placed | None) -> dict[str
 
 
 @pytest.mark.parametrize(
-    ("tip", "is_closed", "place"),  # before a side, beside an edge, inside; what is open has no inside
+    ("tip", "is_closed", "place"),  # before a side, beside an edge, inside; without a side: inside, before it
     [
         ((0.014, 0.002, -0.003), True, (HALF, 0.002, -0.003)), ((0.013, 0.012, 0), True, (HALF, HALF, 0)),
-        ((0, 0.004, 0.008), True, (0, 0.004, 0.008)), ((0, 0.004, 0.008), False, (0, 0.004, HALF)),
+        ((0, 0.004, 0.008), True, (0, 0.004, 0.008)), ((0, 0.004, 0.008), False, (0, 0.004, 0.008)),
+        ((0.012, 0, 0.008), False, (HALF, 0, HALF)),
     ],
 )  # fmt: skip
 def test_the_nearest_place_of_a_zone_is_on_its_mesh(tip: Any, is_closed: bool, place: Any) -> None:
@@ -78,6 +80,30 @@ def test_the_nearest_place_of_a_zone_is_on_its_mesh(tip: Any, is_closed: bool, p
         assert row["distance"][0] == pytest.approx(np.linalg.norm(at - there), abs=1e-6)
         assert (row["zone"][0], row["id"].view(np.uint32)[0]) == (1, 1)
         assert row["margin"][0] == np.float32(MARGIN)
+
+
+@pytest.mark.fault(
+    "file: a forbidden zone's mesh has a hole, an empty or a repeated triangle, or split vertices"
+)
+@pytest.mark.parametrize("name", ["a.obj", "a.stl"])
+@pytest.mark.parametrize("flaw", ["hole", "empty", "twice", "turned round", "split"])
+def test_the_inside_of_a_zone_is_known_in_spite_of_flaws(flaw: str, name: str, tmp_path: Path) -> None:
+    whole = cube()
+    vertices, faces = whole.vertices, whole.triangles
+    added = {"empty": [[5, 5, 6]], "twice": faces[3:4], "turned round": faces[3:4, ::-1]}
+    faces = faces[1:] if flaw == "hole" else np.vstack([faces, added.get(flaw, faces[:0])])
+    if flaw == "split":  # at every edge
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+    lines = [" ".join(f"{x:g}" for x in vertex) for vertex in vertices]
+    text = "".join(f"v {line}\n" for line in lines) + "".join(f"f {a} {b} {c}\n" for a, b, c in faces + 1)
+    if name == "a.stl":
+        corners = ("".join(f"vertex {lines[corner]}\n" for corner in face) for face in faces)
+        facets = (f"facet normal 0 0 0\nouter loop\n{each}endloop\nendfacet\n" for each in corners)
+        text = f"solid a\n{''.join(facets)}endsolid a\n"
+    (tmp_path / name).write_text(text)
+    body = Body(mesh_of(ObjectSpec(file=tmp_path / name)), 0.5, "artery")
+    row = looked(watched(body), told([(0, 0.004, 0.002), (0.014, 0, 0)]), Placed(body, np.eye(4)))
+    assert sorted(row["distance"].tolist()) == pytest.approx([0, 0.014 - HALF], abs=1e-6)
 
 
 def test_only_what_is_nearer_than_its_margin_is_told() -> None:

@@ -161,6 +161,33 @@ def test_a_mirrored_file_is_refused(organ: Organ, pairs: int) -> None:
     assert found.verdict == "refused" and "handedness" in found.reason
 
 
+@pytest.mark.fault("file: points of a model in other axes (RAS for LPS) or another unit than its file")
+@pytest.mark.parametrize(
+    ("factors", "moved", "said"),
+    [
+        ((-1, -1, 1), 0.2, "-x, -y, z (one is RAS, the other LPS)"), ((1, 1, -1), 0.2, "x, y, -z"),
+        ((1e-3, 1e-3, 1e-3), 0.2, "x, y, z times 1e+03"), ((-1, -1, 1), 0.0, "-x, -y, z"),
+    ],
+)  # fmt: skip
+def test_points_in_other_axes_or_another_unit_than_the_file_are_refused(
+    organ: Organ, factors: Any, moved: float, said: str
+) -> None:
+    """Wherever the file has its origin, with picks that are 1 mm wrong."""
+    away = np.array([moved, -moved, 2 * moved]) - organ.vertices.mean(0)
+    model = Shape(organ.vertices + away, organ.triangles)
+    at = organ.at + away + np.random.default_rng(3).normal(0, 3e-4, organ.at.shape)
+    found = register(model, at * factors, organ.picks, organ.surface, organ.targets + away)
+    assert found.verdict == "refused" and f"as {said}" in found.reason and "mm from the file" in found.reason
+    assert register(model, at, organ.picks, organ.surface, organ.targets + away).verdict == "good"
+
+
+def test_a_point_aside_of_the_model_is_the_reason_if_it_does_not_fit(organ: Organ) -> None:
+    at = organ.at.copy()
+    at[2] += (0.04, 0, 0.03)
+    found = register(organ.model, at, organ.picks, organ.surface, organ.targets)
+    assert found.verdict == "refused" and "mm from the model: are these points of this file" in found.reason
+
+
 def test_too_few_points_and_those_on_a_line_are_refused(organ: Organ) -> None:
     few = register(organ.model, organ.at[:2], organ.picks[:2], organ.surface, organ.targets)
     assert few.verdict == "refused" and "2 pairs: give 3 to 20" in few.reason
@@ -238,7 +265,7 @@ def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, 
     thing = read_scene(scene).objects[0]
     kept = thing.registration and thing.registration.model_dump()
     assert kept == {key: said[key] for key in said if key != "scene"}
-    assert said["verdict"] == "good" and said["share"] > 0.8
+    assert said["verdict"] == "good" and said["share"] > 0.8 and said["session"] and said["epoch"] >= 0
     places, at = (np.array([getattr(anchor, key) for anchor in thing.anchors]) for key in ("place", "at"))
     T, misfit = rigid_fit(thing.scale * at, places, np.ones(len(at)))
     off = np.linalg.norm(transform(T, organ.targets) - DEEP * organ.picks, axis=1)

@@ -28,7 +28,7 @@ from sags_node.clients.bridge import igtl
 from sags_node.clients.bridge.compressed import over_black
 from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
 from sags_node.clients.bridge.options import ServerOptions
-from sags_node.clients.bridge.pins import Pin, Pins, Release
+from sags_node.clients.bridge.pins import MOST, Pin, Pins, Release
 from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source
 from sags_node.clients.bridge.requests import Requests
 from sags_node.clients.overlay.draw import over
@@ -217,6 +217,10 @@ class OpenIgtLink(Outlet):
 
     def _hear(self, said: igtl.Said) -> None:
         if said.kind == "POINT" and said.device == PIN:
+            if len(said.points) > MOST:
+                self._say(
+                    f"the last {len(said.points) - MOST} points are left out: {MOST} at most are pinned"
+                )
             self._release(self._pins.hear(said.points, time.monotonic()))
         elif said.kind == "STRING" and said.device == REQUEST:
             request = request_of(said.text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,6 +21,7 @@ class Pin(NamedTuple):
 
     name: str
     place: F64  # [3] mm, as the peer said it
+    number: int = 1  # among those of that name: names need not differ
 
 
 class Release(NamedTuple):
@@ -40,36 +42,40 @@ class Pins:
     """Compares the list that came with what is pinned; used from one thread."""
 
     def __init__(self) -> None:
-        self._points: dict[str, _Point] = {}
+        self._points: dict[tuple[str, int], _Point] = {}  # by name, and number of that name
 
     def hear(self, points: Iterable[tuple[str, F64]], now: float) -> list[Release]:
         """The list as it is now; returns what is to be given back, since its point has gone or moved."""
-        listed = dict(list(points)[:MOST])
+        listed: dict[tuple[str, int], F64] = {}
+        named: Counter[str] = Counter()
+        for name, place in list(points)[:MOST]:
+            named[name] += 1
+            listed[name, named[name]] = place
         released: list[Release] = []
-        for name in list(self._points):
-            point = self._points[name]
-            if name not in listed or float(np.abs(listed[name] - point.place).max()) > STILL:
+        for key in list(self._points):
+            point = self._points[key]
+            if key not in listed or float(np.abs(listed[key] - point.place).max()) > STILL:
                 if point.anchor is not None:
                     released.append(Release(point.anchor))
-                del self._points[name]
-        for name, place in listed.items():
-            self._points.setdefault(name, _Point(place, now))
+                del self._points[key]
+        for key, place in listed.items():
+            self._points.setdefault(key, _Point(place, now))
         return released
 
     def due(self, now: float) -> list[Pin]:
         """The points that have come to rest; each is said once."""
         resting = [
-            (name, point)
-            for name, point in self._points.items()
+            (key, point)
+            for key, point in self._points.items()
             if not point.asked and now - point.since >= REST
         ]
         for _, point in resting:
             point.asked = True
-        return [Pin(name, point.place) for name, point in resting]
+        return [Pin(name, point.place, number) for (name, number), point in resting]
 
     def pinned(self, pin: Pin, anchor: int) -> list[Release]:
         """The anchor of a point; it is given back at once if the point has gone or moved meanwhile."""
-        point = self._points.get(pin.name)
+        point = self._points.get((pin.name, pin.number))
         if point is None or point.place is not pin.place:
             return [Release(anchor)]
         point.anchor = anchor

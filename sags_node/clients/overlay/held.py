@@ -17,7 +17,9 @@ from sags_node.clients.overlay.pinner import Pinner, Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
 from sags_node.clients.overlay.residual import Residual
 from sags_node.clients.overlay.scene import ObjectSpec
+from sags_node.clients.registration.misread import misread
 from sags_node.clients.registration.rigid import on_a_line, rigid_fit
+from sags_node.clients.registration.surfaces import Shape
 from sags_node.confidence import LEAST
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, transform
@@ -27,6 +29,7 @@ LEAST_ANCHORS = 3  # for a rigid fit
 FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
 MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of ten are within half of it
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
+ELSEWHERE = "it was registered in another session of the node, whose world is another: register it again"
 AGAIN = "it comes back once recognised; else pin it again, by four anchors or more"
 GONE = f"the tissue at its anchors left the model; {AGAIN}"
 
@@ -84,6 +87,8 @@ class HeldObject:
         self._residual: Residual | None = None
         self._follow()
         self._refused: str | None = None  # for good
+        self._misread = self._misreadings()
+        self._doubt: str | None = None  # of its `at`, once their unit is known, and of its places
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
@@ -259,12 +264,16 @@ class HeldObject:
         places = np.stack([state.place for state in states])
         if said and said[0] is not None:
             at = np.array(said, np.float64)
-            self._model = at * self._unit(at, places)
+            unit = self._unit(at, places)
+            self._model, self._doubt = at * unit, self._misread.get(unit)
         elif len(states) < LEAST_ANCHORS:
             self._model = np.zeros((1, 3))
         else:
             in_camera = self.spec.coordinates == "camera"
             self._model = np.asarray(transform(invert(T_world_cam), places)) if in_camera else places
+        stated = self.spec.registration
+        if stated is not None and stated.session not in (None, frame.session):
+            self._doubt = ELSEWHERE
         far = self._distance(self._model)
         if far > 0:
             hint = f"is `at` in the file's units, and is scale: {self.spec.scale:g} right?"
@@ -275,6 +284,14 @@ class HeldObject:
                         f"are the file's coordinates those of the {self.spec.coordinates}? If not, say `at`"
                     )
             self._refused = f"it lies {1e3 * far:.3g} mm from its anchors: {hint}"
+
+    def _misreadings(self) -> dict[float, str | None]:
+        """What is wrong with its `at`, for either unit (m) that they may be in; asked before frames wait."""
+        said = [anchor.at for anchor in self.spec.anchors if anchor.at is not None]
+        if self.spec.file is None or self._body is None or len(said) < LEAST_ANCHORS:
+            return {}
+        shape, at = Shape(self._body.vertices, self._body.triangles), np.array(said, np.float64)
+        return {unit: misread(shape, unit * at) for unit in {1.0, self.spec.scale}}
 
     def _unit(self, at: F64, places: F64) -> float:
         """m for one of what every `at` [k, 3] is in, by what lies at the anchors (at [k, 3], m)."""
@@ -331,6 +348,8 @@ class HeldObject:
                 f"an anchor is {1e3 * off.max():.1f} mm from where its shape has it: check `at` and scale, "
                 "unless the tissue was bent"
             )
+        if self._doubt is not None:
+            self.is_sure, self.unsure = False, self._doubt
         return T, None
 
     def _on_surface(self, frame: TissueFrame, holding: Sequence[Anchor]) -> tuple[F64 | None, str | None]:

@@ -6,6 +6,7 @@ Everything ends as one triangle mesh in metres; a point becomes a small octahedr
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,7 @@ def _content(file: Path) -> bytes:
         if size > MAX_FILE_BYTES:
             most = MAX_FILE_BYTES >> 20
             raise UsageError(f"{file} has {size >> 20} MiB, {most} at most are read; simplify it")
-        data = read_file(file, MAX_FILE_BYTES)
+        data = read_file(file, MAX_FILE_BYTES).removeprefix(BOM_UTF8)  # Windows puts it before text
     except OSError as error:
         raise UsageError(f"cannot read {file}: {error.strerror}; check the path") from None
     start, size, claimed = data[:HEADER_BYTES], len(data), 0

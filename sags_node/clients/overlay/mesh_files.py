@@ -7,6 +7,7 @@ vertex 0 of OBJ as the last one. Here Python and numpy read every number, and al
 
 from __future__ import annotations
 
+import logging
 import re
 import struct
 from collections.abc import Sequence
@@ -31,6 +32,12 @@ _PLY_CORNERS = ("vertex_indices", "vertex_index")
 Shape = tuple[F64, I32]
 Face = Sequence[int]
 
+log = logging.getLogger(__name__)
+
+
+class _OtherFormError(Exception):
+    """What is sound, but is not read in this form; and what to do."""
+
 
 def parse_mesh(file: Path, data: bytes) -> Shape:
     """Points [V, 3] and triangles [T, 3], none of a cloud of points, in the content of a file.
@@ -41,16 +48,49 @@ def parse_mesh(file: Path, data: bytes) -> Shape:
     parse = {".ply": _ply, ".obj": _obj, ".stl": _stl, ".pcd": _pcd, ".xyz": _xyz}[file.suffix.lower()]
     try:
         points, faces = parse(data)
-        triangles = triangulate(points, faces)
+        if parse is _obj and not data.endswith((b"\n", b"\r")):
+            _warn_of_the_rest(file, points, faces)
+        points, triangles = _welded(points, triangulate(points, faces))
     except (ValueError, KeyError, IndexError, TypeError, OverflowError, struct.error) as error:
         why = str(error).partition("\n")[0][:100] or "it ends too early"
         raise UsageError(f"{file} is damaged: {why}; open it in a mesh viewer") from None
+    except _OtherFormError as error:
+        raise UsageError(f"{file}: {error}") from None
     return points, triangles
 
 
-def _rows(lines: Sequence[bytes]) -> F64:
+def _warn_of_the_rest(file: Path, points: F64, faces: Sequence[Face]) -> None:
+    """OBJ has no mark at its end: one that broke off lacks a line break, and faces for its last vertices."""
+    free = len(points) - len({corner for face in faces for corner in face})
+    if free > 0:
+        log.warning(
+            "%s has no line break at its end, and %d of its %d vertices are in no face: if it broke off, "
+            "export it again",
+            *(file, free, len(points)),
+        )
+
+
+def _welded(points: F64, triangles: I32) -> Shape:
+    """With one vertex for each place, as exporters split it at edges of their normals; without triangles that
+    have no area or come twice: what they enclose would be inside of nothing."""
+    if not len(triangles):
+        return points, triangles
+    points, numbers = np.unique(points, axis=0, return_inverse=True)
+    triangles = numbers.reshape(-1)[triangles].astype(np.int32)
+    corners = np.sort(triangles, axis=1)
+    triangles = triangles[np.all(np.diff(corners, axis=1) > 0, axis=1)]
+    if not len(triangles):
+        raise ValueError("none of its triangles has three different corners")
+    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+    return points, triangles[np.sort(first)]
+
+
+def _rows(lines: Sequence[Sequence[bytes]]) -> F64:
     """Points [V, 3]: the first three words of each line."""
-    return np.array([[float(word) for word in line.split()[:3]] for line in lines]).reshape(-1, 3)
+    fewest = min(map(len, lines), default=3)
+    if fewest < 3:
+        raise ValueError(f"a point has {fewest} numbers, not x y z")
+    return np.array([[float(word) for word in line[:3]] for line in lines]).reshape(-1, 3)
 
 
 # ---- PLY -------------------------------------------------------------------------------------------------
@@ -97,7 +137,7 @@ def _ply(data: bytes) -> tuple[F64, list[Face]]:
     header, _, body = data.partition(b"end_header")
     points: F64 = np.zeros((0, 3))
     faces: list[Face] = []
-    first, *elements = re.split(r"^element\s+", header.decode("ascii"), flags=re.MULTILINE)
+    first, *elements = re.split(r"^element\s+", header.decode("latin-1"), flags=re.MULTILINE)
     form = re.search(r"^format\s+(\w+)", first, re.MULTILINE)
     if form is None:
         raise ValueError("its header names no format")
@@ -114,12 +154,16 @@ def _ply(data: bytes) -> tuple[F64, list[Face]]:
                 points = table[:, [names.index(axis) for axis in "xyz"]]
             continue
         corners = next((number for number, called in enumerate(names) if called in _PLY_CORNERS), None)
+        if int(count) and (name == "face") != (corners is not None):
+            raise _OtherFormError(
+                f"its {name} elements are not read, only faces with vertex_indices; save it with these"
+            )
         for _ in range(int(count)):
             row = [
                 numbers.take(kind, 1 if length is None else int(numbers.take(length, 1)[0]))
                 for length, kind in kinds
             ]
-            if name == "face" and corners is not None:
+            if corners is not None:
                 faces.append([int(corner) for corner in row[corners]])
     return points, faces
 
@@ -129,11 +173,11 @@ def _ply(data: bytes) -> tuple[F64, list[Face]]:
 
 def _obj(data: bytes) -> tuple[F64, list[Face]]:
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
-    vertices: list[bytes] = []
+    vertices: list[Sequence[bytes]] = []
     faces: list[Face] = []
     for line in map(bytes.strip, lines):
         if line.startswith((b"v ", b"v\t")):
-            vertices.append(line[2:])
+            vertices.append(line.split()[1:])
         elif line.startswith((b"f ", b"f\t")):
             said = [int(word.partition(b"/")[0]) for word in line.split()[1:]]
             if 0 in said:
@@ -149,19 +193,32 @@ def stl_triangles(start: bytes, size: int) -> int | None:
     return None if is_text else claimed
 
 
+def _stl_words(data: bytes) -> list[bytes]:
+    """All words of a text file, in small letters, but for the names of its solids, which may be any."""
+    words: list[bytes] = []
+    for line in data.lower().splitlines():
+        said = line.split()
+        words += said[:1] if said[:1] in ([b"solid"], [b"endsolid"]) else said
+    return words
+
+
 def _stl(data: bytes) -> tuple[F64, list[Face]]:
     claimed = stl_triangles(data[:STL_START], len(data))
     if claimed is None:
-        words = data.lower().split()
+        words = _stl_words(data)
         places = [number for number, word in enumerate(words) if word == b"vertex"]
+        facets, ended = words.count(b"facet"), words.count(b"endfacet")
+        if not len(places) == 3 * facets == 3 * ended or words[-1] != b"endsolid":
+            raise ValueError(
+                f"it breaks off: {facets} facet, {len(places)} vertex, {ended} endfacet; its last word is "
+                f"{words[-1].decode('latin-1')}"
+            )
         corners = np.array([[float(word) for word in words[at + 1 : at + 4]] for at in places])
     else:
         corners = np.frombuffer(data, _STL_TRIANGLE, claimed, STL_START)["corners"].astype(np.float64)
-    corners = corners.reshape(-1, 3, 3)
-    # Each triangle brings its corners; those in the same place are one vertex.
-    points, numbers = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    faces: list[Face] = list(numbers.reshape(-1, 3).tolist())
-    return points, faces
+    corners = corners.reshape(-1, 3)
+    faces: list[Face] = list(np.arange(len(corners)).reshape(-1, 3).tolist())
+    return corners, faces
 
 
 # ---- points ----------------------------------------------------------------------------------------------
@@ -172,7 +229,9 @@ def _pcd(data: bytes) -> tuple[F64, list[Face]]:
     (https://pointclouds.org/documentation/tutorials/pcd_file_format.html)."""
     header, _, rest = data.partition(b"\nDATA ")
     form, _, body = rest.partition(b"\n")
-    said = {line.split()[0]: line.split()[1:] for line in header.decode("ascii").splitlines() if line.strip()}
+    said = {
+        line.split()[0]: line.split()[1:] for line in header.decode("latin-1").splitlines() if line.strip()
+    }
     names, count = said["FIELDS"], int(said["POINTS"][0])
     repeats = [int(number) for number in said.get("COUNT", ["1"] * len(names))]
     if form.strip() == b"ascii":
@@ -191,4 +250,13 @@ def _pcd(data: bytes) -> tuple[F64, list[Face]]:
 
 
 def _xyz(data: bytes) -> tuple[F64, list[Face]]:
-    return _rows([line for line in data.splitlines() if line.strip() and not line.startswith(b"#")]), []
+    lines = [line.split() for line in data.splitlines() if line.strip() and not line.startswith(b"#")]
+    points = _rows(lines)
+    if (
+        len(points) > 2
+        and len(lines[0]) > 3
+        and points[0, 0] in (0, 1)
+        and np.all(np.diff(points[:, 0]) == 1)
+    ):
+        raise _OtherFormError("its first column counts its lines; remove it, so that each begins with x y z")
+    return points, []

@@ -61,6 +61,7 @@ def register_live(
     if found.verdict == "refused":
         return said, None
     assert found.T_world_model is not None and found.matched is not None
+    said |= {"session": seen[-1].session, "epoch": seen[-1].epoch}  # in whose world its places are
     held = holding(surface.points[found.matched])
     local = transform(invert(found.T_world_model), held) / scale
     anchors = [

@@ -7,7 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from sags_node.config.schema import Section
 from sags_node.config.yaml_reader import read_yaml
@@ -19,10 +27,22 @@ KEY_DISTANCE = 64  # of 255: an object's colour nearer than this to the key colo
 
 Place = tuple[float, float, float]  # m
 Byte = Annotated[int, Field(ge=0, le=255)]
-Color = tuple[Byte, Byte, Byte]  # RGB
 Shape = Literal["target", "sphere"]
 SHAPES: tuple[str, ...] = get_args(Shape)
 S = TypeVar("S", bound=Section)
+
+
+def _in_bytes(value: object) -> object:
+    if not isinstance(value, list | tuple) or not all(isinstance(each, int | float) for each in value):
+        return value
+    if len(value) == 4:
+        raise ValueError("a colour is [red, green, blue]; how opaque it is says `opacity:`, 0..1")
+    if value and 0 < max(value) <= 1:
+        raise ValueError(f"a colour is bytes of 0..255, this is {list(value)}; multiply 0..1 by 255")
+    return value
+
+
+Color = Annotated[tuple[Byte, Byte, Byte], BeforeValidator(_in_bytes)]  # RGB
 
 
 def _margin(value: float) -> float:
@@ -57,6 +77,7 @@ class Registered(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     residual_p90_mm: float | None = Field(None, ge=0)
     share: float = Field(1.0, gt=0, le=1)
+    session: str | None = Field(None, description="of the node, in whose world its places are")
 
 
 class ObjectSpec(Section):

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sags_node.clients.registration.certainty import nine_of_ten, of_pairs, picking_error
+from sags_node.clients.registration.misread import UNITS, farthest, misread
 from sags_node.clients.registration.rigid import kabsch, on_a_line
 from sags_node.clients.registration.surface_fit import fit_surface
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
@@ -16,7 +17,6 @@ from sags_node.types import F64, Bool
 
 LEAST_PAIRS, MOST_PAIRS = 3, 20
 OTHER_UNIT = 1.3  # times too large or too small: no picking is so wrong
-UNITS = {1000: "mm for m", 100: "cm for m", 10: "mm for cm", 25.4: "mm for inch"}
 MATCHED = 0.003  # m: nearer to the model the surface is the model's
 NEAR = 0.010  # m: farther from it the surface is something else
 
@@ -33,6 +33,7 @@ FREELY = 0.1  # m: no organ slides farther
 MIRRORED = (
     "it fits as its mirror image only, so the file has the other handedness: turn one of its axes round"
 )
+ASIDE = "a point `at` lies {:.3g} mm from the model: are these points of this file, in its unit and its axes?"
 UNSEEN = "no surface was measured where the pairs put the model: check them, and that it is in sight"
 Verdict = Literal["good", "doubtful", "refused"]
 
@@ -69,7 +70,9 @@ class Registration:
         return said
 
 
-def register(model: Shape, at: F64, places: F64, surface: Surface, targets: F64) -> Registration:
+def register(  # noqa: PLR0911, one return per reason
+    model: Shape, at: F64, places: F64, surface: Surface, targets: F64
+) -> Registration:
     """Place a model on the tissue.
 
     Args:
@@ -80,15 +83,20 @@ def register(model: Shape, at: F64, places: F64, surface: Surface, targets: F64)
         return Registration("refused", f"{len(at)} pairs: give {LEAST_PAIRS} to {MOST_PAIRS}, far apart")
     if on_a_line(at) or on_a_line(places):
         return Registration("refused", "the points lie on a line, about which it could turn: add one aside")
+    other = misread(model, at)
+    if other is not None:
+        return Registration("refused", other)
     apart, there = (float(np.linalg.norm(points - points.mean(0))) for points in (at, places))
+    off = farthest(model, at)
+    aside = ASIDE.format(1e3 * off) if off > NEAR * max(1.0, apart / there) else None
     if not 1 / OTHER_UNIT < apart / there < OTHER_UNIT:
-        return Registration("refused", _wrong_unit(apart / there))
+        return Registration("refused", aside or _wrong_unit(apart / there))
     found = _placed(model, at, places, surface, targets)
     if found.verdict == "good":
         return found
     if _placed(model.mirrored(), at * MIRROR, places, surface, targets * MIRROR).verdict == "good":
         return replace(found, verdict="refused", reason=MIRRORED)
-    return found
+    return found if aside is None else replace(found, verdict="refused", reason=aside)
 
 
 def _wrong_unit(factor: float) -> str:

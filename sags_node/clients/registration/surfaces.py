@@ -15,6 +15,7 @@ from sags_node.types import F32, F64, I32, Bool, Camera
 MIRROR = np.array([-1.0, 1.0, 1.0])
 POINTS = 1500  # of one frame, about
 NINE_OF_TEN = 1.645  # standard deviations, within which nine of ten errors of a depth lie
+DIRECTIONS = 99  # of rays that tell inside from outside; odd, so that there is a majority
 BEHIND = 1.01  # of the way to a triangle's middle: what is hit there first is the triangle itself
 
 
@@ -30,7 +31,6 @@ class Shape:
         self._scene: Any = RaycastingScene()
         corners = np.ascontiguousarray(triangles.astype(np.uint32))
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(corners))
-        self._is_closed: bool | None = None  # None: nobody asked
 
     def facing(self, eye: Array) -> Shape:
         """Return what of it an eye at [3] sees: triangles whose middles nothing hides. Files wind their
@@ -47,14 +47,12 @@ class Shape:
         )
 
     def contains(self, points: Array) -> Bool:
-        """Which points [N, 3] lie inside of it; none, where it is not closed."""
-        if self._is_closed is None:  # each edge of a closed one belongs to two triangles
-            edges = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-            self._is_closed = bool(np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2))
-        if not self._is_closed:
-            return np.zeros(len(points), np.bool_)
-        inside = self._scene.compute_occupancy(self._tensor(points.astype(np.float32)), nsamples=3)
-        return np.asarray(inside.numpy() > 0)
+        """Which points [N, 3] lie inside of it: most rays from there cross it an odd number of times
+        (Nooruddin and Turk 2003), so that it may have holes."""
+        rays = np.empty((len(points), DIRECTIONS, 6), np.float32)
+        rays[..., :3], rays[..., 3:] = points[:, None], _all_round(DIRECTIONS)
+        crossed = self._scene.count_intersections(self._tensor(rays)).numpy()
+        return np.asarray((crossed % 2).mean(1) > 0.5)
 
     def hides(self, eye: Array, points: Array) -> Bool:
         """Which rays from an eye at [3] through points [N, 3] meet it, before or behind the point."""
@@ -70,6 +68,14 @@ class Shape:
         rays = np.hstack([np.broadcast_to(eye, points.shape), points - eye]).astype(np.float32)
         found: F32 = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))["t_hit"].numpy()
         return found
+
+
+def _all_round(count: int) -> F64:
+    """So many directions [count, 3], evenly spread: a spiral by the golden angle."""
+    turns = np.arange(count) * np.pi * (3 - 5**0.5)
+    z = 1 - (2 * np.arange(count) + 1) / count
+    flat = np.sqrt(1 - z**2)
+    return np.stack([flat * np.cos(turns), flat * np.sin(turns), z], -1)
 
 
 def evenly(shape: tuple[int, ...]) -> tuple[int, tuple[slice, slice]]:
