@@ -20,11 +20,10 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.rig import check_intrinsics, rectified_rig
 from sags_node.sources.pictures import FolderPairs, RawPair, pair_files, read_picture, size_text
 from sags_node.sources.pose_axes import READINGS, Seen, reading_that_fits
-from sags_node.sources.truth import load_npy
+from sags_node.sources.truth import UNKNOWN, load_npy
 from sags_node.types import F32, F64, StereoRig
 
 # Of a frame's known depths: what lies outside is drawn to them, as EndoGaussian's loader does.
-UNKNOWN = 65535  # counts, as many programs write it
 DEPTH_PERCENTILES = (3.0, 99.8)
 ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median of a frame: in an endoscope's view
 FARTHEST_DEPTH = 1.0  # m: what is said to lie farther away is refused

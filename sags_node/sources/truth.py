@@ -19,6 +19,7 @@ from sags_node.geometry import is_rotation
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.types import F32, F64, Reference
 
+UNKNOWN = 65535  # counts of depth, as many programs write it, beside 0
 _LARGEST = 2**31  # bytes
 FARTHEST = 1.0  # m that a scope moves: a millimetre that is taken for a metre
 
@@ -132,7 +133,7 @@ class References:
                 f"{file} is {size_text(width, height)} px, of another shape than the pictures "
                 f"({size_text(wide, high)}); reference depth must show what they show, cropped as they are"
             )
-        return counts * np.float32(self._config.depth_unit)
+        return np.where(counts == UNKNOWN, np.float32(0), counts * np.float32(self._config.depth_unit))
 
 
 def _by_frame_number(folder: Path) -> dict[int, Path]:

@@ -179,6 +179,18 @@ def test_reference_depth_of_another_shape_is_refused(tmp_path: Path, width: int,
             next(frames)
 
 
+def test_reference_depth_of_65535_counts_is_not_known(tmp_path: Path) -> None:
+    recordings(tmp_path)
+    counts = np.full((HEIGHT, WIDTH), 6000, np.uint16)
+    counts[:2], counts[2:4] = 65535, 0
+    write_png(tmp_path / "depth/000.png", counts)
+    with open_source(measured(tmp_path)) as source:
+        reference = next(iter(source)).reference
+    assert reference is not None and reference.depth is not None
+    assert reference.depth.dtype == np.float32 and not reference.depth[:4].any()
+    np.testing.assert_allclose(reference.depth[4:], 0.06, rtol=1e-6)
+
+
 @pytest.mark.fault("file: a picture is cut off")
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 def test_damaged_picture_in_the_middle_is_named(tmp_path: Path, suffix: str) -> None:

@@ -12,6 +12,7 @@ from sags_node.checks import Finding
 from sags_node.config.schema import GeometryConfig
 from sags_node.sources.endonerf import fitting_units
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
+from sags_node.sources.truth import UNKNOWN
 from sags_node.tools.calibration.matches import match_eyes
 from sags_node.types import U8, Bool
 
@@ -164,7 +165,7 @@ def check_depth(
     for file, depth in read_some(list_pictures(folder), cv2.IMREAD_UNCHANGED).items():
         if (wrong := _no_depth(file, depth, size)) is not None:
             return [wrong]
-        known: Bool = depth > 0
+        known: Bool = (depth > 0) & (depth != UNKNOWN)
         if known.any():
             medians.append(float(np.median(depth[known])))
             coarse = depth.dtype == np.uint8
