@@ -85,7 +85,6 @@ def judge_stamps(
             found.append(Finding("warning", what, "let the driver stamp each picture when it is taken"))
     came = np.array([[each[0] for each in pair] for pair in keys], np.int64)
     later = float(np.median((came - stamps) @ [-1, 1])) * 1e-6
-    skew = float(np.median(stamps @ [-1, 1])) * 1e-6
     if rate is not None and abs(later) > LATE_STEPS * 1e3 / rate:
         eye, other = ("right", "left") if later > 0 else ("left", "right")
         what = (
@@ -93,13 +92,8 @@ def judge_stamps(
             "stamps: if they did not come so late, the eyes' clocks differ, and pairs are of other moments"
         )
         found.append(Finding("warning", what, DIFFER_FIX, {"clocks_differ_ms": round(later, 1)}))
-    elif abs(skew) > SYNCHRONISED_MS:
-        what = (
-            f"right pictures were taken {abs(skew):.1f} ms {'after' if skew > 0 else 'before'} the left ones "
-            "(median): the cameras are not synchronised"
-        )
-        fix = "depth is wrong where tissue moves: trigger both cameras together, or use genlock"
-        found.append(Finding("warning", what, fix, {"skew_ms": round(skew, 2)}))
+    else:
+        found += judge_skew(stamps)
     steps = np.diff(stamps[:, 0]) * 1e-6
     usual = float(np.median(steps)) if len(steps) else 0.0
     if np.count_nonzero(steps > LONG * usual) > OFTEN * len(steps):
@@ -114,3 +108,16 @@ def judge_stamps(
         what = f"{len(keys)} pairs of {counts[0]} left and {counts[1]} right pictures"
         found.append(Finding("warning", what, "what has no partner in time is left out"))
     return tuple(found)
+
+
+def judge_skew(stamps: I64) -> tuple[Finding, ...]:
+    """Return what is odd about pairs of these stamps [N, 2], ns: they are not of one moment."""
+    skew = float(np.median(stamps @ [-1, 1])) * 1e-6
+    if abs(skew) <= SYNCHRONISED_MS:
+        return ()
+    what = (
+        f"right pictures were taken {abs(skew):.1f} ms {'after' if skew > 0 else 'before'} the left ones "
+        "(median): the cameras are not synchronised"
+    )
+    fix = "depth is wrong where tissue moves: trigger both cameras together, or use genlock"
+    return (Finding("warning", what, fix, {"skew_ms": round(skew, 2)}),)

@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 QUEUE_LENGTH = 4  # pictures of one eye that wait for their partner
 REPORT_EVERY = 100  # unpaired pictures between two warnings
 POLL_S = 0.1  # how soon a waiting taker notices `stop`, if nobody tells it
+NEAR = 0.6  # of a period, from a picture to its partner: free-running eyes are up to half of one apart
 SETTLING_NS = 300_000_000  # stamps that go back by less: their clock is better known now (`sources.clock`)
 
 

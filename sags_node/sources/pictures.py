@@ -17,9 +17,11 @@ from sags_node.config.schema import Instruments, Levels
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import SHOWN, read_file
 from sags_node.media.picture_file import KINDS, SUFFIXES, decode, is_whole, pages
+from sags_node.sources.bag_stamps import judge_skew
 from sags_node.sources.bit_depth import EightBits
 from sags_node.sources.masks import Masks
 from sags_node.sources.names import gaps_in, in_order, numbers, times_in, together
+from sags_node.sources.pairing import NEAR, pair
 from sags_node.types import F32, F64, I64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
@@ -142,7 +144,11 @@ class FolderPairs(Pairs):
         self.files = [files[0] for files in self._files]
         times = times_in(self.files)
         if times is not None and len(times) > 1:
-            self.stamps, self.rate = np.stack([times, times], axis=1), 1e9 / float(np.median(np.diff(times)))
+            others = times if right is None else times_in([files[1] for files in self._files])
+            if others is None or not _are_near(times, others):
+                others = times
+            self.stamps, self.rate = np.stack([times, others], axis=1), 1e9 / float(np.median(np.diff(times)))
+            self.judged = judge_skew(self.stamps)
         self.oddities = gaps_in(self.files, times is not None)
         self._has_right = right is not None
         self._masks: Masks | None = None
@@ -262,8 +268,8 @@ def size_text(width: int, height: int) -> str:
 
 
 def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Path, ...]]:
-    """The pictures of several folders that belong together: by their names, where most are in all folders,
-    else by order. What is left out, and odd pairs, are said in the log.
+    """The pictures of several folders that belong together: by their names, where most are in all folders, by
+    the times that these say, or else by order. What is left out, and odd pairs, are said in the log.
 
     Args:
         numbered: something else counts on their number, so that none may be left out.
@@ -272,19 +278,21 @@ def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Pa
         UsageError: a folder cannot be read, or they cannot be paired.
     """
     files = [list_pictures(folder) for folder in folders]
-    by_name = together(files)
+    found, how = together(files), "of their name"
+    if not found:
+        found, how = _at_one_time(files), "at their time"
     most = max(map(len, files))
-    if len(by_name) == most:
-        return by_name
-    if by_name:
-        kept = {file for pair in by_name for file in pair}
+    if len(found) == most:
+        return found
+    if found:
+        kept = {file for each in found for file in each}
         alone = [file for each in files for file in each if file not in kept]
         where = " and ".join(map(str, folders))
-        said = f"{len(alone)} pictures of {where} have no partner of their name, e.g. {alone[0]}"
+        said = f"{len(alone)} pictures of {where} have no partner {how}, e.g. {alone[0]}"
         if numbered:
             raise UsageError(f"{said}; poses and depth go by number, so every picture needs its partners")
         log.warning("%s; they are left out", said)
-        return by_name
+        return found
     for folder, each in zip(folders, files, strict=True):
         if len(each) != len(files[0]):
             raise UsageError(
@@ -294,6 +302,33 @@ def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Pa
     for each in files[1:]:
         _warn_of_gaps(files[0], each)
     return list(zip(*files, strict=True))
+
+
+def _at_one_time(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
+    """Files whose names are times that are near each other, in the order of the first folder; none where most
+    have no such partner."""
+    times = [found for files in folders if (found := times_in(files)) is not None and len(found) > 1]
+    if len(times) < len(folders):
+        return []
+    period = float(np.median(np.diff(times[0])))
+    partners = [dict(pair(times[0], others, NEAR * period * 1e-9).tolist()) for others in times[1:]]
+    shared = [at for at in range(len(times[0])) if all(at in each for each in partners)]
+    if 2 * len(shared) <= max(map(len, folders)):
+        apart = [
+            abs(int(np.median(others[: len(times[0])] - times[0][: len(others)]))) for others in times[1:]
+        ]
+        said = "%s: its times are %.3g s from those of %s; both are paired by order: is that what they show?"
+        for files, each in zip(folders[1:], apart, strict=True):
+            log.warning(said, files[0].parent, each * 1e-9, folders[0][0].parent)
+        return []
+    return [
+        (folders[0][at], *(files[each[at]] for files, each in zip(folders[1:], partners, strict=True)))
+        for at in shared
+    ]
+
+
+def _are_near(times: I64, others: I64) -> bool:
+    return bool(np.abs(others - times).max() <= NEAR * float(np.median(np.diff(times))))
 
 
 def _spread(files: Sequence[F]) -> Sequence[F]:

@@ -11,13 +11,12 @@ import numpy as np
 from sags_node.errors import SagsError, UsageError
 from sags_node.media.video import Video
 from sags_node.sources.layout import Layout
-from sags_node.sources.pairing import pair
+from sags_node.sources.pairing import NEAR, pair
 from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64, U8, Bool
 
 log = logging.getLogger(__name__)
 
-NEAR = 0.6  # of a period, from a picture to its partner: free-running eyes are up to half of one apart
 PARTNERED = 0.5  # share of the pictures that have a partner, where stamps of two files tell it
 TORN = (
     "the file says that its pictures are interlaced: what moves is torn, unless both fields are of one moment"

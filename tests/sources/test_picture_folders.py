@@ -380,17 +380,52 @@ def test_partners_are_found_by_name(name: str, tmp_path: Path, caplog: pytest.Lo
         open_source(config.model_copy(update={"poses": poses}))
 
 
+def renamed(config: cfg.FoldersSource, name: Callable[[int, int], str]) -> None:
+    """The right eye's pictures, by their place and the number that was their name."""
+    for place, file in enumerate(sorted(config.right.iterdir())):
+        file.rename(config.right / f"{name(place, int(file.stem))}.png")
+
+
 def test_eyes_of_other_names_are_paired_in_order(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Stamps of two cameras that jitter are no gap; a picture that is missing on both sides is one."""
-    config = eyes(tmp_path, [f"{each}" for each in nanoseconds(24)])
-    for number, file in enumerate(sorted(config.right.iterdir())):
-        file.rename(config.right / f"{int(file.stem) + 1_000_000 + 300_000 * (number % 4)}.png")
+    """A picture that is missing on both sides is a gap."""
+    config = eyes(tmp_path, [f"{each:03}" for each in range(24)])
+    renamed(config, lambda place, number: f"{number + 7:05}")
     assert numbers(played(config)) == list(range(24)) and caplog.text == ""
     sorted(config.left.iterdir())[5].unlink()
     sorted(config.right.iterdir())[15].unlink()
     frames = played(config)
     assert number_of(frames[5].left) == 6 and number_of(frames[5].right) == 5
     assert "is paired with" in caplog.text and "is a picture missing?" in caplog.text
+
+
+@pytest.mark.fault("file: pictures of two cameras, named by their own times, are missing")
+def test_eyes_that_are_named_by_their_own_times_are_paired_by_these(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Stamps jitter; the right eye begins two pictures later, and each lost one; then its clock is wrong."""
+    config = eyes(tmp_path, [f"{each}" for each in nanoseconds(24)])
+    config = config.model_copy(update={"rate": None})
+    renamed(config, lambda place, stamp: f"{stamp + 6_000_000 + 300_000 * (place % 4)}")
+    with open_source(config) as source:
+        found = [each.what for each in source.pairs.findings]  # type: ignore[attr-defined]
+        skews = [frame.t_capture_right_ns - frame.t_capture_ns for frame in source]
+    assert set(skews) == {6_000_000 + 300_000 * step for step in range(4)}
+    assert len(found) == 1 and "right pictures were taken 6.4 ms after the left ones" in found[0]
+    for gone in sorted(config.right.iterdir())[:2], sorted(config.right.iterdir())[15:16]:
+        for file in gone:
+            file.unlink()
+    sorted(config.left.iterdir())[7].unlink()
+    frames = played(config)
+    assert numbers(frames) == [number for number in range(24) if number not in (0, 1, 7, 15)]
+    assert all(number_of(frame.left) == number_of(frame.right) for frame in frames)
+    assert "4 pictures of" in caplog.text and "have no partner at their time" in caplog.text
+    (tmp_path / "late").mkdir()
+    config = eyes(tmp_path / "late", [f"{each}" for each in nanoseconds(24)])
+    config = config.model_copy(update={"rate": None})
+    renamed(config, lambda place, stamp: f"{stamp + 3_600_000_000_000}")
+    with open_source(config) as source:
+        assert {frame.t_capture_right_ns - frame.t_capture_ns for frame in source} == {0}
+    assert "begins 3.6e+03 s from" in caplog.text and "paired by order" in caplog.text
 
 
 def test_eyes_of_other_depths_are_refused_and_no_levels_advised(
