@@ -314,12 +314,12 @@ def _at_one_time(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
     partners = [dict(pair(times[0], others, NEAR * period * 1e-9).tolist()) for others in times[1:]]
     shared = [at for at in range(len(times[0])) if all(at in each for each in partners)]
     if 2 * len(shared) <= max(map(len, folders)):
-        apart = [
-            abs(int(np.median(others[: len(times[0])] - times[0][: len(others)]))) for others in times[1:]
-        ]
-        said = "%s: its times are %.3g s from those of %s; both are paired by order: is that what they show?"
-        for files, each in zip(folders[1:], apart, strict=True):
-            log.warning(said, files[0].parent, each * 1e-9, folders[0][0].parent)
+        for files, others in zip(folders[1:], times[1:], strict=True):
+            log.warning(
+                "%s begins %.3g s from %s by the times in names; both are paired by order: were the clocks set "
+                "alike, and do they show the same moments?",
+                *(files[0].parent, (others[0] - times[0][0]) * 1e-9, folders[0][0].parent),
+            )
         return []
     return [
         (folders[0][at], *(files[each[at]] for files, each in zip(folders[1:], partners, strict=True)))
