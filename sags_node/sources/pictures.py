@@ -316,8 +316,8 @@ def _at_one_time(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
     if 2 * len(shared) <= max(map(len, folders)):
         for files, others in zip(folders[1:], times[1:], strict=True):
             log.warning(
-                "%s begins %.3g s from %s by the times in names; both are paired by order: were the clocks set "
-                "alike, and do they show the same moments?",
+                "%s begins %.3g s from %s by the times in names; both are paired by order: were the clocks "
+                "set alike, and do they show the same moments?",
                 *(files[0].parent, (others[0] - times[0][0]) * 1e-9, folders[0][0].parent),
             )
         return []
