@@ -9,6 +9,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from sags_node.geometry import rigid
 from sags_node.tools.fitting.clip import ClipFrame, check_memory
 from sags_node.types import F64
 
@@ -55,7 +56,6 @@ def _midway(before: ClipFrame, after: ClipFrame, flow: cv2.DISOpticalFlow) -> Cl
 
 def _pose_midway(before: F64, after: F64) -> F64:
     """The pose half way, [4, 4]: half the turn, half the way."""
-    middle = (before + after) / 2
     turn, _ = cv2.Rodrigues(before[:3, :3].T @ after[:3, :3])
-    middle[:3, :3] = before[:3, :3] @ cv2.Rodrigues(turn / 2)[0]
-    return middle
+    half, _ = cv2.Rodrigues(turn / 2)
+    return rigid(before[:3, :3] @ half, (before[:3, 3] + after[:3, 3]) / 2)
