@@ -17,6 +17,7 @@ from sags_node.geometry import is_rotation
 from sags_node.types import F64
 
 FILE = "hand_eye.yaml"
+KEYS = ("T_hand_cam", "offset_ms", "figures")
 LARGEST_DISTANCE = 2.0  # m, from the hand to the camera: a scope has half a metre
 
 
@@ -32,7 +33,7 @@ def read_hand_eye(file: Path) -> HandEye:
     """Read a `hand_eye.yaml`.
 
     Raises:
-        UsageError: it is missing, or holds no rigid transform in metres.
+        UsageError: it is missing, holds no rigid transform in metres, or has an unknown key.
     """
     if not file.is_file():
         raise UsageError(
@@ -40,6 +41,8 @@ def read_hand_eye(file: Path) -> HandEye:
         )
     tree = read_yaml(file, "hand-eye calibration")
     said: Any = tree if isinstance(tree, dict) else {}
+    if other := [str(key) for key in said if key not in KEYS]:
+        raise UsageError(f"{file}: unknown key '{other[0]}'; known: {', '.join(KEYS)}")
     try:
         T = np.array(said["T_hand_cam"], np.float64)
         offset_ns = round(float(said.get("offset_ms", 0.0)) * 1e6)
