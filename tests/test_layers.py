@@ -39,7 +39,7 @@ LINES = {
     "sags_node/clients/latency": 431,
     "sags_node/clients/overlay": 3167,
     "sags_node/clients/recording": 1403,
-    "sags_node/clients/registration": 536,
+    "sags_node/clients/registration": 543,
     "sags_node/clients/viewer": 1485,
     "sags_node/config": 1432,
     "sags_node/detail": 886,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1764,
     "sags_node/tools/importing": 1173,
     "sags_node/vision": 5455,
-    "tests": 48621,
+    "tests": 48620,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

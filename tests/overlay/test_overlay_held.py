@@ -16,7 +16,7 @@ from synthetic import BASELINE, NORMAL, plane_depth, plane_result
 from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
 from sags_node.clients.overlay.held import AGAIN, ELSEWHERE, GONE, HeldObject
-from sags_node.clients.overlay.mesh import Mesh
+from sags_node.clients.overlay.mesh import Mesh, rod
 from sags_node.clients.overlay.pinner import Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
 from sags_node.clients.overlay.scene import ObjectSpec
@@ -241,9 +241,8 @@ def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any
     for anchor, said in zip(anchors, [] if at is None else at.tolist(), strict=False):
         anchor["at"] = said
     spec = ObjectSpec.model_validate({"file": "tube.stl", "scale": scale, "anchors": anchors, **more})
-    corners = np.array([[-0.015, -0.002, -0.002], [0.015, 0.002, 0.002]]) + (0 if around is None else around)
-    diagonal = Mesh(corners.astype(np.float32), np.array([[0, 0, 1]], np.int32), np.zeros((1, 3), np.float32))
-    body = Body(diagonal, 1.0, None)
+    ends = np.array([[-0.015, 0.0, 0.0], [0.015, 0.0, 0.0]]) + (0 if around is None else around)
+    body = Body(rod(*ends, (0, 0, 0)), 1.0, None)
     return HeldObject(spec, "pin", FakePinner(), False, 0, body), with_anchors(frame, places)
 
 

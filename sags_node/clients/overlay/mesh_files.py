@@ -77,10 +77,10 @@ def _welded(points: F64, triangles: I32) -> Shape:
         return points, triangles
     points, numbers = np.unique(points, axis=0, return_inverse=True)
     triangles = numbers.reshape(-1)[triangles].astype(np.int32)
-    corners = np.sort(triangles, axis=1)
-    triangles = triangles[np.all(np.diff(corners, axis=1) > 0, axis=1)]
+    first, second, third = points[triangles].swapaxes(0, 1)
+    triangles = triangles[np.cross(second - first, third - first).any(axis=1)]
     if not len(triangles):
-        raise ValueError("none of its triangles has three different corners")
+        raise ValueError("none of its triangles has an area")
     _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
     return points, triangles[np.sort(first)]
 

@@ -11,7 +11,9 @@ from sags_node.types import F64
 
 UNITS = {1000: "mm for m", 100: "cm for m", 10: "mm for cm", 25.4: "mm for inch"}
 ON = 0.003  # m: so near to a surface a point is picked on it
-CLEARLY = 3.0  # times nearer: chance does not bring all points there
+# Times nearer than they were, and than they lie apart: neither chance nor a scale that draws all of them
+# together brings them there.
+CLEARLY, APART = 3.0, 10.0
 LPS = "-x, -y, z"
 
 _TURNED = {
@@ -34,10 +36,15 @@ def misread(model: Shape, at: F64) -> str | None:
     off = farthest(model, at)
     if off <= ON:
         return None
-    left = {said: farthest(model, at * factors) for said, factors in (_TURNED | _SCALED).items()}
-    said = min(left, key=lambda each: left[each])
-    if left[said] > min(ON, off / CLEARLY):
+    others = {said: at * factors for said, factors in (_TURNED | _SCALED).items()}
+    left = {
+        said: near
+        for said, points in others.items()
+        if (near := farthest(model, points)) <= min(ON, off / CLEARLY, np.ptp(points, axis=0).max() / APART)
+    }
+    if not left:
         return None
+    said = min(left, key=lambda each: left[each])
     usual = " (one is RAS, the other LPS)" if said == LPS else ""
     far = f"`at` lies up to {1e3 * off:.3g} mm from the file's surface"
     return f"{far}, but on it as {said}{usual}: write each so"
