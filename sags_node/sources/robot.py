@@ -133,10 +133,8 @@ class _PushedPoses(Robot):
         sent, name = absolute(message.topic), absolute(message.topic.partition("/")[2])
         if self._scope is not None and self._scope in {sent, name}:
             return self._scope
-        known = [
-            topic for topic in (STATIC, *self.tools) if sent.endswith(topic)
-        ]  # namespaces may have parts
-        return max(known, key=len, default=name)
+        # A namespace may have parts of its own.
+        return max((known for known in (STATIC, *self.tools) if sent.endswith(known)), key=len, default=name)
 
     def _pose_of(self, message: Message) -> list[str]:
         """Transforms of a tree may come from several programs."""
