@@ -121,8 +121,9 @@ def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[C
                 began, first, count = moment, done, of
             if moment - said >= SAY_EVERY:
                 said = moment
-                left = (moment - began) / (done - first) * (of - done) if done > first and of else None
-                rest = "" if left is None else f", about {time_text(left)} left"
+                rest = ""
+                if of and done > first + 1:  # the first step may have compiled kernels
+                    rest = f", about {time_text((moment - began) / (done - first) * (of - done))} left"
                 _print(f"{description or what}: {done}" + ("" if total is None else f" of {total}{rest}"))
 
         yield advance
