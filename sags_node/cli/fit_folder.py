@@ -169,6 +169,8 @@ def fit_session(
         "published": published(
             session.config.source.folder if isinstance(session.config.source, EndoNerfSource) else None,
             len(everything),
+            options.hold_out,
+            session.working_size,
         ),
     }  # fmt: skip
     last = fit.gaussians(clip.train[-1])

@@ -33,6 +33,7 @@ class ClipFrame:
     camera: Camera
     image: U8  # [H, W, 3] RGB
     tissue: Bool  # [H, W]
+    bare: Bool  # [H, W] the same without its margin around instruments, for `paper_psnr` alone
     depth: F32  # [H, W] m, 0 unknown
     reference: Reference | None
 
@@ -53,8 +54,9 @@ class ClipFrame:
         """The frame at half its size, without what it knows to be true."""
         small = resized(self.observation(), 0.5)
         return ClipFrame(
-            self.frame_id, self.t_capture_ns, small.camera, small.image, small.tissue, small.depth, None
-        )
+            self.frame_id, self.t_capture_ns, small.camera, small.image, small.tissue, small.tissue,
+            small.depth, None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +104,9 @@ def play(
             depth = pipeline.depth(frame, pair, tissue).depth
             on_frame(frame, tissue)
             yield ClipFrame(
-                pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
-            )
+                pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, pipeline.tissue.bare,
+                depth, frame.reference,
+            )  # fmt: skip
     if unposed:
         log.warning("%d frames are left out, since the robot tells no pose of them", unposed)
 
@@ -145,7 +148,8 @@ def check_memory(frame: ClipFrame, count: int | None) -> None:
     Raises:
         SagsError: they have none.
     """
-    needed = (count or 0) * (frame.image.nbytes + frame.tissue.nbytes + frame.depth.nbytes)
+    kept = frame.image, frame.tissue, frame.bare, frame.depth
+    needed = (count or 0) * sum(array.nbytes for array in kept)
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > MEMORY_SHARE * free:
         raise SagsError(
