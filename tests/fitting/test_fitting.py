@@ -22,13 +22,13 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.field.decoder import Decoder
 from sags_node.field.losses import LossWeights, compare
 from sags_node.field.model import FADE_NS, LOOK_BACK_NS
-from sags_node.geometry import quat_to_matrix
+from sags_node.geometry import quat_to_matrix, transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.pipeline.session import open_session
 from sags_node.quality.metrics import psnr
 from sags_node.tools.fitting import checkpoint, residuals, start
-from sags_node.tools.fitting.clip import Clip, read_clip
+from sags_node.tools.fitting.clip import Clip, ClipFrame, play, read_clip
 from sags_node.tools.fitting.density import quarter
 from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.midway import midway_frames
@@ -102,6 +102,26 @@ def test_a_clip_is_split_and_whole(clip: Clip) -> None:
     assert frame.image.dtype == np.uint8 and frame.image.shape == (*frame.tissue.shape, 3)
     assert not frame.depth[~frame.tissue].any()
     assert frame.reference is not None and frame.reference.depth is not None
+
+
+@pytest.mark.fault("pose: a fit is told to estimate it")
+def test_the_cameras_pose_is_the_one_that_was_asked_for() -> None:
+    """Recorded, or fixed: then points are where that camera sees them. What a fit cannot do is refused."""
+    moving = ["seconds:=1", "width:=160", "height:=128", "camera_motion:=sway", "frames:=3", "pace:=step"]
+
+    def played(way: str) -> list[ClipFrame]:
+        options = [*(f"source.{each}" for each in moving), "source.loop:=false", f"vision.pose:={way}"]
+        return list(play(open_session(None, options), references=True))
+
+    followed, fixed = played("session")[-1], played("fixed")[-1]
+    pose = followed.camera.T_world_cam
+    assert np.abs(pose[:3, 3]).max() > 1e-4 and np.array_equal(fixed.camera.T_world_cam, np.eye(4))
+    assert followed.reference is not None and fixed.reference is not None
+    assert fixed.reference.points is not None and followed.reference.points is not None
+    np.testing.assert_allclose(transform(pose, fixed.reference.points), followed.reference.points, atol=1e-9)
+    for way in ("estimate", "refine"):
+        with pytest.raises(UsageError, match=rf"vision\.pose {way} .*vision\.pose:=session.* or fixed"):
+            played(way)
 
 
 @pytest.mark.parametrize("tokens", ["self", "nodes"])

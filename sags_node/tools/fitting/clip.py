@@ -6,12 +6,13 @@ import logging
 import os
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import transform
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
 from sags_node.types import F32, U8, Bool, Camera, Observation, Reference, StereoFrame
@@ -80,7 +81,8 @@ def play(
     """Frames of a session, which is opened anew, through the node's own front end.
 
     Those whose pose the robot does not tell are left out: nobody knows from where they were seen. So are
-    those of the warm-up: there is no model yet that would settle.
+    those of the warm-up: there is no model yet that would settle. With `vision.pose` fixed the world is the
+    camera's, that of true points too.
 
     Args:
         session: it is played from its start.
@@ -88,8 +90,14 @@ def play(
         on_frame: called with each frame that is delivered.
 
     Raises:
+        UsageError: the camera's pose is not that of the recording.
         SagsError: the recording cannot be read.
     """
+    if (way := session.config.vision.pose) in ("estimate", "refine"):
+        raise UsageError(
+            f"vision.pose {way} is for a running node (sags run) and sags eval: a fit takes the recorded "
+            "poses as they are. Set vision.pose:=session for these, or fixed where the scope stands still"
+        )
     pipeline = Pipeline(session.config, session.rig)
     unposed = 0
     with open_posed(session.config, session.rig, references) as source:
@@ -99,13 +107,18 @@ def play(
             if frame.pose_problem is not None:
                 unposed += 1
                 continue
-            pair = pipeline.rectifier(frame)
+            pair, reference = pipeline.rectifier(frame), frame.reference
+            if way == "fixed":
+                if reference is not None and reference.points is not None:
+                    there = transform(pair.camera.viewmat, reference.points)
+                    reference = replace(reference, points=there)
+                pair = replace(pair, camera=pipeline.rectifier.camera)
             tissue = pipeline.tissue(frame, pair)
             depth = pipeline.depth(frame, pair, tissue).depth
             on_frame(frame, tissue)
             yield ClipFrame(
                 pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, pipeline.tissue.bare,
-                depth, frame.reference,
+                depth, reference,
             )  # fmt: skip
     if unposed:
         log.warning("%d frames are left out, since the robot tells no pose of them", unposed)
@@ -126,6 +139,7 @@ def read_clip(
         on_frame: called with each frame.
 
     Raises:
+        UsageError: see `play`.
         SagsError: no frame to learn from, the recording cannot be read, or it does not fit into memory.
     """
     train: list[ClipFrame] = []
