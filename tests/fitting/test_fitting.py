@@ -27,6 +27,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
 from sags_node.pipeline.session import open_session
 from sags_node.quality.metrics import psnr
+from sags_node.tools.export.scene import from_fit
 from sags_node.tools.fitting import checkpoint, residuals, start
 from sags_node.tools.fitting.clip import Clip, ClipFrame, play, read_clip
 from sags_node.tools.fitting.density import quarter
@@ -435,6 +436,42 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
     again = sags_fit(phantom_session, "source.frames:=10", *options, "--resume")
     assert again.exit_code == 0, again.output
     assert json.loads(again.stdout)["heldout"]["psnr"] == found["heldout"]["psnr"]
+
+
+def test_a_folder_holds_one_fit_alone(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new one, also one that was interrupted, keeps nothing of the one before, and no file of somebody."""
+    out = tmp_path / "fit"
+    options = ["--schedule", "paper", "--warm-up", "1", "--iterations", "1", "--max-gaussians", "300"]
+    options += ["--set", "midway=false", "--set", "coarse=0", "--out", str(out)]
+
+    def left() -> set[str]:
+        return {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+
+    def checked(wanted: int, *arguments: str | Path) -> str:
+        result = sags_fit(phantom_session, *arguments, *options)
+        assert result.exit_code == wanted, result.output
+        return str(result.output)
+
+    checked(0, "source.frames:=10")
+    finished = (out / "figures.json").read_bytes()
+    (out / "test/mine.png").touch()
+    results = {"checkpoint.npz", "figures.json", "model.ply", "test/000001.png", "test/mine.png"}
+    assert left() == results | {"test/000009.png"}
+    with monkeypatch.context() as patched:
+        patched.setattr(Fit, "iterate", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
+        checked(130, "source.frames:=6")
+    assert left() == {"checkpoint.npz", "test/mine.png"}
+    said = "there is no .*figures.json; name the folder of a finished sags fit"
+    session = open_session(phantom_session, [*FRAMES[:2], "source.frames:=6"])
+    with pytest.raises(UsageError, match=said):
+        from_fit(out, session, None, lambda done, of, what: None)
+    (out / "figures.json").write_bytes(finished.replace(b'"frames": 2', b'"frames": 1'))  # as of old
+    with pytest.raises(UsageError, match="not finished; go on with sags fit --resume"):
+        from_fit(out, session, None, lambda done, of, what: None)
+    checked(0, "source.frames:=6", "--resume")
+    assert left() == results
 
 
 @pytest.mark.parametrize(
