@@ -402,8 +402,19 @@ def test_a_checkpoint_of_another_fit_is_refused(clip: Clip, tmp_path: Path) -> N
     with pytest.raises(UsageError, match="other training frames"):
         checkpoint.load(Fit(Clip(clip.train[1:], clip.test), settings), path)
     other = [dataclasses.replace(frame, image=frame.image[:, ::-1].copy()) for frame in clip.train[5:]]
-    with pytest.raises(UsageError, match=r"another recording: 5 of 10 .* first is frame 6"):
+    with pytest.raises(UsageError, match=r"other pictures \(5 of 10, first in frame 6\);"):
         checkpoint.load(Fit(Clip([*clip.train[:5], *other], clip.test), settings), path)
+    camera = clip.train[2].camera
+    for what, change in {
+        "times": {"t_capture_ns": clip.train[2].t_capture_ns + 5_000_000},
+        "camera matrix": {"camera": dataclasses.replace(camera, K=camera.K * 1.01)},
+        "camera poses": {"camera": camera.moved_right(0.001)},
+        "tissue masks": {"tissue": clip.train[2].bare},
+        "depth": {"depth": clip.train[2].depth / 2},
+    }.items():
+        other = [*clip.train[:2], dataclasses.replace(clip.train[2], **change), *clip.train[3:]]
+        with pytest.raises(UsageError, match=rf"fitted to other {what} \(1 of 10, first in frame 2\); give"):
+            checkpoint.load(Fit(Clip(other, clip.test), settings), path)
     dimmer = [dataclasses.replace(frame, image=frame.image - (frame.image > 2)) for frame in clip.train]
     checkpoint.load(Fit(Clip(dimmer, clip.test), settings), path)  # as another decoder rounds
     whole = dict(np.load(path))

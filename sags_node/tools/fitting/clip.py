@@ -111,7 +111,7 @@ def play(
             if way == "fixed":
                 if reference is not None and reference.points is not None:
                     there = transform(pair.camera.viewmat, reference.points)
-                    reference = replace(reference, points=there)
+                    reference = replace(reference, points=np.asarray(there, np.float64))
                 pair = replace(pair, camera=pipeline.rectifier.camera)
             tissue = pipeline.tissue(frame, pair)
             depth = pipeline.depth(frame, pair, tissue).depth
