@@ -105,7 +105,7 @@ def test_a_clip_is_split_and_whole(clip: Clip) -> None:
     assert frame.reference is not None and frame.reference.depth is not None
 
 
-@pytest.mark.fault("pose: a fit is told to estimate it")
+@pytest.mark.fault("launch file: a fit is told to estimate the pose")
 def test_the_cameras_pose_is_the_one_that_was_asked_for() -> None:
     """Recorded, or fixed: then points are where that camera sees them. What a fit cannot do is refused."""
     moving = ["seconds:=1", "width:=160", "height:=128", "camera_motion:=sway", "frames:=3", "pace:=step"]
