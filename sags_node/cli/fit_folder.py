@@ -16,7 +16,7 @@ from sags_node.cli.launching import write_json
 from sags_node.config.schema import DeviceName, EndoNerfSource
 from sags_node.engine.device import choose_device
 from sags_node.errors import SagsError, UsageError
-from sags_node.files import check_results, is_result
+from sags_node.files import check_results, is_result, writing
 from sags_node.kernels.threads import configure_threads
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
@@ -94,7 +94,7 @@ def fit_session(
         session: a recording.
         settings: of the fit.
         options: hold-out and LPIPS weights.
-        out: an existing folder. An earlier result there is replaced.
+        out: an existing folder. An earlier result there is removed as soon as this one has started.
         resume: go on from its checkpoint.
         advance: called with what is going on.
         device: of `device_of`.
@@ -132,6 +132,8 @@ def fit_session(
         else:
             advance(0, None, "starting; the first time, kernels are compiled for a minute")
             fit.start(lambda what, done, of: advance(done, of, what))
+        if not (resume and fit.done):  # results there are of another fit, or of other frames
+            _clear(out, FIGURES, MODEL)
         _iterate(fit, stored, advance)
     except RuntimeError as error:  # which is what torch and Warp raise
         if device is None:
@@ -142,6 +144,7 @@ def fit_session(
 
     drawn = out / DRAWN
     drawn.mkdir(exist_ok=True)
+    _clear(out)
     advance(0, len(clip.test), "measuring")
     segments = session.config.segments
     everything = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
@@ -169,12 +172,22 @@ def fit_session(
         "published": published(
             session.config.source.folder if isinstance(session.config.source, EndoNerfSource) else None,
             len(everything),
+            options.hold_out,
+            session.working_size,
         ),
     }  # fmt: skip
     last = fit.gaussians(clip.train[-1])
     write_ply(out / MODEL, last, force=True)
     write_json(out / FIGURES, found)
     return found
+
+
+def _clear(out: Path, *names: str) -> None:
+    """Remove the drawn test frames of an earlier fit, and files of these names."""
+    drawn = [file for file in (out / DRAWN).glob("*.png") if file.stem.isdecimal()]
+    with writing(out):
+        for file in (*drawn, *(out / name for name in names)):
+            file.unlink(missing_ok=True)
 
 
 def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:

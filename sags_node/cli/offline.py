@@ -57,7 +57,7 @@ HOLD_OUT = 8  # every so many frames, as in the literature
 )
 @shown("--every", type=click.IntRange(1), default=5, help="Right eye and LPIPS on every N-th frame.")
 @lpips_option
-@click.option("--paper-psnr", is_flag=True, help="Also PSNR with masked pixels counted as perfect.")
+@click.option("--paper-psnr", is_flag=True, help="Also PSNR: what given masks hide counts as perfect.")
 @click.option(
     "--hidden",
     is_flag=True,

@@ -30,8 +30,8 @@ def psnr(picture: F32, truth: F32, tissue: Bool) -> float:
 
 
 def paper_psnr(picture: F32, truth: F32, tissue: Bool) -> float:
-    """PSNR (dB) in the literature's convention: both pictures are multiplied by the mask and all pixels are
-    averaged, so that every masked pixel counts as perfect (EndoGaussian, SAGS: `metrics.py`)."""
+    """PSNR (dB) in the literature's convention: both pictures are multiplied by the mask, without a margin,
+    and all pixels are averaged: masked ones count as perfect (EndoGaussian, SAGS: `metrics.py`)."""
     return _decibel(_squared_error(picture, truth, tissue) * float(tissue.mean()))
 
 

@@ -85,6 +85,11 @@ class TissueMask:
         """Return what shows an instrument in the newest frame [H, W], before it grows; None: nobody looks."""
         return None if self._found is None else ~self._found & self.usable
 
+    @property
+    def bare(self) -> Bool:
+        """Return the newest frame's mask [H, W] as it was given or found, without the margin."""
+        return self.usable if self._found is None else self._found & self.usable
+
     def _given(self, frame: StereoFrame, pair: RectifiedPair) -> Bool | None:
         if self._segment is not None:
             try:

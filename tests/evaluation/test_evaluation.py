@@ -289,6 +289,26 @@ def test_counts_and_segments(frames: list[StereoFrame]) -> None:
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
 
+def test_papers_count_with_the_masks_as_they_were_given(frames: list[StereoFrame]) -> None:
+    """Whatever margin the node puts around instruments, of frames that it was shown and of those held out."""
+    options, found = MeasureOptions(paper_psnr=True), []
+    for margin in (0, 2):
+        config = load_launch(None, ["publish.detail:=false", f"vision.tissue.dilate:={margin}"])
+        with Run() as run:
+            result = frame_result(frames[0], SPEED, late=0.1)
+            tissue = cv2.erode(result.observation.tissue.view(np.uint8), np.ones((2 * margin + 1,) * 2)) > 0
+            run.add(replace(result, observation=replace(result.observation, tissue=tissue)), 21.0, 0)
+            receipt = Receipt(rig(), (WIDTH, HEIGHT), None)
+            measurer = Measurer(run, Rectifier(rig(), WIDTH, HEIGHT), config, options, receipt)
+            measurer.run(frames[:2], lambda what, done: None)
+        found.append({group: row.figures[group] for row in measurer.rows for group in row.figures})
+    plain, margined = found
+    for group in ("online", "heldout"):
+        assert margined[group]["paper_psnr"] == plain[group]["paper_psnr"]
+        assert margined[group]["paper_ssim"] == plain[group]["paper_ssim"]
+        assert margined[group]["psnr"] != plain[group]["psnr"]
+
+
 def test_what_was_not_known_is_null(frames: list[StereoFrame]) -> None:
     blind = [replace(frame, reference=None) for frame in frames[:4]]
     options = MeasureOptions(hold_out=0, paper_psnr=True)

@@ -134,9 +134,12 @@ def test_parts_of_a_row_have_their_own_rates() -> None:
 # ---- published figures stand beside the clip that they belong to, and beside no other ------------------
 
 
-def test_only_the_clip_itself_has_published_figures() -> None:
-    assert published(Path("pulling_soft_tissues"), 63)["SAGS"] == 38.3
-    assert published(Path("cutting_tissues_twice"), 156)["SAGS"] == 39.5
-    assert published(Path("pulling_soft_tissues"), 40) == {}  # a part of it
-    assert published(Path("my_pulling"), 100) == {}
-    assert published(Path("other"), 63) == published(None, 63) == {}
+def test_only_the_clip_itself_measured_their_way_has_published_figures() -> None:
+    way = 8, (640, 512)
+    pulling = Path("pulling_soft_tissues")
+    assert published(pulling, 63, *way)["SAGS"] == 38.3
+    assert published(Path("cutting_tissues_twice"), 156, *way)["SAGS"] == 39.5
+    assert published(pulling, 40, *way) == {}  # a part of it
+    assert published(Path("my_pulling"), 100, *way) == {}
+    assert published(Path("other"), 63, *way) == published(None, 63, *way) == {}
+    assert published(pulling, 63, 4, (640, 512)) == published(pulling, 63, 8, (320, 256)) == {}

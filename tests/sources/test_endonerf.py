@@ -399,7 +399,7 @@ def test_a_clip_is_measured_by_its_path_alone(clip: Path) -> None:
     assert figures["session"] == "pulling_soft_tissues"
     # The literature's test split: frames 1 and 9.
     assert [figures[key] for key in ("frames", "processed", "held_out", "dropped")] == [12, 10, 2, 0]
-    assert figures["online"]["psnr"] > 45 and figures["online"]["paper_psnr"] > figures["online"]["psnr"]
+    assert min(figures["online"]["psnr"], figures["online"]["paper_psnr"]) > 45
     assert figures["heldout"]["psnr"] > 40 and figures["predict"]["psnr"] > figures["predict"]["copy_psnr"]
     assert figures["novel"] is None and figures["depth"] is None  # no right eye, no reference
 

@@ -217,7 +217,7 @@ class Measurer:
         frame, left, place = now.frame, now.pair.left, next(self._places)
         self._receipt.add(frame, shown.tissue)
         costly = place % self._options.every == 0
-        found = self._quality(metrics.as_float(shown.rgb), now.truth, shown.tissue, costly)
+        found = self._quality(metrics.as_float(shown.rgb), now, shown.tissue, costly)
         depth = np.zeros(shown.tissue.shape, np.float32) if shown.depth is None else shown.depth
         self.gallery.offer(
             place, Picture(frame.frame_id, found["psnr"], left, shown.rgb, depth, shown.tissue)
@@ -333,7 +333,7 @@ class Measurer:
         camera, truth = self._camera_of_run(now.pair.camera, before), now.truth
         guess = self._draw(extrapolated(before.shown.snapshot, now.seconds - before.recorded.seconds), camera)
         tissue = self._tissue_of(now.frame, now.pair)
-        found = self._quality(guess, truth, tissue, costly=True)
+        found = self._quality(guess, now, tissue, costly=True)
         found["copy_psnr"] = metrics.psnr(before.recorded.truth, truth, tissue)
         row = FrameRow(now.frame.frame_id, now.seconds, {"heldout": found})
         self._held = _HeldOut(row, camera, truth, tissue)
@@ -355,15 +355,23 @@ class Measurer:
         }
         return {name: metrics.psnr(picture, held.truth, held.tissue) for name, picture in pictures.items()}
 
-    def _quality(self, picture: F32, truth: F32, tissue: Bool, costly: bool) -> Figures:
-        """How near a picture [H, W, 3] is to the truth where there is tissue [H, W]."""
+    def _quality(self, picture: F32, now: _Recorded, tissue: Bool, costly: bool) -> Figures:
+        """How near a picture [H, W, 3] is to the recorded one where there is tissue [H, W]."""
+        truth = now.truth
         figures = {"psnr": metrics.psnr(picture, truth, tissue), "ssim": metrics.ssim(picture, truth, tissue)}
         if self._options.paper_psnr:
-            figures["paper_psnr"] = metrics.paper_psnr(picture, truth, tissue)
-            figures["paper_ssim"] = metrics.paper_ssim(picture, truth, tissue)
+            bare = self._bare(now.frame, tissue)
+            figures["paper_psnr"] = metrics.paper_psnr(picture, truth, bare)
+            figures["paper_ssim"] = metrics.paper_ssim(picture, truth, bare)
         if costly and self._lpips is not None:
             figures["lpips"] = self._lpips(picture, truth, tissue)
         return figures
+
+    def _bare(self, frame: StereoFrame, tissue: Bool) -> Bool:
+        """The mask as the recording gives it, without the margin of `tissue`; that where it gives none."""
+        if self._config.vision.tissue.method != "session" or frame.tissue is None:
+            return tissue
+        return self._rectifier.mask(frame.tissue) & self._tissue_of.usable
 
     def _draw(self, gaussians: Gaussians, camera: Camera) -> F32:
         return colours_of(self._rasterizer.forward(gaussians, camera))

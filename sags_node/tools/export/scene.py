@@ -140,7 +140,7 @@ def from_fit(folder: Path, session: Session, at: float | None, advance: Advance)
         advance: called with what is going on.
 
     Raises:
-        UsageError: there is no fit, it is one of another recording, or the recording ends before.
+        UsageError: there is no finished fit, it is one of another recording, or that ends before.
         SagsError: the recording or the checkpoint cannot be read.
     """
     fit, frames = _read_fit(folder, session, advance)
@@ -192,6 +192,8 @@ def _read_fit(folder: Path, session: Session, advance: Advance) -> tuple[Fit, li
     advance(0, None, "reading the fit")
     fit = Fit(clip, settings)
     checkpoint.load(fit, stored)
+    if not fit.done:
+        raise UsageError(f"the fit in {folder} is not finished; go on with sags fit --resume")
     return fit, sorted((*clip.train, *clip.test), key=lambda frame: frame.t_capture_ns)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,20 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import whole
 from sags_node.tools.fitting.clip import Clip
 from sags_node.tools.fitting.fit import Fit
-from sags_node.types import F32
+from sags_node.types import F32, F64, U8
 
-VERSION = 6
+VERSION = 7
 CELLS = 8  # across and down: means of so many parts of a picture tell one recording from another
-SAME = 4.0  # levels of 255, a picture's mean difference: decoders and processors round in their own ways
+# What a clip is known by, see `_known`, and how far a frame's may differ in the mean: decoders and processors
+# round in their own ways.
+SAME: dict[str, tuple[str, float]] = {
+    "clip.looks": ("pictures", 4.0),  # levels of 255
+    "clip.times": ("times", 1e-4),  # s
+    "clip.K": ("camera matrix", 1e-2),  # px
+    "clip.poses": ("camera poses", 1e-5),  # m, and parts of a rotation matrix
+    "clip.tissue": ("tissue masks", 2e-3),  # share of the picture
+    "clip.depth": ("depth", 1e-2),  # share of it
+}
 
 
 def save(fit: Fit, path: Path) -> None:
@@ -36,8 +46,8 @@ def save(fit: Fit, path: Path) -> None:
         "progress": fit.state(),
     }
     with whole(path) as partial, partial.open("wb") as file:
-        arrays: dict[str, Any] = fit.arrays()
-        np.savez(file, about=np.array(json.dumps(about)), looks=_looks(fit.clip), **arrays)
+        arrays: dict[str, Any] = {**_known(fit.clip), **fit.arrays()}
+        np.savez(file, about=np.array(json.dumps(about)), **arrays)
         file.flush()
         os.fsync(file.fileno())
 
@@ -47,7 +57,7 @@ def load(fit: Fit, path: Path) -> None:
 
     Raises:
         SagsError: the file cannot be read or is damaged.
-        UsageError: it belongs to other settings or another clip.
+        UsageError: it belongs to other settings or another clip, or to one that was read in another way.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -59,29 +69,49 @@ def load(fit: Fit, path: Path) -> None:
         raise SagsError(f"cannot resume from {path}: {error}; start without --resume") from None
     if version != VERSION:
         raise UsageError(f"{path} was made by another version of this software; start without --resume")
-    mine = json.loads(json.dumps(asdict(fit.settings)))
-    others = [key for key in mine if settings.get(key) != mine[key]]
-    if others:
-        raise UsageError(
-            f"{path} was made with other settings ({', '.join(others)}); "
-            "give the same, or start without --resume"
-        )
     if frames != [frame.frame_id for frame in fit.clip.train]:
         raise UsageError(f"{path} belongs to other training frames; start without --resume")
     try:
-        apart = np.abs(_looks(fit.clip) - arrays.pop("looks")).mean(axis=(1, 2, 3)) > SAME
-        if apart.any():
+        others = []
+        for name, known in _known(fit.clip).items():
+            what, most = SAME[name]
+            apart = np.abs(known - arrays.pop(name)).reshape(len(frames), -1).mean(axis=1) > most
+            if apart.any():
+                first = frames[int(np.argmax(apart))]
+                others.append(f"{what} ({np.count_nonzero(apart)} of {len(apart)}, first in frame {first})")
+        if others:
             raise UsageError(
-                f"{path} is of another recording: {np.count_nonzero(apart)} of {len(apart)} pictures look "
-                f"different, the first is frame {frames[int(np.argmax(apart))]}; give that recording, or "
-                "fit this one without --resume"
+                f"{path} was fitted to other {', other '.join(others)}; give the recording, calibration and "
+                "overrides of that fit, or fit anew without --resume"
+            )
+        mine = json.loads(json.dumps(asdict(fit.settings)))  # some of them follow from the clip
+        others = [key for key in mine if settings.get(key) != mine[key]]
+        if others:
+            raise UsageError(
+                f"{path} was made with other settings ({', '.join(others)}); "
+                "give the same, or start without --resume"
             )
         fit.restore(progress, arrays)
     except (KeyError, ValueError, TypeError) as error:
         raise SagsError(f"{path} is damaged ({error}); start without --resume") from None
 
 
-def _looks(clip: Clip) -> F32:
-    """What the training frames look like, [F, CELLS, CELLS, 3] RGB 0..255."""
-    small = [cv2.resize(frame.image, (CELLS, CELLS), interpolation=cv2.INTER_AREA) for frame in clip.train]
-    return np.array(small, np.float32)
+def _known(clip: Clip) -> dict[str, F32 | F64]:
+    """What training frames are known by, keys of `SAME`, [F, ...] each: colours of parts of the picture and
+    shares of tissue in them; seconds since the first; camera; logarithm of the median depth in m."""
+    frames = clip.train
+
+    def small(planes: Iterable[U8 | F32]) -> F32:
+        cells = [cv2.resize(plane, (CELLS, CELLS), interpolation=cv2.INTER_AREA) for plane in planes]
+        return np.array(cells, np.float32)
+
+    depths = [frame.depth[::4, ::4] for frame in frames]  # enough for a median
+    medians = [float(np.median(depth[depth > 0])) if depth.any() else 1.0 for depth in depths]
+    return {
+        "clip.looks": small(frame.image for frame in frames),
+        "clip.times": np.array([frame.t_capture_ns - frames[0].t_capture_ns for frame in frames]) * 1e-9,
+        "clip.K": np.array([frame.camera.K for frame in frames]),
+        "clip.poses": np.array([frame.camera.T_world_cam for frame in frames]),
+        "clip.tissue": small(frame.tissue.astype(np.float32) for frame in frames),
+        "clip.depth": np.log(medians),
+    }

@@ -6,12 +6,13 @@ import logging
 import os
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
+from sags_node.geometry import transform
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_posed
 from sags_node.types import F32, U8, Bool, Camera, Observation, Reference, StereoFrame
@@ -33,6 +34,7 @@ class ClipFrame:
     camera: Camera
     image: U8  # [H, W, 3] RGB
     tissue: Bool  # [H, W]
+    bare: Bool  # [H, W] the same without its margin around instruments, for `paper_psnr` alone
     depth: F32  # [H, W] m, 0 unknown
     reference: Reference | None
 
@@ -53,8 +55,9 @@ class ClipFrame:
         """The frame at half its size, without what it knows to be true."""
         small = resized(self.observation(), 0.5)
         return ClipFrame(
-            self.frame_id, self.t_capture_ns, small.camera, small.image, small.tissue, small.depth, None
-        )
+            self.frame_id, self.t_capture_ns, small.camera, small.image, small.tissue, small.tissue,
+            small.depth, None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +81,8 @@ def play(
     """Frames of a session, which is opened anew, through the node's own front end.
 
     Those whose pose the robot does not tell are left out: nobody knows from where they were seen. So are
-    those of the warm-up: there is no model yet that would settle.
+    those of the warm-up: there is no model yet that would settle. With `vision.pose` fixed the world is the
+    camera's, that of true points too.
 
     Args:
         session: it is played from its start.
@@ -86,8 +90,14 @@ def play(
         on_frame: called with each frame that is delivered.
 
     Raises:
+        UsageError: the camera's pose is not that of the recording.
         SagsError: the recording cannot be read.
     """
+    if (way := session.config.vision.pose) in ("estimate", "refine"):
+        raise UsageError(
+            f"vision.pose {way} is for a running node (sags run) and sags eval: a fit takes the recorded "
+            "poses as they are. Set vision.pose:=session for these, or fixed where the scope stands still"
+        )
     pipeline = Pipeline(session.config, session.rig)
     unposed = 0
     with open_posed(session.config, session.rig, references) as source:
@@ -97,13 +107,19 @@ def play(
             if frame.pose_problem is not None:
                 unposed += 1
                 continue
-            pair = pipeline.rectifier(frame)
+            pair, reference = pipeline.rectifier(frame), frame.reference
+            if way == "fixed":
+                if reference is not None and reference.points is not None:
+                    there = transform(pair.camera.viewmat, reference.points)
+                    reference = replace(reference, points=np.asarray(there, np.float64))
+                pair = replace(pair, camera=pipeline.rectifier.camera)
             tissue = pipeline.tissue(frame, pair)
             depth = pipeline.depth(frame, pair, tissue).depth
             on_frame(frame, tissue)
             yield ClipFrame(
-                pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, depth, frame.reference
-            )
+                pair.frame_id, pair.t_capture_ns, pair.camera, pair.left, tissue, pipeline.tissue.bare,
+                depth, reference,
+            )  # fmt: skip
     if unposed:
         log.warning("%d frames are left out, since the robot tells no pose of them", unposed)
 
@@ -123,6 +139,7 @@ def read_clip(
         on_frame: called with each frame.
 
     Raises:
+        UsageError: see `play`.
         SagsError: no frame to learn from, the recording cannot be read, or it does not fit into memory.
     """
     train: list[ClipFrame] = []
@@ -145,7 +162,8 @@ def check_memory(frame: ClipFrame, count: int | None) -> None:
     Raises:
         SagsError: they have none.
     """
-    needed = (count or 0) * (frame.image.nbytes + frame.tissue.nbytes + frame.depth.nbytes)
+    kept = frame.image, frame.tissue, frame.bare, frame.depth
+    needed = (count or 0) * sum(array.nbytes for array in kept)
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > MEMORY_SHARE * free:
         raise SagsError(

@@ -49,6 +49,7 @@ def _midway(before: ClipFrame, after: ClipFrame, flow: cv2.DISOpticalFlow) -> Cl
         replace(before.camera, T_world_cam=_pose_midway(before.camera.T_world_cam, after.camera.T_world_cam)),
         cv2.addWeighted(images[0], 0.5, images[1], 0.5, 0),
         tissue,
+        tissue,
         np.where(known, (depths[0] + depths[1]) / 2, np.float32(0)),
         None,
     )

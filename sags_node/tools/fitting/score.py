@@ -23,22 +23,28 @@ from sags_node.types import F32
 Segments = dict[str, tuple[int, int]]  # first and last frame
 
 # EndoNeRF's two public clips: how many frames they have, and what was published for the held-out ones.
-# Pictures are multiplied by the tissue mask and averaged over all pixels (`paper_psnr`, dB).
+# Pictures of 640x512 are multiplied by the tissue mask, which has no margin, and averaged over all pixels
+# (`paper_psnr`, dB); every eighth is held out.
 CLIPS: dict[str, tuple[int, dict[str, float]]] = {
     "pulling": (63, {"SAGS": 38.3, "EndoGaussian": 37.2}),
     "cutting": (156, {"SAGS": 39.5, "EndoGaussian": 38.4}),
 }
+PUBLISHED_WAY = 8, (640, 512)  # hold-out, size
 
 
-def published(folder: Path | None, frames: int) -> dict[str, float]:
-    """Figures published for a clip, dB by the method's name; none for any other.
+def published(folder: Path | None, frames: int, hold_out: int, size: tuple[int, int]) -> dict[str, float]:
+    """Figures published for a clip, dB by the method's name; none for any other, or measured another way.
 
     Args:
         folder: of the recording in EndoNeRF's layout; None: it has another one.
         frames: that were read of it.
+        hold_out: every so many frames are.
+        size: width and height of the pictures that are compared, px.
     """
+    if folder is None or (hold_out, size) != PUBLISHED_WAY:
+        return {}
     for clip, (count, figures) in CLIPS.items():
-        if folder is not None and clip in folder.resolve().name.lower() and frames == count:
+        if clip in folder.resolve().name.lower() and frames == count:
             return figures
     return {}
 
@@ -62,8 +68,9 @@ def score(
         progress: called with the frames done.
 
     Returns:
-        Means over frames: `psnr` over tissue and `paper_psnr`, dB; `ssim` and `lpips`; the same for each
-        segment below its name; and `frames`, their number.
+        Means over frames: `psnr` over tissue and `paper_psnr` with the masks as they were given, without
+        our margin, dB; `ssim` and `lpips`; the same for each segment below its name; and `frames`, their
+        number.
 
     Raises:
         SagsError: a picture cannot be written.
@@ -163,7 +170,7 @@ def _figures(shown: F32, frame: ClipFrame, lpips: Lpips | None) -> dict[str, flo
     figures: dict[str, float] = {
         "frame_id": frame.frame_id,
         "psnr": metrics.psnr(shown, truth, frame.tissue),
-        "paper_psnr": metrics.paper_psnr(shown, truth, frame.tissue),
+        "paper_psnr": metrics.paper_psnr(shown, truth, frame.bare),
         "ssim": metrics.ssim(shown, truth, frame.tissue),
     }
     if lpips is not None:
