@@ -483,6 +483,21 @@ def test_a_recording_without_truth_is_measured_against_itself(session_folder: Pa
     assert known["right"] == found["right"] and known["hidden"] == found["hidden"]
 
 
+def test_of_a_warm_up_nothing_is_hidden_or_counted(
+    session_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Boxes are hidden after 0.15 of what is measured, for half a second."""
+    monkeypatch.setattr("sags_node.tools.evaluation.second.MOST", 8)
+    warm_up, measured = ["source.warm_up:=10"], MeasureOptions(0, hidden=True)
+    hidden = [
+        row.frame_id for row in evaluate(session_folder, warm_up, measured).rows if "hidden" in row.figures
+    ]
+    assert hidden == list(range(12, 20))
+    again = evaluate(session_folder, warm_up, MeasureOptions(0, second=True))
+    hidden = [row.frame_id for row in again.rows if "hidden" in row.figures]
+    assert hidden == list(range(11, 18)) and again.summary["second_run"] == {"frames": 8}
+
+
 def test_a_session_in_real_time_is_seen_as_a_subscriber_sees_it(
     session_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

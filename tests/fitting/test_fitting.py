@@ -404,6 +404,13 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
     assert json.loads(again.stdout)["heldout"]["psnr"] == found["heldout"]["psnr"]
 
 
+def test_a_fit_that_holds_nothing_out_says_what_it_learnt(phantom_session: Path, tmp_path: Path) -> None:
+    options = ["--hold-out", "0", "--iterations", "2", "--max-gaussians", "1500", "--verbose"]
+    result = sags_fit(phantom_session, "source.frames:=4", *options, "--out", tmp_path / "fit")
+    assert result.exit_code == 0, result.output
+    assert "on frames that it was fitted to" in result.output and "kept back" not in result.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
