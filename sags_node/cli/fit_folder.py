@@ -143,7 +143,7 @@ def fit_session(
     drawn = out / DRAWN
     drawn.mkdir(exist_ok=True)
     advance(0, len(clip.test), "measuring")
-    segments = session.config.segments
+    segments = session.config.played_segments
     everything = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
     found = {
         "session": session.name,

@@ -406,8 +406,11 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
 
 def test_a_fit_that_holds_nothing_out_says_what_it_learnt(phantom_session: Path, tmp_path: Path) -> None:
     options = ["--hold-out", "0", "--iterations", "2", "--max-gaussians", "1500", "--verbose"]
-    result = sags_fit(phantom_session, "source.frames:=4", *options, "--out", tmp_path / "fit")
+    played = ["source.frames:=4", "source.stride:=3", "segments:={late: [3, 6]}"]
+    result = sags_fit(phantom_session, *played, *options, "--out", tmp_path / "fit")
     assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "fit/figures.json").read_text())
+    assert found["train"]["frames"] == 4 and found["train"]["late"]["frames"] == 2  # 3 and 6 of 0, 3, 6, 9
     assert "on frames that it was fitted to" in result.output and "kept back" not in result.output
 
 
