@@ -419,6 +419,7 @@ def test_a_fit_that_holds_nothing_out_says_what_it_learnt(phantom_session: Path,
     [
         (["--resume"], 2, "start without --resume"),
         (["--lpips-weights", "nothing.npz"], 2, "nothing.npz"),
+        (["--warm-up", "7", "--set", "batch_size=4"], 2, "warm_up, batch_size would change nothing"),
         (["source.frames:=1", "vision.stereo.min_depth:=0.25"], 1, "depth"),
     ],
 )
