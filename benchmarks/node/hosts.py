@@ -92,7 +92,7 @@ def _played(
             judge.run(frames, lambda what, frames: None)
         size = list(run.size())
     after = judge.rows[round(session.source.rate) :]
-    summary = summarise(session.name, judge.rows, options, session.config.segments, None)
+    summary = summarise(session.name, judge.rows, options, session.config.played_segments, None)
     kept = ("first_render_ms", "latency_ms", "gaussians", "rungs", "depth")
     return {
         "share_after_first_second": sum(row.facts is not None for row in after) / max(1, len(after)),

@@ -86,7 +86,7 @@ def measured_baselines(
         return []
 
     def figures(rows: Sequence[FrameRow], group: str) -> Row:
-        return {group: summarise(session.name, rows, options, config.segments, None)[group]}
+        return {group: summarise(session.name, rows, options, config.played_segments, None)[group]}
 
     return [
         {

@@ -147,7 +147,7 @@ class _Comparison:
             "frames": frames,
             "rate_hz": rate,
             "receipt": compared,  # of the default; the others play the same frames
-            "segments": {name: list(span) for name, span in session.config.segments.items()},
+            "segments": {name: list(span) for name, span in session.config.played_segments.items()},
             "why_default": why_default(rows, 1e3 / rate),
             "settings": rows,
             "baselines": baselines,
@@ -259,5 +259,5 @@ def online_at(
             quality = metrics.psnr(shown, metrics.as_float(pair.left), tissue_of(frame, pair))
             rows.append(FrameRow(frame.frame_id, 0.0, {"online": {"psnr": quality}}))
             progress("measuring at full size", len(rows))
-    online: dict[str, Any] = summarise(session.name, rows, options, config.segments, None)["online"]
+    online: dict[str, Any] = summarise(session.name, rows, options, config.played_segments, None)["online"]
     return online

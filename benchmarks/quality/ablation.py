@@ -117,7 +117,7 @@ def measure_ablation(
     for seed in range(seeds):
         for name, settings in chosen.items():
             fit, started = _fitted(known, replace(settings, seed=seed), f"{name}, seed {seed}", advance)
-            row = _measured(fit, ahead, session.config.segments, lpips)
+            row = _measured(fit, ahead, session.config.played_segments, lpips)
             row["ms_per_iteration"] = round(1e3 * (fit.seconds - started) / fit.total, 1)
             variants[name].append(row)
     return {

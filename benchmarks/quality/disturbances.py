@@ -143,7 +143,7 @@ def _stretch(session: Session, start: int | None, seconds: float) -> tuple[float
         first = next(iter(source)).frame_id
     assert count is not None  # it does not loop
     if start is None:
-        begins = [begin for begin, _ in session.config.segments.values() if begin >= first + LEAD]
+        begins = [begin for begin, _ in session.config.played_segments.values() if begin >= first + LEAD]
         start = begins[0] if begins else first + round(BEGINS_AT * count)
     during = range(start, start + max(1, round(seconds * rate)))
     if start < first + LEAD or during.stop + RECOVERY + STEADY > first + count:

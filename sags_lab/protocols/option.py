@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from sags_node.cli.launching import check_files, words_of, write_json
 from sags_node.errors import UsageError
@@ -33,10 +34,20 @@ def evaluate_protocol(
 
     Args:
         others: options of `sags eval` that no protocol takes.
+
+    Raises:
+        UsageError: one of these is given, or the folder is wrong.
+        SagsError: the data set cannot be measured.
     """
     from sags_lab.protocols import run
     from sags_lab.protocols.d4d import measure_d4d
 
+    source_of = click.get_current_context().get_parameter_source
+    idle = others.keys() - {"verbose"} | ({"lpips_weights"} if protocol != "endonerf" else set())
+    given = [name for name in sorted(idle) if source_of(name) is ParameterSource.COMMANDLINE]
+    if given:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise UsageError(f"--protocol {protocol} measures by rules of its own: leave out {options}")
     path, overrides = words_of(launch)
     if path is None:
         raise UsageError(f"--protocol {protocol} needs the data set's folder")

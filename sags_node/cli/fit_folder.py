@@ -146,7 +146,7 @@ def fit_session(
     drawn.mkdir(exist_ok=True)
     _clear(out)
     advance(0, len(clip.test), "measuring")
-    segments = session.config.segments
+    segments = session.config.played_segments
     everything = sorted((*clip.train, *clip.test), key=lambda frame: frame.frame_id)
     found = {
         "session": session.name,
@@ -214,7 +214,7 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
     tested, learnt, depth, track = found["heldout"], found["train"], found["depth"], found["track"]
     mean = (found["between"] or {}).get("mean")
     lines = {}
-    if tested is not None:
+    if tested["frames"]:  # else none was held out
         lines["picture"] = f"{_number(tested['psnr'], 'dB')} PSNR on {tested['frames']} frames kept back" + (
             "" if mean is None else f" (the mean of the pictures around: {_number(mean['psnr'], 'dB')})"
         )
@@ -222,10 +222,9 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
             others = ", ".join(f"{name} {psnr:.1f} dB" for name, psnr in found["published"].items())
             own = _number(tested.get("paper_psnr"), "dB")
             lines["published"] = f"{others}; here, counted as they do: {own}"
-    if learnt is not None:
-        lines["learnt"] = f"{_number(learnt['psnr'], 'dB')} PSNR on frames that it was fitted to"
+    lines["learnt"] = f"{_number(learnt['psnr'], 'dB')} PSNR on frames that it was fitted to"
     if depth is not None:
-        lines["depth"] = f"{depth['median_mm']:.2f} mm off (median), on {depth['frames']} frames"
+        lines["depth"] = f"{_number(depth['median_mm'], 'mm')} off (median), on {depth['frames']} frames"
     if track is not None:
         lines["points"] = f"{track['median_mm']:.2f} mm off (median); {track['lost']:,} times given up"
     size = f"{found['gaussians']:,} Gaussians (at most {found['cap']:,})"
@@ -246,7 +245,7 @@ def figures_table(found: dict[str, Any]) -> Table:
         "train": found["train"],
     }
     for name, row in rows.items():
-        if row is None:
+        if not row or not row["frames"]:
             continue
         table.add_row(
             name,
@@ -259,10 +258,10 @@ def figures_table(found: dict[str, Any]) -> Table:
     for name, psnr in found["published"].items():
         table.add_row(f"{name}, published", "–", "–", _number(psnr, "dB"), "–", "–")
     depth = found["depth"]
-    depths = f", depth {depth['median_mm']:.2f} mm off (median, {depth['frames']} frames)" if depth else ""
-    table.caption = (
-        f"{found['gaussians']} Gaussians (at most {found['cap']}), {found['seconds']:.0f} s{depths}"
-    )
+    table.caption = f"{found['gaussians']} Gaussians (at most {found['cap']}), {found['seconds']:.0f} s"
+    if depth:
+        off = _number(depth["median_mm"], "mm")
+        table.caption += f", depth {off} off (median, {depth['frames']} frames)"
     return table
 
 

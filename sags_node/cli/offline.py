@@ -216,7 +216,7 @@ def fit(
     from sags_node.cli.fit_folder import check_fit, device_of, figures_table, fit_session, fit_verdict
     from sags_node.config.launch_file import load_launch
     from sags_node.tools.evaluation.measure import MeasureOptions
-    from sags_node.tools.fitting.settings import MONOCULAR, PRESETS, with_changes
+    from sags_node.tools.fitting.settings import MONOCULAR, PRESETS, check_used, with_changes
 
     no_cameras = "live cameras cannot be fitted; record them first, then fit the recording"
     path, overrides = split_recording(dataset, no_cameras)
@@ -231,6 +231,7 @@ def fit(
         given["weights"] = replace(settings.weights, **MONOCULAR)
     settings = replace(settings, antialias=not no_alias_free, **given)
     settings = with_changes(settings, changes)
+    check_used(settings, PRESETS[schedule])
     check_fit(out)
     device = device_of(load_launch(path, overrides).device, settings.schedule)
     session = open_launched(path, [*overrides, f"device:={device or 'cpu'}", *STEPWISE])

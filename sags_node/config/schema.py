@@ -865,7 +865,7 @@ class LaunchConfig(Section):
     mapping: MappingConfig = MappingConfig()
     publish: PublishConfig = PublishConfig()
     segments: Segments = Field(
-        {}, description="stretches that `sags eval` measures apart, `{name: [first, last frame]}`"
+        {}, description="stretches of the recording that are measured apart, `{name: [first, last frame]}`"
     )
 
     @model_validator(mode="after")
@@ -886,6 +886,12 @@ class LaunchConfig(Section):
                 "mapping.method sags runs on the CPU: leave device out, or use mapping.method nodes"
             )
         return self
+
+    @property
+    def played_segments(self) -> Segments:
+        """`segments` in the numbers of frames that are played, of which a stride leaves some out."""
+        stride = self.source.stride if isinstance(self.source, RecordedSource) else 1
+        return {name: (-(-first // stride), last // stride) for name, (first, last) in self.segments.items()}
 
     @property
     def in_real_time(self) -> bool:

@@ -54,7 +54,7 @@ def cached_session(config: PhantomSource, progress: Progress | None = None) -> P
 def write_session(
     config: PhantomSource, folder: Path, rate: float = RATE, progress: Progress | None = None
 ) -> None:
-    """Render `round(config.seconds * rate)` frames and all that is true of them into a new folder.
+    """Render `frame_count` frames and all that is true of them into a new folder.
 
     The folder appears only when it is complete. `launch_file.load_launch(folder)` reads the result. Same
     config and rate, same files on one machine.
@@ -64,13 +64,18 @@ def write_session(
         SagsError: the folder cannot be written.
     """
     folder = Path(folder)
-    count = max(1, round(config.seconds * rate))
+    count = frame_count(config, rate)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} exists and is not empty; remove it or name another folder")
     check_folder(folder.parent)
     with whole(folder) as partial:
         partial.mkdir()
         _write_frames(config, partial, count, rate, progress)
+
+
+def frame_count(config: PhantomSource, rate: float = RATE) -> int:
+    """How many frames a session has."""
+    return max(1, round(config.seconds * rate))
 
 
 def _write_frames(

@@ -25,10 +25,12 @@ from sags_node.phantom.rig import phantom_rig
 from sags_node.pipeline.session import open_session
 from sags_node.rig import save_rig
 from sags_node.rig.hand_eye import HandEye, read_hand_eye, save_hand_eye
-from sags_node.sources.pose_track import NoPoseError, PoseTrack
+from sags_node.sources.pose_track import PoseTrack
 from sags_node.sources.robot import open_robot, rectified
+from sags_node.sources.source import open_source
 from sags_node.tools.calibration.boards import StereoView
 from sags_node.tools.calibration.hand_eye_solve import solve_hand_eye
+from sags_node.tools.calibration.pictures import spread
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
 from sags_node.tools.fitting.clip import read_clip
@@ -66,13 +68,17 @@ def hand_at(t: float, scale: float = 1.0) -> F64:
     return camera_at(t, scale) @ invert(X)
 
 
-def tracked(offset_ms: float, seconds: float, scale: float = 1.0, rate: int = 100) -> PoseTrack:
-    """The robot's poses; its clock is `offset_ms` ahead of the pictures'."""
+def tracked(
+    offset_ms: float, seconds: float, scale: float = 1.0, rate: int = 100, unit: float = 1.0
+) -> PoseTrack:
+    """The robot's poses; its clock is `offset_ms` ahead of the pictures', its length 1 is 1 m / `unit`."""
     track = PoseTrack()
     for number in range(round((seconds + 1) * rate)):
         t = number / rate - 0.5
         stamp = START + round((t * 1e3 + offset_ms) * MS)
-        (part,) = cdr.pose(hand_at(t, scale), stamp).parts
+        hand = hand_at(t, scale)
+        hand[:3, 3] *= unit
+        (part,) = cdr.pose(hand, stamp).parts
         track.add(bytes(part), cdr.POSE)
     return track
 
@@ -100,13 +106,6 @@ def seen(
     return views, stamps
 
 
-def pose_at(track: PoseTrack, t_ns: int) -> F64 | None:
-    try:
-        return track.at(t_ns)
-    except NoPoseError:
-        return None
-
-
 def errors(found: F64) -> tuple[float, float]:
     """mm and degrees."""
     apart = invert(X) @ found
@@ -119,7 +118,7 @@ def test_it_is_found_on_the_phantoms_path(scale: float, offset_ms: float) -> Non
     """Also from its own sway of 1.7 degrees alone, with the corners' usual noise of 0.1 px."""
     track = tracked(offset_ms, PERIOD, scale)
     views, stamps = seen(RIG, PERIOD, 10, 0.1, scale)
-    solution = solve_hand_eye(views, stamps, grid(), RIG, lambda t_ns: pose_at(track, t_ns))
+    solution = solve_hand_eye(views, stamps, grid(), RIG, track.at)
     place, turn = errors(solution.hand_eye.T_hand_cam)
     assert place < 0.3 and turn < 0.2
     assert solution.hand_eye.offset_ns * 1e-6 == pytest.approx(offset_ms, abs=5)
@@ -133,13 +132,30 @@ def test_a_motion_that_tells_nothing_is_said() -> None:
     track = tracked(0, PERIOD, 0.0)  # the scope shifts and is never turned
     views, stamps = seen(RIG, PERIOD, 10, 0.1, 0.0)
     with pytest.raises(SagsError, match="turn the scope about two different axes"):
-        solve_hand_eye(views, stamps, grid(), RIG, lambda t_ns: pose_at(track, t_ns))
+        solve_hand_eye(views, stamps, grid(), RIG, track.at)
 
 
 def test_poses_of_another_time_are_said() -> None:
     views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
-    with pytest.raises(SagsError, match="0 of 40 views of the board have a pose"):
-        solve_hand_eye(views, stamps, grid(), RIG, lambda t_ns: None)
+    late = [stamp + 60 * S for stamp in stamps]
+    said = "0 of 40 views of the board have a pose of the robot; 20 are needed.* has stopped"
+    with pytest.raises(SagsError, match=said):
+        solve_hand_eye(views, late, grid(), RIG, tracked(0, PERIOD).at)
+    with pytest.raises(SagsError, match=r"9 of 9 views .* 10 are needed.* give a larger --views"):
+        solve_hand_eye(views[:9], stamps[:9], grid(), RIG, tracked(0, PERIOD).at)
+    short = tracked(0, 0.5)  # 1.5 s of poses, ten pictures a second
+    with pytest.raises(SagsError, match=r"15 of 40 views .* 20 are needed"):
+        solve_hand_eye(views, stamps, grid(), RIG, short.at)
+
+
+@pytest.mark.parametrize(
+    ("rate", "unit", "said"), [(100, 1e3, "are its lengths in metres"), (5, 1.0, "poses are 0.20 s apart")]
+)
+def test_why_no_view_has_a_pose_is_said(rate: int, unit: float, said: str) -> None:
+    """Poses in millimetres, which jump, and too few of them."""
+    views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
+    with pytest.raises(SagsError, match=rf"0 of 40 views .* Frame 2\d: the robot's .*{said}"):
+        solve_hand_eye(views, stamps, grid(), RIG, tracked(3, PERIOD, rate=rate, unit=unit).at)
 
 
 # ---- the file --------------------------------------------------------------------------------------------
@@ -253,6 +269,21 @@ def test_from_a_bag_to_poses_of_the_camera(recording: Path) -> None:
             exact[:3, :3] = exact[:3, :3] @ session.rig.left.R.T
             assert np.linalg.norm(frame.T_world_cam[:3, 3] - exact[:3, 3]) < 0.3e-3
             assert np.abs(frame.T_world_cam[:3, :3] - exact[:3, :3]).max() < np.radians(0.2)
+
+
+@pytest.mark.parametrize(("start", "frames"), [(0.0, 13), (0.5, 13), (0.7, None), (1.1, 13)])
+def test_views_are_spread_over_what_is_played_and_nothing_else(
+    recording: Path, start: float, frames: int | None
+) -> None:
+    """Before and after it the board may have been moved."""
+    config = load_launch(recording, [f"source.start:={start}", f"source.frames:={frames or 'null'}"])
+    whole = range(VIEWS)[round(start * RATE) :][:frames]
+    for count in (2, 3, 5, 10, 40):
+        with open_source(spread(config.source, count), references=False) as source:
+            numbers = [frame.recorded_number for frame in source]
+        assert set(numbers) <= set(whole) and len(numbers) >= min(count, len(whole))
+        steps = set(np.diff(numbers))
+        assert steps == {max(1, len(whole) // count)}
 
 
 def test_the_example_gives_what_it_says(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
+from sags_node.phantom.scene import Phantom
 from sags_node.rig import rectified_rig, save_rig
 from sags_node.tools.evaluation import plots
 from sags_node.tools.evaluation.figures import MEANS, POOLED
@@ -501,6 +502,52 @@ def test_a_recording_without_truth_is_measured_against_itself(session_folder: Pa
     assert known["stereo"] is None and known["forth_back"] is None  # the truth says more
     assert known["depth"]["median_mm"] < 1.5 and known["track"]["lost"] < 0.05
     assert known["right"] == found["right"] and known["hidden"] == found["hidden"]
+
+
+def test_a_segment_is_of_frames_of_the_recording(session_folder: Path) -> None:
+    """With a stride of 2 its frames 5 to 14 are those played as 3 to 7."""
+    outcome = evaluate(session_folder, ["source.stride:=2"], MeasureOptions(0), iterations=0)
+    inside = [row.figures["online"]["psnr"] for row in outcome.rows if 5 <= 2 * row.frame_id <= 14]
+    assert outcome.summary["segments"] == {"motion": [3, 7]} and len(inside) == 5
+    assert outcome.summary["online"]["motion"]["psnr"] == pytest.approx(np.mean(inside), abs=1e-4)
+    config = load_launch(None, ["segments:={whole: [0, 14], none: [13, 14]}", "source.stride:=4"])
+    assert config.played_segments == {"whole": (0, 3), "none": (4, 3)}
+
+
+def test_views_from_aside_are_compared_with_the_truth_of_their_moment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Part of a recording of 15 frames: every second one from the seventh."""
+    looked_at: list[float] = []
+
+    class Nothing:
+        def look(self, camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
+            return np.zeros((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH), np.float32)
+
+    def still(phantom: Phantom, phase: float) -> Nothing:
+        looked_at.append(phase)
+        return Nothing()
+
+    monkeypatch.setattr(Phantom, "still", still)
+    scene = ["source.seconds:=0.5", f"source.width:={WIDTH}", f"source.height:={HEIGHT}"]
+    part = ["source.start:=0.2", "source.stride:=2", "source.frames:=4"]
+    evaluate(None, [*scene, *part], MeasureOptions(0, aside=True), iterations=0)
+    assert looked_at == [6 / 15, 8 / 15, 10 / 15, 12 / 15]
+
+
+def test_of_a_warm_up_nothing_is_hidden_or_counted(
+    session_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Boxes are hidden after 0.15 of what is measured, for half a second."""
+    monkeypatch.setattr("sags_node.tools.evaluation.second.MOST", 8)
+    warm_up, measured = ["source.warm_up:=10"], MeasureOptions(0, hidden=True)
+    hidden = [
+        row.frame_id for row in evaluate(session_folder, warm_up, measured).rows if "hidden" in row.figures
+    ]
+    assert hidden == list(range(12, 20))
+    again = evaluate(session_folder, warm_up, MeasureOptions(0, second=True))
+    hidden = [row.frame_id for row in again.rows if "hidden" in row.figures]
+    assert hidden == list(range(11, 18)) and again.summary["second_run"] == {"frames": 8}
 
 
 def test_a_session_in_real_time_is_seen_as_a_subscriber_sees_it(

@@ -485,11 +485,22 @@ def test_a_folder_holds_one_fit_alone(
     assert left() == results
 
 
+def test_a_fit_that_holds_nothing_out_says_what_it_learnt(phantom_session: Path, tmp_path: Path) -> None:
+    options = ["--hold-out", "0", "--iterations", "2", "--max-gaussians", "1500", "--verbose"]
+    played = ["source.frames:=4", "source.stride:=3", "segments:={late: [3, 6]}"]
+    result = sags_fit(phantom_session, *played, *options, "--out", tmp_path / "fit")
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "fit/figures.json").read_text())
+    assert found["train"]["frames"] == 4 and found["train"]["late"]["frames"] == 2  # 3 and 6 of 0, 3, 6, 9
+    assert "on frames that it was fitted to" in result.output and "kept back" not in result.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
         (["--resume"], 2, "start without --resume"),
         (["--lpips-weights", "nothing.npz"], 2, "nothing.npz"),
+        (["--warm-up", "7", "--set", "batch_size=4"], 2, "warm_up, batch_size would change nothing"),
         (["source.frames:=1", "vision.stereo.min_depth:=0.25"], 1, "depth"),
     ],
 )

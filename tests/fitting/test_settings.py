@@ -15,12 +15,14 @@ from sags_node.tools.fitting.score import published
 from sags_node.tools.fitting.settings import (
     LEAST,
     ONLINE,
+    ONLY_PAPER,
     PAPER,
     PRESETS,
     RELEASED,
     FieldShape,
     RowRates,
     Units,
+    check_used,
     path_frames,
     with_changes,
 )
@@ -93,6 +95,33 @@ def test_rates_fall_by_a_factor_all_along_or_in_a_line_at_the_end() -> None:
 def test_a_change_that_cannot_be_says_why(change: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         with_changes(ONLINE, [change])
+
+
+@pytest.mark.parametrize("key", ONLY_PAPER)
+def test_a_setting_without_effect_is_refused(key: str) -> None:
+    """What only the paper's schedule reads; and what only some of its settings do."""
+    other = {"rates.decaying": "[means]", "growth": "7", "weights": "0.2", "slopes": "true"}
+    part = {"growth": ".every", "weights": ".color"}.get(key, "")
+    change = f"{key}{part}={other.get(key, '0.5' if key in ('coarse', 'stable') else '9')}"
+    changes = [change, "color_softness=0.1"] if key == "slopes" else [change]
+    if key == "smooth_everywhere":
+        changes = ["smooth_everywhere=true"]
+    with pytest.raises(UsageError, match=rf"{key}.* nothing after an online start; give --schedule paper"):
+        check_used(with_changes(ONLINE, changes), ONLINE)
+    released = dataclasses.replace(RELEASED, slopes=False, stable=None)
+    check_used(with_changes(released, [change for change in changes if "slopes" not in change]), RELEASED)
+
+
+def test_settings_that_hide_others_are_said() -> None:
+    for preset in PRESETS.values():
+        check_used(preset, preset)
+    check_used(with_changes(ONLINE, ["rates.mean_px=0.2", "decay=0.1", "midway=true"]), ONLINE)
+    with pytest.raises(UsageError, match="decay_over would change nothing beside stable"):
+        check_used(with_changes(PAPER, ["decay_over=100"]), PAPER)
+    check_used(with_changes(PAPER, ["decay_over=100", "stable=null"]), PAPER)
+    with pytest.raises(UsageError, match=r"rates\.color would change nothing beside slopes"):
+        check_used(with_changes(PAPER, ["rates.color=0.1"]), PAPER)
+    check_used(with_changes(PAPER, ["rates.color=0.1", "slopes=false"]), PAPER)
 
 
 def test_slots_of_time_grow_with_the_clip() -> None:

@@ -11,13 +11,13 @@ from rich.table import Table
 
 from sags_node.config.schema import BagRobot, LaunchConfig, RecordedSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources.pose_track import NoPoseError
 from sags_node.sources.robot import open_robot
 from sags_node.sources.source import open_source
 from sags_node.terminal import text
 from sags_node.tools.calibration.boards import Board, Chessboard, StereoView, find_in_both, turned_like
 from sags_node.tools.calibration.hand_eye_solve import HandEyeSolution, solve_hand_eye
-from sags_node.types import F64, StereoRig
+from sags_node.tools.calibration.pictures import spread
+from sags_node.types import StereoRig
 
 Progress = Callable[[int, int], None]
 
@@ -41,17 +41,8 @@ def calibrate_hand_eye(
             "a hand-eye calibration needs a recording with pictures and poses: record both topics (ros2 bag "
             "record), then set source.kind:=bag and robot.kind:=bag"
         )
-    with open_source(source, references=False) as recording:
-        stride = max(1, (recording.frame_count or count) // count)
-    playing = source.model_copy(update={"stride": source.stride * stride, "pace": "step", "loop": False})
+    playing = spread(source, count)
     track = open_robot(config).track
-
-    def pose_at(t_ns: int) -> F64 | None:
-        try:
-            return track.at(t_ns)
-        except NoPoseError:
-            return None
-
     views: list[StereoView] = []
     stamps: list[int] = []
     with open_source(playing, references=False) as opened:
@@ -68,7 +59,7 @@ def calibrate_hand_eye(
             progress(number + 1, opened.frame_count or number + 1)
     if not views:
         raise SagsError("the board is seen in no frame; check --board, --squares, light and focus")
-    return solve_hand_eye(views, stamps, board.points, rig, pose_at)
+    return solve_hand_eye(views, stamps, board.points, rig, track.at)
 
 
 def summarise_hand_eye(solution: HandEyeSolution) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -17,10 +17,12 @@ import numpy as np
 from sags_node.errors import SagsError
 from sags_node.geometry import invert, rigid
 from sags_node.rig.hand_eye import HandEye
+from sags_node.sources.pose_track import NoPoseError
 from sags_node.tools.calibration.boards import StereoView
 from sags_node.types import F32, F64, I64, StereoRig
 
-PoseAt = Callable[[int], F64 | None]  # the robot's pose [4, 4] at its own time, ns; None: not known
+PoseAt = Callable[[int], F64]  # the robot's pose [4, 4] at its own time, ns; NoPoseError: not known
+KnownPose = Callable[[int], F64 | None]  # the same; None: not known
 
 FEWEST_VIEWS = 10
 LARGEST_OFFSET_NS = 500_000_000
@@ -60,17 +62,19 @@ def solve_hand_eye(
     Raises:
         SagsError: there are too few views with poses, the scope was not turned enough, or nothing fits.
     """
-    pose_at = cache(pose_at)  # steps that leave the offset ask again
+    known_at = cache(partial(_known_pose, pose_at))  # steps that leave the offset ask again
     boards = np.stack([_board_pose(view, points, rig) for view in views])
-    offset = _coarse_offset(boards, stamps, pose_at)
-    known = [i for i, stamp in enumerate(stamps) if _around(pose_at, stamp + offset)]
-    _enough(len(known), len(views))
+    offset, most = _coarse_offset(boards, stamps, known_at)
+    problems = [_problem(pose_at, stamp + (offset or 0)) for stamp in stamps]
+    known = [i for i, problem in enumerate(problems) if problem is None]
+    if offset is None or len(known) < FEWEST_VIEWS:
+        raise _too_few(views, problems, len(known) if offset is not None else most)
     views, boards, stamps = [views[i] for i in known], boards[known], [stamps[i] for i in known]
-    hands = np.stack([_known(pose_at(stamp + offset)) for stamp in stamps])
+    hands = np.stack([pose_at(stamp + offset) for stamp in stamps])
     _turned_enough(_turns(hands, boards)[1])
     X = _linear(hands, boards)
     Z = hands[0] @ X @ boards[0]
-    residuals = _Residuals(views, stamps, points, rig, pose_at, X, Z, offset)
+    residuals = _Residuals(views, stamps, points, rig, known_at, X, Z, offset)
     parameters, covariance, spread = _least_squares(residuals)
     X, _, offset = residuals.unpacked(parameters)
     corners = residuals(parameters).reshape(-1, 2)
@@ -92,12 +96,21 @@ def solve_hand_eye(
     return HandEyeSolution(HandEye(X, offset), errors, names, float(place), float(turn), float(clock * 1e9))
 
 
-def _enough(count: int, of: int) -> None:
-    if count < FEWEST_VIEWS:
-        raise SagsError(
-            f"{count} of {of} views of the board have a pose of the robot; {FEWEST_VIEWS} are needed, "
-            "60 are good"
-        )
+def _needed(views: int) -> int:
+    """So many of them must have a pose: with few, any offset that knows only these might seem to agree."""
+    return max(FEWEST_VIEWS, -(-views // 2))
+
+
+def _too_few(views: Sequence[StereoView], problems: Sequence[str | None], count: int) -> SagsError:
+    """The error that so few views have a pose; why, is told of the middle one that has none."""
+    told = [(view.name, why) for view, why in zip(views, problems, strict=True) if why is not None]
+    fix = "; give a larger --views, or record for longer"
+    if told:
+        fix = ". Frame {}: {}".format(*told[len(told) // 2])
+    return SagsError(
+        f"{count} of {len(views)} views of the board have a pose of the robot; {_needed(len(views))} are "
+        f"needed, 60 are good{fix}"
+    )
 
 
 def _turned_enough(turns: F64) -> None:
@@ -110,15 +123,22 @@ def _turned_enough(turns: F64) -> None:
         )
 
 
-def _known(T: F64 | None) -> F64:
-    assert T is not None
-    return T
+def _known_pose(pose_at: PoseAt, t_ns: int) -> F64 | None:
+    try:
+        return pose_at(t_ns)
+    except NoPoseError:
+        return None
 
 
-def _around(pose_at: PoseAt, t_ns: int) -> bool:
-    """Tell whether the pose is known also for the steps of the search."""
+def _problem(pose_at: PoseAt, t_ns: int) -> str | None:
+    """Why the pose is not known, also for the steps of the search; None: it is."""
     reach = 2 * OFFSET_STEP_NS
-    return all(pose_at(t_ns + step) is not None for step in (-reach, 0, reach))
+    try:
+        for step in (0, -reach, reach):
+            pose_at(t_ns + step)
+    except NoPoseError as error:
+        return error.finding.text
+    return None
 
 
 def _board_pose(view: StereoView, points: F32, rig: StereoRig) -> F64:
@@ -130,23 +150,22 @@ def _board_pose(view: StereoView, points: F32, rig: StereoRig) -> F64:
     return _rigid(np.concatenate([turn.ravel(), place.ravel()]))
 
 
-def _coarse_offset(boards: F64, stamps: Sequence[int], pose_at: PoseAt) -> int:
-    """The offset at which the turns of robot and camera agree best, ns."""
-    best, least, most = 0, np.inf, 0
+def _coarse_offset(boards: F64, stamps: Sequence[int], pose_at: KnownPose) -> tuple[int | None, int]:
+    """The offset at which the turns of robot and camera agree best, ns, and how many views have a pose at
+    most; None: at no offset enough of them have one."""
+    best, least, most = None, np.inf, 0
     for offset in range(-LARGEST_OFFSET_NS, LARGEST_OFFSET_NS + 1, OFFSET_STEP_NS):
-        poses = [pose_at(stamp + offset) for stamp in stamps]
-        known = [i for i, pose in enumerate(poses) if pose is not None]
+        poses = {i: pose for i, stamp in enumerate(stamps) if (pose := pose_at(stamp + offset)) is not None}
+        known = list(poses)
         most = max(most, len(known))
-        if len(known) < max(FEWEST_VIEWS, 0.5 * len(stamps)):
+        if len(known) < _needed(len(stamps)):
             continue
-        robot, camera = _turns(np.stack([_known(poses[i]) for i in known]), boards[known])
+        robot, camera = _turns(np.stack(list(poses.values())), boards[known])
         R = _rotation(robot, camera)
         residual = float(np.mean(np.sum((robot - camera @ R.T) ** 2, 1)))
         if residual < least:
             best, least = offset, residual
-    if least == np.inf:
-        _enough(min(most, FEWEST_VIEWS - 1), len(stamps))
-    return best
+    return best, most
 
 
 def _pairs(count: int) -> tuple[I64, I64]:
@@ -196,7 +215,7 @@ class _Residuals:
     stamps: Sequence[int]
     points: F32
     rig: StereoRig
-    pose_at: PoseAt
+    pose_at: KnownPose
     X: F64  # where the search begins: camera to hand, board to base, and the offset, ns
     Z: F64
     offset: int

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sags_node.config.launch_file import VIDEO_SUFFIXES
-from sags_node.config.schema import LaunchConfig, RecordedSource
+from sags_node.config.schema import LaunchConfig, PhantomSource, RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.pictures import pair_files, read_picture, size_text
+from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8
 
@@ -55,14 +56,7 @@ def pairs_of_session(
     """
     source, stride = config.source, LIVE_STRIDE
     if isinstance(source, RecordedSource):
-        with open_source(source, references=False, progress=progress) as recording:
-            stride = max(1, (recording.frame_count or PAIRS) // PAIRS)
-        if stride > REFERENCE_EVERY:
-            stride -= stride % REFERENCE_EVERY
-        playing = {"stride": source.stride * stride, "pace": "step", "loop": False}
-        if source.frames is not None:  # behind them the recording may be cut off
-            playing["frames"] = -(-source.frames // stride)
-        source, stride = source.model_copy(update=playing), 1
+        source, stride = spread(source, PAIRS, REFERENCE_EVERY, progress), 1
     pairs: list[Pair] = []
     depths: list[F32 | None] = []
     with open_source(source) as opened:
@@ -75,3 +69,35 @@ def pairs_of_session(
             if len(pairs) == PAIRS:
                 break
     return pairs, depths
+
+
+def spread(
+    source: Recording | PhantomSource,
+    count: int,
+    multiple: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Recording | PhantomSource:
+    """Return what plays `count` frames or more, spread over those that `source` plays, and none beside them.
+
+    Args:
+        multiple: of frames from one to the next, where there are so many.
+        progress: called while a phantom session is rendered.
+
+    Raises:
+        UsageError: the recording has a wrong path.
+        SagsError: it cannot be read.
+    """
+    source = source.model_copy(update={"pace": "step", "loop": False})
+    with open_source(source, references=False, progress=progress) as recording:
+        assert isinstance(recording, Replay)
+        there = recording.frame_count or 0
+        stride = max(1, there // count)
+        if stride > multiple:
+            stride -= stride % multiple
+        begin = -(-recording.first // stride) * stride  # a stride counts from the recording's first frame
+        playing = {
+            "stride": source.stride * stride,
+            "start": recording.seconds_of(begin),
+            "frames": -(-(recording.first + there - begin) // stride),
+        }
+    return source.model_copy(update=playing)

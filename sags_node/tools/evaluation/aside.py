@@ -24,19 +24,20 @@ class Aside:
     def __init__(self, config: LaunchConfig, frames: int) -> None:
         """
         Args:
-            frames: of the recording.
+            frames: that are played.
 
         Raises:
             UsageError: it is not the phantom.
         """
         from sags_node.phantom.scene import Phantom  # only here: it loads Open3D
+        from sags_node.phantom.session import frame_count
 
         if not isinstance(config.source, PhantomSource):
             raise UsageError(
                 "--aside needs the built-in phantom: nobody knows what other scenes show from aside"
             )
         self._phantom = Phantom(config.source)
-        self._frames = frames
+        self._recorded, self._frames = frame_count(config.source), frames
         self._next = frames // TIMES // 2
 
     def due(self, shown: MappedFrame) -> bool:
@@ -47,18 +48,19 @@ class Aside:
         self._next = number + self._frames // TIMES
         return True
 
-    def __call__(self, shown: MappedFrame, left: U8, draw: Draw) -> dict[str, dict[str, float]]:
+    def __call__(self, shown: MappedFrame, number: int, left: U8, draw: Draw) -> dict[str, dict[str, float]]:
         """`view_2` to `view_20`, by the distance in mm: dB after a fit of gain and offset, where the left eye
         sees the place too. `psnr` of what is shown, `model_psnr` of the model alone, `warp_psnr` of the left
         picture, warped by the frame's own stereo depth.
 
         Args:
+            number: of the frame in the recording.
             left: [H, W, 3] the rectified picture.
             draw: what a view shows, and the model alone in it, [H, W, 3] 0..1 each.
         """
         camera = shown.snapshot.camera
         focal_px = float(camera.K[0, 0])
-        truth_of = self._phantom.still(shown.snapshot.frame_id / self._frames)
+        truth_of = self._phantom.still(number / self._recorded)
         figures = {}
         for millimetres in AWAY:
             baseline = millimetres * 1e-3

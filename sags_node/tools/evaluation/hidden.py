@@ -38,7 +38,7 @@ def measure_hidden(
     they were seen, shown again; dB, each the mean over the boxes.
 
     Args:
-        frames: of the recording.
+        frames: of the recording, without those of its warm-up: in these nothing is hidden.
     """
     pipeline = Pipeline(config, rig)
     curtain = Curtain(config.vision.tissue, pipeline.rectifier)
@@ -48,12 +48,12 @@ def measure_hidden(
     every = np.logical_or.reduce(boxes)
     found: dict[int, dict[str, float]] = {}
     before: F32 | None = None  # the last picture that showed the boxes
-    until = 0
+    number = until = 0
     with source as playing:
-        for number, frame in enumerate(playing):
+        for frame in playing:
             now = frame.t_capture_ns
             for share, seconds in TIMES:
-                if number == round(share * frames):
+                if not frame.warm_up and number == round(share * frames):
                     until = now + round(seconds * 1e9)
             curtain.drawn = every if now < until else None
             result = pipeline.process(frame, budget, FrameRequest(left=True))
@@ -72,7 +72,8 @@ def measure_hidden(
                     name: float(np.mean([metrics.psnr(picture, truth, box) for box in where if box.any()]))
                     for name, picture in pictures.items()
                 }
-            progress("hiding tissue", number + 1)
+            number += not frame.warm_up
+            progress("hiding tissue", number)
     return found
 
 

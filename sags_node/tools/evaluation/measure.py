@@ -254,7 +254,10 @@ class Measurer:
         after = _Mapped(now, shown, self._lent(shown, pair))
         if self._aside is not None and self._aside.due(shown):
             figures |= self._aside(
-                shown, pair.left, lambda camera: self._view(after, shown.snapshot.gaussians, camera, 0)
+                shown,
+                now.frame.recorded_number,
+                pair.left,
+                lambda camera: self._view(after, shown.snapshot.gaussians, camera, 0),
             )
         self._learn(after)
         if self._held is not None and now.seconds > self._earlier[0].recorded.seconds:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sags_node.config.schema import RecordedSource
 from sags_node.geometry import transform, unproject
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
@@ -44,8 +45,11 @@ def measure_second(
         Rows by frame number, with figures of `GROUPS` and `hidden`; the summary's `second_run` and, where no
         true points are known, `forth_back` (see `_forth_and_back`).
     """
-    frames = min(MOST, session.source.frame_count or MOST)
-    source = session.config.source.model_copy(update={"frames": frames})
+    played = session.config.source
+    assert isinstance(played, RecordedSource)
+    most = MOST + played.warm_up
+    frames = min(most, session.source.frame_count or most)
+    source = played.model_copy(update={"frames": frames})
     publish = session.config.publish.model_copy(update={"right": True})
     alone = session.config.model_copy(update={"source": source})  # nobody looks at the right eye
     config = alone.model_copy(update={"publish": publish})
@@ -70,10 +74,10 @@ def measure_second(
         row.frame_id: replace(row, figures={key: row.figures[key] for key in GROUPS if key in row.figures})
         for row in measurer.rows
     }
-    of_hidden = measure_hidden(alone, session.rig, again(session), frames, told) if hidden else {}
+    of_hidden = measure_hidden(alone, session.rig, again(session), len(rows), told) if hidden else {}
     for frame_id in of_hidden.keys() & rows.keys():
         rows[frame_id].figures["hidden"] = of_hidden[frame_id]
-    return rows, {"second_run": {"frames": frames}, "forth_back": found}
+    return rows, {"second_run": {"frames": len(rows)}, "forth_back": found}
 
 
 def _forth_and_back(

@@ -130,7 +130,7 @@ def completed(
         figures = {group: also.figures[group] for group in missing & also.figures.keys()}
         track = row.track if followed else also.track
         rows.append(replace(row, figures=row.figures | figures, track=track))
-    summary |= rounded({**quality(rows, options, session.config.segments), **told})
+    summary |= rounded({**quality(rows, options, session.config.played_segments), **told})
     return replace(found, rows=rows)
 
 
@@ -197,7 +197,7 @@ def _summary(
     config = session.config
     rate = session.source.rate if config.in_real_time else None
     budget_ms = None if config.mapping.iterations is not None else config.mapping.frame_ms(rate)
-    summary = summarise(session.name, rows, options, config.segments, budget_ms)
+    summary = summarise(session.name, rows, options, config.played_segments, budget_ms)
     summary["settings"] = {
         "overrides": list(overrides),
         "pace": None if isinstance(config.source, LiveSource) else config.source.pace,

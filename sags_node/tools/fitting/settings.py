@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
@@ -104,10 +105,11 @@ class FitSettings:
     pixels_each: float = 3.3
     seed: int = 0
     shape: FieldShape = FieldShape()
-    rates: RowRates = RowRates()  # only with schedule = paper
+    rates: RowRates = RowRates()  # after an online start only mean_px and log_scale
     field_rates: FieldRates = field(default_factory=FieldRates)
     decay: float = 0.01  # rates that decay fall to this share of their first values
-    decay_over: int | None = None  # in so many iterations of a stage; None: in all that it has
+    # In so many iterations of a stage; None: in all. Only with schedule = paper, and without `stable`.
+    decay_over: int | None = None
     # Only with schedule = paper: share of a stage after which they fall, in a straight line (Hu et al. 2024,
     # MiniCPM, section 4); None: all along, by the same factor.
     stable: float | None = None
@@ -119,7 +121,8 @@ class FitSettings:
     # Whether Gaussians have slopes of luminance (`types.Gaussians`), which are learnt with canonical colours
     # in closed form; only with schedule = paper. An online start always has them.
     slopes: bool = False
-    smooth_everywhere: bool = False  # False: the two kinds of smoothness are for what no frame shows
+    # False: the two kinds of smoothness are for what no frame shows; only with schedule = paper.
+    smooth_everywhere: bool = False
 
     def __post_init__(self) -> None:
         """
@@ -201,6 +204,10 @@ RELEASED = FitSettings(
     smooth_everywhere=True,
 )
 PRESETS = {"online": ONLINE, "paper": PAPER, "released": RELEASED}
+ONLY_PAPER = (
+    *("warm_up", "coarse", "rates.quat", "rates.color", "rates.logit", "rates.decaying", "decay_over"),
+    *("stable", "growth", "batch_size", "weights", "color_softness", "slopes", "smooth_everywhere"),
+)
 
 
 def path_frames(frames: int) -> list[int]:
@@ -236,6 +243,23 @@ def with_changes(settings: FitSettings, changes: Sequence[str]) -> FitSettings:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise UsageError(f"--set {key}: {first['msg'].lower()}, not {first['input']!r}") from None
+
+
+def check_used(settings: FitSettings, preset: FitSettings) -> None:
+    """Look whether all that is set otherwise than in a preset has an effect.
+
+    Raises:
+        UsageError: it has none.
+    """
+    online, stable, slopes = settings.schedule == "online", settings.stable is not None, settings.slopes
+    idle = {
+        "after an online start; give --schedule paper": ONLY_PAPER if online else (),
+        "beside stable; set stable=null": ("decay_over",) if stable else (),
+        "beside slopes; set slopes=false": ("rates.color",) if slopes else (),
+    }
+    for why, keys in idle.items():
+        if set_in_vain := [key for key in keys if attrgetter(key)(settings) != attrgetter(key)(preset)]:
+            raise UsageError(f"{', '.join(set_in_vain)} would change nothing {why}, or leave it out")
 
 
 def _keys(tree: dict[str, Any], before: str = "") -> list[str]:

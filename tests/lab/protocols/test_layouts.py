@@ -246,6 +246,15 @@ def test_tum_trajectories(tmp_path: Path) -> None:
             read_tum(file)
 
 
+def test_options_that_a_protocol_does_not_take_are_refused(tmp_path: Path) -> None:
+    command = ("eval", "--protocol", "endonerf", tmp_path, "--iterations", "1")
+    given = ("--hold-out", "4", "--warm-up", "12", "--receipt", tmp_path / "receipt.json", "--pace", "step")
+    refused(2, *command, *given, said=("leave out --hold-out, --pace, --receipt, --warm-up",))
+    weights = ("--lpips-weights", tmp_path / "weights.npz")
+    refused(2, "eval", "--protocol", "scared", tmp_path, *weights, said=("leave out --lpips-weights",))
+    refused(2, *command, *weights, said=("no file of LPIPS weights",))
+
+
 @pytest.mark.parametrize("protocol", ["d4d", "stir", "stereomis", "endonerf", "scared"])
 def test_another_folder_is_refused_in_one_line(protocol: str, tmp_path: Path) -> None:
     refused(2, "eval", "--protocol", protocol, tmp_path, said=(str(tmp_path),))
