@@ -87,6 +87,56 @@ def test_governors(governor: str, driver: str, level: str, said: str, tmp_path: 
     assert bool(found.fix) == (governor != "performance")
 
 
+OWN = "sys__fs__cgroup__a__memory."
+OLD = "sys__fs__cgroup__memory__x__memory."
+
+
+@pytest.mark.parametrize(
+    ("files", "granted"),
+    [
+        ({"proc__self__cgroup": "0::/a\n", f"{OWN}max": "max\n", f"{OWN}current": "7\n"}, None),
+        ({"proc__self__cgroup": "0::/a\n", f"{OWN}max": "512\n", f"{OWN}current": "100\n"}, 412),
+        ({"proc__self__cgroup": "0::/a\n", f"{OWN}high": "512\n", f"{OWN}current": "600\n"}, 0),
+        (  # the least of those above it; files that were read are no use of it
+            {
+                "proc__self__cgroup": "0::/a/b\n",
+                f"{OWN}max": "900\n",
+                f"{OWN}current": "800\n",
+                f"{OWN}stat": "anon 500\ninactive_file 300\n",
+                "sys__fs__cgroup__a__b__memory.max": "600\n",
+                "sys__fs__cgroup__a__b__memory.current": "100\n",
+            },
+            400,
+        ),
+        (
+            {
+                "proc__self__cgroup": "4:memory:/x\n",
+                f"{OLD}limit_in_bytes": "700\n",
+                f"{OLD}usage_in_bytes": "300\n",
+                "sys__fs__cgroup__memory__memory.limit_in_bytes": "9223372036854771712\n",
+                "sys__fs__cgroup__memory__memory.usage_in_bytes": "300\n",
+            },
+            400,
+        ),
+    ],
+)
+def test_the_memory_of_control_groups(files: dict[str, str], granted: int | None, tmp_path: Path) -> None:
+    assert doctor.memory_quota(made(tmp_path, **files)) == granted
+
+
+def test_a_container_with_too_little_memory_is_said(tmp_path: Path) -> None:
+    files = {
+        "proc__meminfo": "MemAvailable: 60000000 kB\n",
+        "proc__self__cgroup": "0::/\n",
+        "sys__fs__cgroup__memory.max": "536870912\n",
+        "sys__fs__cgroup__memory.current": "36870912\n",
+    }
+    found = doctor.check_memory(made(tmp_path, **files))
+    assert found.level == "warning" and "0.5 GB more granted" in found.what and "--memory" in found.fix
+    made(tmp_path, **{"sys__fs__cgroup__memory.max": "8000000000\n"})
+    assert doctor.check_memory(tmp_path).level == "ok"
+
+
 @pytest.mark.parametrize(
     ("free", "swap", "unused", "level", "said"),
     [

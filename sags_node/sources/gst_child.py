@@ -36,33 +36,13 @@ from sags_node.sources.gst_library import (
     GstError,
     Picture,
 )
+from sags_node.wall_clock import DRIFT_NS, WallClock
 
 START = b"\xff\xff"
 SLOTS = 4  # pictures of a sink that may be on their way
 POLL_NS = 100_000_000
 LAST_S = 2.0  # for the parent to take the last pictures of a file
-DRIFT_NS = 1_000_000
 BYTES = {"RGB": 3, "ARGB64_LE": 8}  # of a pixel
-
-
-class WallClock:
-    """When the pipeline's clock was zero, the same for both eyes: equal stamps stay equal."""
-
-    def __init__(self) -> None:
-        self._held_ns = 0
-        self._lock = threading.Lock()
-
-    def at_zero(self, measured_ns: int, took_ns: int) -> int:
-        """Return what is held, until a measurement is a millisecond off: one of the clocks was set, or
-        drifts.
-
-        Args:
-            took_ns: to measure; where that is long, another process came between.
-        """
-        with self._lock:
-            if not self._held_ns or (took_ns < DRIFT_NS / 10 and abs(measured_ns - self._held_ns) > DRIFT_NS):
-                self._held_ns = measured_ns
-            return self._held_ns
 
 
 class Sink:

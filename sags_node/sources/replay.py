@@ -22,6 +22,7 @@ from sags_node.sources.scared import ScaredPairs
 from sags_node.sources.truth import Poses, References
 from sags_node.sources.videos import OneVideoPairs, VideoPairs
 from sags_node.types import U8, StereoFrame
+from sags_node.wall_clock import WallClock
 
 Recording = (
     cfg.FoldersSource
@@ -50,8 +51,10 @@ class Replay:
 
     Every pair of the recording (each stride-th, if a stride is set) has its turn, numbered by `frame_id`: its
     place in the first pass, counted on when the recording loops. `rate` is that of the turns. In `realtime`
-    pace turn `n` is due `n / rate` seconds after the first; a pair that would come more than one period late
-    is left out and counted. In `step` pace the stamp is `frame_id / rate`, whatever the clock says.
+    pace turn `n` is due `n / rate` seconds after the first, by a clock that nobody sets, and is stamped with
+    the wall clock's time then; a pair that would come more than one period late is left out and counted. In
+    `step` pace the stamp is `frame_id / rate`, whatever the clock says. `epoch` grows with each loop, and
+    where a stamp goes back.
 
     A recording that keeps a stamp of each picture is played by those, unless `config.rate` is set.
 
@@ -106,7 +109,8 @@ class Replay:
         # Those of the left pictures, ns: by them poses of the same recording are found.
         self._recorded = stamps[:, 0] if stamps is not None and isinstance(self.pairs, BagPairs) else None
         self.dropped = 0
-        self._began: tuple[float, int] | None = None  # monotonic seconds and wall clock of the first turn
+        self._began: float | None = None  # monotonic seconds of the first turn
+        self._wall = WallClock()
         self._dropped_in_a_row = 0
         self.first = self.frame_at(config.start)
         if self.first >= self._count:
@@ -182,7 +186,7 @@ class Replay:
         self.pairs.seek(self.first * stride)
         self._began = None
         self._dropped_in_a_row = 0
-        epoch, index, frame_id = 0, self.first, self.first
+        epoch, index, frame_id, last = 0, self.first, self.first, 0
         limit = None if self._config.frames is None else self.first + self._config.frames
         while not self._stopped.is_set() and frame_id != limit:
             pair = None
@@ -219,6 +223,7 @@ class Replay:
                     refuse_one_eye_twice(pair.left, pair.right)
                 if frame_id == self.first and not self._quiet and is_mosaic(pair.left):
                     say(MOSAIC)
+                epoch, last = epoch + (stamp < last), stamp
                 yield StereoFrame(
                     frame_id,
                     t_capture_ns=stamp,
@@ -243,8 +248,8 @@ class Replay:
     def _due_in(self, frame_id: int) -> float:
         """Seconds until the turn of this frame, negative when it is over; the first turn is now."""
         if self._began is None:
-            self._began = self._clock(), self._wall_ns()
-        return self._began[0] + self._elapsed(frame_id) * 1e-9 - self._clock()
+            self._began = self._clock()
+        return self._began + self._elapsed(frame_id) * 1e-9 - self._clock()
 
     def _elapsed(self, frame_id: int) -> int:
         """Time from the first turn to this one, as the recording has it, ns."""
@@ -281,7 +286,7 @@ class Replay:
         if wait > 0:
             self._sleep(wait)
         assert self._began is not None
-        return self._began[1] + self._elapsed(frame_id)
+        return self._wall.at(self._began, self._clock, self._wall_ns) + self._elapsed(frame_id)
 
 
 def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, one return per kind

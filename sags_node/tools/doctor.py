@@ -11,7 +11,7 @@ import os
 import platform
 import socket
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -22,6 +22,7 @@ from sags_node.config.schema import (
     GstSource,
     Guarded,
     LaunchConfig,
+    LiveSource,
     OnnxConfig,
     PhantomSource,
     PushRobot,
@@ -35,7 +36,9 @@ from sags_node.config.schema import (
 from sags_node.engine.device import find_gpu, has_gpu
 from sags_node.errors import SagsError, UsageError, install
 from sags_node.kernels.cache import cache_root
+from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import lacks_rig, rig_of
 from sags_node.rig.hand_eye import read_hand_eye
 from sags_node.ros.graph import domain_of
@@ -56,6 +59,7 @@ REQUIRED = (
 ).split()
 CORES = 2  # for the rate of a camera
 ENOUGH_MEMORY = 2e9  # bytes: about twice what a node takes
+UNLIMITED = 1 << 62  # bytes: so much control groups of version 1 say where there is no limit
 TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
 MAX_ERROR = struct.Struct("@I3l")  # modes, offset, frequency and largest error (us) of its `timex`
 TIME_KEEPERS = {"chronyd", "ntpd", "phc2sys", "ptp4l", "systemd-timesyn"}  # as far as /proc tells names
@@ -132,6 +136,13 @@ def _launched(config: LaunchConfig) -> list[Look]:
     if vision.tissue.method == "onnx":
         tissue = OnnxConfig(path=vision.tissue.path)
         looks.append(("tissue network", _tried(lambda: OnnxSession(tissue, "vision.tissue"), "loads")))
+    if vision.tissue.method == "topic":
+        address = str(vision.tissue.endpoint), vision.tissue.ns
+        looks.append(("tissue masks", _tried(lambda: MaskSubscriber(*address).close(), "can be received")))
+    if config.rig is not None and isinstance(source, LiveSource):
+        made = _tried(lambda: Pipeline(config, rig_of(config), lambda stamp_ns: None), "can be made")
+        if made.what not in [each.what for _, each in looks]:  # else that was said
+            looks.append(("pipeline", made))
     return looks
 
 
@@ -219,11 +230,16 @@ def check_governor(root: Path = ROOT) -> Finding:
 
 
 def check_memory(root: Path = ROOT) -> Finding:
-    amounts = memory(root)
+    amounts, granted = memory(root), memory_quota(root)
     free = amounts.get("MemAvailable", 0)
     swap, used = amounts.get("SwapTotal", 0), amounts.get("SwapTotal", 0) - amounts.get("SwapFree", 0)
     swapped = f"{used / 1e9:.1f} of {swap / 1e9:.1f} GB swap used" if swap else "no swap"
     found = f"{free / 1e9:.1f} GB free, {swapped}"
+    if granted is not None:
+        found += f"; {granted / 1e9:.1f} GB more granted"
+        if granted < min(free, ENOUGH_MEMORY):  # the kernel ends what takes more
+            fix = "give the container or unit 2 GB more (MemoryMax=, --memory), or end what shares it"
+            return Finding("warning", found, fix)
     if free < ENOUGH_MEMORY or used > free:  # it would not all fit, were it needed again
         fix = "close other programs" + ": what is swapped out misses frames" * bool(swap)
         return Finding("warning", found, fix)
@@ -335,22 +351,42 @@ def core_quota(root: Path = ROOT) -> float | None:
     Versions 2 and 1 (https://docs.kernel.org/admin-guide/cgroup-v2.html).
     """
     granted = []
+    for group in _control_groups("cpu", root):
+        one = [_read(group / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
+        said = _read(group / "cpu.max").split() or one
+        with suppress(ValueError, ZeroDivisionError):  # "max", -1 and nothing: no limit
+            if float(said[0]) > 0:
+                granted.append(float(said[0]) / float(said[1]))
+    return min(granted, default=None)
+
+
+def memory_quota(root: Path = ROOT) -> int | None:
+    """The memory that control groups still grant, as `core_quota`, bytes. Files that are kept in it in case
+    that they are read again give way."""
+    granted = []
+    for group in _control_groups("memory", root):
+        stat = dict(line.split() for line in _read(group / "memory.stat").splitlines())
+        kept = int(stat.get("total_inactive_file", stat.get("inactive_file", 0)))
+        for limit, used in (("max", "current"), ("high", "current"), ("limit_in_bytes", "usage_in_bytes")):
+            with suppress(ValueError):  # "max" and nothing: no limit
+                most = int(_read(group / f"memory.{limit}"))
+                if most < UNLIMITED:
+                    granted.append(max(0, most - int(_read(group / f"memory.{used}")) + kept))
+    return min(granted, default=None)
+
+
+def _control_groups(controller: str, root: Path) -> Iterator[Path]:
+    """The folders of this process's control group and of those above it."""
     for line in _read(root / "proc/self/cgroup").splitlines():
         _, controllers, path = line.split(":", 2)
-        mount = root / "sys/fs/cgroup" / ("cpu" if controllers else "")
-        if controllers and "cpu" not in controllers.split(","):
+        if controllers and controller not in controllers.split(","):
             continue
+        mount = root / "sys/fs/cgroup" / (controller if controllers else "")
         # A container may see its own group as the root, whatever it is called outside.
         for group in (mount / path.lstrip("/"), *(mount / path.lstrip("/")).parents):
-            said = _read(group / "cpu.max").split()
-            if controllers:
-                said = [_read(group / "cpu.cfs_quota_us").strip(), _read(group / "cpu.cfs_period_us").strip()]
-            with suppress(ValueError, ZeroDivisionError):  # "max", -1 and nothing: no limit
-                if float(said[0] if said else "") > 0:
-                    granted.append(float(said[0]) / float(said[1]))
+            yield group
             if group == mount:
                 break
-    return min(granted, default=None)
 
 
 def governors(root: Path = ROOT) -> set[str]:

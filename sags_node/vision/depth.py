@@ -112,23 +112,29 @@ class DepthChoice:
         was_sound, self._was_sound = self._was_sound, True
         if no_stereo and frame.depth is None and pair.right is not None:
             return Measured.nothing(tissue.shape, no_stereo)
-        before, skipped = self.stereo.rows.newest, {}
-        measure = cache(partial(self._without_network, frame, pair, tissue))
-        found = None
-        if self._network is not None:
-            can = frame.depth is not None or pair.right is not None
-            found = self._network(pair, tissue, lambda: measure()[0] if can else None)
-            if self._network.problem:
-                skipped["network"] = self._network.problem
-        depth, confidence = found or measure()
+        measure = cache(partial(self._judged, frame, pair, tissue))
+        network, found, skipped = self._network, None, {}
+        can = frame.depth is not None or pair.right is not None
+        # It is not laid onto matches that are no depth: it waits until they are.
+        if network is not None and not (can and network.measures and measure().skipped):
+            found = network(pair, tissue, lambda: measure().depth if can else None)
+            if network.problem:
+                skipped["network"] = network.problem
+        known = Measured(*found) if found else measure()
+        found_out = was_sound and not self._was_sound
+        return known._replace(skipped={**known.skipped, **skipped}, found_out=found_out)
+
+    def _judged(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> Measured:
+        """What is known without the network; nothing where the eyes were matched and that is no depth."""
+        before = self.stereo.rows.newest
+        depth, confidence = self._without_network(frame, pair, tissue)
         rows = self.stereo.rows.newest
         if rows is not None and rows is not before:  # the eyes were matched
-            unsound = self._unsound(pair.t_capture_ns, rows, measure()[0], tissue)
-            if unsound:
-                depth, confidence = np.zeros((2, *tissue.shape), np.float32)
-                skipped["depth"] = unsound
+            unsound = self._unsound(pair.t_capture_ns, rows, depth, tissue)
             self._was_sound = not unsound
-        return Measured(depth, confidence, skipped, found_out=was_sound and not self._was_sound)
+            if unsound:
+                return Measured.nothing(tissue.shape, unsound)
+        return Measured(depth, confidence)
 
     def _unsound(self, stamp_ns: int, rows: RowErrors, depth: F32, tissue: Bool) -> str:
         """Why the depth that was matched is none; empty: it is."""

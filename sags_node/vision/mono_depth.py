@@ -62,6 +62,11 @@ class MonoDepth:
         self._before: F32 | None = None  # [H, W] m, depth of the frame before, 0 unknown
         self._frames_to_measure = 0
 
+    @property
+    def measures(self) -> bool:
+        """The next frame is laid onto what is measured."""
+        return self._frames_to_measure == 0
+
     def __call__(self, relative: F32, tissue: Bool, measure: Measure) -> tuple[F32, F32]:
         """Depth [H, W] (m, 0 unknown) and confidence [H, W] (one number where known).
 
@@ -85,7 +90,7 @@ class MonoDepth:
         return self._before * known, known * np.float32(confidence)
 
     def _align(self, relative: F32, tissue: Bool, measure: Measure) -> ScaleShift:
-        measured = measure() if self._frames_to_measure == 0 else None
+        measured = measure() if self.measures else None
         if measured is not None:
             found = fit_scale_shift(relative, measured, tissue)
             if found is None:

@@ -183,6 +183,11 @@ class NetworkDepth:
         self._failures = 0  # in a row
         self.problem = ""
 
+    @property
+    def measures(self) -> bool:
+        """The next frame is laid onto what `measure` gives, if that is anything."""
+        return not self._network.is_stereo and self._mono.measures and self._failures < MOST_FAILURES
+
     def __call__(self, pair: RectifiedPair, tissue: Bool, measure: Measure) -> tuple[F32, F32] | None:
         """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1); None: `problem` says why.
 

@@ -66,15 +66,13 @@ class TissueMask:
                 mask.
 
         Raises:
-            UsageError: the masks that were given say of the first frames that most of them is instrument.
+            UsageError: the masks of a recording say of its first frames that most of them is instrument.
         """
         if self._config.method == "none":
             return self.usable
         tissue = self._given(frame, pair)
         if tissue is None:
             tissue = ~self._find_instruments(pair.left, expected, pair.t_capture_ns)
-        elif self._topic is None or self._topic.is_new:
-            self._check_polarity(tissue)
         self._found = tissue
         # The picture's border counts as tissue here: only instruments grow.
         eroded: U8 = cv2.erode(tissue.view(np.uint8), self._neighbourhood)
@@ -94,6 +92,7 @@ class TissueMask:
         if self._segment is not None:
             try:
                 tissue = self._segment(pair)
+                self._check_polarity(tissue, is_live=frame.t_arrival_ns > 0)
             except (DepthNetworkError, NoMaskError) as error:
                 if not self.problem:
                     log.warning("%s; instruments are found without it", error)
@@ -102,23 +101,31 @@ class TissueMask:
             self.problem = ""
             return tissue
         if self._config.method == "session" and frame.tissue is not None:
-            return self._rectifier.mask(frame.tissue)
+            tissue = self._rectifier.mask(frame.tissue)
+            self._check_polarity(tissue, is_live=False)
+            return tissue
         return None
 
-    def _check_polarity(self, tissue: Bool) -> None:
-        """A mask upside down would have the model learn the instruments alone."""
+    def _check_polarity(self, tissue: Bool, is_live: bool) -> None:
+        """A mask upside down would have the model learn the instruments alone. Live it may also be right: the
+        scope is still outside. Then none is taken until one calls less instrument."""
         if self._frames_checked == FIRST_FRAMES:
             return
         share = float(np.mean(~tissue[self.usable]))
         if share <= LARGEST_INSTRUMENTS:
             self._frames_checked = FIRST_FRAMES
             return
-        self._frames_checked += 1
+        said = self._config.tissue_is
+        opposite = {"white": "black", "black": "white"}.get(str(said), "other class numbers")
+        hint = f"set vision.tissue.tissue_is to {opposite}, it is {said}"
+        whose = {"onnx": "network's", "topic": "topic's"}.get(self._config.method, "session's")
+        if is_live:
+            raise NoMaskError(
+                f"so far the {whose} masks call over half of each picture instrument: the scope is outside, "
+                f"or they are upside down: {hint}"
+            )
+        self._frames_checked += self._topic is None or self._topic.is_new
         if self._frames_checked == FIRST_FRAMES:
-            said = self._config.tissue_is
-            opposite = {"white": "black", "black": "white"}.get(str(said), "other class numbers")
-            hint = f"set vision.tissue.tissue_is to {opposite}, it is {said}"
-            whose = {"onnx": "network's", "topic": "topic's"}.get(self._config.method, "session's")
             if self._segment is None:
                 hint = "white must be instrument in its files; source.instruments turns EndoNeRF's round"
             raise UsageError(

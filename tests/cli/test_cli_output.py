@@ -19,6 +19,7 @@ from unittest.mock import Mock
 import click
 import pytest
 from command_line import pure_json, refused, sags
+from onnx_networks import save_matcher
 from places import ROOT
 from rich.markup import escape
 from user_files import videos
@@ -282,6 +283,29 @@ def test_doctor_looks_at_all_that_a_launch_file_names(user_files: Path, what: st
     code, checks = doctor(user_files, *launch)
     assert code == 1 and checks[row]["level"] == "error"
     assert said in checks[row]["found"]
+
+
+TOPIC = ("vision.tissue.method:=topic", "vision.tissue.tissue_is:=white")
+
+
+@pytest.mark.parametrize(
+    ("launch", "row", "said"),
+    [
+        (("vision.onnx.path:=NETWORK",), "pipeline", "network.onnx .* is not described"),
+        (("vision.tissue.exclude:=[[0,0,9000,5]]",), "pipeline", "is not inside the raw picture of 320x256"),
+        ((*TOPIC, "vision.tissue.endpoint:=tcp://10.0.0.1:5600"), "tissue masks", "is not on this machine"),
+        ((*TOPIC, "vision.tissue.endpoint:=tcp://127.0.0.1:5600"), "pipeline", ""),
+    ],
+)
+def test_doctor_makes_the_pipeline_of_a_live_source(
+    launch: tuple[str, ...], row: str, said: str, user_files: Path, tmp_path: Path
+) -> None:
+    """What `sags run` refuses only when it makes it is said before the camera is there."""
+    network = save_matcher(tmp_path / "network.onnx")
+    words = [word.replace("NETWORK", str(network)) for word in launch]
+    code, checks = doctor(user_files, "source.kind:=push", "rig:=FILES/calib", *words)
+    assert (code, checks[row]["level"]) == ((1, "error") if said else (0, "ok"))
+    assert re.search(said, f"{checks[row]['found']}; {checks[row]['fix']}")
 
 
 def test_doctor_asks_for_the_packages_that_a_launch_file_needs(

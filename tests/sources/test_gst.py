@@ -34,6 +34,7 @@ from sags_node.sources.gst_process import GstProcess, in_words
 from sags_node.tools.calibration.eyes import look
 from sags_node.tools.doctor import examine
 from sags_node.types import StereoFrame
+from sags_node.wall_clock import WallClock
 
 pytestmark = pytest.mark.live
 
@@ -212,7 +213,7 @@ class Unstamped:
 
 
 def test_pictures_without_stamps_are_refused() -> None:
-    sink = gst_child.Sink(Unstamped(), 1, gst_child.WallClock(), "left", 0, None)
+    sink = gst_child.Sink(Unstamped(), 1, WallClock(), "left", 0, None)
     with pytest.raises(gst_library.GstError, match="pictures of left carry no time stamp") as raised:
         sink.show_first()
     assert "add do-timestamp=true" in in_words(str(raised.value), raised.value.debug)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -38,10 +38,12 @@ PHASE = 24  # times that a clock is told before the player is paused, and goes o
 
 
 @contextmanager
-def playing(path: Path, run_dir: Path, paused: bool = True, **options: Any) -> Iterator[Player]:
+def playing(
+    path: Path, run_dir: Path, paused: bool = True, wall_ns: Callable[[], int] = time.time_ns, **options: Any
+) -> Iterator[Player]:
     """A player on a thread, paused so that subscribers can come."""
     config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir)
-    player = Player(path, PlayOptions(**options), config, "sags", paused)
+    player = Player(path, PlayOptions(**options), config, "sags", paused, wall_ns)
     outcome: list[Any] = []
     with beside(lambda: outcome.append(player.play()), player.stop):
         until((run_dir / "sags.json").exists)
@@ -209,6 +211,29 @@ def test_a_clock_tells_the_moment_of_the_recording(plane_bag: Path, tmp_path: Pa
         around = [k for k in (after - 1, after) if 0 <= k < len(walls)]  # a pause may lie before or after it
         moments = [told[k] + (stamp - walls[k]) * rate for k in around]
         assert min(abs(m - original) for m in moments for original in recorded.values()) < 2e6
+
+
+@pytest.mark.fault("clock: set while a bag is played")
+def test_a_played_bag_is_stamped_by_the_wall_clock_of_now(plane_bag: Path, tmp_path: Path) -> None:
+    """Set forward by a minute, and back: then messages are of another epoch."""
+    said: list[tuple[int, int]] = []
+    minutes, run_dir = 0, tmp_path / "run"
+
+    def wall_ns() -> int:
+        return time.time_ns() + minutes * 60 * 10**9
+
+    with playing(plane_bag, run_dir, topics=("left/depth",), rate=0.1, wall_ns=wall_ns) as player:
+        player.toggle_pause()
+        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["left/depth"], 60.0):
+            if arrived is not None:
+                said.append((arrived[0].meta.stamp_ns, arrived[0].meta.epoch))
+                minutes = int(3 <= len(said) < 6)
+            if len(said) == 9:
+                break
+    stamps, epochs = np.diff(said, axis=0).T
+    steps = np.round(stamps / 60e9)
+    assert steps[steps != 0].tolist() == [1, -1]
+    assert np.array_equal(epochs, steps < 0)
 
 
 def test_without_being_asked_there_is_no_clock(plane_bag: Path, tmp_path: Path) -> None:

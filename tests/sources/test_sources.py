@@ -30,6 +30,7 @@ class Clock:
 
     def __init__(self) -> None:
         self.now = 100.0
+        self.set_by = 7000  # s
 
     def __call__(self) -> float:
         return self.now
@@ -39,7 +40,7 @@ class Clock:
         self.now += seconds
 
     def wall_ns(self) -> int:
-        return round(self.now * 1e9) + 7_000_000_000_000
+        return round(self.now * 1e9) + self.set_by * 10**9
 
 
 def replay(config: Recording, clock: Clock) -> Replay:
@@ -102,6 +103,24 @@ def test_realtime_waits_and_stamps_the_due_moment(folders: cfg.FoldersSource) ->
             assert frame.t_capture_ns == 7_100_000_000_000 + 50_000_000 * frame.frame_id
     assert np.allclose(released, 100 + 0.05 * np.arange(12))
     assert source.dropped == 0
+
+
+@pytest.mark.fault("clock: set, or the machine slept, while a recording is played")
+@pytest.mark.parametrize("jump", [60, -60])
+def test_realtime_stamps_by_the_wall_clock_of_now(jump: int, folders: cfg.FoldersSource) -> None:
+    clock = Clock()
+    seen = []
+    with replay(folders.model_copy(update={"pace": "realtime", "loop": True, "frames": 30}), clock) as source:
+        for frame in source:
+            seen.append(frame)
+            assert frame.t_capture_ns == clock.wall_ns()
+            clock.set_by += jump * (frame.frame_id == 4)
+            clock.now += 0.01
+    steps = np.diff([frame.t_capture_ns for frame in seen])
+    assert np.flatnonzero(steps != 50_000_000).tolist() == [4] and steps[4] == jump * 10**9 + 50_000_000
+    loops = [frame.frame_id // 12 for frame in seen]
+    back = [int(jump < 0 and frame.frame_id > 4) for frame in seen]
+    assert [frame.epoch for frame in seen] == [sum(both) for both in zip(loops, back, strict=True)]
 
 
 def test_realtime_leaves_out_what_comes_too_late(folders: cfg.FoldersSource) -> None:

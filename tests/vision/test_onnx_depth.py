@@ -416,6 +416,33 @@ def test_one_eye_beside_stereo_is_aligned_to_it(
     assert min(share for _, share in figures) > 0.8, figures
 
 
+def knocked(frame: StereoFrame, aside: int) -> StereoFrame:
+    """The right eye turned: its picture stands 3 px lower."""
+    assert frame.right is not None
+    height, width = frame.right.shape[:2]
+    shift = np.array([[1, 0, aside], [0, 1, 3]], np.float32) * (1, 1, height / HEIGHT)
+    moved = cv2.warpAffine(frame.right, shift, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    return replace(frame, right=np.asarray(moved, np.uint8))
+
+
+@pytest.mark.fault("network: a monocular one beside eyes whose matches are no depth")
+@pytest.mark.parametrize("aside", [0, -4])
+def test_a_monocular_network_is_not_laid_onto_matches_that_are_no_depth(
+    aside: int, knowing: Path, phantom_session: Path, frames: list[StereoFrame]
+) -> None:
+    """Nor is that a failure of the network: it goes on with the first match that is sound."""
+    pipeline = pipeline_with(phantom_session, knowing)
+    shown = [knocked(frame, aside) if 15 <= frame.frame_id < 23 else frame for frame in frames]
+    results = play(pipeline, shown)
+    for place, (result, frame) in enumerate(zip(results, frames, strict=True)):
+        if 15 <= place < 23:
+            assert not result.observation.depth.any()
+            assert "so there is no depth" in result.skipped["depth"]
+            assert "network" not in result.skipped
+        else:
+            assert not result.skipped and depth_error(result, frame)[0] < 0.02
+
+
 def test_one_camera_alone_keeps_the_declared_scale(
     knowing: Path, phantom_session: Path, frames: list[StereoFrame]
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -295,6 +296,29 @@ def test_a_topic_upside_down_is_refused_with_a_hint() -> None:
         UsageError, match=r"topic's masks.*set vision\.tissue\.tissue_is to black, it is white"
     ):
         find_tissue(frame, rectifier(frame))
+
+
+@pytest.mark.fault("masks: a live node begins outside the patient, or reads them the wrong way round")
+@pytest.mark.parametrize("method", ["topic", "onnx"])
+def test_masks_of_a_live_node_are_not_taken_before_an_ordinary_one(method: str, tmp_path: Path) -> None:
+    sender = Sender()
+    path = save_segmenter(tmp_path / "net.onnx", "logit") if method == "onnx" else None
+    find_tissue, rectifier = topic_mask(sender, method=method, path=path)
+    values, truth = shaft_mask()
+    inside, _ = instrument_frame()
+    outside = make_frame(np.full_like(inside.left, 90))  # all grey: no tissue
+    for number in range(2 * FIRST_FRAMES):
+        stamp = (number + 1) * FRAME_NS
+        is_inside = number in (FIRST_FRAMES + 1, FIRST_FRAMES + 3)
+        sender.sent = {stamp: values if is_inside else np.zeros_like(values)}
+        shown = inside if is_inside else outside
+        frame = replace(shown, t_capture_ns=stamp, t_arrival_ns=stamp + 1)
+        mask = find_tissue(frame, rectifier(frame))
+        if number <= FIRST_FRAMES:
+            assert "scope is outside" in find_tissue.problem and "tissue_is to black" in find_tissue.problem
+        else:
+            assert find_tissue.problem == ""
+            assert iou(mask, truth) > 0.97 if is_inside else not mask.any()
 
 
 def test_a_topic_needs_an_address_a_polarity_and_a_node() -> None:

@@ -6,6 +6,7 @@ import threading
 import time
 import uuid
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from sags_node.errors import SagsError
 from sags_node.files import check_name
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.publisher import Publisher
+from sags_node.wall_clock import WallClock
 
 POLL_SECONDS = 0.02  # how soon pause and stop are noticed
 STAMPS_KEPT = 64
@@ -51,15 +53,13 @@ class PlayClock:
     `at` is a time of `time.monotonic`, s.
     """
 
-    def __init__(self, first_ns: int, rate: float) -> None:
-        self._first_ns = first_ns
-        self._rate = rate
-        self._started, self._started_ns = time.monotonic(), time.time_ns()
+    def __init__(self, first_ns: int, rate: float, wall_ns: Callable[[], int]) -> None:
+        self._first_ns, self._rate, self._wall_ns = first_ns, rate, wall_ns
+        self._started, self._wall = time.monotonic(), WallClock()
 
     def pause(self, seconds: float) -> None:
         """The last `seconds` did not count."""
         self._started += seconds
-        self._started_ns += round(seconds * 1e9)
 
     def until(self, recorded_ns: int, at: float) -> float:
         """Seconds from `at` until a moment of the recording is due; negative when it was."""
@@ -67,7 +67,8 @@ class PlayClock:
 
     def wall_ns(self, recorded_ns: int) -> int:
         """When, on the wall clock, a moment of the recording is due."""
-        return self._started_ns + round((recorded_ns - self._first_ns) / self._rate)
+        began_ns = self._wall.at(self._started, wall_ns=self._wall_ns)
+        return began_ns + round((recorded_ns - self._first_ns) / self._rate)
 
     def moment_ns(self, at: float) -> int:
         """The moment of the recording that is due at `at`."""
@@ -78,9 +79,10 @@ class Player:
     """Call `play` once. `stop` and `toggle_pause` may be called from any thread or signal handler."""
 
     def __init__(
-        self, path: Path, options: PlayOptions, config: PublishConfig, ns: str = "sags", paused: bool = False
-    ) -> None:
-        self._path = path
+        self, path: Path, options: PlayOptions, config: PublishConfig, ns: str = "sags", paused: bool = False,
+        wall_ns: Callable[[], int] = time.time_ns,
+    ) -> None:  # fmt: skip
+        self._path, self._wall_ns = path, wall_ns
         self._options = options
         self._config = config
         self._ns = self._recorded_ns = ns
@@ -88,6 +90,7 @@ class Player:
         self._paused = paused
         self._sent = 0
         self._clock_due = 0.0
+        self._epoch = 0  # grows with each pass, and where the wall clock is set back
         self._frames: OrderedDict[int, int] = OrderedDict()  # original stamp -> number of the frame
         self._frame_count = 0
 
@@ -120,36 +123,38 @@ class Player:
         with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
             self._delay(publisher)
             while not self._stopping.is_set():
-                self._play_once(publisher, epoch=passes)
-                passes += 1
+                self._play_once(publisher)
+                passes, self._epoch = passes + 1, self._epoch + 1
                 if not self._sent and not self._stopping.is_set():
                     raise SagsError(f"{self._path} holds no message that was asked for; see sags bag info")
                 if not self._options.loop:
                     break
         return {"messages": self._sent, "passes": passes, "seconds": round(time.monotonic() - began, 3)}
 
-    def _play_once(self, publisher: Publisher, epoch: int) -> None:
+    def _play_once(self, publisher: Publisher) -> None:
         options = self._options
-        first_ns = 0
-        clock = PlayClock(0, options.rate)
+        first_ns = began_ns = 0
+        clock = PlayClock(0, options.rate, self._wall_ns)
         for message in read_messages(self._path):
             if not first_ns:
                 first_ns = message.log_ns + round(options.start_offset * 1e9)
-                clock = PlayClock(first_ns, options.rate)
+                clock = PlayClock(first_ns, options.rate, self._wall_ns)
             after = (message.log_ns - first_ns) * 1e-9
             if after < 0 or not self._is_wanted(message):
                 continue
             if options.playback_duration is not None and after > options.playback_duration:
                 return
-            self._wait_for(message.log_ns, clock, publisher, epoch)
+            self._wait_for(message.log_ns, clock, publisher)
             if self._stopping.is_set():
                 return
+            before_ns, began_ns = began_ns, clock.wall_ns(first_ns)
+            self._epoch += began_ns < before_ns
             original = original_stamp(message)
             stamp_ns = clock.wall_ns(original)
             name, content = outgoing(message, stamp_ns)
             number = self._frame_number(original) if content.type in FRAME_TYPES else -1
             name, content = self._plain(name), replace(content, relative=message.relative)
-            publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, epoch)
+            publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, self._epoch)
             self._sent += 1
 
     def _delay(self, publisher: Publisher) -> None:
@@ -161,7 +166,7 @@ class Player:
                 return
             publisher.poll(int(min(POLL_SECONDS, left) * 1e3))
 
-    def _wait_for(self, recorded_ns: int, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+    def _wait_for(self, recorded_ns: int, clock: PlayClock, publisher: Publisher) -> None:
         """Serve subscriptions until a moment of the recording is due, and playing is not paused."""
         before = time.monotonic()
         while not self._stopping.is_set():
@@ -169,7 +174,7 @@ class Player:
             if self._paused:
                 clock.pause(now - before)
             before = now
-            self._tell_time(now, clock, publisher, epoch)
+            self._tell_time(now, clock, publisher)
             left = clock.until(recorded_ns, now)
             if left <= 0 and not self._paused:
                 return
@@ -178,7 +183,7 @@ class Player:
                 wait = min(wait, self._clock_due - now)
             publisher.poll(int(max(wait, 0.0) * 1e3))
 
-    def _tell_time(self, now: float, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+    def _tell_time(self, now: float, clock: PlayClock, publisher: Publisher) -> None:
         """Publish the clock when that is due, also while playing is paused."""
         hz = self._options.clock_hz
         if hz is None or now < self._clock_due:
@@ -187,7 +192,8 @@ class Player:
         if self._clock_due < now:  # the first time, or this machine is too busy for so many
             self._clock_due = now + 1 / hz
         moment_ns = clock.moment_ns(now)
-        publisher.publish_content(CLOCK_TOPIC, cdr.clock(moment_ns), -1, clock.wall_ns(moment_ns), epoch)
+        stamp_ns = clock.wall_ns(moment_ns)
+        publisher.publish_content(CLOCK_TOPIC, cdr.clock(moment_ns), -1, stamp_ns, self._epoch)
 
     def _is_wanted(self, message: BagMessage) -> bool:
         name = self._plain(message.topic.removesuffix(COMPRESSED_SUFFIX))

@@ -202,7 +202,7 @@ def _fits(config: LaunchConfig) -> list[Finding]:
     """Nothing, where a node can be made, and a frame and the robot's poses are of the calibration."""
     rig = rig_to_play(config, guess=guess_rig)
     with open_posed(config, rig, references=False) as opened:
-        pipeline = Pipeline(config, rig, rate=opened.rate)
+        pipeline = Pipeline(config, rig, lambda stamp_ns: None, rate=opened.rate)
         for frame in islice(opened, 1):
             pipeline.rectifier(frame)
     return []
