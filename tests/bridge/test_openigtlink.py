@@ -236,6 +236,10 @@ class Node:
         self.pinned: list[dict[str, Any]] = []
         self.removed: list[int] = []
 
+    @property
+    def handlers(self) -> dict[str, Any]:
+        return {"add_anchor": self.add, "remove_anchor": self.remove}
+
     def add(self, args: dict[str, Any]) -> dict[str, Any]:
         self.pinned.append(args)
         return {"id": len(self.pinned), "frame_id": 7, "depth_confidence": 0.9}
@@ -247,7 +251,7 @@ class Node:
 def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path) -> None:
     node = Node()
     with (
-        sockets(tmp_path, {"add_anchor": node.add, "remove_anchor": node.remove}) as running,
+        sockets(tmp_path, node.handlers) as running,
         stream(running),
     ):
         with bridged(run_openigtlink, options(tmp_path)) as port:
@@ -265,6 +269,48 @@ def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path
             with Peer(program, port, "say", "SagsRequest", "dance"):
                 pass
     assert node.pinned[2] == {"u": 320.0, "v": 256.5}
+
+
+def points(*places: tuple[float, float, float]) -> bytes:
+    names = [f"F-{number}" for number, _ in enumerate(places)]
+    return PointMessage(np.array(places, float), names, device_name="SagsPin").pack()
+
+
+@pytest.mark.fault("node: restarted, then a point of Slicer's list is deleted")
+@pytest.mark.parametrize("connected", [True, False], ids=["connected", "away meanwhile"])
+def test_anchors_of_a_node_that_was_restarted_are_left_to_whoever_has_their_numbers(
+    tmp_path: Path, program: Path, connected: bool
+) -> None:
+    before, after = Node(), Node()
+    with bridged(run_openigtlink, options(tmp_path)) as port, Peer(program, port) as told:
+
+        def slicer() -> socket.socket:
+            return socket.create_connection(("127.0.0.1", port), timeout=60)
+
+        def said(words: str) -> bool:
+            return any(each[1] == "SagsAnswer" and words in " ".join(each) for each in told.came)
+
+        with sockets(tmp_path, before.handlers) as running, stream(running, anchored_at):
+            peer = slicer()
+            peer.sendall(points((0, 0, 80), (20, 0, 80)))
+            until(lambda: len(before.pinned) == 2 and said("'id': 2"))
+            if not connected:
+                peer.close()
+                told.close()
+        with sockets(tmp_path, after.handlers) as running, stream(running, anchored_at):
+            if connected:
+                until(lambda: said("started anew"))
+            else:
+                until(lambda: running.wanted("status"))
+                time.sleep(1.0)  # without a peer nothing tells when the bridge has seen it
+                peer = slicer()
+            peer.sendall(points((0, 0, 80)))  # the other one is deleted
+            peer.sendall(points((0, 0, 70)))  # and this one moved
+            until(lambda: len(after.pinned) == 1)
+            peer.sendall(points((0, 0, 60)))  # that anchor is this node's, and is given back
+            until(lambda: after.removed)
+            peer.close()
+    assert after.removed == [1] and not before.removed
 
 
 @pytest.mark.parametrize(

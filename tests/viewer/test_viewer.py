@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from browsers import new_page
@@ -223,6 +224,25 @@ def test_the_distance_of_two_anchors_is_a_guess_unless_both_are_sure() -> None:
     assert distance(row(0, 0), row(0.003, 0.004), "mm") == "Distance: 5.0 mm"
     assert "5.0 mm, a guess" in distance(row(0, 0), row(0.003, 0.004, 0.4), "mm")
     assert "lost" in distance(row(0, 0), row(np.nan, np.nan), "mm")
+
+
+@needs_viser
+def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
+    from sags_node.clients.viewer.panel import Panel
+    from sags_node.clients.viewer.scene import Scene
+    from sags_node.clients.viewer.server import serving
+
+    def seen(session: str) -> Moment:
+        return replace(moment(), status=msgspec.structs.replace(moment().status, session=session))
+
+    with serving("127.0.0.1", 0, False) as (server, _):
+        panel = Panel(server, Scene(server), None, None, "sags", 20.0)
+        panel.show(seen("first"))
+        panel.choose(1)
+        panel.show(Moment("stale", Status(session="first")))
+        assert panel.chosen == 1, "nothing fresh came: it stays"
+        panel.show(Moment("the node is starting", Status(session="second")))
+        assert panel.chosen is None, "number 1 is another anchor now"
 
 
 # ---- the command -----------------------------------------------------------------------------------------

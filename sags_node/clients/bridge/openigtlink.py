@@ -141,7 +141,7 @@ class OpenIgtLink(Outlet):
         self._shapes: dict[str, tuple[U8, F64]] = {}
         self._pins = Pins()
         self._answers: deque[Callable[[], list[Release]]] = deque()  # for the peers' thread
-        self._now_ns = options.node.now_ns
+        self._ns, self._now_ns = options.node.ns, options.node.now_ns
         listener = options.listen(MOST_PEERS)
         self.port = int(listener.getsockname()[1])
         self._requests = Requests(options.node)
@@ -180,6 +180,10 @@ class OpenIgtLink(Outlet):
             )
         elif output.name == "Anchors":
             self._peers.send(device, igtl.points(device, seconds, np.empty((0, 3)), [], []))
+
+    def started_anew(self, ns: str) -> None:
+        if ns == self._ns:
+            self._answers.append(self._forget)
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
         words = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
@@ -230,7 +234,7 @@ class OpenIgtLink(Outlet):
                 self._requests.ask(*request, lambda _, words: self._say(words))
 
     def _idle(self) -> None:
-        """Pin what has come to rest, and take in what was answered."""
+        """Pin what has come to rest, and take in what was answered, or told by the relay."""
         for pin in self._pins.due(time.monotonic()):
             place = (RAS[:3, :3] @ pin.place) * 1e-3
             args = dict(zip("xyz", place.tolist(), strict=True))
@@ -243,6 +247,11 @@ class OpenIgtLink(Outlet):
         self._say(f"{pin.name}: {words}")
         if result is not None:
             self._answers.append(partial(self._pins.pinned, pin, int(result["id"])))
+
+    def _forget(self) -> list[Release]:
+        if self._pins.forget():
+            self._say("the node was started anew: its anchors are gone; move a point to pin it again")
+        return []
 
     def _release(self, released: Sequence[Release]) -> None:
         for release in released:

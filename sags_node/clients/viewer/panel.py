@@ -31,6 +31,7 @@ PLOT_HEIGHT = 80  # px
 NOTICE_TIME = 6.0  # s
 JPEG_QUALITY = 80
 NONE = "-"  # no anchor chosen
+OLD = "what you see is old: Go on first"
 BRIGHT, BLUE, ORANGE = "#c9d1d9", "#4dabf7", "#ffa94d"
 
 
@@ -70,7 +71,7 @@ class Panel:
     ) -> None:
         self._gui, self._scene, self._asker, self._exporter = server.gui, scene, asker, exporter
         self._sheet, self._history = Sheet(), History()
-        self._moment, self._unit = Moment("connecting"), "mm"
+        self._moment, self._unit, self._session = Moment("connecting"), "mm", ""
         self._frozen_since: float | None = None
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"sags view · {ns}")
@@ -100,6 +101,11 @@ class Panel:
         """Tell whether somebody wants to look at one moment."""
         return self._frozen_since is not None
 
+    @property
+    def chosen(self) -> int | None:
+        """The anchor that Remove takes."""
+        return None if self._chosen.value == NONE else int(self._chosen.value)
+
     def fit(self, client: viser.ClientHandle) -> None:
         """Leave half of a narrow browser to the scene."""
         client.gui.main_panel.set_width(min(WIDTH, client.camera.image_width // 2))
@@ -114,6 +120,9 @@ class Panel:
             for plot, figures in self._plots:
                 plot.data = self._history.series(*figures)
         self._overlay.content = _overlay_table(moment.overlay)
+        if moment.status.session not in ("", self._session):  # another node: that number is another anchor's
+            self._session = moment.status.session
+            self._chosen.value = self._other.value = NONE  # type: ignore[misc]  # viser's setter, which mypy misses
         self._list_anchors(moment.anchors)
 
     def stay(self) -> None:
@@ -268,10 +277,11 @@ class Panel:
             tell(client, title, name, "green")
 
     def _remove(self, client: viser.ClientHandle) -> None:
-        if self._chosen.value == NONE:
-            tell(client, "Remove", "choose an anchor first", "orange")
+        anchor = self.chosen
+        if anchor is None or self.frozen:
+            why = "choose an anchor first" if anchor is None else OLD
+            tell(client, "Remove", why, "orange")
             return
-        anchor = int(self._chosen.value)
         self._asker.ask(client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
@@ -279,14 +289,14 @@ class Panel:
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         hit = self._scene.anchor_at(origin, direction)
         if hit is not None:
-            self._choose(hit)
+            self.choose(hit)
         elif self._pinning.value:
             self._pin(event.client, origin * UNIT, direction)
 
     def _pin(self, client: viser.ClientHandle | None, origin: F64, direction: F64) -> None:
         splats = self._scene.splats
         if splats is None or self.frozen:
-            why = "what you see is old: Go on first" if self.frozen else "there is nothing to pin to now"
+            why = OLD if self.frozen else "there is nothing to pin to now"
             tell(client, "Pin", why, "orange")
             return
         point = splats.hit(origin, direction)
@@ -296,10 +306,10 @@ class Panel:
         place = {axis: float(x) for axis, x in zip("xyz", point, strict=True)}
         answer = self._asker.ask(client, "Pin", "add_anchor", place)
         if answer is not None:
-            self._choose(int(answer["id"]))
+            self.choose(int(answer["id"]))
 
-    def _choose(self, anchor: int) -> None:
-        """The one chosen before is what the distance is measured to."""
+    def choose(self, anchor: int) -> None:
+        """Choose it for Remove. The one chosen before is what the distance is measured to."""
         before = self._chosen.value
         for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
             if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
