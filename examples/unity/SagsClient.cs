@@ -61,6 +61,7 @@ public sealed class SagsClient : IDisposable {
     readonly Stopwatch watch = Stopwatch.StartNew(); // nobody sets it
     double Now { get { return watch.Elapsed.TotalMilliseconds; } }
     double asked = double.NegativeInfinity, answered = double.NegativeInfinity;
+    bool waiting; // for an answer: `asked` is of that one
     volatile string problem = "not connected";
 
     public SagsClient(string url, double maxAge, params string[] topics) {
@@ -88,10 +89,12 @@ public sealed class SagsClient : IDisposable {
             try {
                 using (var socket = new ClientWebSocket()) {
                     await socket.ConnectAsync(new Uri(url), stop.Token);
+                    waiting = false;
                     await Say(socket, "{\"subscribe\": [\"" + string.Join("\",\"", topics) + "\"]}");
                     while (true) {
-                        if (Now - asked > ClockEvery) {
+                        if (!waiting && Now - asked > ClockEvery) {
                             asked = Now;
+                            waiting = true;
                             await Say(socket, "{\"id\": 1, \"op\": \"get_clock\"}");
                         }
                         await Receive(socket);
@@ -123,6 +126,7 @@ public sealed class SagsClient : IDisposable {
         int size = binary && length >= 4 ? BitConverter.ToInt32(buffer, 0) : length, from = binary ? 4 : 0;
         if (size < 0 || size > MaxHeader || from + size > length) throw new IOException("that is no gateway");
         var head = (Header)new DataContractJsonSerializer(typeof(Header)).ReadObject(new MemoryStream(buffer, from, size));
+        if (head.id == 1) waiting = false;
         lock (newest) {
             if (binary) Keep(head, from + size, length);
             else if (head.topic != null) { newest.Remove(head.topic); problem = head.stale; }
