@@ -16,7 +16,7 @@ using System.Threading.Tasks;
 namespace Sags {
 
 [DataContract] public sealed class Header { // what any message of the gateway may say
-    [DataMember] public string topic, encoding, session, stale, error;
+    [DataMember] public string topic, encoding, session, stale, error, units; // units: null, or "relative": lengths have none
     [DataMember] public long stamp_ns, epoch, id;
     [DataMember] public int[] shape, parts;
     [DataMember] public bool ok;
@@ -25,7 +25,8 @@ namespace Sags {
 
 [DataContract] public sealed class Clock { [DataMember] public long received_ns, answered_ns; }
 
-public struct Anchor { public uint Id; public float X, Y, Z, U, V, Visibility, Confidence; } // m in the world, px
+public struct Anchor { public uint Id; public float X, Y, Z, U, V, Visibility, Confidence, DepthConfidence; } // m in the world, px
+// Show none as sure whose Confidence is below 0.5, nor its X, Y, Z where DepthConfidence is.
 
 public sealed class Message {
     public Header Head;
@@ -41,7 +42,7 @@ public sealed class Message {
             Func<string, float> of = name => FloatAt(at(name));
             if (float.IsNaN(of("x"))) continue;
             found.Add(new Anchor { Id = BitConverter.ToUInt32(Data, 4 * at("id")), X = of("x"), Y = of("y"), Z = of("z"),
-                U = of("u"), V = of("v"), Visibility = of("visibility"), Confidence = of("confidence") });
+                U = of("u"), V = of("v"), Visibility = of("visibility"), Confidence = of("confidence"), DepthConfidence = of("depth_confidence") });
         }
         return found;
     }

@@ -108,6 +108,17 @@ def test_every_device_says_in_millimetres_what_the_node_says(tmp_path: Path, pro
     assert (np.cross(b - a, c - a)[:, 2] < 0).all(), "every triangle turns its front to the camera"
 
 
+def test_an_anchor_whose_depth_is_a_guess_is_no_sure_place(tmp_path: Path, program: Path) -> None:
+    result = anchored_at(1)
+    guessed = replace(result.anchors, depth_confidence=np.array([0.49, 1, 1, 1], np.float32))
+    result = replace(result, anchors=guessed)
+    with sockets(tmp_path) as running, stream(running, lambda i: at_frame(result, i, time.time_ns())):
+        with bridged(run_openigtlink, options(tmp_path, send=("anchors",))) as port:
+            with Peer(program, port) as joined:
+                seen, _, unsure = np.array(until(lambda: joined.newest("SagsAnchors"))).reshape(-1, 2)[:, 1]
+    assert seen.split(";")[4] == unsure.split(";")[4], "orange, as one that is not recognised"
+
+
 def test_debians_own_example_receives_it_unchanged(tmp_path: Path) -> None:
     if not RECEIVE_CLIENT.exists():
         pytest.skip("no example without the Debian package openigtlink-examples")

@@ -330,12 +330,24 @@ def test_only_its_own_page_may_connect(view: RunningView) -> None:
 
 
 @needs_viser
-def test_an_anchor_that_is_seen_and_not_recognised_has_a_colour_of_its_own() -> None:
+def test_an_anchor_that_is_seen_and_not_sure_in_space_has_a_colour_of_its_own() -> None:
     from sags_node.clients.viewer.scene import HIDDEN, SEEN, UNSURE, anchor_color
 
-    rows = [(1.0, 0.9), (0.2, 0.5), (1.0, 0.49), (0.0, 0.9), (0.0, 0.0)]
-    colors = [anchor_color({"visibility": seen, "confidence": sure}) for seen, sure in rows]
-    assert colors == [SEEN, SEEN, UNSURE, HIDDEN, HIDDEN] and len({SEEN, UNSURE, HIDDEN}) == 3
+    names = ("visibility", "confidence", "depth_confidence")
+    rows = [(1.0, 0.9, 0.9), (0.2, 0.5, 0.5), (1.0, 0.49, 0.9), (1.0, 0.9, 0.49), (0.0, 0.9, 0.9), (0, 0, 0)]
+    colors = [anchor_color(dict(zip(names, row, strict=True))) for row in rows]
+    assert colors == [SEEN, SEEN, UNSURE, UNSURE, HIDDEN, HIDDEN] and len({SEEN, UNSURE, HIDDEN}) == 3
+
+
+@needs_viser
+def test_the_table_of_anchors_says_which_place_is_a_guess() -> None:
+    from sags_node.clients.viewer.panel import anchor_table
+
+    row = {"id": 3, "x": 0.01, "y": 0.02, "z": 0.07, "visibility": 1.0, "confidence": 1.0}
+    assert "10.0 20.0 70.0<" in anchor_table([row | {"depth_confidence": 0.5}], "mm")
+    assert "10.0 20.0 70.0, a guess<" in anchor_table([row | {"depth_confidence": 0.05}], "mm")
+    lost = anchor_table([row | {"x": np.nan, "depth_confidence": 0.0}], "mm")
+    assert "lost<" in lost and "guess" not in lost
 
 
 # ---- in a browser ----------------------------------------------------------------------------------------

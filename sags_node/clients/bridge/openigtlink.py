@@ -32,7 +32,7 @@ from sags_node.clients.bridge.pins import MOST, Pin, Pins, Release
 from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source
 from sags_node.clients.bridge.requests import Requests
 from sags_node.clients.overlay.draw import over
-from sags_node.confidence import SURE, SURE_OF_ANCHOR
+from sags_node.confidence import SURE, is_sure_in_space
 from sags_node.errors import UsageError
 from sags_node.geometry import unproject
 from sags_node.messaging.received import (
@@ -275,15 +275,15 @@ def request_of(text: str) -> tuple[str, dict[str, float]] | None:
 
 
 def _anchors(cloud: ReceivedCloud, device: str, seconds: float) -> bytes | None:
-    """The anchors whose place is known, by number. Orange: not sure of; red: hidden."""
+    """The anchors whose place is known, by number. Orange: not sure there; red: hidden."""
     rows = cloud.points
-    if not {"id", "visibility", "confidence"} <= set(rows.dtype.names or ()):
+    if not {"id", "visibility", "confidence", "depth_confidence"} <= set(rows.dtype.names or ()):
         return None
     places = cloud.xyz().astype(np.float64)
     known = np.isfinite(places).all(axis=1)
     names = [f"anchor {number}" for number in rows["id"][known]]
     colors = [
-        HIDDEN if row["visibility"] < LEAST_SEEN else SEEN if row["confidence"] >= SURE_OF_ANCHOR else UNSURE
+        HIDDEN if row["visibility"] < LEAST_SEEN else SEEN if is_sure_in_space(row) else UNSURE
         for row in rows[known]
     ]
     return igtl.points(device, seconds, _ras(places[known]), names, colors)

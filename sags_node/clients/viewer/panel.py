@@ -19,7 +19,7 @@ from sags_node.clients.viewer.overlay import Overlay
 from sags_node.clients.viewer.pictures import VIEWS, Sheet
 from sags_node.clients.viewer.saving import KINDS, Exporter, exported, screenshot
 from sags_node.clients.viewer.scene import UNIT, Scene
-from sags_node.confidence import SURE, SURE_OF_ANCHOR
+from sags_node.confidence import SURE, is_sure_in_space
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
@@ -318,7 +318,7 @@ class Panel:
 
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
         rows = [] if anchors is None else list(anchors)
-        self._anchor_rows.content = _anchor_table(rows, self._unit)
+        self._anchor_rows.content = anchor_table(rows, self._unit)
         if anchors is None:  # nothing fresh came: what somebody has chosen stays
             self._distance.content = ""
             return
@@ -337,9 +337,7 @@ def distance(first: Any, second: Any, unit: str) -> str:
     apart = float(np.linalg.norm([first[axis] - second[axis] for axis in "xyz"])) / UNIT
     if not np.isfinite(apart):
         return "Distance: one of them is lost"
-    sure = all(
-        row["confidence"] >= SURE_OF_ANCHOR and row["depth_confidence"] >= SURE for row in (first, second)
-    )
+    sure = all(map(is_sure_in_space, (first, second)))
     return f"Distance: {apart:.1f} {unit}" + ("" if sure else ", a guess: one is not sure")
 
 
@@ -398,13 +396,15 @@ def _overlay_table(overlay: Overlay | None) -> str:
     return "".join(map(_line, said))
 
 
-def _anchor_table(rows: list[Any], unit: str) -> str:
-    """Find where each anchor is, and how sure it is."""
+def anchor_table(rows: list[Any], unit: str) -> str:
+    """Say where each anchor is, how sure it is to be on its tissue, and which depth is a guess."""
     if not rows:
         return _line("none yet")
     cells = []
     for row in rows:
         place = " ".join(f"{row[axis] / UNIT:.1f}" for axis in "xyz") if np.isfinite(row["x"]) else "lost"
+        if np.isfinite(row["x"]) and row["depth_confidence"] < SURE:
+            place += ", a guess"
         seen, sure = f"{100 * row['visibility']:.0f} %", f"{100 * row['confidence']:.0f} %"
         values = (int(row["id"]), place, seen, sure)
         cells.append("<tr>" + "".join(f"<td>{value}</td>" for value in values) + "</tr>")
