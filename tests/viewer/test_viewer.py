@@ -32,6 +32,7 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT,
 from sags_node.clients.viewer.history import GAP, History
 from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
 from sags_node.clients.viewer.splats import Splats, splats_of
+from sags_node.clients.viewer.still import SILENT_AFTER
 from sags_node.config.schema import PhantomSource
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
@@ -408,6 +409,27 @@ def anchors(subscriber: Subscriber) -> dict[int, np.ndarray]:
 def test_without_a_node_it_says_so(page: Any) -> None:
     until(lambda: "no node runs as 'sags'" in status(page), page)
     assert contrast(page) < 2, "an empty scene"
+
+
+@needs_viser
+@pytest.mark.fault("link: stands still, to the viewer's page")
+def test_a_page_that_hears_nothing_covers_itself_and_a_folded_one_does_not(
+    page: Any, view: RunningView
+) -> None:
+    cover = page.locator("#sags-still")
+    page.mouse.click(1037, 8)  # viser's button that folds the panels away, and the status with them
+    page.wait_for_function("() => document.getElementById('sags-status') === null")
+    page.wait_for_timeout(1000 * (SILENT_AFTER + 2))
+    assert cover.count() == 0
+    view.process.send_signal(signal.SIGSTOP)
+    try:
+        page.wait_for_function("() => document.elementFromPoint(300, 250)?.id === 'sags-still'")
+        assert "no word from sags view for" in cover.text_content()
+    finally:
+        view.process.send_signal(signal.SIGCONT)
+    page.wait_for_function("() => document.getElementById('sags-still') === null")
+    page.mouse.click(1037, 8)
+    page.wait_for_function("() => document.getElementById('sags-status') !== null")
 
 
 @needs_viser

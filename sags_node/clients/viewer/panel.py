@@ -114,7 +114,7 @@ class Panel:
         """Bring status, pictures, plots and the list of anchors up to date."""
         self._moment = moment
         self._unit = "no unit" if "uncalibrated" in moment.status.warning_codes else "mm"
-        self._status.content = status_line(moment)
+        self._say(moment)
         self._draw()
         if self._history.add(moment):
             for plot, figures in self._plots:
@@ -129,15 +129,16 @@ class Panel:
         """Say how old the frozen moment is by now; what is looked at of it may change."""
         assert self._frozen_since is not None
         age = time.monotonic() - self._frozen_since
-        self._status.content = status_line(
-            Moment(f"FROZEN {age:.0f} s ago: what you see is old; Go on shows the node again")
-        )
+        self._say(Moment(f"FROZEN {age:.0f} s ago: what you see is old; Go on shows the node again"))
         self._draw(f"  FROZEN {age:.0f} s ago")
         self._list_anchors(self._moment.anchors)
 
     def go_on(self) -> None:
         """Show the node again."""
         self._frozen_since, self._freeze.label = None, "Freeze"
+
+    def _say(self, moment: Moment) -> None:
+        self._status.content = status_line(moment, int(time.monotonic()))
 
     def _draw(self, remark: str = "") -> None:
         self._sheet.fixed = None if self._auto.value else (self._near.value * UNIT, self._far.value * UNIT)
@@ -353,8 +354,12 @@ def _in_words(answer: Any) -> str:
     return ", ".join(f"{key}: {value}" for key, value in answer.items()) or "done"
 
 
-def status_line(moment: Moment) -> str:
-    """One line: why nothing is shown, or how the node does; below it what it warns of."""
+def status_line(moment: Moment, second: int = 0) -> str:
+    """One line: why nothing is shown, or how the node does; below it what it warns of.
+
+    Args:
+        second: of any clock, so that a line comes every second, see `still`.
+    """
     status = moment.status
     if moment.problem is not None:
         color, text = "#ff922b", moment.problem
@@ -367,7 +372,8 @@ def status_line(moment: Moment) -> str:
     if status.last_error is not None:
         text += f" ({status.last_error})"
     style = f"padding:0.4em 1em;font-size:0.9em;color:{color}"
-    return f'<div id="sags-status" style="{style}">{html.escape(text)}</div>{_warnings(status)}'
+    line = f'<div id="sags-status" data-second="{second}" style="{style}">{html.escape(text)}</div>'
+    return line + _warnings(status)
 
 
 def _warnings(status: Status) -> str:
