@@ -22,6 +22,9 @@ def follow(u: float, v: float, frames: int | None) -> None:
     """Print where the tissue at pixel u, v of the left picture is, a line for each frame."""
     with Subscriber([ANCHORS], patience=60) as node, ControlClient() as control:
         newest = node.wait(ANCHORS, timeout=60)  # with the first frame there is a model to pin to
+        if newest is None:
+            raise SagsError(f"no frame came: {node.problem(ANCHORS)}")
+        session = newest.meta.session  # of the node; in another one that number is another anchor's
         pinned = control.request("add_anchor", {"u": u, "v": v})["id"]
         try:
             while frames is None or frames > 0:
@@ -29,6 +32,8 @@ def follow(u: float, v: float, frames: int | None) -> None:
                 if newest is None or not node.ok(ANCHORS):
                     print(f"nothing fresh: {node.problem(ANCHORS)}", file=sys.stderr)
                     continue
+                if newest.meta.session != session:
+                    raise SagsError("the node was started anew: its anchors are gone; start this again")
                 rows = newest.points[newest.points["id"] == pinned]
                 if not len(rows):
                     continue  # pinned in a frame after this one; or the model was reset
@@ -43,7 +48,8 @@ def follow(u: float, v: float, frames: int | None) -> None:
                     )
                 frames = None if frames is None else frames - 1
         finally:
-            control.request("remove_anchor", {"id": pinned})
+            if node.latest(ANCHORS).meta.session == session:
+                control.request("remove_anchor", {"id": pinned})
 
 
 def main() -> None:

@@ -8,6 +8,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sags_node.types import F32, F64
@@ -19,6 +21,11 @@ SURE_OF_ANCHOR = (
     0.5  # of an anchor's confidence, with which it is taken to be on its tissue, see `overlay.frame`
 )
 FAINTEST = 1e-30  # of confidence: 0.3 m
+
+
+def is_sure_in_space(anchor: Any) -> bool:
+    """Tell whether the place of an anchor, a row of `anchors`, is measured: on its tissue, its depth sure."""
+    return bool(anchor["confidence"] >= SURE_OF_ANCHOR and anchor["depth_confidence"] >= SURE)
 
 
 def confidence_of(error: F32 | F64 | np.float32) -> F32:

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from bridging import SEEN, anchored_at, sockets
 from places import ROOT, SESSION
+from synthetic import stream
 from waiting import until
 
 from sags_node.errors import SagsError
@@ -77,3 +83,62 @@ def test_all_start_and_end_together_and_the_notebook_plots_what_was_recorded(
     assert 0.03 < np.nanmedian(depth) < 0.2 and len(np.unique(path[:, 0])) > 1, (
         "a frame, and the anchor in more"
     )
+
+
+def test_a_point_is_not_followed_into_another_session_of_the_node(tmp_path: Path) -> None:
+    asked: list[tuple[int, str]] = []
+
+    def node(number: int) -> dict[str, Any]:
+        return {
+            "add_anchor": lambda args: asked.append((number, "add")) or {"id": SEEN},
+            "remove_anchor": lambda args: asked.append((number, "remove")),
+        }
+
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, ROOT / "examples/follow_point.py", "20", "20"]
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as example:
+        with sockets(tmp_path / "sags", node(1)) as running, stream(running, anchored_at):
+            assert "m" in example.stdout.readline()
+        with sockets(tmp_path / "sags", node(2)) as running, stream(running, anchored_at):
+            _, errors = example.communicate(timeout=60)
+    assert example.returncode == 1 and "started anew" in errors and asked == [(1, "add")]
+
+
+def test_the_node_of_rclpy_ends_with_the_node_that_it_follows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own code, beside stand-ins for ROS; tests/bridge/test_ros2_rclpy.py has ROS."""
+
+    class Node:
+        def __init__(self, name: str) -> None:
+            self.sent: list[Any] = []
+
+        def __getattr__(self, name: str) -> MagicMock:
+            return MagicMock()
+
+        def create_publisher(self, *_: Any) -> Any:
+            return SimpleNamespace(publish=self.sent.append)
+
+    for name in ("rclpy", "geometry_msgs.msg", "sensor_msgs.msg", "std_msgs.msg"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    monkeypatch.setitem(sys.modules, "rclpy.node", SimpleNamespace(Node=Node))
+    follow = runpy.run_path(str(ROOT / "examples/ros2/follow_tissue.py"))["FollowTissue"]()
+    follow.anchor = 1
+    columns = ("x", "y", "z", "id", "age", "confidence", "depth_confidence")
+
+    def cloud(stamp: float, age: float) -> Any:
+        row = np.array([0.01, 0.02, 0.07, 0, age, 1, 1], "<f4")
+        row[3:4].view("<u4")[:] = 1
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=int(stamp), nanosec=int(stamp % 1 * 1e9)))
+        fields = [SimpleNamespace(name=name, offset=4 * at) for at, name in enumerate(columns)]
+        return SimpleNamespace(header=header, fields=fields, data=row.tobytes(), point_step=4 * len(columns))
+
+    now = 1.7e9
+    for late in (2.0, 2.03, 60.0, 86400.0):
+        follow.came(cloud(now + late, late - 1.0))
+    follow.came(cloud(now - 100.0, 86399.0))  # the clock was set back: ages stand still
+    follow.came(cloud(now - 99.0, 86400.0))
+    assert len(follow.sent) == 6
+    with pytest.raises(SystemExit, match="started anew"):
+        follow.came(cloud(now + 200000.0, 100000.0))  # older than ours was, and pinned since
+    assert len(follow.sent) == 6

@@ -51,6 +51,7 @@ struct Message {
     std::string session;
     std::int64_t epoch = 0, seq = 0, stamp_ns = 0;
     std::int64_t height = 0, width = 0;
+    bool metric = true;  // false: nobody has calibrated the eyes, and lengths have no unit
     zmq::message_t data;  // the pixels, as they were received
 };
 
@@ -84,6 +85,7 @@ Message decode(const std::string& topic, std::vector<zmq::message_t>& parts) {
     message.epoch = meta.at("epoch").as<std::int64_t>();
     message.seq = meta.at("seq").as<std::int64_t>();
     message.stamp_ns = meta.at("stamp_ns").as<std::int64_t>();
+    message.metric = meta.count("units") == 0;
 
     const auto shape = meta.at("shape").as<std::vector<std::int64_t>>();
     if (shape.size() != (depth ? 2 : 3) || (!depth && shape[2] != 4))
@@ -163,11 +165,11 @@ void show(const Message& image, const Message& depth) {
     const float metres = float_at(depth.data, centre);
     const auto* pixel = image.data.data<unsigned char>() + 4 * centre;
     std::cout << "stamp_ns=" << depth.stamp_ns << " age_ms=" << (now_ns() - depth.stamp_ns) / 1000000
-              << " shape=" << depth.height << 'x' << depth.width << " depth_mm=";
+              << " shape=" << depth.height << 'x' << depth.width << (depth.metric ? " depth_mm=" : " depth_no_unit=");
     if (std::isnan(metres))
         std::cout << "unknown";
     else
-        std::cout << 1000 * metres;
+        std::cout << (depth.metric ? 1000 * metres : metres);
     std::cout << " rgba=" << +pixel[0] << ',' << +pixel[1] << ',' << +pixel[2] << ',' << +pixel[3]
               << std::endl;
 }

@@ -10,6 +10,7 @@ It needs rclpy and ROS' messages, and nothing of this package. Tried with Kilted
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import rclpy
@@ -19,6 +20,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 SURE = 0.5  # of both confidences: docs/wire.md, Anchors
+EXACT = 0.1  # s, of the time when an anchor was pinned: its `age` is a float32
 ASK_AGAIN = 2.0  # s: a request of a publisher that has just begun may be lost
 
 
@@ -28,6 +30,7 @@ class FollowTissue(Node):
     def __init__(self) -> None:
         super().__init__("follow_tissue")
         self.anchor: int | None = None
+        self.pinned = float("inf")  # s; when, by its first row
         self.pixel = Point(
             x=self.declare_parameter("u", 320.0).value, y=self.declare_parameter("v", 256.0).value
         )
@@ -55,6 +58,10 @@ class FollowTissue(Node):
         numbers = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_step // 4)
         ids = numbers[:, columns["id"]].view("<u4") if len(numbers) else np.zeros(0, "<u4")
         for row in numbers[ids == self.anchor]:
+            pinned = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec - float(row[columns["age"]])
+            if pinned > self.pinned + EXACT:  # another anchor: numbers begin again with a new node
+                sys.exit("the node was started anew: its anchors are gone; start this again")
+            self.pinned = pinned
             if min(row[columns["confidence"]], row[columns["depth_confidence"]]) >= SURE:
                 place = PointStamped(header=cloud.header)
                 place.point.x, place.point.y, place.point.z = (float(row[columns[axis]]) for axis in "xyz")

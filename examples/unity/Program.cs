@@ -30,8 +30,9 @@ public static class Program {
                 if (depth.Head.stamp_ns == shown) continue;
                 int height = depth.Head.shape[0], width = depth.Head.shape[1], centre = height / 2 * width + width / 2;
                 var rgba = string.Join(",", image.Data.Skip(4 * centre).Take(4));
-                var found = string.Join(";", pins.Anchors().Select(pin => pin.Id + ":" + pin.Z + ":" + pin.Visibility));
-                Console.WriteLine("stamp_ns={0} shape={1}x{2} depth_mm={3} rgba={4} anchors={5}", depth.Head.stamp_ns, height, width, 1000 * depth.FloatAt(centre), rgba, found);
+                var found = string.Join(";", pins.Anchors().Select(pin => pin.Id + ":" + pin.Z + ":" + pin.Visibility + ":" + pin.DepthConfidence));
+                string said = depth.Head.units == null ? "depth_mm=" + 1000 * depth.FloatAt(centre) : "depth_no_unit=" + depth.FloatAt(centre);
+                Console.WriteLine("stamp_ns={0} shape={1}x{2} {3} rgba={4} anchors={5}", depth.Head.stamp_ns, height, width, said, rgba, found);
                 shown = depth.Head.stamp_ns;
                 frames--;
             }

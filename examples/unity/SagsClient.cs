@@ -16,7 +16,7 @@ using System.Threading.Tasks;
 namespace Sags {
 
 [DataContract] public sealed class Header { // what any message of the gateway may say
-    [DataMember] public string topic, encoding, session, stale, error;
+    [DataMember] public string topic, encoding, session, stale, error, units; // units: null, or "relative": lengths have none
     [DataMember] public long stamp_ns, epoch, id;
     [DataMember] public int[] shape, parts;
     [DataMember] public bool ok;
@@ -25,7 +25,8 @@ namespace Sags {
 
 [DataContract] public sealed class Clock { [DataMember] public long received_ns, answered_ns; }
 
-public struct Anchor { public uint Id; public float X, Y, Z, U, V, Visibility, Confidence; } // m in the world, px
+public struct Anchor { public uint Id; public float X, Y, Z, U, V, Visibility, Confidence, DepthConfidence; } // m in the world, px
+// Show none as sure whose Confidence is below 0.5, nor its X, Y, Z where DepthConfidence is.
 
 public sealed class Message {
     public Header Head;
@@ -41,7 +42,7 @@ public sealed class Message {
             Func<string, float> of = name => FloatAt(at(name));
             if (float.IsNaN(of("x"))) continue;
             found.Add(new Anchor { Id = BitConverter.ToUInt32(Data, 4 * at("id")), X = of("x"), Y = of("y"), Z = of("z"),
-                U = of("u"), V = of("v"), Visibility = of("visibility"), Confidence = of("confidence") });
+                U = of("u"), V = of("v"), Visibility = of("visibility"), Confidence = of("confidence"), DepthConfidence = of("depth_confidence") });
         }
         return found;
     }
@@ -61,6 +62,7 @@ public sealed class SagsClient : IDisposable {
     readonly Stopwatch watch = Stopwatch.StartNew(); // nobody sets it
     double Now { get { return watch.Elapsed.TotalMilliseconds; } }
     double asked = double.NegativeInfinity, answered = double.NegativeInfinity;
+    bool waiting; // for an answer: `asked` is of that one
     volatile string problem = "not connected";
 
     public SagsClient(string url, double maxAge, params string[] topics) {
@@ -88,10 +90,12 @@ public sealed class SagsClient : IDisposable {
             try {
                 using (var socket = new ClientWebSocket()) {
                     await socket.ConnectAsync(new Uri(url), stop.Token);
+                    waiting = false;
                     await Say(socket, "{\"subscribe\": [\"" + string.Join("\",\"", topics) + "\"]}");
                     while (true) {
-                        if (Now - asked > ClockEvery) {
+                        if (!waiting && Now - asked > ClockEvery) {
                             asked = Now;
+                            waiting = true;
                             await Say(socket, "{\"id\": 1, \"op\": \"get_clock\"}");
                         }
                         await Receive(socket);
@@ -123,6 +127,7 @@ public sealed class SagsClient : IDisposable {
         int size = binary && length >= 4 ? BitConverter.ToInt32(buffer, 0) : length, from = binary ? 4 : 0;
         if (size < 0 || size > MaxHeader || from + size > length) throw new IOException("that is no gateway");
         var head = (Header)new DataContractJsonSerializer(typeof(Header)).ReadObject(new MemoryStream(buffer, from, size));
+        if (head.id == 1) waiting = false;
         lock (newest) {
             if (binary) Keep(head, from + size, length);
             else if (head.topic != null) { newest.Remove(head.topic); problem = head.stale; }

@@ -38,7 +38,8 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     anchor chooses it, and the distance to the one before is told.
 
     Nothing old is shown as new: what stops coming disappears within a second, and the line at the top right
-    says why. The node may be started later and restarted.
+    says why. A page that hears nothing from here for 6 s, as when the link to it is cut, covers itself. The
+    node may be started later and restarted.
 
     It is a process of its own. While no browser is open it takes nothing from the node.
 

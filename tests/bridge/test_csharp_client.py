@@ -8,7 +8,9 @@ import shutil
 import struct
 import subprocess
 import time
-from contextlib import AbstractContextManager
+from collections import deque
+from contextlib import AbstractContextManager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ import pytest
 from bridging import SEEN, anchored, anchored_at, bridged, sockets
 from command_line import killed
 from places import ROOT
-from synthetic import HEIGHT, WIDTH, stream
+from synthetic import HEIGHT, WIDTH, at_frame, stream
 from waiting import beside
 
 pytest.importorskip("websockets", reason="no gateway without: pip install '.[bridges]'")
@@ -45,7 +47,7 @@ namespace UnityEngine {
         public class RawImage { public bool enabled; public Texture texture; public Rect uvRect; }
     }
 }"""
-LINE = re.compile(r"stamp_ns=(\d+) shape=(\d+)x(\d+) depth_mm=(\S+) rgba=(\S+) anchors=(\S*)\n")
+LINE = re.compile(r"stamp_ns=(\d+) shape=(\d+)x(\d+) depth_(?:mm|no_unit)=(\S+) rgba=(\S+) anchors=(\S*)\n")
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +80,12 @@ def until_line(process: subprocess.Popen[str], start: str) -> str:
 
 
 def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_path: Path) -> None:
-    view = anchored().views["left"]
+    result = anchored()
+    guessed = replace(result.anchors, depth_confidence=np.full(4, 0.25, np.float32))
+    result, view = replace(result, anchors=guessed), result.views["left"]
     options = WebOptions(NodeAddress(run_dir=tmp_path), NodeAddress("overlay", run_dir=tmp_path), port=0)
     with sockets(tmp_path) as node, bridged(run_web, options) as port, running(program, port) as process:
-        with stream(node, anchored_at):
+        with stream(node, lambda i: at_frame(result, i, time.time_ns())):
             found = LINE.fullmatch(until_line(process, "stamp_ns="))
             until_line(process, "stamp_ns=")
         assert "stale: too old" in until_line(process, "stale")
@@ -93,6 +97,7 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     assert float(depth_mm) == pytest.approx(1000 * view.depth[middle], abs=1e-3)
     assert rgba.split(",") == [*map(str, view.rgb[middle]), str(round(255 * view.alpha[middle]))]
     first = anchors.split(";")[0].split(":")
+    assert list(map(float, first[2:])) == [1, 0.25], "seen, and its depth a guess"
     assert int(first[0]) == SEEN and float(first[1]) == pytest.approx(0.07) and len(anchors.split(";")) == 3
 
 
@@ -103,23 +108,26 @@ def test_the_part_for_unity_compiles(program: Path, tmp_path: Path) -> None:
              f"-out:{tmp_path / 'unity.dll'}")  # fmt: skip
 
 
+def message(topic: str, encoding: str, shape: list[int], data: bytes, **changes: object) -> bytes:
+    head = {"topic": topic, "encoding": encoding, "shape": shape, "stamp_ns": time.time_ns()}
+    text = json.dumps({**head, "parts": [0, len(data)], **changes}).encode()
+    return struct.pack("<I", len(text)) + text + data
+
+
+def frame(stamp: int, **said: object) -> list[bytes]:
+    """All that the program shows of one frame, of 2 x 2 pixels."""
+    pixels, metres = np.full((2, 2, 4), 9, np.uint8).tobytes(), np.full(4, 0.07, "<f4").tobytes()
+    return [
+        message("sags/left/render/image", "rgba8", [2, 2, 4], pixels, stamp_ns=stamp),
+        message("sags/left/render/depth", "32FC1", [2, 2], metres, stamp_ns=stamp, **said),
+        message("sags/anchors", "x,y,z,id", [0, 4], b"", stamp_ns=stamp),
+    ]
+
+
 def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
     """Broken messages, then a true one over a new connection."""
     now_ns = time.time_ns
     attempts: list[int] = []
-    stamp = now_ns()
-
-    def message(topic: str, encoding: str, shape: list[int], data: bytes, **changes: object) -> bytes:
-        head = {
-            "topic": topic,
-            "encoding": encoding,
-            "shape": shape,
-            "stamp_ns": stamp,
-            "parts": [0, len(data)],
-        }
-        text = json.dumps({**head, **changes}).encode()
-        return struct.pack("<I", len(text)) + text + data
-
     broken = [
         b"", b"\x01", b"\xff\xff\xff\xff", b"\x00\x00\x00\x7f", struct.pack("<I", 4) + b"none",
         message("t", "32FC1", [1, 1], bytes(4), parts=[-4, 8]),
@@ -127,7 +135,6 @@ def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
     ]  # fmt: skip
 
     def attend(connection: ServerConnection) -> None:
-        nonlocal stamp
         attempts.append(len(attempts))
         if attempts[-1] < len(broken):
             connection.send(broken[attempts[-1]])
@@ -138,13 +145,9 @@ def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
                 clock = {"received_ns": now_ns(), "answered_ns": now_ns()}
                 if "op" in asked:
                     connection.send(json.dumps({"id": asked["id"], "ok": True, "result": clock}))
-                stamp = now_ns()
-                pixels = np.full((2, 2, 4), 9, np.uint8).tobytes()
-                connection.send(message("sags/left/render/image", "rgba8", [3, 2, 4], pixels))  # left out
-                connection.send(message("sags/left/render/image", "rgba8", [2, 2, 4], pixels))
-                metres = np.full(4, 0.07, "<f4").tobytes()
-                connection.send(message("sags/left/render/depth", "32FC1", [2, 2], metres))
-                connection.send(message("sags/anchors", "x,y,z,id", [0, 4], b""))
+                connection.send(message("sags/left/render/image", "rgba8", [3, 2, 4], bytes(16)))  # left out
+                for each in frame(now_ns()):
+                    connection.send(each)
 
     with serve(attend, "127.0.0.1", 0) as server:
         with beside(server.serve_forever, server.shutdown):
@@ -152,3 +155,49 @@ def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
                 found = LINE.fullmatch(until_line(process, "stamp_ns="))
     assert found is not None and found[4] == "70" and found[5] == "9,9,9,9" and found[6] == ""
     assert len(attempts) > len(broken)
+
+
+@pytest.mark.fault("link: slow, to a client in C#")
+@pytest.mark.parametrize("late", [1.2, 2.2])
+def test_pictures_that_come_late_are_old_also_where_the_clock_s_answers_are_as_late(
+    program: Path, late: float
+) -> None:
+    timely: list[int] = []  # ns; when the link has become quick
+
+    def attend(connection: ServerConnection) -> None:
+        due: deque[tuple[int, dict[str, object]]] = deque()
+        answers = 0
+        while True:
+            with suppress(TimeoutError):
+                asked = json.loads(connection.recv(timeout=0.05))
+                if "op" in asked:
+                    clock = {"received_ns": time.time_ns(), "answered_ns": time.time_ns()}
+                    due.append((time.time_ns(), {"id": asked["id"], "ok": True, "result": clock}))
+            behind = 0 if timely else int(late * 1e9)
+            while due and due[0][0] + behind <= time.time_ns():
+                connection.send(json.dumps(due.popleft()[1]))
+                answers += 1
+            for each in frame(time.time_ns() - behind):
+                connection.send(each)
+            if answers == 3 and not timely:
+                timely.append(time.time_ns())
+
+    with serve(attend, "127.0.0.1", 0) as server, beside(server.serve_forever, server.shutdown):
+        with running(program, server.socket.getsockname()[1]) as process:
+            found = LINE.fullmatch(until_line(process, "stamp_ns="))
+    assert found is not None and timely and int(found[1]) >= timely[0]
+
+
+def test_lengths_without_a_unit_are_not_said_to_be_millimetres(program: Path) -> None:
+    def attend(connection: ServerConnection) -> None:
+        while True:
+            asked = json.loads(connection.recv())
+            clock = {"received_ns": time.time_ns(), "answered_ns": time.time_ns()}
+            if "op" in asked:
+                connection.send(json.dumps({"id": asked["id"], "ok": True, "result": clock}))
+            for each in frame(time.time_ns(), units="relative"):
+                connection.send(each)
+
+    with serve(attend, "127.0.0.1", 0) as server, beside(server.serve_forever, server.shutdown):
+        with running(program, server.socket.getsockname()[1]) as process:
+            assert " depth_no_unit=0.07 " in until_line(process, "stamp_ns=")

@@ -51,6 +51,9 @@ class Node:
             self._wake()
             self._world.sleep(max(0.0, number / CAMERA_RATE - self._world.now))
 
+    def started_anew(self) -> bool:
+        return False
+
     def ask(self, names: Iterable[str]) -> None:
         self.asked.append((self._world.now, frozenset(names)))
 

@@ -287,6 +287,14 @@ def test_a_browser_draws_what_comes_and_goes_blank(page: Any, tmp_path: Path) ->
         assert np.abs(ring[np.argmax(ring[:, 3])][:3] - color).max() < 20
 
 
+def test_the_page_says_that_lengths_have_no_unit(page: Any, tmp_path: Path) -> None:
+    with sockets(tmp_path, metric=False) as running, bridged(run_web, options(tmp_path)) as port:
+        with stream(running, anchored_at):
+            page.goto(f"http://127.0.0.1:{port}/?thin=raw")
+            page.wait_for_function("() => document.getElementById('range').textContent.startsWith('no unit')")
+            assert page.evaluate("() => window.sags.units[`sags/left/render/depth`]") == "relative"
+
+
 def test_the_example_shows_the_model_in_a_page_of_its_own(page: Any, tmp_path: Path) -> None:
     """examples/web, as its first lines say."""
     shutil.copytree(ROOT / "examples/web", tmp_path / "page")

@@ -26,13 +26,15 @@ SEEN, HIDDEN, LOST, UNSURE = 3, 5, 8, 9  # numbers of the anchors in `anchored`
 
 @contextmanager
 def sockets(
-    run_dir: Path, handlers: Mapping[str, Callable[[dict[str, Any]], Any]] | None = None
+    run_dir: Path,
+    handlers: Mapping[str, Callable[[dict[str, Any]], Any]] | None = None,
+    metric: bool = True,
 ) -> Iterator[Publisher]:
     """The sockets of a node named `sags`, on free ports."""
     config = PublishConfig(
         data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=run_dir, right=True
     )
-    with Publisher(config, "sags", f"session-{time.time_ns()}", handlers) as running:
+    with Publisher(config, "sags", f"session-{time.time_ns()}", handlers, metric=metric) as running:
         yield running
 
 

@@ -22,7 +22,7 @@ from independent_client import zmq_socket
 from made_messages import message_of
 from places import ROOT
 from running_node import RunningNode
-from synthetic import plane_result
+from synthetic import HEIGHT, WIDTH, plane_result
 
 from sags_node.config.schema import PushSource
 from sags_node.messaging import content
@@ -152,6 +152,21 @@ def test_hostile_messages_are_left_out(read_depth: Path) -> None:
         assert process.returncode == 0
         assert complaints.count("left out: ") == len(bad) - 1
         assert [row[4] for row in LINE.findall(said)] == ["unknown"]
+
+
+def test_lengths_without_a_unit_are_not_said_to_be_millimetres(read_depth: Path) -> None:
+    result = plane_result()
+    with zmq_socket(zmq.XPUB, "tcp://127.0.0.1:*", bind=True) as socket:
+        with running(read_depth, socket.getsockopt_string(zmq.LAST_ENDPOINT), "1") as process:
+            for _ in range(2):
+                assert socket.poll(60_000) and socket.recv()[:1] == b"\x01"
+            for name in (IMAGE, DEPTH):
+                topic, meta, *rest = parts_of(name, result)
+                socket.send_multipart([topic, changed(meta, units="relative"), *rest])
+            said, _ = process.communicate(timeout=30)
+    assert float(re.search(r" depth_no_unit=(\S+) ", said)[1]) == pytest.approx(
+        result.views["left"].depth[HEIGHT // 2, WIDTH // 2], rel=1e-4
+    )
 
 
 def test_pictures_are_handed_in_and_a_wrong_size_is_told(examples: Path) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from browsers import new_page
@@ -31,6 +32,7 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT,
 from sags_node.clients.viewer.history import GAP, History
 from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
 from sags_node.clients.viewer.splats import Splats, splats_of
+from sags_node.clients.viewer.still import SILENT_AFTER
 from sags_node.config.schema import PhantomSource
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
@@ -225,6 +227,25 @@ def test_the_distance_of_two_anchors_is_a_guess_unless_both_are_sure() -> None:
     assert "lost" in distance(row(0, 0), row(np.nan, np.nan), "mm")
 
 
+@needs_viser
+def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
+    from sags_node.clients.viewer.panel import Panel
+    from sags_node.clients.viewer.scene import Scene
+    from sags_node.clients.viewer.server import serving
+
+    def seen(session: str) -> Moment:
+        return replace(moment(), status=msgspec.structs.replace(moment().status, session=session))
+
+    with serving("127.0.0.1", 0, False) as (server, _):
+        panel = Panel(server, Scene(server), None, None, "sags", 20.0)
+        panel.show(seen("first"))
+        panel.choose(1)
+        panel.show(Moment("stale", Status(session="first")))
+        assert panel.chosen == 1, "nothing fresh came: it stays"
+        panel.show(Moment("the node is starting", Status(session="second")))
+        assert panel.chosen is None, "number 1 is another anchor now"
+
+
 # ---- the command -----------------------------------------------------------------------------------------
 
 
@@ -310,12 +331,24 @@ def test_only_its_own_page_may_connect(view: RunningView) -> None:
 
 
 @needs_viser
-def test_an_anchor_that_is_seen_and_not_recognised_has_a_colour_of_its_own() -> None:
+def test_an_anchor_that_is_seen_and_not_sure_in_space_has_a_colour_of_its_own() -> None:
     from sags_node.clients.viewer.scene import HIDDEN, SEEN, UNSURE, anchor_color
 
-    rows = [(1.0, 0.9), (0.2, 0.5), (1.0, 0.49), (0.0, 0.9), (0.0, 0.0)]
-    colors = [anchor_color({"visibility": seen, "confidence": sure}) for seen, sure in rows]
-    assert colors == [SEEN, SEEN, UNSURE, HIDDEN, HIDDEN] and len({SEEN, UNSURE, HIDDEN}) == 3
+    names = ("visibility", "confidence", "depth_confidence")
+    rows = [(1.0, 0.9, 0.9), (0.2, 0.5, 0.5), (1.0, 0.49, 0.9), (1.0, 0.9, 0.49), (0.0, 0.9, 0.9), (0, 0, 0)]
+    colors = [anchor_color(dict(zip(names, row, strict=True))) for row in rows]
+    assert colors == [SEEN, SEEN, UNSURE, UNSURE, HIDDEN, HIDDEN] and len({SEEN, UNSURE, HIDDEN}) == 3
+
+
+@needs_viser
+def test_the_table_of_anchors_says_which_place_is_a_guess() -> None:
+    from sags_node.clients.viewer.panel import anchor_table
+
+    row = {"id": 3, "x": 0.01, "y": 0.02, "z": 0.07, "visibility": 1.0, "confidence": 1.0}
+    assert "10.0 20.0 70.0<" in anchor_table([row | {"depth_confidence": 0.5}], "mm")
+    assert "10.0 20.0 70.0, a guess<" in anchor_table([row | {"depth_confidence": 0.05}], "mm")
+    lost = anchor_table([row | {"x": np.nan, "depth_confidence": 0.0}], "mm")
+    assert "lost<" in lost and "guess" not in lost
 
 
 # ---- in a browser ----------------------------------------------------------------------------------------
@@ -376,6 +409,27 @@ def anchors(subscriber: Subscriber) -> dict[int, np.ndarray]:
 def test_without_a_node_it_says_so(page: Any) -> None:
     until(lambda: "no node runs as 'sags'" in status(page), page)
     assert contrast(page) < 2, "an empty scene"
+
+
+@needs_viser
+@pytest.mark.fault("link: stands still, to the viewer's page")
+def test_a_page_that_hears_nothing_covers_itself_and_a_folded_one_does_not(
+    page: Any, view: RunningView
+) -> None:
+    cover = page.locator("#sags-still")
+    page.mouse.click(1037, 8)  # viser's button that folds the panels away, and the status with them
+    page.wait_for_function("() => document.getElementById('sags-status') === null")
+    page.wait_for_timeout(1000 * (SILENT_AFTER + 2))
+    assert cover.count() == 0
+    view.process.send_signal(signal.SIGSTOP)
+    try:
+        page.wait_for_function("() => document.elementFromPoint(300, 250)?.id === 'sags-still'")
+        assert "no word from sags view for" in cover.text_content()
+    finally:
+        view.process.send_signal(signal.SIGCONT)
+    page.wait_for_function("() => document.getElementById('sags-still') === null")
+    page.mouse.click(1037, 8)
+    page.wait_for_function("() => document.getElementById('sags-status') !== null")
 
 
 @needs_viser

@@ -31,7 +31,7 @@ class Feed:
     def __init__(
         self, topics: Iterable[str], sender: NodeAddress, max_age: float, wake: Callable[[], None]
     ) -> None:
-        self._max_age = max_age
+        self._max_age, self._session = max_age, ""
         rates = dict.fromkeys(topics, LEAST_HZ)
         self._subscriber = Subscriber.at(sender, rates, rates=rates, paused=True, may_be_absent=True)
         self._resources = ExitStack()
@@ -52,6 +52,12 @@ class Feed:
         """Why the newest message of a topic must not be shown as new; None when it may be."""
         limit = SILENT_AFTER if name in EVERY_SECOND else self._max_age
         return self._subscriber.problem(name, limit)
+
+    def started_anew(self) -> bool:
+        """Tell whether the sender is another one than when this was last asked."""
+        status, before = self._subscriber.latest("status"), self._session
+        self._session = before if status is None else status.meta.session
+        return before not in ("", self._session)
 
     def latest(self, name: str) -> Received | None:
         """The newest message of a topic, however old it is."""

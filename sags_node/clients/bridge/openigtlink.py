@@ -32,7 +32,7 @@ from sags_node.clients.bridge.pins import MOST, Pin, Pins, Release
 from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source
 from sags_node.clients.bridge.requests import Requests
 from sags_node.clients.overlay.draw import over
-from sags_node.confidence import SURE, SURE_OF_ANCHOR
+from sags_node.confidence import SURE, is_sure_in_space
 from sags_node.errors import UsageError
 from sags_node.geometry import unproject
 from sags_node.messaging.received import (
@@ -141,7 +141,7 @@ class OpenIgtLink(Outlet):
         self._shapes: dict[str, tuple[U8, F64]] = {}
         self._pins = Pins()
         self._answers: deque[Callable[[], list[Release]]] = deque()  # for the peers' thread
-        self._now_ns = options.node.now_ns
+        self._ns, self._now_ns = options.node.ns, options.node.now_ns
         listener = options.listen(MOST_PEERS)
         self.port = int(listener.getsockname()[1])
         self._requests = Requests(options.node)
@@ -180,6 +180,10 @@ class OpenIgtLink(Outlet):
             )
         elif output.name == "Anchors":
             self._peers.send(device, igtl.points(device, seconds, np.empty((0, 3)), [], []))
+
+    def started_anew(self, ns: str) -> None:
+        if ns == self._ns:
+            self._answers.append(self._forget)
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
         words = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
@@ -230,7 +234,7 @@ class OpenIgtLink(Outlet):
                 self._requests.ask(*request, lambda _, words: self._say(words))
 
     def _idle(self) -> None:
-        """Pin what has come to rest, and take in what was answered."""
+        """Pin what has come to rest, and take in what was answered, or told by the relay."""
         for pin in self._pins.due(time.monotonic()):
             place = (RAS[:3, :3] @ pin.place) * 1e-3
             args = dict(zip("xyz", place.tolist(), strict=True))
@@ -243,6 +247,11 @@ class OpenIgtLink(Outlet):
         self._say(f"{pin.name}: {words}")
         if result is not None:
             self._answers.append(partial(self._pins.pinned, pin, int(result["id"])))
+
+    def _forget(self) -> list[Release]:
+        if self._pins.forget():
+            self._say("the node was started anew: its anchors are gone; move a point to pin it again")
+        return []
 
     def _release(self, released: Sequence[Release]) -> None:
         for release in released:
@@ -266,15 +275,15 @@ def request_of(text: str) -> tuple[str, dict[str, float]] | None:
 
 
 def _anchors(cloud: ReceivedCloud, device: str, seconds: float) -> bytes | None:
-    """The anchors whose place is known, by number. Orange: not sure of; red: hidden."""
+    """The anchors whose place is known, by number. Orange: not sure there; red: hidden."""
     rows = cloud.points
-    if not {"id", "visibility", "confidence"} <= set(rows.dtype.names or ()):
+    if not {"id", "visibility", "confidence", "depth_confidence"} <= set(rows.dtype.names or ()):
         return None
     places = cloud.xyz().astype(np.float64)
     known = np.isfinite(places).all(axis=1)
     names = [f"anchor {number}" for number in rows["id"][known]]
     colors = [
-        HIDDEN if row["visibility"] < LEAST_SEEN else SEEN if row["confidence"] >= SURE_OF_ANCHOR else UNSURE
+        HIDDEN if row["visibility"] < LEAST_SEEN else SEEN if is_sure_in_space(row) else UNSURE
         for row in rows[known]
     ]
     return igtl.points(device, seconds, _ras(places[known]), names, colors)

@@ -80,3 +80,14 @@ class Pins:
             return [Release(anchor)]
         point.anchor = anchor
         return []
+
+    def forget(self) -> bool:
+        """Let go of all anchors, and give none back: their numbers are another node's by now.
+
+        Returns:
+            whether there were any. Their points are pinned again once they move: the world may be another.
+        """
+        pinned = [point for point in self._points.values() if point.anchor is not None]
+        for point in pinned:
+            point.anchor = None
+        return bool(pinned)

@@ -70,6 +70,10 @@ class Outlet(Protocol):
         """Take back what was sent: it is not new any more."""
         return None
 
+    def started_anew(self, ns: str) -> None:
+        """Hear that a sender is another one now: what the last one numbered, as anchors, is gone."""
+        return None
+
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
         """Hear what is asked for and does not come, output -> reason, and whether anything does; called when
         that changes."""
@@ -140,6 +144,8 @@ class Relay:
             self._courses.setdefault(output.name, _Course(since=now))
         asked = {source for output in wanted for source in self._asked(output, now)}
         for ns, feed in self._feeds.items():
+            if feed.started_anew():
+                self._outlet.started_anew(ns)
             feed.ask(source.topic for source in asked if source.ns == ns)
         for output in wanted:
             self._pass_on(output, self._courses[output.name], now)

@@ -72,6 +72,7 @@ class Status(msgspec.Struct, frozen=True):
     rung: Rung | None = None
     last_error: str | None = None
     warning_codes: dict[str, str] = {}  # code -> what is wrong and how to fix it
+    session: str = ""  # of the node that says so
 
 
 SILENT = Status()
@@ -209,9 +210,10 @@ def _status_of(subscriber: Subscriber) -> Status:
     if not isinstance(status, ReceivedText):
         return SILENT
     try:
-        return msgspec.json.decode(status.text, type=Status)
+        said = msgspec.json.decode(status.text, type=Status)
     except (msgspec.MsgspecError, RecursionError):
         return SILENT
+    return msgspec.structs.replace(said, session=status.meta.session)
 
 
 def _records(cloud: Received | None, fields: set[str]) -> NDArray[Any] | None:

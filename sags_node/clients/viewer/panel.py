@@ -19,7 +19,7 @@ from sags_node.clients.viewer.overlay import Overlay
 from sags_node.clients.viewer.pictures import VIEWS, Sheet
 from sags_node.clients.viewer.saving import KINDS, Exporter, exported, screenshot
 from sags_node.clients.viewer.scene import UNIT, Scene
-from sags_node.confidence import SURE, SURE_OF_ANCHOR
+from sags_node.confidence import SURE, is_sure_in_space
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
@@ -31,6 +31,7 @@ PLOT_HEIGHT = 80  # px
 NOTICE_TIME = 6.0  # s
 JPEG_QUALITY = 80
 NONE = "-"  # no anchor chosen
+OLD = "what you see is old: Go on first"
 BRIGHT, BLUE, ORANGE = "#c9d1d9", "#4dabf7", "#ffa94d"
 
 
@@ -70,7 +71,7 @@ class Panel:
     ) -> None:
         self._gui, self._scene, self._asker, self._exporter = server.gui, scene, asker, exporter
         self._sheet, self._history = Sheet(), History()
-        self._moment, self._unit = Moment("connecting"), "mm"
+        self._moment, self._unit, self._session = Moment("connecting"), "mm", ""
         self._frozen_since: float | None = None
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"sags view · {ns}")
@@ -100,6 +101,11 @@ class Panel:
         """Tell whether somebody wants to look at one moment."""
         return self._frozen_since is not None
 
+    @property
+    def chosen(self) -> int | None:
+        """The anchor that Remove takes."""
+        return None if self._chosen.value == NONE else int(self._chosen.value)
+
     def fit(self, client: viser.ClientHandle) -> None:
         """Leave half of a narrow browser to the scene."""
         client.gui.main_panel.set_width(min(WIDTH, client.camera.image_width // 2))
@@ -108,27 +114,31 @@ class Panel:
         """Bring status, pictures, plots and the list of anchors up to date."""
         self._moment = moment
         self._unit = "no unit" if "uncalibrated" in moment.status.warning_codes else "mm"
-        self._status.content = status_line(moment)
+        self._say(moment)
         self._draw()
         if self._history.add(moment):
             for plot, figures in self._plots:
                 plot.data = self._history.series(*figures)
         self._overlay.content = _overlay_table(moment.overlay)
+        if moment.status.session not in ("", self._session):  # another node: that number is another anchor's
+            self._session = moment.status.session
+            self._chosen.value = self._other.value = NONE  # type: ignore[misc]  # viser's setter, which mypy misses
         self._list_anchors(moment.anchors)
 
     def stay(self) -> None:
         """Say how old the frozen moment is by now; what is looked at of it may change."""
         assert self._frozen_since is not None
         age = time.monotonic() - self._frozen_since
-        self._status.content = status_line(
-            Moment(f"FROZEN {age:.0f} s ago: what you see is old; Go on shows the node again")
-        )
+        self._say(Moment(f"FROZEN {age:.0f} s ago: what you see is old; Go on shows the node again"))
         self._draw(f"  FROZEN {age:.0f} s ago")
         self._list_anchors(self._moment.anchors)
 
     def go_on(self) -> None:
         """Show the node again."""
         self._frozen_since, self._freeze.label = None, "Freeze"
+
+    def _say(self, moment: Moment) -> None:
+        self._status.content = status_line(moment, int(time.monotonic()))
 
     def _draw(self, remark: str = "") -> None:
         self._sheet.fixed = None if self._auto.value else (self._near.value * UNIT, self._far.value * UNIT)
@@ -268,10 +278,11 @@ class Panel:
             tell(client, title, name, "green")
 
     def _remove(self, client: viser.ClientHandle) -> None:
-        if self._chosen.value == NONE:
-            tell(client, "Remove", "choose an anchor first", "orange")
+        anchor = self.chosen
+        if anchor is None or self.frozen:
+            why = "choose an anchor first" if anchor is None else OLD
+            tell(client, "Remove", why, "orange")
             return
-        anchor = int(self._chosen.value)
         self._asker.ask(client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
@@ -279,14 +290,14 @@ class Panel:
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
         hit = self._scene.anchor_at(origin, direction)
         if hit is not None:
-            self._choose(hit)
+            self.choose(hit)
         elif self._pinning.value:
             self._pin(event.client, origin * UNIT, direction)
 
     def _pin(self, client: viser.ClientHandle | None, origin: F64, direction: F64) -> None:
         splats = self._scene.splats
         if splats is None or self.frozen:
-            why = "what you see is old: Go on first" if self.frozen else "there is nothing to pin to now"
+            why = OLD if self.frozen else "there is nothing to pin to now"
             tell(client, "Pin", why, "orange")
             return
         point = splats.hit(origin, direction)
@@ -296,10 +307,10 @@ class Panel:
         place = {axis: float(x) for axis, x in zip("xyz", point, strict=True)}
         answer = self._asker.ask(client, "Pin", "add_anchor", place)
         if answer is not None:
-            self._choose(int(answer["id"]))
+            self.choose(int(answer["id"]))
 
-    def _choose(self, anchor: int) -> None:
-        """The one chosen before is what the distance is measured to."""
+    def choose(self, anchor: int) -> None:
+        """Choose it for Remove. The one chosen before is what the distance is measured to."""
         before = self._chosen.value
         for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
             if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
@@ -308,7 +319,7 @@ class Panel:
 
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
         rows = [] if anchors is None else list(anchors)
-        self._anchor_rows.content = _anchor_table(rows, self._unit)
+        self._anchor_rows.content = anchor_table(rows, self._unit)
         if anchors is None:  # nothing fresh came: what somebody has chosen stays
             self._distance.content = ""
             return
@@ -327,9 +338,7 @@ def distance(first: Any, second: Any, unit: str) -> str:
     apart = float(np.linalg.norm([first[axis] - second[axis] for axis in "xyz"])) / UNIT
     if not np.isfinite(apart):
         return "Distance: one of them is lost"
-    sure = all(
-        row["confidence"] >= SURE_OF_ANCHOR and row["depth_confidence"] >= SURE for row in (first, second)
-    )
+    sure = all(map(is_sure_in_space, (first, second)))
     return f"Distance: {apart:.1f} {unit}" + ("" if sure else ", a guess: one is not sure")
 
 
@@ -345,8 +354,12 @@ def _in_words(answer: Any) -> str:
     return ", ".join(f"{key}: {value}" for key, value in answer.items()) or "done"
 
 
-def status_line(moment: Moment) -> str:
-    """One line: why nothing is shown, or how the node does; below it what it warns of."""
+def status_line(moment: Moment, second: int = 0) -> str:
+    """One line: why nothing is shown, or how the node does; below it what it warns of.
+
+    Args:
+        second: of any clock, so that a line comes every second, see `still`.
+    """
     status = moment.status
     if moment.problem is not None:
         color, text = "#ff922b", moment.problem
@@ -359,7 +372,8 @@ def status_line(moment: Moment) -> str:
     if status.last_error is not None:
         text += f" ({status.last_error})"
     style = f"padding:0.4em 1em;font-size:0.9em;color:{color}"
-    return f'<div id="sags-status" style="{style}">{html.escape(text)}</div>{_warnings(status)}'
+    line = f'<div id="sags-status" data-second="{second}" style="{style}">{html.escape(text)}</div>'
+    return line + _warnings(status)
 
 
 def _warnings(status: Status) -> str:
@@ -388,13 +402,15 @@ def _overlay_table(overlay: Overlay | None) -> str:
     return "".join(map(_line, said))
 
 
-def _anchor_table(rows: list[Any], unit: str) -> str:
-    """Find where each anchor is, and how sure it is."""
+def anchor_table(rows: list[Any], unit: str) -> str:
+    """Say where each anchor is, how sure it is to be on its tissue, and which depth is a guess."""
     if not rows:
         return _line("none yet")
     cells = []
     for row in rows:
         place = " ".join(f"{row[axis] / UNIT:.1f}" for axis in "xyz") if np.isfinite(row["x"]) else "lost"
+        if np.isfinite(row["x"]) and row["depth_confidence"] < SURE:
+            place += ", a guess"
         seen, sure = f"{100 * row['visibility']:.0f} %", f"{100 * row['confidence']:.0f} %"
         values = (int(row["id"]), place, seen, sure)
         cells.append("<tr>" + "".join(f"<td>{value}</td>" for value in values) + "</tr>")

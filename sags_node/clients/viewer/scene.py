@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sags_node.clients.viewer.feed import LEFT, Moment, known_depth
 from sags_node.clients.viewer.overlay import Overlay
 from sags_node.clients.viewer.splats import Splats, splats_of
-from sags_node.confidence import SURE_OF_ANCHOR
+from sags_node.confidence import is_sure_in_space
 from sags_node.geometry import matrix_to_quat, transform
 from sags_node.types import F64, U8, Camera
 
@@ -167,10 +167,10 @@ def names_of(overlay: Overlay) -> dict[int, str]:
 
 
 def anchor_color(row: Any) -> tuple[int, int, int]:
-    """Grey while the left eye does not see it; orange where it is seen and not recognised."""
+    """Grey while the left eye does not see it; orange where it is seen, and its place in space not sure."""
     if row["visibility"] == 0:
         return HIDDEN
-    return SEEN if row["confidence"] >= SURE_OF_ANCHOR else UNSURE
+    return SEEN if is_sure_in_space(row) else UNSURE
 
 
 def _fov(camera: Camera) -> float:

@@ -14,7 +14,7 @@ import viser
 import websockets.asyncio.server
 from websockets.http11 import Request, Response
 
-from sags_node.clients.viewer.cursor import SCRIPT
+from sags_node.clients.viewer import cursor, still
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import is_loopback
 
@@ -93,7 +93,9 @@ def _answer(
         del request.headers["Accept-Encoding"]  # so that the page can be read here
     response = answer(connection, request)
     if response is not None and b"</head>" in response.body:
-        response.body = response.body.replace(b"</head>", f"{SCRIPT}{MEND}</head>".encode(), 1)
+        response.body = response.body.replace(
+            b"</head>", f"{cursor.SCRIPT}{still.SCRIPT}{MEND}</head>".encode(), 1
+        )
         del response.headers["Content-Length"]  # else there are two
         response.headers["Content-Length"] = str(len(response.body))
     return response

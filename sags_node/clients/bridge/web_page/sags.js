@@ -4,6 +4,7 @@
 //     sags.show("sags/thin/half/left/render/image/jpeg", canvas);       // any picture topic
 //     sags.anchors("sags/anchors", (rows) => ...);                      // [] when they are not new any more
 //
+// `sags.units[topic]` is "relative" where nobody has calibrated the eyes: lengths have no unit then.
 // A canvas is cleared, transparent, as soon as what it shows is older than `maxAge`, whatever the reason.
 export const NEAR = 0.03, FAR = 0.2; // m, of the colours of depth: warm to cold
 const COLOURS = Uint32Array.from({ length: 256 }, (_, far) => // as an ImageData holds them
@@ -13,7 +14,7 @@ const bytes = (view) => new Uint8Array(view.buffer, view.byteOffset, view.byteLe
 
 export class Sags {
   constructor(url = `ws://${location.host}/ws`, { maxAge = 0.4 } = {}) {
-    Object.assign(this, { url, maxAge, topics: new Map(), waiting: new Map(), asked: 0, drawn: {}, reasons: {} });
+    Object.assign(this, { url, maxAge, topics: new Map(), waiting: new Map(), asked: 0, drawn: {}, reasons: {}, units: {} });
     this.forgetClock();
     this.connect();
     const look = () => { this.look(); requestAnimationFrame(look); }; // before each time the page is painted
@@ -99,6 +100,7 @@ export class Sags {
         if (this.age(stampMs) > this.maxAge) continue;
         draw();
         way.shownMs = stampMs;
+        this.units[topic] = head.units;
         this.drawn[topic] = (this.drawn[topic] ?? 0) + 1;
         delete this.reasons[topic];
       } catch (error) { this.takeBack(topic, String(error)); }
