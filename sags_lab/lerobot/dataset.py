@@ -52,8 +52,8 @@ class LeRobot:
     """A data set of one episode.
 
     Observations: pictures of both eyes (`observation.images.endoscope.left` and `right`), the model's depth
-    (m, 0 unknown) and the tissue mask at a fourth of the size, the camera's pose T_world_cam [4, 4] (m), and
-    64 points that are followed ([64, 3] m, world; NaN: lost) with their visibility 0..1.
+    (m, 0 unknown) and the tissue mask at a fourth of the size, the camera's pose T_world_cam [4, 4] (m, NaN:
+    not known), and 64 points that are followed ([64, 3] m, world; NaN: lost) with their visibility 0..1.
 
     Args:
         folder: to be made.
@@ -90,13 +90,14 @@ class LeRobot:
         pair = result.pair
         if self._count == 0:
             self._open(pair)
-        points, visibility = points_of(anchors)
+        points, visibility = points_of(result, anchors)
         small = pair.camera.width // COARSE, pair.camera.height // COARSE
         tissue = result.observation.tissue.astype(np.uint8)
+        pose = np.full((4, 4), np.nan) if "pose" in result.skipped else pair.camera.T_world_cam
         row = {
             DEPTH: cv2.resize(depth_of(result), small, interpolation=cv2.INTER_NEAREST),
             TISSUE: cv2.resize(tissue, small, interpolation=cv2.INTER_NEAREST),
-            POSE: pair.camera.T_world_cam.astype(np.float32),
+            POSE: pose.astype(np.float32),
             POINTS: points,
             VISIBILITY: visibility,
             "timestamp": np.float32(self._count / self._fps),

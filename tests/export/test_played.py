@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,22 @@ import numpy as np
 import open3d
 import pytest
 from command_line import pure_json, refused, sags
+from synthetic import plane_result
 from tiny_archive import TINY_FRAMES, write_tiny_session
 
-from sags_lab.lerobot.dataset import merge
-from sags_lab.lerobot.form import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, TISSUE, Version
+from sags_lab.lerobot.dataset import LeRobot, merge
+from sags_lab.lerobot.form import (
+    COARSE,
+    DEPTH,
+    LEFT,
+    POINTS,
+    POSE,
+    RIGHT,
+    TASK,
+    TISSUE,
+    VISIBILITY,
+    Version,
+)
 from sags_lab.lerobot.stats import Sums, merged
 from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
@@ -33,6 +46,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="the extra archive is not ins
 av = pytest.importorskip("av", reason="a second reader of videos")
 
 SESSIONS = 3
+DARK_FROM = 3  # frame
 CHUNKS = ("chunk_index", "file_index")
 CODING = 6  # of 255: a video's error; another frame of these sessions differs by 10 and more
 
@@ -212,6 +226,64 @@ def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None
     for name, of in {"min": np.nanmin, "max": np.nanmax, "mean": np.nanmean, "std": np.nanstd}.items():
         assert found[name] == pytest.approx(of(together, axis=0)), name
     assert found["count"] == [89]
+
+
+@pytest.fixture(scope="module")
+def darkened(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session whose light is switched off: frames from `DARK_FROM` on, of both eyes, are black."""
+    folder = tmp_path_factory.mktemp("dark") / "session"
+    write_tiny_session(folder, seed=0)
+    for eye in ("left", "right"):
+        for file in sorted((folder / eye).iterdir())[DARK_FROM:]:
+            cv2.imwrite(str(file), np.zeros_like(cv2.imread(str(file))))
+    return folder
+
+
+@pytest.mark.fault("picture: black to the end of a recording that is exported")
+def test_frames_that_were_not_taken_in_have_no_points(darkened: Path, tmp_path: Path) -> None:
+    into = ("--depth", tmp_path / "depth", "--tracks", tmp_path / "t.npz", "--lerobot", tmp_path / "lerobot")
+    assert sags("export", darkened, "mapping.iterations:=1", *into).exit_code == 0
+    with np.load(tmp_path / "t.npz") as tracks:
+        points, visible = tracks["points"], tracks["visible"]
+    (table,) = (tmp_path / "lerobot/data").rglob("*.parquet")
+    rows = pq.read_table(table).to_pylist()
+    for number in range(TINY_FRAMES):
+        dark = number >= DARK_FROM
+        depth = cv2.imread(str(tmp_path / f"depth/{number:05d}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.all(depth == 0) == dark
+        assert np.isnan(points[number]).all() == dark and visible[number].any() != dark
+        assert np.isnan(rows[number][POINTS]).all() == dark and np.any(rows[number][VISIBILITY]) != dark
+        assert np.array_equal(rows[number][POSE], np.eye(4))  # this camera stands still
+
+
+def test_a_pose_that_the_robot_does_not_tell_is_not_the_last_one(tmp_path: Path) -> None:
+    told = plane_result(stamp_ns=0)
+    unknown = replace(told, held="no pose came", skipped={"pose": "no pose came"})
+    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
+    for number, result in enumerate((told, unknown)):
+        episode.add(number, result, result.anchors)
+    episode.finish()
+    (table,) = (tmp_path / "out/data").rglob("*.parquet")
+    first, second = pq.read_table(table)[POSE].to_pylist()
+    assert np.array_equal(first, np.float32(told.pair.camera.T_world_cam)) and np.isnan(second).all()
+
+
+def test_the_model_is_exported_of_frames_that_were_taken_in(
+    darkened: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    command = ("export", darkened, "mapping.iterations:=1")
+    last = (DARK_FROM - 1) / 10  # s
+    mistake = (f"at {last + 0.2:.2f} s was not taken in", "black", f"--at {last:g}")
+    refused(2, *command, "--at", last + 0.2, "--splats", tmp_path / "dark.ply", said=mistake)
+    files = [tmp_path / "at.ply", tmp_path / "end.ply"]
+    assert sags(*command, "--at", last, "--splats", files[0]).exit_code == 0
+    assert sags(*command, "--splats", files[1]).exit_code == 0
+    assert "was not taken in" in caplog.text and f"at {last:g} s" in caplog.text
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert sags(*command, "--sequence", tmp_path / "all").exit_code == 0
+    assert f"{TINY_FRAMES - DARK_FROM} frames are left out" in caplog.text
+    kept = sorted(file.name for file in (tmp_path / "all").glob("frame_*.ply"))
+    assert kept == [f"frame_{number:05d}.ply" for number in range(DARK_FROM)]
 
 
 def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:

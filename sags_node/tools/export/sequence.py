@@ -7,6 +7,7 @@ goes on when the same command is given again: frames that are there are not writ
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -23,6 +24,8 @@ from sags_node.pipeline.session import Session
 from sags_node.tools.evaluation.receipt import digest, rig_digest
 from sags_node.tools.export.orbit import picture_of
 from sags_node.tools.export.scene import Advance, Scene, files_of_fit
+
+log = logging.getLogger(__name__)
 
 ABOUT = "sequence.json"
 LOOP = "loop.mp4"
@@ -79,7 +82,8 @@ def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
 def write_sequence(
     folder: Path, scenes: Iterable[Scene], rate: float, count: int | None, advance: Advance
 ) -> list[dict[str, Any]]:
-    """Write `frame_NNNNN.ply` for every scene that shows something, and `loop.mp4`: there and back.
+    """Write `frame_NNNNN.ply` for every scene that was taken in and shows something, and `loop.mp4`: there
+    and back.
 
     Args:
         rate: pictures per second.
@@ -92,10 +96,14 @@ def write_sequence(
         SagsError: nothing is shown, or a file cannot be written; what was written stays.
     """
     written = kept = size = pictures = 0
+    held: list[str] = []
     with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-", dir=folder) as passing:
         rasterizer, camera = None, None
         for number, scene in enumerate(scenes):
             advance(number + 1, count, f"writing frames, {kept} were there")
+            if scene.held:
+                held.append(scene.held)
+                continue
             if len(scene.gaussians) == 0:
                 continue
             path = folder / FRAME.format(number)
@@ -120,6 +128,8 @@ def write_sequence(
             pictures += 1
         if camera is None:
             raise SagsError("no frame shows anything to make a model of")
+        if held:
+            log.warning("%d frames are left out, since they were not taken in (%s)", len(held), held[-1])
         loop = folder / LOOP
         order = [*range(pictures), *range(pictures - 2, 0, -1)]
         with whole(loop) as partial:
