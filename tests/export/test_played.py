@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -284,6 +285,56 @@ def test_the_model_is_exported_of_frames_that_were_taken_in(
     assert f"{TINY_FRAMES - DARK_FROM} frames are left out" in caplog.text
     kept = sorted(file.name for file in (tmp_path / "all").glob("frame_*.ply"))
     assert kept == [f"frame_{number:05d}.ply" for number in range(DARK_FROM)]
+
+
+STAMPS = (0, 0.1, 0.2, 5.2, 5.3, 5.4)  # s; the recording paused
+
+
+@pytest.mark.fault("stamp: a recording that paused is exported as a video")
+def test_videos_have_the_recordings_own_stamps(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    write_tiny_session(session, seed=0)
+    shutil.rmtree(session / "tools")
+    for eye in ("left", "right"):
+        for file, at in zip(sorted((session / eye).iterdir()), STAMPS, strict=True):
+            file.rename(file.with_name(f"{1_700_000_000_000_000_000 + round(at * 1e9)}{file.suffix}"))
+    played = {"source": {"kind": "folders", "left": "left", "right": "right"}, "rig": "calib"}
+    (session / "launch.yaml").write_text(json.dumps(played))
+    command = ("export", session, "mapping.iterations:=1")
+    assert sags(*command, "--render", tmp_path / "model.mp4").exit_code == 0
+    assert times_of(tmp_path / "model.mp4") == pytest.approx(STAMPS, abs=1e-3)
+    assert sags(*command, "--sequence", tmp_path / "all").exit_code == 0
+    back = [2 * STAMPS[-1] - at for at in STAMPS[-2:0:-1]]
+    assert times_of(tmp_path / "all/loop.mp4") == pytest.approx([*STAMPS, *back], abs=1e-3)
+
+
+def times_of(video: Path) -> list[float]:
+    """When each picture is shown, s."""
+    with av.open(str(video)) as opened:
+        return [float(frame.time) for frame in opened.decode(video=0)]
+
+
+@pytest.mark.parametrize(
+    ("rate", "fits"), [(30.0, True), (29.97, True), (1000 / 33, True), (12.5, False), (0.5, False)]
+)
+def test_lerobot_takes_whole_rates(tmp_path: Path, rate: float, fits: bool) -> None:
+    if fits:
+        LeRobot(tmp_path / "out", rate, "v3.0")
+    else:
+        with pytest.raises(UsageError, match=f"{rate:g} frames a second are recorded; set source.rate"):
+            LeRobot(tmp_path / "out", rate, "v3.0")
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_gaps_that_lerobot_does_not_know_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, paused: bool
+) -> None:
+    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
+    for number, at in enumerate(STAMPS if paused else np.arange(6) * 0.11):
+        result = plane_result(stamp_ns=round(at * 1e9))
+        episode.add(number, result, result.anchors)
+    assert episode.finish() == len(STAMPS)
+    assert ("1 of 5 steps" in caplog.text and "5.0 s" in caplog.text) if paused else not caplog.text
 
 
 def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:

@@ -180,8 +180,8 @@ class Tracks:
 
 
 class Renders:
-    """An MP4 of the model as the left eye sees it; black where nothing is known, and in frames that were not
-    taken in."""
+    """An MP4 of the model as the left eye sees it, by the frames' stamps; black where nothing is known, and
+    in frames that were not taken in."""
 
     def __init__(self, file: Path, rate: float, size: tuple[int, int]) -> None:
         self._video = VideoFile(file, rate, size)
@@ -190,7 +190,8 @@ class Renders:
     def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
         pair, view = result.pair, result.views["left"]
         shown = published.alpha(pair, view)[..., None] > 0
-        self._video.add(published.colours(pair, view) * shown * np.uint8(not result.held))
+        picture = published.colours(pair, view) * shown * np.uint8(not result.held)
+        self._video.add(picture, pair.t_capture_ns)
         self._holds += 1
 
     def finish(self) -> int:

@@ -86,7 +86,7 @@ def write_sequence(
     and back.
 
     Args:
-        rate: pictures per second.
+        rate: pictures per second, where stamps begin anew.
         count: how many scenes there will be, where that is known.
 
     Returns:
@@ -95,7 +95,8 @@ def write_sequence(
     Raises:
         SagsError: nothing is shown, or a file cannot be written; what was written stays.
     """
-    written = kept = size = pictures = 0
+    written = kept = size = 0
+    stamps: list[int] = []  # ns, of the pictures
     held: list[str] = []
     with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-", dir=folder) as passing:
         rasterizer, camera = None, None
@@ -124,24 +125,25 @@ def write_sequence(
             jpeg = cv2.imencode(
                 ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
             )
-            (Path(passing) / f"{pictures}.jpg").write_bytes(jpeg[1].tobytes())
-            pictures += 1
+            (Path(passing) / f"{len(stamps)}.jpg").write_bytes(jpeg[1].tobytes())
+            stamps.append(scene.t_capture_ns)
         if camera is None:
             raise SagsError("no frame shows anything to make a model of")
         if held:
             log.warning("%d frames are left out, since they were not taken in (%s)", len(held), held[-1])
         loop = folder / LOOP
-        order = [*range(pictures), *range(pictures - 2, 0, -1)]
+        shown = [*enumerate(stamps)]
+        shown += [(number, 2 * stamps[-1] - stamp_ns) for number, stamp_ns in shown[-2:0:-1]]
         with whole(loop) as partial:
             video = VideoFile(partial, rate, (camera.width, camera.height))
-            for done, number in enumerate(order):
+            for done, (number, stamp_ns) in enumerate(shown):
                 read = cv2.imread(str(Path(passing) / f"{number}.jpg"))
                 if read is None:
                     raise SagsError(f"a picture in {passing} was removed; export again")
-                video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB))
-                advance(done + 1, len(order), "writing the video")
+                video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), stamp_ns)
+                advance(done + 1, len(shown), "writing the video")
             video.finish()
     return [
         {"file": str(folder / FRAME.format(0)), "kind": "sequence", "holds": written + kept, "bytes": size},
-        {"file": str(loop), "kind": "loop", "holds": len(order), "bytes": loop.stat().st_size},
+        {"file": str(loop), "kind": "loop", "holds": len(shown), "bytes": loop.stat().st_size},
     ]
