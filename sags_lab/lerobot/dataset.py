@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,6 +41,9 @@ from sags_node.types import AnchorStates, FrameResult, RectifiedPair
 if TYPE_CHECKING:
     import pyarrow as pa
 
+log = logging.getLogger(__name__)
+
+UNEVEN = 0.02  # of a rate that is still whole: that of 30 Hz by stamps in whole ms is 1 % off
 ROWS = 64  # frames that are in memory
 PICTURES_LOOKED_AT = 10  # one frame in so many, for the statistics
 STATISTICS = {  # feature -> the shape of its statistics; what is a field has one for all of it
@@ -52,22 +56,28 @@ class LeRobot:
     """A data set of one episode.
 
     Observations: pictures of both eyes (`observation.images.endoscope.left` and `right`), the model's depth
-    (m, 0 unknown) and the tissue mask at a fourth of the size, the camera's pose T_world_cam [4, 4] (m), and
-    64 points that are followed ([64, 3] m, world; NaN: lost) with their visibility 0..1.
+    (m, 0 unknown) and the tissue mask at a fourth of the size, the camera's pose T_world_cam [4, 4] (m, NaN:
+    not known), and 64 points that are followed ([64, 3] m, world; NaN: lost) with their visibility 0..1.
 
     Args:
         folder: to be made.
-        rate: frames per second; LeRobot takes whole ones.
+        rate: frames per second; LeRobot takes whole ones, without gaps.
 
     Raises:
-        UsageError: pyarrow is not installed.
+        UsageError: pyarrow is not installed, or the rate is not whole.
     """
 
     def __init__(self, folder: Path, rate: float, version: Version) -> None:
         check_lerobot()
+        self._fps = max(1, round(rate))
+        if abs(rate - self._fps) > UNEVEN * self._fps:
+            raise UsageError(
+                f"LeRobot knows whole rates only, and {rate:.4g} frames a second are recorded; set "
+                f"source.rate to what they are to have, e.g. source.rate:={self._fps}"
+            )
         folder.mkdir()
         self._folder, self._version = folder, version
-        self._fps = max(1, round(rate))
+        self._stamps: list[int] = []  # ns
         self._features: dict[str, Any] = {}
         self._videos: dict[str, VideoFile] = {}
         self._sums: dict[str, Sums] = {}
@@ -90,13 +100,15 @@ class LeRobot:
         pair = result.pair
         if self._count == 0:
             self._open(pair)
-        points, visibility = points_of(anchors)
+        self._stamps.append(pair.t_capture_ns)
+        points, visibility = points_of(result, anchors)
         small = pair.camera.width // COARSE, pair.camera.height // COARSE
         tissue = result.observation.tissue.astype(np.uint8)
+        pose = np.full((4, 4), np.nan) if "pose" in result.skipped else pair.camera.T_world_cam
         row = {
             DEPTH: cv2.resize(depth_of(result), small, interpolation=cv2.INTER_NEAREST),
             TISSUE: cv2.resize(tissue, small, interpolation=cv2.INTER_NEAREST),
-            POSE: pair.camera.T_world_cam.astype(np.float32),
+            POSE: pose.astype(np.float32),
             POINTS: points,
             VISIBILITY: visibility,
             "timestamp": np.float32(self._count / self._fps),
@@ -120,6 +132,13 @@ class LeRobot:
         self._table.close()
         for video in self._videos.values():
             video.finish()
+        steps = np.diff(self._stamps) * 1e-9
+        if uneven := int(np.sum(np.abs(steps - 1 / self._fps) > 0.5 / self._fps)):
+            log.warning(
+                "%d of %d steps between frames are not of %d Hz, the longest is of %.1f s: LeRobot knows no "
+                "gaps, so the timestamps are not the recording's there; cut it where it paused",
+                *(uneven, len(steps), self._fps, steps.max()),
+            )
         stats = {name: sums.stats(STATISTICS[name]) for name, sums in self._sums.items()}
         describe(self._folder, self._version, self._features, self._fps, [self._count], [stats])
         return self._count

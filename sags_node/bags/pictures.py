@@ -24,9 +24,9 @@ _BAYER = re.compile("bayer_(rggb|bggr|gbrg|grbg)")
 _STAMP = struct.Struct("<iI")
 _BIG_STAMP = struct.Struct(">iI")
 
-_FILE_TO_RGB = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}  # channels: conversion
-
-_TO_FILE = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}  # OpenCV writes BGR
+_OF_CHANNELS = {3: "rgb8", 4: "rgba8"}
+_FROM_FILE = {"rgb8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_BGRA2RGBA}  # OpenCV reads and writes BGR
+_TO_FILE = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}
 
 
 class Encoding(NamedTuple):
@@ -79,21 +79,36 @@ def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
         SagsError: the message is damaged, or of an encoding that is not read.
     """
     message = decode_message(data, kind, where)
-    if kind == cdr.COMPRESSED:
-        try:
-            decoded = decode_file(np.asarray(message.data, np.uint8), where)
-        except SagsError:
-            if (stream := _STREAM.search(message.format)) is None:
-                raise
-            raise SagsError(
-                f"{where}: {stream[0]!r} is a stream of pictures, and single ones are read (JPEG, PNG); make "
-                "a video of each eye's messages, or record single pictures"
-            ) from None
-        channels = 1 if decoded.ndim == 2 else decoded.shape[2]
-        mosaic = _mosaic(message.format) if channels == 1 else None
-        of_file: U8 = cv2.cvtColor(decoded, _FILE_TO_RGB[channels] if mosaic is None else mosaic)
-        return of_file
-    return _raw_to_rgb(message, where)
+    if kind != cdr.COMPRESSED:
+        return _raw_to_rgb(message, where)
+    picture, encoding = decompressed(message, where)
+    to_rgb = ENCODINGS[encoding].to_rgb
+    of_file: U8 = picture if to_rgb is None else cv2.cvtColor(picture, to_rgb)
+    return of_file
+
+
+def decompressed(message: Any, where: str) -> tuple[U8, str]:
+    """The picture in a `CompressedImage`, and its encoding: mono8 [H, W], rgb8 or rgba8 [H, W, C].
+
+    It is what its file is. `format` says only how grey was a mosaic: each recorder has its own words there.
+
+    Raises:
+        SagsError: as `decode_picture`.
+    """
+    try:
+        decoded = decode_file(np.asarray(message.data, np.uint8), where)
+    except SagsError:
+        if (stream := _STREAM.search(message.format)) is None:
+            raise
+        raise SagsError(
+            f"{where}: {stream[0]!r} is a stream of pictures, and single ones are read (JPEG, PNG); make "
+            "a video of each eye's messages, or record single pictures"
+        ) from None
+    if decoded.ndim == 3:
+        encoding = _OF_CHANNELS[decoded.shape[2]]
+        return np.asarray(cv2.cvtColor(decoded, _FROM_FILE[encoding])), encoding
+    mosaic = _mosaic(message.format)
+    return (decoded, "mono8") if mosaic is None else (np.asarray(cv2.cvtColor(decoded, mosaic)), "rgb8")
 
 
 def _mosaic(said: str) -> int | None:

@@ -38,7 +38,7 @@ NO_CAMERAS = "live cameras are exported from the running node; name no recording
 @click.command()
 @launch_argument
 @session_option
-@click.option("--at", type=from_zero, help="Seconds into the session; default: its end.")
+@click.option("--at", type=from_zero, help="Seconds into the session; default: its last frame taken in.")
 @folder_option("--fit", help="What sags fit made of that session, in place of the online model.")
 @file_option("--splats", metavar="F.ply", help="All Gaussians with the fields of 3D Gaussian Splatting.")
 @file_option(

@@ -240,6 +240,30 @@ def test_pictures_come_as_h264_that_anybody_can_begin_with(tmp_path: Path) -> No
     assert np.mean([len(message) for _, message in second.came[name][began + 1 : began + 6]]) < raw / 10
 
 
+@pytest.mark.fault("picture: what is unsure, or not drawn, in H.264")
+def test_h264_shows_what_has_alpha_over_black() -> None:
+    """As the node's JPEG, and OpenIGTLink: what is unsure is faint, and what is not drawn is not there."""
+    av = pytest.importorskip("av", reason="no H.264 without PyAV")
+    from sags_node.clients.bridge.h264 import Encoder
+
+    color, alphas = np.array([255, 220, 0]), (0, 0.35, 1)
+    stripes = [np.full((65, 64, 4), [*color, round(255 * alpha)], np.uint8) for alpha in alphas]
+    (decoded,) = av.CodecContext.create("h264", "r").decode(av.Packet(Encoder().encode(np.hstack(stripes))))
+    for n, alpha in enumerate(alphas):
+        middle = decoded.to_ndarray(format="rgb24")[16:48, 64 * n + 16 : 64 * n + 48]
+        assert np.abs(middle - alpha * color).max() <= 6  # of 255: coding
+
+
+@pytest.mark.parametrize("eye", ["left", "right"])
+def test_h264_is_in_the_frame_of_its_eye(tmp_path: Path, eye: str) -> None:
+    pytest.importorskip("av", reason="no H.264 without PyAV")
+    name = f"/sags/{eye}/render/image/h264"
+    with plane_bridged(run_foxglove, options(tmp_path)) as (_, port), Client(port) as joined:
+        joined.subscribe(name)
+        until(lambda: joined.came[name])
+    assert protobuf_bytes(joined.came[name][0][1])[2].decode() == f"{eye}_optical_frame"
+
+
 def protobuf_bytes(message: bytes) -> dict[int, bytes]:
     """The fields of a protobuf message that hold bytes."""
     fields, at = {}, 0

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,22 @@ import numpy as np
 import open3d
 import pytest
 from command_line import pure_json, refused, sags
+from synthetic import plane_result
 from tiny_archive import TINY_FRAMES, write_tiny_session
 
-from sags_lab.lerobot.dataset import merge
-from sags_lab.lerobot.form import COARSE, DEPTH, LEFT, POINTS, POSE, RIGHT, TASK, TISSUE, Version
+from sags_lab.lerobot.dataset import LeRobot, merge
+from sags_lab.lerobot.form import (
+    COARSE,
+    DEPTH,
+    LEFT,
+    POINTS,
+    POSE,
+    RIGHT,
+    TASK,
+    TISSUE,
+    VISIBILITY,
+    Version,
+)
 from sags_lab.lerobot.stats import Sums, merged
 from sags_node.config.schema import ReferenceConfig
 from sags_node.errors import SagsError, UsageError
@@ -33,6 +47,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="the extra archive is not ins
 av = pytest.importorskip("av", reason="a second reader of videos")
 
 SESSIONS = 3
+DARK_FROM = 3  # frame
 CHUNKS = ("chunk_index", "file_index")
 CODING = 6  # of 255: a video's error; another frame of these sessions differs by 10 and more
 
@@ -212,6 +227,114 @@ def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None
     for name, of in {"min": np.nanmin, "max": np.nanmax, "mean": np.nanmean, "std": np.nanstd}.items():
         assert found[name] == pytest.approx(of(together, axis=0)), name
     assert found["count"] == [89]
+
+
+@pytest.fixture(scope="module")
+def darkened(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session whose light is switched off: frames from `DARK_FROM` on, of both eyes, are black."""
+    folder = tmp_path_factory.mktemp("dark") / "session"
+    write_tiny_session(folder, seed=0)
+    for eye in ("left", "right"):
+        for file in sorted((folder / eye).iterdir())[DARK_FROM:]:
+            cv2.imwrite(str(file), np.zeros_like(cv2.imread(str(file))))
+    return folder
+
+
+@pytest.mark.fault("picture: black to the end of a recording that is exported")
+def test_frames_that_were_not_taken_in_have_no_points(darkened: Path, tmp_path: Path) -> None:
+    into = ("--depth", tmp_path / "depth", "--tracks", tmp_path / "t.npz", "--lerobot", tmp_path / "lerobot")
+    assert sags("export", darkened, "mapping.iterations:=1", *into).exit_code == 0
+    with np.load(tmp_path / "t.npz") as tracks:
+        points, visible = tracks["points"], tracks["visible"]
+    (table,) = (tmp_path / "lerobot/data").rglob("*.parquet")
+    rows = pq.read_table(table).to_pylist()
+    for number in range(TINY_FRAMES):
+        dark = number >= DARK_FROM
+        depth = cv2.imread(str(tmp_path / f"depth/{number:05d}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.all(depth == 0) == dark
+        assert np.isnan(points[number]).all() == dark and visible[number].any() != dark
+        assert np.isnan(rows[number][POINTS]).all() == dark and np.any(rows[number][VISIBILITY]) != dark
+        assert np.array_equal(rows[number][POSE], np.eye(4))  # this camera stands still
+
+
+def test_a_pose_that_the_robot_does_not_tell_is_not_the_last_one(tmp_path: Path) -> None:
+    told = plane_result(stamp_ns=0)
+    unknown = replace(told, held="no pose came", skipped={"pose": "no pose came"})
+    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
+    for number, result in enumerate((told, unknown)):
+        episode.add(number, result, result.anchors)
+    episode.finish()
+    (table,) = (tmp_path / "out/data").rglob("*.parquet")
+    first, second = pq.read_table(table)[POSE].to_pylist()
+    assert np.array_equal(first, np.float32(told.pair.camera.T_world_cam)) and np.isnan(second).all()
+
+
+def test_the_model_is_exported_of_frames_that_were_taken_in(
+    darkened: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    command = ("export", darkened, "mapping.iterations:=1")
+    last = (DARK_FROM - 1) / 10  # s
+    mistake = (f"at {last + 0.2:.2f} s was not taken in", "black", f"--at {last:g}")
+    refused(2, *command, "--at", last + 0.2, "--splats", tmp_path / "dark.ply", said=mistake)
+    files = [tmp_path / "at.ply", tmp_path / "end.ply"]
+    assert sags(*command, "--at", last, "--splats", files[0]).exit_code == 0
+    assert sags(*command, "--splats", files[1]).exit_code == 0
+    assert "was not taken in" in caplog.text and f"at {last:g} s" in caplog.text
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert sags(*command, "--sequence", tmp_path / "all").exit_code == 0
+    assert f"{TINY_FRAMES - DARK_FROM} frames are left out" in caplog.text
+    kept = sorted(file.name for file in (tmp_path / "all").glob("frame_*.ply"))
+    assert kept == [f"frame_{number:05d}.ply" for number in range(DARK_FROM)]
+
+
+STAMPS = (0, 0.1, 0.2, 5.2, 5.3, 5.4)  # s; the recording paused
+
+
+@pytest.mark.fault("stamp: a recording that paused is exported as a video")
+def test_videos_have_the_recordings_own_stamps(tmp_path: Path) -> None:
+    session = tmp_path / "session"
+    write_tiny_session(session, seed=0)
+    shutil.rmtree(session / "tools")
+    for eye in ("left", "right"):
+        for file, at in zip(sorted((session / eye).iterdir()), STAMPS, strict=True):
+            file.rename(file.with_name(f"{1_700_000_000_000_000_000 + round(at * 1e9)}{file.suffix}"))
+    played = {"source": {"kind": "folders", "left": "left", "right": "right"}, "rig": "calib"}
+    (session / "launch.yaml").write_text(json.dumps(played))
+    command = ("export", session, "mapping.iterations:=1")
+    assert sags(*command, "--render", tmp_path / "model.mp4").exit_code == 0
+    assert times_of(tmp_path / "model.mp4") == pytest.approx(STAMPS, abs=1e-3)
+    assert sags(*command, "--sequence", tmp_path / "all").exit_code == 0
+    back = [2 * STAMPS[-1] - at for at in STAMPS[-2:0:-1]]
+    assert times_of(tmp_path / "all/loop.mp4") == pytest.approx([*STAMPS, *back], abs=1e-3)
+
+
+def times_of(video: Path) -> list[float]:
+    """When each picture is shown, s."""
+    with av.open(str(video)) as opened:
+        return [float(frame.time) for frame in opened.decode(video=0)]
+
+
+@pytest.mark.parametrize(
+    ("rate", "fits"), [(30.0, True), (29.97, True), (1000 / 33, True), (12.5, False), (0.5, False)]
+)
+def test_lerobot_takes_whole_rates(tmp_path: Path, rate: float, fits: bool) -> None:
+    if fits:
+        LeRobot(tmp_path / "out", rate, "v3.0")
+    else:
+        with pytest.raises(UsageError, match=f"{rate:g} frames a second are recorded; set source.rate"):
+            LeRobot(tmp_path / "out", rate, "v3.0")
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_gaps_that_lerobot_does_not_know_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, paused: bool
+) -> None:
+    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
+    for number, at in enumerate(STAMPS if paused else np.arange(6) * 0.11):
+        result = plane_result(stamp_ns=round(at * 1e9))
+        episode.add(number, result, result.anchors)
+    assert episode.finish() == len(STAMPS)
+    assert ("1 of 5 steps" in caplog.text and "5.0 s" in caplog.text) if paused else not caplog.text
 
 
 def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:

@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+import bag_files
+import cv2
 import numpy as np
 import pytest
 from command_line import sags, start, stopped, wait_for
@@ -18,9 +20,12 @@ from recorded_plane import by_topic, record_plane
 from synthetic import HEIGHT, WIDTH, plane_result
 from waiting import beside, heard, until
 
+from sags_node.bags.bag import read_messages
+from sags_node.bags.pictures import decode_picture, encode_file
 from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 from sags_node.clients.recording.info import bag_info
-from sags_node.clients.recording.player import Player, PlayOptions
+from sags_node.clients.recording.outgoing import outgoing
+from sags_node.clients.recording.player import PlayClock, Player, PlayOptions
 from sags_node.clients.recording.recover import recover
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
@@ -34,6 +39,7 @@ from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
+EYES = ["left/image_rect_color", "right/image_rect_color"]
 PHASE = 24  # times that a clock is told before the player is paused, and goes on
 
 
@@ -123,6 +129,87 @@ def test_compressed_pictures_are_played_raw(tmp_path: Path) -> None:
     assert np.array_equal(seen[names[0]].array, plane_result().pair.left)
     assert seen[names[1]].meta.encoding == "rgba8" and seen[names[1]].array[..., 3].max() == 191
     assert seen[names[2]].array.shape == (HEIGHT, WIDTH)
+
+
+COLOR = bag_files.picture(0, 0)
+GREY = np.ascontiguousarray(COLOR[..., 1])
+MOSAIC = cv2.cvtColor(GREY, cv2.COLOR_BayerRG2RGB)
+ALPHA = np.dstack([COLOR, GREY])
+
+
+@pytest.mark.fault("file: compressed pictures of other recorders are played")
+@pytest.mark.parametrize(
+    ("said", "stored", "encoding", "expected"),
+    [
+        ("bgr8; jpeg compressed bgr8", COLOR, "rgb8", COLOR),
+        *((form, COLOR, "rgb8", COLOR) for form in ("jpeg", "png", "")),
+        ("bgra8; png compressed bgra8", ALPHA, "rgba8", ALPHA),
+        ("8UC1; png compressed ", GREY, "mono8", GREY),
+        ("mono8; png compressed mono8", GREY, "mono8", GREY),
+        ("bayer_bggr8; png compressed bayer_bggr8", GREY, "rgb8", MOSAIC),
+    ],
+)
+def test_compressed_pictures_of_others_are_what_their_file_is(
+    tmp_path: Path, said: str, stored: np.ndarray, encoding: str, expected: np.ndarray
+) -> None:
+    """As `sags run` reads them, whatever their recorder calls them."""
+    file = encode_file(stored, "mono8" if stored is GREY else encoding, "png", ())
+    head = bag_files.header(bag_files.ROS2, bag_files.START)
+    picture = bag_files.ROS2.types[bag_files.COMPRESSED](head, said, np.frombuffer(file, np.uint8))
+    rows = [("/cam/image/compressed", picture, bag_files.START)]
+    (message,) = read_messages(bag_files.write_rosbag2(tmp_path / "bag", rows))
+    name, content = outgoing(message, stamp_ns=5)
+    assert (name, content.encoding) == ("cam/image", encoding)
+    found = cdr.decode(b"".join(bytes(part) for part in content.parts), content.type)
+    assert np.array_equal(found.data, expected.ravel()) and found.header.stamp.nanosec == 5
+    read = decode_picture(message.data, message.type, "")
+    assert np.array_equal(read, np.dstack([expected] * 3)[..., :3])
+
+
+@pytest.mark.fault("stamp: of a simulator or of none, or latency in slow motion, in a bag that is played")
+@pytest.mark.parametrize("rate", [1.0, 0.1])
+@pytest.mark.parametrize("clock", ["late", "simulated", "half as fast", "none", "hours ahead"])
+def test_what_is_played_is_new_whoever_stamped_it(tmp_path: Path, clock: str, rate: float) -> None:
+    """Two topics of each frame, received 60 and 80 ms after it was captured."""
+    ms, rows = bag_files.MS, []
+    for number in range(40):
+        captured = bag_files.START + number * 40 * ms
+        stamp = {
+            "late": captured,
+            "simulated": 10**9 + number * 40 * ms,
+            "half as fast": 10**9 + number * 20 * ms,
+            "none": 0,
+            "hours ahead": captured + 7 * 3600 * 1000 * ms,
+        }[clock]
+        for eye, name in enumerate(EYES):
+            message = bag_files.image(bag_files.ROS2, bag_files.picture(number, eye), stamp)
+            rows.append((f"/sags/{name}", message, captured + (55 + 20 * eye) * ms))  # received 5 ms later
+    path = bag_files.write_rosbag2(tmp_path / "bag", rows)
+    with (
+        playing(path, tmp_path / "run", loop=True, rate=rate) as player,
+        Subscriber(EYES, run_dir=tmp_path / "run") as sub,
+    ):
+        player.toggle_pause()
+        until(lambda: all(sub.ok(name) for name in EYES))
+        newest = sub.wait(EYES[0], 30)
+        assert newest is not None and abs(newest.age(sub.now_ns())) < 60
+        if clock != "none":
+            assert sub.aligned(EYES, newest.stamp_ns, timeout=30) is not None
+
+
+def test_stamps_keep_their_order_and_their_latency() -> None:
+    """Frames of which some come late: as fast as recorded, faster, and in slow motion."""
+    captured = np.arange(0, 3000, 33) * bag_files.MS + bag_files.START
+    latencies = np.random.default_rng(0).choice([20, 60, 300], len(captured)) * bag_files.MS
+    received = np.maximum.accumulate(captured + latencies)
+    for rate in (0.02, 0.1, 0.5, 1.0, 3.0):
+        clock = PlayClock(bag_files.START, rate)
+        pairs = [(int(log), int(stamp)) for log, stamp in zip(received, captured, strict=True)]
+        stamps = np.array([clock.stamp_ns(log, stamp) for log, stamp in pairs])
+        ages = np.array([clock.wall_ns(log) for log in received.tolist()]) - stamps
+        assert (np.diff(stamps) > 0).all()
+        late = (received - captured) / max(rate, 1)
+        assert (ages > late - 3).all() and (ages < late + 100 * bag_files.MS + 3).all()  # ns of rounding
 
 
 def test_flags_of_play(plane_bag: Path, tmp_path: Path) -> None:

@@ -250,16 +250,16 @@ class _Video:
 
     def show(self, received: Received, grown: bool) -> None:
         assert isinstance(received, ReceivedImage)
-        self._send(received.array, received.stamp_ns, grown)
+        self._send(received, received.array, received.stamp_ns, grown)
 
     def blank(self, shown: Received, reason: str) -> None:
         assert isinstance(shown, ReceivedImage)
-        self._send(np.zeros_like(shown.array), time.time_ns(), key=True)
+        self._send(shown, np.zeros_like(shown.array), time.time_ns(), key=True)
 
-    def _send(self, picture: U8, stamp_ns: int, key: bool) -> None:
+    def _send(self, of: Received, picture: U8, stamp_ns: int, key: bool) -> None:
         data = self._encoder.encode(picture, key)
         stamp = Timestamp(*divmod(stamp_ns, SECOND_NS))
-        frame = CompressedVideo(timestamp=stamp, frame_id=cdr.LEFT_FRAME, data=data, format="h264")
+        frame = CompressedVideo(timestamp=stamp, frame_id=_frame_of(of), data=data, format="h264")
         self._channel.log(frame, log_time=stamp_ns)
 
 
@@ -305,8 +305,7 @@ def empty_of(shown: Received, now_ns: int, reason: str) -> bytes | None:
     camera, is nothing to look at."""
     if isinstance(shown, ReceivedImage):
         nothing = np.nan if shown.array.dtype == np.float32 else 0
-        frame = cdr.RIGHT_FRAME if "/right/" in shown.topic else cdr.LEFT_FRAME
-        empty = cdr.image(np.full_like(shown.array, nothing), shown.meta.encoding, now_ns, frame)
+        empty = cdr.image(np.full_like(shown.array, nothing), shown.meta.encoding, now_ns, _frame_of(shown))
     elif isinstance(shown, ReceivedCloud):
         fields = shown.meta.encoding.split(",")
         empty = cdr.point_cloud(np.empty((0, len(fields)), np.float32), fields, now_ns)
@@ -317,6 +316,10 @@ def empty_of(shown: Received, now_ns: int, reason: str) -> bytes | None:
     else:
         return None
     return empty.cdr()
+
+
+def _frame_of(picture: Received) -> str:
+    return cdr.RIGHT_FRAME if "/right/" in picture.topic else cdr.LEFT_FRAME
 
 
 def clicked(data: bytes) -> tuple[float, float, float] | None:

@@ -8,6 +8,7 @@ import av
 import numpy as np
 from av.video.frame import PictureType
 
+from sags_node.clients.bridge.compressed import over_black
 from sags_node.types import U8
 
 RATE = 30.0  # Hz of the pictures, for what it may send
@@ -26,7 +27,7 @@ class Encoder:
         self._number = 0
 
     def encode(self, picture: U8, key: bool = False) -> bytes:
-        """One picture [H, W, 3 or 4], as RGB and without its alpha, cut to even sizes.
+        """One picture [H, W, 3], or [H, W, 4] over black: H.264 knows no alpha; cut to even sizes.
 
         Args:
             key: make it one that stands for itself.
@@ -34,8 +35,9 @@ class Encoder:
         height, width = (side - side % 2 for side in picture.shape[:2])
         if self._codec is None or (self._codec.height, self._codec.width) != (height, width):
             self._codec, self._number = self._opened(width, height), 0
-        rgb = np.ascontiguousarray(picture[:height, :width, :3])
-        frame = av.VideoFrame.from_ndarray(rgb, "rgb24").reformat(format="yuv420p")
+        rgb = over_black(picture) if picture.shape[2] == 4 else picture
+        even = np.ascontiguousarray(rgb[:height, :width])
+        frame = av.VideoFrame.from_ndarray(even, "rgb24").reformat(format="yuv420p")
         frame.pts, self._number = self._number, self._number + 1
         frame.pict_type = PictureType.I if key else PictureType.NONE
         return b"".join(bytes(packet) for packet in self._codec.encode(frame))

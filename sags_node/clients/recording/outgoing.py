@@ -5,12 +5,10 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sags_node.bags.bag import BagMessage
-from sags_node.bags.pictures import decode_file, header_stamp
-from sags_node.errors import SagsError
+from sags_node.bags.pictures import decompressed, header_stamp
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.wire import Buffer
@@ -20,16 +18,16 @@ COMPRESSED_SUFFIX = "/compressed"
 _HEADER_AT = 4  # after the four bytes that say how a CDR message is encoded
 _FIRST_TRANSFORM_AT = 8  # after the length of the sequence too
 _STAMP = struct.Struct("<iI")
-_FROM_OPENCV = {"rgb8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_BGRA2RGBA}
 
 
 def original_stamp(message: BagMessage) -> int:
-    """Return what the message itself says of its time, ns; when it was published where it says nothing.
+    """Return what the message itself says of its time, ns; when it was published where it says nothing, or 0.
 
     Raises:
         SagsError: it is too short.
     """
-    return header_stamp(message.data) if message.type in STAMPED else message.publish_ns
+    stamp_ns = header_stamp(message.data) if message.type in STAMPED else 0
+    return stamp_ns or message.publish_ns
 
 
 def outgoing(message: BagMessage, stamp_ns: int) -> tuple[str, Content]:
@@ -94,12 +92,5 @@ def _cloud(message: BagMessage, stamp_ns: int) -> Content:
 
 def _raw_picture(message: BagMessage, stamp_ns: int) -> Content:
     ros: Any = cdr.decode(message.data, cdr.COMPRESSED)
-    encoding = ros.format.split(";")[0].strip()
-    decoded = decode_file(np.asarray(ros.data, np.uint8), message.topic)
-    channels = 1 if decoded.ndim == 2 else decoded.shape[2]
-    if cdr.IMAGE_ENCODINGS.get(encoding) != ("uint8", channels):
-        raise SagsError(
-            f"{message.topic}: a compressed picture of {channels} channels says it is {encoding!r}"
-        )
-    picture = cv2.cvtColor(decoded, _FROM_OPENCV[encoding]) if channels > 1 else decoded
+    picture, encoding = decompressed(ros, message.topic)
     return cdr.image(picture, encoding, stamp_ns, ros.header.frame_id)

@@ -17,13 +17,17 @@ from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.files import check_name
 from sags_node.messaging import cdr, topics
+from sags_node.messaging.freshness import STALE_AFTER
 from sags_node.messaging.publisher import Publisher
 from sags_node.wall_clock import WallClock
 
 POLL_SECONDS = 0.02  # how soon pause and stop are noticed
-STAMPS_KEPT = 64
+STAMPS_KEPT = 1024
+SAME_CLOCK = round(STALE_AFTER * 1e9)  # ns between stamp and receipt; beyond it another clock stamped
+DAMAGED = 3600 * 1_000_000_000  # ns; beyond it no clock stamped
+STRETCHED = 100_000_000  # ns
 CLOCK_TOPIC = topics.PLAYER_TOPICS[0].name
-FRAME_TYPES = (topics.IMAGE, topics.POINT_CLOUD, topics.CAMERA_INFO, topics.TF)
+FRAME_TYPES = (topics.IMAGE, cdr.COMPRESSED, topics.POINT_CLOUD, topics.CAMERA_INFO, topics.TF)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +74,15 @@ class PlayClock:
         began_ns = self._wall.at(self._started, wall_ns=self._wall_ns)
         return began_ns + round((recorded_ns - self._first_ns) / self._rate)
 
+    def stamp_ns(self, log_ns: int, original_ns: int) -> int:
+        """The stamp, on the wall clock, of a message that was captured and received at these moments of the
+        recording. Slow playing adds at most `STRETCHED` to its latency, and keeps the order of stamps."""
+        stamp_ns = self.wall_ns(original_ns)
+        if self._rate >= 1:
+            return stamp_ns
+        as_late = self.wall_ns(log_ns) - (log_ns - original_ns)
+        return min(max(stamp_ns, as_late - STRETCHED), as_late + STRETCHED)
+
     def moment_ns(self, at: float) -> int:
         """The moment of the recording that is due at `at`."""
         return self._first_ns + round((at - self._started) * self._rate * 1e9)
@@ -91,8 +104,9 @@ class Player:
         self._sent = 0
         self._clock_due = 0.0
         self._epoch = 0  # grows with each pass, and where the wall clock is set back
-        self._frames: OrderedDict[int, int] = OrderedDict()  # original stamp -> number of the frame
+        self._frames: OrderedDict[int, tuple[int, int]] = OrderedDict()  # original stamp -> as `_frame_at`
         self._frame_count = 0
+        self._same_clock: dict[str, bool] = {}  # by topic: the recorder's clock stamped its first message
 
     def stop(self) -> None:
         self._stopping.set()
@@ -134,6 +148,7 @@ class Player:
     def _play_once(self, publisher: Publisher) -> None:
         options = self._options
         first_ns = began_ns = 0
+        self._frames.clear()
         clock = PlayClock(0, options.rate, self._wall_ns)
         for message in read_messages(self._path):
             if not first_ns:
@@ -149,10 +164,8 @@ class Player:
                 return
             before_ns, began_ns = began_ns, clock.wall_ns(first_ns)
             self._epoch += began_ns < before_ns
-            original = original_stamp(message)
-            stamp_ns = clock.wall_ns(original)
+            number, stamp_ns = self._frame_at(message, clock)
             name, content = outgoing(message, stamp_ns)
-            number = self._frame_number(original) if content.type in FRAME_TYPES else -1
             name, content = self._plain(name), replace(content, relative=message.relative)
             publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, self._epoch)
             self._sent += 1
@@ -208,11 +221,17 @@ class Player:
         """A topic of the bag without the namespace that was recorded: ours takes its place."""
         return topics.plain_name(self._recorded_ns, name)
 
-    def _frame_number(self, stamp_ns: int) -> int:
-        """Number frames by their stamps."""
-        if stamp_ns not in self._frames:
-            self._frames[stamp_ns] = self._frame_count
+    def _frame_at(self, message: BagMessage, clock: PlayClock) -> tuple[int, int]:
+        """Number (-1: it shows no frame) and new stamp: the same for all that was stamped alike."""
+        log_ns, original_ns = message.log_ns, original_stamp(message)
+        apart = abs(log_ns - original_ns)
+        same = self._same_clock.setdefault(message.topic, apart <= SAME_CLOCK) and apart <= DAMAGED
+        stamp_ns = clock.stamp_ns(log_ns, original_ns if same else log_ns)
+        if message.type not in FRAME_TYPES:
+            return -1, stamp_ns
+        if original_ns not in self._frames:
+            self._frames[original_ns] = self._frame_count, stamp_ns
             self._frame_count += 1
             if len(self._frames) > STAMPS_KEPT:
                 self._frames.popitem(last=False)
-        return self._frames[stamp_ns]
+        return self._frames[original_ns]

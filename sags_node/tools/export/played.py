@@ -125,10 +125,13 @@ def depth_of(result: FrameResult) -> F32:
     return np.zeros_like(depth) if result.held else depth
 
 
-def points_of(anchors: AnchorStates) -> tuple[F32, F32]:
-    """World points [TRACKS, 3] (m, NaN: lost, or never pinned) and visibility [TRACKS]."""
+def points_of(result: FrameResult, anchors: AnchorStates) -> tuple[F32, F32]:
+    """World points [TRACKS, 3] (m, NaN: lost, or never pinned) and visibility [TRACKS]; none in a frame
+    that was not taken in."""
     points = np.full((TRACKS, 3), np.nan, np.float32)
     visibility = np.zeros(TRACKS, np.float32)
+    if result.held:
+        return points, visibility
     places = anchors.ids - 1  # they are numbered from 1, and nobody else pins any
     points[places] = anchors.points
     visibility[places] = np.where(np.isfinite(anchors.points[:, 0]), anchors.visibility, 0)
@@ -164,7 +167,7 @@ class Tracks:
         self._frames: list[int] = []
 
     def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
-        points, visibility = points_of(anchors)
+        points, visibility = points_of(result, anchors)
         self._points.append(points)
         self._visible.append(visibility)
         self._frames.append(number)
@@ -177,8 +180,8 @@ class Tracks:
 
 
 class Renders:
-    """An MP4 of the model as the left eye sees it; black where nothing is known, and in frames that were not
-    taken in."""
+    """An MP4 of the model as the left eye sees it, by the frames' stamps; black where nothing is known, and
+    in frames that were not taken in."""
 
     def __init__(self, file: Path, rate: float, size: tuple[int, int]) -> None:
         self._video = VideoFile(file, rate, size)
@@ -187,7 +190,8 @@ class Renders:
     def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
         pair, view = result.pair, result.views["left"]
         shown = published.alpha(pair, view)[..., None] > 0
-        self._video.add(published.colours(pair, view) * shown * np.uint8(not result.held))
+        picture = published.colours(pair, view) * shown * np.uint8(not result.held)
+        self._video.add(picture, pair.t_capture_ns)
         self._holds += 1
 
     def finish(self) -> int:

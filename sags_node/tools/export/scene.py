@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.settings import FitSettings
 from sags_node.types import Camera, Gaussians
 
+log = logging.getLogger(__name__)
+
 SPLATS = TopicName("splats", ReceivedCloud)
 INFO = TopicName("left/camera_info", ReceivedCameraInfo)
 POSE = TopicName("tf", ReceivedRos)
@@ -42,6 +45,7 @@ class Scene:
     gaussians: Gaussians
     camera: Camera
     t_capture_ns: int
+    held: str = ""  # as `FrameResult.held`
 
 
 # ---- a running node --------------------------------------------------------------------------------------
@@ -89,25 +93,36 @@ def from_session(session: Session, at: float | None, advance: Advance) -> Scene:
 
     Args:
         session: a recording with `source.pace` step.
-        at: seconds after its first frame; None: its end.
+        at: seconds after its first frame; None: its last frame that was taken in.
         advance: called with what is going on.
 
     Raises:
-        UsageError: the recording ends before.
+        UsageError: the recording ends before, or the frame there was not taken in.
         SagsError: it cannot be read, or shows nothing to make a model of.
     """
     count = session.source.frame_count
-    scene: Scene | None = None
+    taken: Scene | None = None
     first_ns = last_ns = 0
+    held = ""
     for done, scene in enumerate(scenes_of_session(session)):
         first_ns, last_ns = (scene.t_capture_ns if done == 0 else first_ns), scene.t_capture_ns
+        held = scene.held
+        taken = taken if held else scene
         advance(done + 1, count, "playing")
         if at is not None and last_ns - first_ns >= at * 1e9:
             break
-    if scene is None or len(scene.gaussians) == 0:
-        raise SagsError(f"{session.name}: no frame shows anything to make a model of")
+    if taken is None or len(taken.gaussians) == 0:
+        why = f": {held}" if held else ""
+        raise SagsError(f"{session.name}: no frame shows anything to make a model of{why}")
     _check_time(session, at, first_ns, last_ns)
-    return scene
+    if held:
+        # Rounded down: `--at` takes the frame that follows.
+        before = (taken.t_capture_ns - first_ns) // 1_000_000 / 1000
+        said = f"{session.name}: the frame at {(last_ns - first_ns) * 1e-9:.2f} s was not taken in ({held})"
+        if at is not None:
+            raise UsageError(f"{said}; the last one before it is at {before:g} s: --at {before:g}")
+        log.warning("%s: exported is the last one before it, at %g s", said, before)
+    return taken
 
 
 def scenes_of_session(session: Session) -> Iterator[Scene]:
@@ -122,9 +137,10 @@ def scenes_of_session(session: Session) -> Iterator[Scene]:
     budget = pipeline.make_budget()
     with session.source as source:
         for frame in source:
-            snapshot = pipeline.process(frame, budget).snapshot
+            result = pipeline.process(frame, budget)
             if not frame.warm_up:
-                yield Scene(snapshot.gaussians, snapshot.camera, frame.t_capture_ns)
+                snapshot = result.snapshot
+                yield Scene(snapshot.gaussians, snapshot.camera, frame.t_capture_ns, result.held)
 
 
 # ---- a fit -----------------------------------------------------------------------------------------------

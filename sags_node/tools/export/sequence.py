@@ -7,6 +7,7 @@ goes on when the same command is given again: frames that are there are not writ
 from __future__ import annotations
 
 import json
+import logging
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -23,6 +24,8 @@ from sags_node.pipeline.session import Session
 from sags_node.tools.evaluation.receipt import digest, rig_digest
 from sags_node.tools.export.orbit import picture_of
 from sags_node.tools.export.scene import Advance, Scene, files_of_fit
+
+log = logging.getLogger(__name__)
 
 ABOUT = "sequence.json"
 LOOP = "loop.mp4"
@@ -79,10 +82,11 @@ def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
 def write_sequence(
     folder: Path, scenes: Iterable[Scene], rate: float, count: int | None, advance: Advance
 ) -> list[dict[str, Any]]:
-    """Write `frame_NNNNN.ply` for every scene that shows something, and `loop.mp4`: there and back.
+    """Write `frame_NNNNN.ply` for every scene that was taken in and shows something, and `loop.mp4`: there
+    and back.
 
     Args:
-        rate: pictures per second.
+        rate: pictures per second, where stamps begin anew.
         count: how many scenes there will be, where that is known.
 
     Returns:
@@ -91,11 +95,16 @@ def write_sequence(
     Raises:
         SagsError: nothing is shown, or a file cannot be written; what was written stays.
     """
-    written = kept = size = pictures = 0
+    written = kept = size = 0
+    stamps: list[int] = []  # ns, of the pictures
+    held: list[str] = []
     with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-", dir=folder) as passing:
         rasterizer, camera = None, None
         for number, scene in enumerate(scenes):
             advance(number + 1, count, f"writing frames, {kept} were there")
+            if scene.held:
+                held.append(scene.held)
+                continue
             if len(scene.gaussians) == 0:
                 continue
             path = folder / FRAME.format(number)
@@ -116,22 +125,25 @@ def write_sequence(
             jpeg = cv2.imencode(
                 ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
             )
-            (Path(passing) / f"{pictures}.jpg").write_bytes(jpeg[1].tobytes())
-            pictures += 1
+            (Path(passing) / f"{len(stamps)}.jpg").write_bytes(jpeg[1].tobytes())
+            stamps.append(scene.t_capture_ns)
         if camera is None:
             raise SagsError("no frame shows anything to make a model of")
+        if held:
+            log.warning("%d frames are left out, since they were not taken in (%s)", len(held), held[-1])
         loop = folder / LOOP
-        order = [*range(pictures), *range(pictures - 2, 0, -1)]
+        shown = [*enumerate(stamps)]
+        shown += [(number, 2 * stamps[-1] - stamp_ns) for number, stamp_ns in shown[-2:0:-1]]
         with whole(loop) as partial:
             video = VideoFile(partial, rate, (camera.width, camera.height))
-            for done, number in enumerate(order):
+            for done, (number, stamp_ns) in enumerate(shown):
                 read = cv2.imread(str(Path(passing) / f"{number}.jpg"))
                 if read is None:
                     raise SagsError(f"a picture in {passing} was removed; export again")
-                video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB))
-                advance(done + 1, len(order), "writing the video")
+                video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), stamp_ns)
+                advance(done + 1, len(shown), "writing the video")
             video.finish()
     return [
         {"file": str(folder / FRAME.format(0)), "kind": "sequence", "holds": written + kept, "bytes": size},
-        {"file": str(loop), "kind": "loop", "holds": len(order), "bytes": loop.stat().st_size},
+        {"file": str(loop), "kind": "loop", "holds": len(shown), "bytes": loop.stat().st_size},
     ]
