@@ -350,7 +350,7 @@ class Pipeline:
         seconds = 1e-9 * (t_capture_ns - before) if before is not None else 0.0
         if self._steps and seconds > GAP * median(self._steps):
             self._unwatched = max(self._unwatched, UNWATCHED * seconds)
-        elif seconds > 0:
+        if seconds > 0:  # long ones, too: they are usual where the camera's rate has fallen
             self._steps.append(seconds)
 
     def _still_frames(self, pair: RectifiedPair) -> int:

@@ -319,3 +319,21 @@ def test_where_no_frame_comes_depth_is_doubted_as_where_none_is_taken_in(
         results, _, _ = play(session, [*there, last])
         before, after = (np.median(each.snapshot.gaussians.depth_errors) for each in results[-2:])
         assert (after > before + 0.9 * 0.016) == doubted  # m: 0.8 s at 20 mm/s
+
+
+@pytest.mark.fault("camera: its rate falls to a quarter, as in the dark")
+def test_depth_is_as_sure_as_ever_at_a_rate_that_has_fallen(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    """Half of the steps that are remembered are long after eight frames: then they are usual."""
+    sure = []
+    for first in (30.0, 7.5):  # Hz
+        steps = [1 / first] * FIRST + [1 / 7.5] * (COUNT + AFTER)
+        stamps = (10**18 + np.rint(1e9 * np.cumsum(steps)).astype(np.int64)).tolist()
+        given = [replace(frame, t_capture_ns=ns) for frame, ns in zip(frames, stamps, strict=True)]
+        last = play(session, given)[0][-1]
+        confidence, tissue = last.views["left"].confidence, last.observation.tissue
+        assert confidence is not None
+        sure.append(float((confidence[tissue] >= SURE).mean()))
+    fallen, always = sure
+    assert always > 0.5 and fallen > 0.9 * always
