@@ -337,3 +337,23 @@ def test_depth_is_as_sure_as_ever_at_a_rate_that_has_fallen(
         sure.append(float((confidence[tissue] >= SURE).mean()))
     fallen, always = sure
     assert always > 0.5 and fallen > 0.9 * always
+
+
+@pytest.mark.fault("picture: of another scene, before and after a gap")
+@pytest.mark.parametrize("between", ["black", "nothing"])
+def test_another_scene_has_not_lasted_while_nobody_looked(
+    between: str, session: Session, frames: list[StereoFrame]
+) -> None:
+    """One frame of it, nothing to be seen for four seconds, and one more: the model stays."""
+    spoil, _ = FAULTS["picture_unknown_scene"]
+    there, back = frames[:FIRST], frames[FIRST : FIRST + 2]
+    other, dark = spoil(frames[FIRST], 0), both(frames[FIRST], np.zeros_like)
+    given = [*there, other, *([dark] * (40 if between == "black" else 0)), other, *back]
+    seconds = [0.1] * len(given)
+    if between == "nothing":
+        seconds[FIRST + 1] = 4.0
+    stamps = (10**18 + np.rint(1e9 * np.cumsum(seconds)).astype(np.int64)).tolist()
+    given = [replace(frame, t_capture_ns=ns) for frame, ns in zip(given, stamps, strict=True)]
+    results, _, pipeline = play(session, given)
+    assert pipeline.map.restarts == 0 and all(result.held for result in results[FIRST:-2])
+    assert not results[-1].held
