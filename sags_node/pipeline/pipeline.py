@@ -182,10 +182,15 @@ class Pipeline:
         self.newest, self._last, self.seen, self._strain = None, None, (), None
         self._unwatched = 0.0
 
+    @property
+    def may_be_sure(self) -> bool:
+        """Neither the calibration nor the scale is a guess. May be read from any thread."""
+        return self.metric and not self.depth.scale_is_declared
+
     def anchor_confidence(self, anchor_id: int) -> float:
         """How far to trust the depth of an anchor that is there, 0..1, now."""
         sure = self.anchors.depth_confidence(anchor_id) * float(confidence_of(np.float32(self._unwatched)))
-        return sure if self.metric else min(sure, MOST)
+        return sure if self.may_be_sure else min(sure, MOST)
 
     def start_strain(self) -> int:
         """From now on frames say how tissue is stretched since the newest one; returns its stamp."""
@@ -243,7 +248,7 @@ class Pipeline:
         """Everything that happens to one frame."""
         result = replace(self._processed(frame, budget, request), recorded_s=frame.recorded_s)
         self.held = result.held
-        return result if self.metric else unsure(result)
+        return result if self.may_be_sure else unsure(result)
 
     def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:
         plan, clock = budget.start(request.waited), Stopwatch()

@@ -183,6 +183,11 @@ class NetworkDepth:
         self._failures = 0  # in a row
         self.problem = ""
 
+    @property
+    def is_declared(self) -> bool:
+        """The scale of its depth is declared, not measured."""
+        return self._mono.is_declared
+
     def __call__(self, pair: RectifiedPair, tissue: Bool, measure: Measure) -> tuple[F32, F32] | None:
         """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1); None: `problem` says why.
 
