@@ -26,6 +26,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "rows_differ": "calibration",
     "uncalibrated": "calibration",
     "calibration_changed": "calibration",
+    "scale_declared": "depth",
     "tissue_too_near": "depth",
     "no_model": "depth",
     "picture_frozen": "picture",

@@ -432,7 +432,7 @@ class RungState:
 class Strained(Protocol):
     """How tissue is stretched since a moment; see `sags_node.model.strain`."""
 
-    since_ns: int
+    since_ns: int  # by the clock as it is now
 
     def at(self, gaussians: Gaussians) -> F32:
         """The largest and the smallest principal strain [N, 2] where each Gaussian is; NaN: not known."""

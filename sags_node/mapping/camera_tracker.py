@@ -16,6 +16,7 @@ from sags_node.mapping.pose_agreement import Agreement, agreement, small_frame, 
 from sags_node.mapping.resting_tissue import RestingTissue, correlation
 from sags_node.mapping.tissue_map import Learnt, TissueMap
 from sags_node.types import F64, Camera, Observation, RenderedView
+from sags_node.vision.watch.standing import watched_ns
 
 HOLD = 0.2  # share of the way to the pose against the tissue at rest, per frame: keeps it from drifting
 LARGEST_JUMP = 8e-3  # m, as `keyframes.distance` counts, between frames: faster, it must be verified
@@ -69,7 +70,8 @@ class CameraTracker:
         self._restarts = tissue_map.restarts
         self._trial: _Candidate | None = None
         self._passed = 0  # frames that the trial's pose has agreed with
-        self._unknown: list[Observation] = []  # first and last of those that show something else
+        self._unknown: Observation | None = None  # the last frame that showed something else
+        self._unknown_ns = 0  # for how long frames have
         self._found_ns: int | None = None  # when the camera was found again, during the probation
         self._before: Learnt | None = None  # what was known then
         self._looked_ns = 0
@@ -104,7 +106,7 @@ class CameraTracker:
         fit = self._follow(observation, last, tracks)
         if isinstance(fit, str):
             self.lost, self._motion = fit, np.eye(4)
-            self._trial, self._passed, self._unknown = None, 0, []
+            self._trial, self._passed, self._unknown = None, 0, None
             return None
         self._pose, self._motion = fit, invert(self._pose) @ fit
         return tracks
@@ -165,13 +167,12 @@ class CameraTracker:
         """Begin a new map where something else has been shown, lit and steadily, for long."""
         if self._trial is not None:
             return
-        if self._unknown and not _is_same_scene(self._unknown[-1], observation):
-            self._unknown = []
-        if not _is_lit(observation):
-            self._unknown = []
+        before, self._unknown = self._unknown, observation if _is_lit(observation) else None
+        if before is None or self._unknown is None or not _is_same_scene(before, observation):
+            self._unknown_ns = 0
             return
-        self._unknown = [*self._unknown[:1], observation]
-        if observation.t_capture_ns - self._unknown[0].t_capture_ns >= GIVE_UP_NS:
+        self._unknown_ns += watched_ns(before.t_capture_ns, observation.t_capture_ns)
+        if self._unknown_ns >= GIVE_UP_NS:
             self._map.restart()
             self.lost = None
 

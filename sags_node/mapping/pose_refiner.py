@@ -10,6 +10,7 @@ from sags_node.mapping.motion import Drawn, Tracks
 from sags_node.mapping.resting_tissue import RestingTissue
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F64, Observation, RenderedView
+from sags_node.vision.watch.standing import watched_ns
 
 SECONDS = 10.0  # over which the correction follows the picture: longer than a breath
 
@@ -63,7 +64,7 @@ class PoseRefiner:
         if isinstance(fit, str):
             self.unsure = fit
             return tracks
-        seconds = min(max(0.0, (self._stamp_ns - before) * 1e-9), 1.0)
+        seconds = watched_ns(before, self._stamp_ns) * 1e-9
         self._pose = towards(guess, fit.at_rest, seconds / SECONDS)
         self._correction = self._pose @ invert(self._given)
         return tracks

@@ -13,6 +13,7 @@ from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.motion import Drawn, Tracks
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F32, F64, I64, U8, Bool, Observation
+from sags_node.vision.watch.standing import watched_ns
 
 CANDIDATES = 2000  # Gaussians, of those found
 POINTS = 300  # of them, those with most texture; measured: one in each cell of a grid is worse
@@ -100,7 +101,7 @@ class RestingTissue:
             self._first_views.clear()
             self._at_rest = self._correction = None
         before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
-        passed = 0.0 if before is None else max(0.0, (self._stamp_ns - before) * 1e-9)
+        passed = watched_ns(before, self._stamp_ns) * 1e-9
         # A model that is younger than a breath rests where it was on average until now.
         self._seconds = min(self._seconds + passed, REST_SECONDS)
         share = passed / max(self._seconds, passed, 1e-9)

@@ -32,7 +32,7 @@ class Strain:
         snapshot: the model at that moment.
 
     Attributes:
-        since_ns: when it was.
+        since_ns: when it was, by the clock as it is now.
     """
 
     def __init__(self, snapshot: Snapshot) -> None:
@@ -56,6 +56,12 @@ class Strain:
         after = copy(self)
         after._followed = self._followed.copy()
         after._followed[at] &= sure
+        return after
+
+    def set_back(self, ns: int) -> Strain:
+        """It since the same moment, after the clock was set back by so much."""
+        after = copy(self)
+        after.since_ns -= ns
         return after
 
     def at(self, gaussians: Gaussians) -> F32:

@@ -170,7 +170,7 @@ class Operations:
         state, newest = self._state, self._state.pipeline.newest
         if newest is None or state.pipeline.held or state.paused.is_set() or not state.statistics.flowing:
             return None
-        return newest if state.pipeline.metric else unsure(newest)
+        return newest if state.pipeline.may_be_sure else unsure(newest)
 
     def _close_view(self, args: dict[str, Any]) -> dict[str, Any]:
         name = parse(ViewName, args).name
@@ -188,7 +188,7 @@ class Operations:
         if newest is None or len(newest.snapshot.gaussians) == 0:
             raise SagsError("there is no model yet; wait for the first frame")
         metric = self._state.pipeline.metric
-        newest = newest if metric else unsure(newest)
+        newest = newest if self._state.pipeline.may_be_sure else unsure(newest)
         file, gaussians = Path(path).absolute(), newest.snapshot.gaussians  # never changed any more
 
         def write() -> dict[str, Any]:

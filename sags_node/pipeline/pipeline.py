@@ -161,6 +161,7 @@ class Pipeline:
         self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
         self._unwatched = 0.0  # m: how far tissue may have moved while no frame was taken in
         self._came_ns: int | None = None  # when the last frame was captured
+        self._mapped_ns = 0  # when the last one that was mapped was, by the clock as it was set since
         self._steps: deque[float] = deque(maxlen=15)  # s between the last ones
 
     def reset(self) -> None:
@@ -179,18 +180,22 @@ class Pipeline:
         self._still.forget()
         self._memory.forget()
         self.newest, self._last, self.seen, self._strain = None, None, (), None
-        self._came_ns = None
         self._unwatched = 0.0
+
+    @property
+    def may_be_sure(self) -> bool:
+        """Neither the calibration nor the scale is a guess. May be read from any thread."""
+        return self.metric and not self.depth.scale_is_declared
 
     def anchor_confidence(self, anchor_id: int) -> float:
         """How far to trust the depth of an anchor that is there, 0..1, now."""
         sure = self.anchors.depth_confidence(anchor_id) * float(confidence_of(np.float32(self._unwatched)))
-        return sure if self.metric else min(sure, MOST)
+        return sure if self.may_be_sure else min(sure, MOST)
 
     def start_strain(self) -> int:
         """From now on frames say how tissue is stretched since the newest one; returns its stamp."""
         assert self.newest is not None  # else there is no tissue
-        self._strain = Strain(self.newest.snapshot)
+        self._strain = Strain(replace(self.newest.snapshot, t_capture_ns=self._mapped_ns))
         self.newest = replace(self.newest, strain=self._strain)
         return self._strain.since_ns
 
@@ -243,7 +248,7 @@ class Pipeline:
         """Everything that happens to one frame."""
         result = replace(self._processed(frame, budget, request), recorded_s=frame.recorded_s)
         self.held = result.held
-        return result if self.metric else unsure(result)
+        return result if self.may_be_sure else unsure(result)
 
     def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:
         plan, clock = budget.start(request.waited), Stopwatch()
@@ -299,6 +304,7 @@ class Pipeline:
         self._instruments_asked = request.instruments
         with clock("instruments"):
             instruments = self._located_instruments(seen, observation, mapped, judged, request)
+        self._mapped_ns = pair.t_capture_ns
         self.newest = FrameResult(
             pair, observation, mapped.snapshot, views, self._epoch(frame), clock.timings_ms,
             self._skipped(measured), anchors, plan.state, hurried=measured.hurried,
@@ -336,8 +342,7 @@ class Pipeline:
             self.anchors.age(pair.t_capture_ns, equal=not self._freeze.findings)
             return repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, self.anchors.states())
         self._still.forget()
-        seconds = max(0, pair.t_capture_ns - self.newest.pair.t_capture_ns) * 1e-9
-        self._unwatched = UNWATCHED * seconds
+        self._unwatched = UNWATCHED * ((pair.t_capture_ns - self._mapped_ns) * 1e-9)
         self.anchors.age(pair.t_capture_ns, held=True)
         last = repeated(self.newest, pair, self._epoch(frame), clock.timings_ms, self.anchors.states())
         held = doubted(last, self._unwatched)
@@ -345,12 +350,18 @@ class Pipeline:
         return replace(held, observation=observation, skipped=skipped, held=judged.hold, hurried=False)
 
     def _note_gap(self, t_capture_ns: int) -> None:
-        """Find where no frame has come for longer than is usual, nobody watched the tissue."""
+        """Find where no frame has come for longer than is usual, nobody watched the tissue. Where the clock
+        was set back, what is counted by it goes on."""
         before, self._came_ns = self._came_ns, t_capture_ns
         seconds = 1e-9 * (t_capture_ns - before) if before is not None else 0.0
+        if before is not None and t_capture_ns < before:
+            self._mapped_ns += t_capture_ns - before
+            if self._strain is not None and self.newest is not None:
+                self._strain = self._strain.set_back(before - t_capture_ns)
+                self.newest = replace(self.newest, strain=self._strain)
         if self._steps and seconds > GAP * median(self._steps):
             self._unwatched = max(self._unwatched, UNWATCHED * seconds)
-        elif seconds > 0:
+        if seconds > 0:  # long ones, too: they are usual where the camera's rate has fallen
             self._steps.append(seconds)
 
     def _still_frames(self, pair: RectifiedPair) -> int:

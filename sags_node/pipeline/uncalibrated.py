@@ -1,4 +1,5 @@
-"""What is made with a guessed calibration says so: its lengths are right up to a factor that nobody knows.
+"""What is made with a guessed calibration, or at a declared scale, says so: its lengths are right up to a
+factor that nobody knows.
 
 How sure a depth is, is an error in mm, and there is none to state. So no confidence reaches `SURE`: programs
 that decide something by a depth, or show it as sure, take none of these, also those that know no more.
@@ -47,5 +48,5 @@ def unsure(result: FrameResult) -> FrameResult:
 
 
 def _at_most(confidence: F32) -> F32:
-    """Confidences as they may be stated without a calibration."""
+    """Confidences as they may be stated where the scale is a guess."""
     return np.minimum(confidence, np.float32(MOST))

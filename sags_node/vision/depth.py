@@ -23,6 +23,11 @@ TOO_FEW = (
     "vision.stereo.max_depth, or the calibration is of another scope; sags calib check tells"
 )
 FARTHEST = 10.0  # m: what a session says to be beyond is no depth
+_DECLARED = Finding(
+    "scale_declared",
+    "one camera alone: the scale is vision.onnx.declared_depth, which nothing measures, so no depth is sure; "
+    "give a right eye or the session's depth, or take depth for a drawing",
+)
 
 
 class Measured(NamedTuple):
@@ -73,7 +78,13 @@ class DepthChoice:
         """Return what is wrong with the eyes, the rig and the network. May be read from any thread."""
         problem = "" if self._network is None else self._network.problem
         failed = (Finding("network_failed", problem),) if problem else ()
-        return (*self._matches.findings, *self.stereo.findings, *failed)
+        declared = (_DECLARED,) if self.scale_is_declared else ()
+        return (*self._matches.findings, *self.stereo.findings, *failed, *declared)
+
+    @property
+    def scale_is_declared(self) -> bool:
+        """All depth is right up to a factor that nobody knows. May be read from any thread."""
+        return self._network is not None and self._network.is_declared
 
     @property
     def eyes_are_late(self) -> bool:

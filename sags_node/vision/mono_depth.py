@@ -53,10 +53,14 @@ class MonoDepth:
     Args:
         declared_depth: m, median of the first picture, for one camera alone.
         config: its depth range is the one that is believed.
+
+    Attributes:
+        is_declared: the scale goes back to that distance; nothing has been measured since.
     """
 
     def __init__(self, declared_depth: float | None, config: StereoConfig) -> None:
         self._declared = declared_depth
+        self.is_declared = False
         self._nearest, self._farthest = config.nearest, config.max_depth
         self._line: ScaleShift | None = None
         self._before: F32 | None = None  # [H, W] m, depth of the frame before, 0 unknown
@@ -98,7 +102,7 @@ class MonoDepth:
                     "the network's inverse depth does not rise with the measured one; one of depth needs "
                     "meaning: depth"
                 )
-            self._frames_to_measure = MEASURE_EVERY - 1
+            self._frames_to_measure, self.is_declared = MEASURE_EVERY - 1, False
             return found
         self._frames_to_measure = max(0, self._frames_to_measure - 1)
         if self._line is None or self._before is None:
@@ -118,6 +122,7 @@ class MonoDepth:
         middle = float(np.median(values)) if values.size else 0.0
         if middle <= 0:
             raise DepthNetworkError("the network says nothing of the first picture's depth")
+        self.is_declared = True
         return ScaleShift(1 / (self._declared * middle), 0.0, DECLARED_ERROR)
 
 

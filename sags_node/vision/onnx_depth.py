@@ -188,6 +188,11 @@ class NetworkDepth:
         """The next frame is laid onto what `measure` gives, if that is anything."""
         return not self._network.is_stereo and self._mono.measures and self._failures < MOST_FAILURES
 
+    @property
+    def is_declared(self) -> bool:
+        """The scale of its depth is declared, not measured."""
+        return self._mono.is_declared
+
     def __call__(self, pair: RectifiedPair, tissue: Bool, measure: Measure) -> tuple[F32, F32] | None:
         """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1); None: `problem` says why.
 

@@ -319,3 +319,79 @@ def test_where_no_frame_comes_depth_is_doubted_as_where_none_is_taken_in(
         results, _, _ = play(session, [*there, last])
         before, after = (np.median(each.snapshot.gaussians.depth_errors) for each in results[-2:])
         assert (after > before + 0.9 * 0.016) == doubted  # m: 0.8 s at 20 mm/s
+
+
+@pytest.mark.fault("camera: its rate falls to a quarter, as in the dark")
+def test_depth_is_as_sure_as_ever_at_a_rate_that_has_fallen(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    """Half of the steps that are remembered are long after eight frames: then they are usual."""
+    sure = []
+    for first in (30.0, 7.5):  # Hz
+        steps = [1 / first] * FIRST + [1 / 7.5] * (COUNT + AFTER)
+        stamps = (10**18 + np.rint(1e9 * np.cumsum(steps)).astype(np.int64)).tolist()
+        given = [replace(frame, t_capture_ns=ns) for frame, ns in zip(frames, stamps, strict=True)]
+        last = play(session, given)[0][-1]
+        confidence, tissue = last.views["left"].confidence, last.observation.tissue
+        assert confidence is not None
+        sure.append(float((confidence[tissue] >= SURE).mean()))
+    fallen, always = sure
+    assert always > 0.5 and fallen > 0.9 * always
+
+
+@pytest.mark.fault("picture: of another scene, before and after a gap")
+@pytest.mark.parametrize("between", ["black", "nothing"])
+def test_another_scene_has_not_lasted_while_nobody_looked(
+    between: str, session: Session, frames: list[StereoFrame]
+) -> None:
+    """One frame of it, nothing to be seen for four seconds, and one more: the model stays."""
+    spoil, _ = FAULTS["picture_unknown_scene"]
+    there, back = frames[:FIRST], frames[FIRST : FIRST + 2]
+    other, dark = spoil(frames[FIRST], 0), both(frames[FIRST], np.zeros_like)
+    given = [*there, other, *([dark] * (40 if between == "black" else 0)), other, *back]
+    seconds = [0.1] * len(given)
+    if between == "nothing":
+        seconds[FIRST + 1] = 4.0
+    stamps = (10**18 + np.rint(1e9 * np.cumsum(seconds)).astype(np.int64)).tolist()
+    given = [replace(frame, t_capture_ns=ns) for frame, ns in zip(given, stamps, strict=True)]
+    results, _, pipeline = play(session, given)
+    assert pipeline.map.restarts == 0 and all(result.held for result in results[FIRST:-2])
+    assert not results[-1].held
+
+
+@pytest.mark.fault("clock: set back while frames are held")
+def test_what_nobody_watched_is_doubted_whatever_the_clock_says(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    """Black for 0.8 s, then one eye alone: nothing is measured. A step back counts for no time: it lacks
+    0.1 s."""
+    last = replace(frames[FIRST + COUNT], right=black(frames[FIRST + COUNT].right))
+    given = [*frames[:FIRST], *(both(f, np.zeros_like) for f in frames[FIRST : FIRST + COUNT]), last]
+    medians = []
+    for back in (0, 60 * 10**9):
+        turned = [
+            replace(frame, t_capture_ns=frame.t_capture_ns - back, epoch=1) if i >= FIRST + 4 else frame
+            for i, frame in enumerate(given)
+        ]
+        results, _, _ = play(session, turned)
+        medians.append([np.median(result.snapshot.gaussians.depth_errors) for result in results[-2:]])
+    kept, turned_back = np.array(medians)
+    assert (kept > 0.016).all() and (turned_back > 0.014).all()  # m: at 20 mm/s
+
+
+@pytest.mark.fault("clock: set back while strain is measured")
+def test_the_seconds_of_strain_go_on_when_the_clock_is_set_back(
+    session: Session, frames: list[StereoFrame]
+) -> None:
+    pipeline, seconds = Pipeline(session.config, session.rig), []
+    hour, (first, second, third) = 3600 * 10**9, frames[:3]
+    pipeline.process(first, StepBudget(2))
+    pipeline.start_strain()
+    again = replace(second, frame_id=7, t_capture_ns=second.t_capture_ns - hour)  # it repeats the one before
+    for frame in (second, again, replace(third, t_capture_ns=third.t_capture_ns - hour)):
+        result = pipeline.process(frame, StepBudget(2))
+        assert result.strain is not None
+        seconds.append(1e-9 * (result.snapshot.t_capture_ns - result.strain.since_ns))
+        if frame is again:
+            pipeline.start_strain()
+    np.testing.assert_allclose(seconds, [0.1, 0.1, 0.1], atol=1e-3)

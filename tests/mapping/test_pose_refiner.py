@@ -14,6 +14,7 @@ from sags_node.config.schema import LaunchConfig, PhantomSource, VisionConfig
 from sags_node.geometry import invert
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, towards
+from sags_node.mapping.first_views import FirstViews
 from sags_node.mapping.motion import Tracks
 from sags_node.mapping.pose_refiner import SECONDS, PoseRefiner
 from sags_node.mapping.resting_tissue import RestingTissue, TissueFit
@@ -114,3 +115,16 @@ def test_the_robot_of_the_measurement_is_off_by_what_it_says() -> None:
     start, end = (robot.gives(np.eye(4), t) for t in (0.0, WANDERS))
     moved = np.linalg.norm((end @ invert(start))[:3, 3])
     assert moved == pytest.approx(np.linalg.norm(WANDERED), abs=1e-3)
+
+
+def test_after_a_gap_tissue_does_not_rest_where_it_is_seen_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may be at the end of a breath there. A model of 5 s rests where it was on average."""
+    shares: list[float] = []
+    monkeypatch.setattr(TissueMap, "settle", lambda _, share: shares.append(share))
+    for look in ("pose", "offer"):
+        monkeypatch.setattr(FirstViews, look, lambda *_: None)
+    tissue = RestingTissue(TissueMap(1))
+    for t in [*np.arange(0, 5.05, 1 / RATE), 60.0]:
+        observation: Any = SimpleNamespace(t_capture_ns=round(t * 1e9), camera=camera(np.eye(4)))
+        tissue.learn(observation)
+    assert shares[-2] == pytest.approx(0.1 / 5) and shares[-1] == pytest.approx(1 / 6)

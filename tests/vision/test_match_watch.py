@@ -129,3 +129,14 @@ def test_what_a_slow_node_says_of_a_late_eye_is_that(recording: Path) -> None:
     """Every third frame matched of every second: 200 ms apart. No other cause is blamed."""
     assert warned(recording, 3, 0, "10") == {"eyes_late"}
     assert warned(recording, 0, 0, "10") == set()
+
+
+def test_a_gap_makes_no_loss_of_matches_usual() -> None:
+    """A second of a gap counts: what has been lost since is noticed in more than the first frame after it."""
+    watch, errors = MatchWatch(), np.random.default_rng(0).normal(0, 0.3, (32, 40)).astype(np.float32)
+    said = []
+    for t, share in [(0.0, 1.0), (0.1, 1.0), *((12 + 0.1 * i, 0.4) for i in range(10))]:
+        matched = np.random.default_rng(1).random((32, 40)) < share
+        watch.see(round(t * SECOND), picture(t))
+        said.append(watch(round(t * SECOND), RowErrors(errors, matched, 0.0)))
+    assert not any(said[:2]) and all("far fewer" in why for why in said[2:])

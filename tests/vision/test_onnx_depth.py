@@ -16,9 +16,11 @@ from frames import played
 from numbered_pictures import write_video
 from onnx_networks import save_matcher, save_odd, save_table
 
+from sags_node.confidence import SURE, confidence_of
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import OnnxConfig, StereoConfig
 from sags_node.errors import SagsError, UsageError
+from sags_node.findings import by_code
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import status
 from sags_node.node.health import Statistics
@@ -455,6 +457,26 @@ def test_one_camera_alone_keeps_the_declared_scale(
     assert max(off for off, _ in figures) < 0.04, figures
     assert min(share for _, share in figures) > 0.8, figures
     assert all(result.snapshot.loss < 0.05 for result in results[1:])
+
+
+@pytest.mark.fault("depth: one camera alone, its distance declared wrong")
+@pytest.mark.parametrize(("shown", "is_sure"), [(one_eye, False), (lambda frame: frame, True)])
+def test_a_declared_scale_makes_no_depth_sure(
+    shown: Callable[[StereoFrame], StereoFrame], is_sure: bool, knowing: Path, phantom_session: Path,
+    frames: list[StereoFrame],
+) -> None:  # fmt: skip
+    """Nothing tells that it is off by a half, but beside a right eye, which measures it."""
+    known = truth(frames[0])
+    wrong = 1.5 * float(np.median(known[known > 0]))
+    pipeline = pipeline_with(phantom_session, knowing, f"vision.onnx.declared_depth:={wrong}")
+    last = play(pipeline, list(map(shown, frames[:12])))[-1]
+    view, errors = last.views["left"], last.snapshot.gaussians.depth_errors
+    assert last.observation.depth.any() and view.confidence is not None and errors is not None
+    row, column = divmod(int(np.argmax(view.confidence * last.observation.tissue)), WIDTH)
+    pinned = pipeline.anchors.add_pixel(column, row, last.observation, last.snapshot, view)
+    most = [view.confidence.max(), confidence_of(errors).max(), pipeline.anchor_confidence(pinned)]
+    assert [sure >= SURE for sure in most] == 3 * [is_sure]
+    assert ("scale_declared" in by_code(pipeline.warnings)) != is_sure
 
 
 @pytest.mark.usefixtures("unwatched")

@@ -231,6 +231,24 @@ def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
             assert codes == []
 
 
+@pytest.mark.fault("picture: blurred after the lens was out for cleaning")
+@pytest.mark.parametrize("between", ["black", "nothing"])
+def test_a_blur_that_begins_while_nobody_looks_has_not_lasted(
+    between: str, session: Session, moving: list[StereoFrame]
+) -> None:
+    """Twelve seconds in which no picture was seen make no blur usual."""
+    watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
+    blurred = [LASTING["both blurred"][0](frame, frame) for frame in moving[10:20]]
+    out = [both(np.zeros_like)(moving[9])] * (120 if between == "black" else 0)
+    for number, frame in enumerate([*moving[:10], *out, *blurred]):
+        later = 0 if number < 10 or out else 12 * 10**9
+        given = replace(frame, t_capture_ns=10**18 + number * STEP_NS + later)
+        verdict = judged(watch, given, rectify(given))
+        if number >= 10 + len(out):
+            assert not verdict.learn
+    assert [finding.code for finding in watch.findings] == ["picture_blurred"]
+
+
 def test_what_is_compressed_hard_from_the_first_picture_on_is_said_too(
     session: Session, moving: list[StereoFrame]
 ) -> None:

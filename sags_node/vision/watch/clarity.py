@@ -12,6 +12,7 @@ import numpy as np
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, Finding, GrayPyramid
 from sags_node.vision.pyramid import BORDER, inner
+from sags_node.vision.watch.standing import watched_ns
 
 WIDTH = 160  # px, at most, of the picture in which contrast is measured, with its border
 LOCAL = 15  # px of it: shading wider than that is no structure
@@ -56,7 +57,7 @@ class Clarity:
         if self._stamp_ns is None:
             self._contrast, self._detail = contrast, detail
             self._details = _usual(apart[1])
-        passed = 0.0 if self._stamp_ns is None else max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
+        passed = 1e-9 * watched_ns(self._stamp_ns, stamp_ns)
         self._stamp_ns = stamp_ns
         is_blurred = detail < self._detail - LOST_DETAIL
         for lost, limit in (

@@ -19,7 +19,7 @@ from sags_node.vision.pyramid import BORDER, inner, pyramids
 from sags_node.vision.watch.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
 from sags_node.vision.watch.judgement import Evidence, Judgement
 from sags_node.vision.watch.picture_fit import middle_of
-from sags_node.vision.watch.standing import Debounced
+from sags_node.vision.watch.standing import Debounced, watched_ns
 
 CELLS = 40  # across the picture
 SMALLEST = 8  # px of the first half, the side of a cell: of fewer, the detail is chance
@@ -68,7 +68,7 @@ class LensWatch(Debounced):
             self._usual = apart.clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
             self._hidden = np.zeros(apart.shape, np.int8)
             self._stamp_ns = pair.t_capture_ns
-        passed = max(0, pair.t_capture_ns - self._stamp_ns) * 1e-9
+        passed = watched_ns(self._stamp_ns, pair.t_capture_ns) * 1e-9
         self._stamp_ns = pair.t_capture_ns
         share = np.float32(min(1.0, passed / REMEMBERED_S))
         off = apart - self._usual

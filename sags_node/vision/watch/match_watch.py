@@ -18,7 +18,7 @@ from sags_node.types import Finding, GrayPyramid
 from sags_node.vision.alignment import RowErrors
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.pyramid import inner, narrowed
-from sags_node.vision.watch.standing import Debounced
+from sags_node.vision.watch.standing import Debounced, watched_ns
 
 STRIDE = 4  # px
 WINDOW_NS = 200_000_000  # of the motion that is compared with row errors
@@ -85,9 +85,8 @@ class MatchWatch(Debounced):
 
     def __call__(self, stamp_ns: int, rows: RowErrors) -> str:
         """Take the row errors of the frame seen last; why its matches are no depth, or empty."""
-        passed = 0 if self._stamp_ns is None else max(0, stamp_ns - self._stamp_ns)
+        share = min(1.0, watched_ns(self._stamp_ns, stamp_ns) * 1e-9 / REMEMBERED_S)
         self._stamp_ns = stamp_ns
-        share = min(1.0, passed * 1e-9 / REMEMBERED_S)
         median, matched = rows.median, np.count_nonzero(rows.matched) / rows.matched.size
         if self._median is None or self._matched is None:
             self._median, self._matched = median, matched

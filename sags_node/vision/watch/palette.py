@@ -12,6 +12,7 @@ import numpy as np
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, U8, Bool
 from sags_node.vision.watch.picture_fit import BRIGHT, DARK, FINE
+from sags_node.vision.watch.standing import watched_ns
 
 BINS = 32  # of the share of red in a colour, and of green
 RARE = 0.002  # of the tissue has a colour like this, or less
@@ -35,7 +36,7 @@ class Palette:
         self._colors, self._is_new = np.empty(tissue.shape, np.int64), np.zeros(tissue.shape, np.bool_)
         self._counted = tissue
         _sort_colors(cv2.blur(picture, (FINE, FINE)), self._colors)
-        passed, self._stamp_ns = max(0, now - self._stamp_ns) * 1e-9, now
+        passed, self._stamp_ns = watched_ns(self._stamp_ns, now) * 1e-9, now
         if self._usual is None:
             self._share = 1.0
             return self._is_new

@@ -23,7 +23,7 @@ from sags_node.vision.watch.clarity import SMOKE
 from sags_node.vision.watch.judgement import Evidence, Judgement
 from sags_node.vision.watch.palette import Palette
 from sags_node.vision.watch.picture_fit import COVERED, FEWEST, GREEN, LEAST_MATCH, Fit
-from sags_node.vision.watch.standing import Debounced
+from sags_node.vision.watch.standing import Debounced, watched_ns
 
 WIDTH = 80  # px of the small pictures
 SEEN_ALPHA = 0.5
@@ -78,7 +78,8 @@ class SceneWatch(Debounced):
         """
         self._moving = moving
         super().__init__()
-        self._since: dict[str, int] = {}  # stamps: how long something has lasted
+        self._since: dict[str, int] = {}  # stamps: how long something has lasted, but for what nobody saw
+        self._looked_ns: int | None = None  # at the frame before
         self._gain: F32 = np.ones(3, np.float32)  # of the frame before
         self._taken_out: F32 = np.ones(3, np.float32)
         self._palette = Palette()
@@ -98,6 +99,7 @@ class SceneWatch(Debounced):
         if last is None or judged.hold or evidence.is_repeat:
             return judged
         now = pair.t_capture_ns
+        self._leave_gaps_out(now)
         step = max(1, pair.camera.width // WIDTH)
         if self._tissue is None or self._is_clear:
             self._tissue = np.ascontiguousarray(last.observation.tissue[::step, ::step])
@@ -162,10 +164,13 @@ class SceneWatch(Debounced):
         if not is_so:
             self._since.pop(what, None)
             return 0
-        since = self._since.setdefault(what, now)
-        if now < since:  # the clock has jumped back
-            since = self._since[what] = now
-        return now - since
+        return now - self._since.setdefault(what, now)
+
+    def _leave_gaps_out(self, now: int) -> None:
+        """Nothing lasted while nobody looked, nor until the clock was set back."""
+        before, self._looked_ns = self._looked_ns, now
+        unseen = 0 if before is None else now - before - watched_ns(before, now)
+        self._since = {what: since + unseen for what, since in self._since.items()}
 
 
 @kernel

@@ -1,4 +1,5 @@
-"""Which findings stand: one bad frame is none, and a warning ends soon after its cause."""
+"""Which findings stand: one bad frame is none, and a warning ends soon after its cause. For how long
+something was watched."""
 
 from __future__ import annotations
 
@@ -10,6 +11,12 @@ from sags_node.types import Finding
 WINDOW_NS = 250_000_000  # half of the time in which a person is to be warned
 BEGINS, ENDS = 0.6, 0.3  # of the frames in that time: a finding stands, and it stands no more
 FEWEST = 2  # frames
+LONGEST_STEP_NS = 1_000_000_000  # between two frames: nobody knows what was to be seen in a longer gap
+
+
+def watched_ns(before_ns: int | None, now_ns: int) -> int:
+    """How much of the time between two frames was watched: none where the clock was set back."""
+    return 0 if before_ns is None else min(max(0, now_ns - before_ns), LONGEST_STEP_NS)
 
 
 class Debounced:
