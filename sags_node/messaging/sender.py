@@ -15,10 +15,12 @@ from collections import Counter
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 import zmq
 from numpy.typing import NDArray
 
 from sags_node.errors import SagsError
+from sags_node.geometry import is_rigid
 from sags_node.messaging import cdr
 from sags_node.messaging.address import Address, ClientKeys, connect
 from sags_node.messaging.cdr import Content
@@ -180,9 +182,18 @@ class PoseSender(Sender):
         Args:
             stamp_ns: wall clock (`time.time_ns`); default: now.
             topic: of one of the node's `robot.tools`, whose tip was there.
+
+        Raises:
+            ValueError: it is no rotation and translation; the quaternion on the wire would hide that.
         """
+        T = np.asarray(T_base_hand, np.float64)
+        if not is_rigid(T):
+            raise ValueError(
+                f"T_base_hand {T.shape} is no rotation and translation (m) above a last row 0 0 0 1, [4, 4]: "
+                "is it transposed, mirrored (of an engine with left-handed axes) or scaled?"
+            )
         stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        return self._send(topic.lstrip("/"), cdr.pose(T_base_hand, stamp_ns), stamp_ns)
+        return self._send(topic.lstrip("/"), cdr.pose(T, stamp_ns), stamp_ns)
 
 
 def _usual_encoding(picture: NDArray[Any]) -> str:
