@@ -36,6 +36,13 @@ def is_rotation(matrices: F64) -> NDArray[np.bool_]:
     return np.asarray(orthogonal & (np.linalg.det(matrices) > 0))
 
 
+def is_rigid(T: F64) -> bool:
+    """True of a rotation and a translation above a last row 0 0 0 1: [4, 4] and finite."""
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not is_rotation(T[:3, :3]):
+        return False
+    return bool(np.abs(T[3] - (0, 0, 0, 1)).max() < 1e-6)  # as exactly as float32 computes it
+
+
 def quat_to_matrix(quats: Array) -> Array:
     """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4] of any non-zero length."""
     w, x, y, z = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)

@@ -70,7 +70,8 @@ def list_anchors(json_out: bool, node: NodeAddress) -> None:
     """Say where the anchors are in the newest frame.
 
     Columns: number, x y z (m, world), pixel, visibility, confidence (it is still on its tissue) and depth
-    confidence. Show no anchor as sure whose confidence is below 0.5.
+    confidence. Show no anchor as sure whose confidence is below 0.5. Without a calibration lengths have no
+    unit.
     """
     from sags_node.messaging.received import ReceivedCloud, TopicName
     from sags_node.messaging.subscriber import Subscriber
@@ -83,11 +84,14 @@ def list_anchors(json_out: bool, node: NodeAddress) -> None:
     columns = ("id", "x", "y", "z", "u", "v", "visibility", "confidence", "depth_confidence")
     rows = [{key: point[key].item() for key in columns} for point in newest.points]
     if json_out:
-        show(rows)
+        unit = {"unit": "m" if newest.metric else None}
+        show([row | unit for row in rows])
     elif not rows:
         show("no anchors; pin one: sags anchor pin U V")
     else:
         show(text.rows_table([{key: _short(key, value) for key, value in row.items()} for row in rows]))
+        if not newest.metric:
+            show("x y z have no unit: the node has no calibration")
 
 
 def _short(key: str, value: float) -> str:

@@ -225,9 +225,10 @@ def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:
 def _echo(received: Received) -> Record:
     meta: Record = msgspec.to_builtins(received.meta)
     kept = ("type", "seq", "frame_id", "stamp_ns", "epoch", "step", "dropped")
+    where_present = ("ahead_ns", "detail_age_ns", "recorded_s", "units")  # else it is what a camera saw, in m
     return {
         "topic": received.topic,
-        **{key: meta[key] for key in kept},
+        **{key: meta[key] for key in (*kept, *where_present) if key in meta},
         "delay_s": received.age(received.received_ns),
         "content": _content(received),
     }

@@ -210,7 +210,10 @@ class Publisher(Closes):
     def publish_view(self, name: str, drawn: DrawnView) -> None:
         """Send the topics of the view `name` to those who asked for them."""
         shown, ahead_ns = next(iter(drawn.eyes.values())), round(drawn.ahead_s * 1e9)
-        for topic, body in content.view(name, drawn).items():
+        said = content.view(name, drawn)
+        for topic in [kept for kept in self._kept if kept.startswith(f"view/{name}/") and kept not in said]:
+            del self._kept[topic]  # of when it was opened with another eye, or with depth
+        for topic, body in said.items():
             self._seq[topic] = self._seq.get(topic, self._view_seq) + 1
             value = _Value(body, shown.t_capture_ns, shown.frame_id, drawn.epoch, ahead_ns)
             if drawn.still or body.type == topics.CAMERA_INFO:

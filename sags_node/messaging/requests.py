@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from sags_node.errors import SagsError
-from sags_node.geometry import is_rotation
+from sags_node.geometry import is_rigid
 from sags_node.messaging.topics import VIEW_NAME
 from sags_node.types import F64
 
@@ -97,7 +97,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return np.eye(4)
         name = "T_left_cam" if self.T_world_cam is None else "T_world_cam"
         T = _matrix(rows, 4, name)
-        if not is_rotation(T[:3, :3]) or np.abs(T[3] - (0, 0, 0, 1)).max() > 0:
+        if not is_rigid(T):
             raise ValueError(f"{name} must be a rotation and a translation above a last row 0 0 0 1")
         if np.linalg.norm(T[:3, 3]) > MAX_DISTANCE:
             raise ValueError(f"{name} is more than {MAX_DISTANCE:g} m away; translations are in metres")

@@ -15,10 +15,12 @@ from collections import Counter
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 import zmq
 from numpy.typing import NDArray
 
 from sags_node.errors import SagsError
+from sags_node.geometry import is_rigid
 from sags_node.messaging import cdr
 from sags_node.messaging.address import Address, ClientKeys, connect
 from sags_node.messaging.cdr import Content
@@ -31,12 +33,15 @@ log = logging.getLogger(__name__)
 
 Picture = NDArray[Any] | bytes  # [H, W] or [H, W, C] uint8; or the bytes of a JPEG or PNG file
 MAX_RECEIPT_BYTES = 1 << 16
+CONNECT_MS = 500  # longest wait for a node, when a sender is made: its first picture is not left out then
+SILENT = 3.0  # s without a receipt, of which one comes each second
 
 
 class Sender(Closes):
     """Sends to a node without ever waiting: what does not fit into the queue is left out and counted.
 
-    Used from one thread. A node that is away or restarted gets what is sent from then on.
+    Used from one thread. A node that is away or restarted gets what is sent from then on. Only the making of
+    a sender waits for it, up to `CONNECT_MS`.
 
     Attributes:
         receipt: the node's last words; None before the first, which comes after a second.
@@ -52,6 +57,7 @@ class Sender(Closes):
     """
 
     _queued: int  # messages that may wait for the network
+    _key: str  # of the launch file: with `push` the node takes what is sent
 
     def __init__(self, endpoint: str, ns: str, keys: ClientKeys | None) -> None:
         self.receipt: Receipt | None = None
@@ -61,20 +67,27 @@ class Sender(Closes):
         self._session = uuid.uuid4().hex
         self._seq: Counter[str] = Counter()
         self._said: str | None = None
+        self._unanswered: float | None = None  # since when (monotonic) it was sent without a receipt
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.SNDHWM, self._queued)
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # nothing waits for a node that is away: it would come late
         try:
             self._watch = connect(self._socket, Address(endpoint, keys), MAX_RECEIPT_BYTES)
         except SagsError:
             self.close()
             raise
+        self._socket.poll(CONNECT_MS, zmq.POLLOUT)
 
     @property
     def problem(self) -> str | None:
         """Return what the node has against what is sent, or that it is not there; None: all is well."""
         self._listen()
-        return self._watch.refusal() or (None if self.receipt is None else self.receipt.problem)
+        if (refusal := self._watch.refusal()) is not None:
+            return refusal
+        if self._unanswered is not None and time.monotonic() - self._unanswered > SILENT:
+            return f"no answer from {self._endpoint}: does a node with {self._key}:=push run there?"
+        return None if self.receipt is None else self.receipt.problem
 
     def _send(self, name: str, body: Content, stamp_ns: int) -> bool:
         self._seq[name] += 1
@@ -84,6 +97,8 @@ class Sender(Closes):
             encoding=body.encoding, shape=list(body.shape), dtype=body.dtype, dropped=self.left_out,
         )  # fmt: skip
         self._complain()
+        if self._unanswered is None:
+            self._unanswered = time.monotonic()
         try:
             # Copied: whoever sends may draw the next picture into the same memory.
             self._socket.send_multipart(encode(Message(f"{self._ns}/{name}", meta, body.parts)), zmq.NOBLOCK)
@@ -98,6 +113,7 @@ class Sender(Closes):
                 self.receipt = msgspec.msgpack.decode(self._socket.recv(), type=Receipt)
             except msgspec.MsgspecError:
                 continue
+            self._unanswered = None
 
     def _complain(self) -> None:
         """Each problem once in the log, when it begins."""
@@ -114,6 +130,7 @@ class FrameSender(Sender):
     """Hands pictures in to a node with `source.kind: push`, at its `source.endpoint`; see `Sender`."""
 
     _queued = 4  # two pairs: a slow node gets new pictures, not old ones
+    _key = "source.kind"
 
     def __init__(
         self, endpoint: str = "tcp://127.0.0.1:5558", ns: str = "camera", keys: ClientKeys | None = None
@@ -168,6 +185,7 @@ class PoseSender(Sender):
     """Hands poses in to a node with `robot.kind: push`, at its `robot.endpoint`; see `Sender`."""
 
     _queued = 1000  # poses are small, and each of them counts
+    _key = "robot.kind"
 
     def __init__(
         self, endpoint: str = "tcp://127.0.0.1:5559", ns: str = "robot", keys: ClientKeys | None = None
@@ -180,9 +198,18 @@ class PoseSender(Sender):
         Args:
             stamp_ns: wall clock (`time.time_ns`); default: now.
             topic: of one of the node's `robot.tools`, whose tip was there.
+
+        Raises:
+            ValueError: it is no rotation and translation; the quaternion on the wire would hide that.
         """
+        T = np.asarray(T_base_hand, np.float64)
+        if not is_rigid(T):
+            raise ValueError(
+                f"T_base_hand {T.shape} is no rotation and translation (m) above a last row 0 0 0 1, [4, 4]: "
+                "is it transposed, mirrored (of an engine with left-handed axes) or scaled?"
+            )
         stamp_ns = time.time_ns() if stamp_ns is None else stamp_ns
-        return self._send(topic.lstrip("/"), cdr.pose(T_base_hand, stamp_ns), stamp_ns)
+        return self._send(topic.lstrip("/"), cdr.pose(T, stamp_ns), stamp_ns)
 
 
 def _usual_encoding(picture: NDArray[Any]) -> str:

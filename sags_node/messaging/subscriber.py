@@ -59,6 +59,7 @@ class Receiver:
         patience: s to wait for a node that does not run yet; default: 10, and 0 for asyncio, whose loop must
             not be blocked. With an `endpoint` none need run.
         may_be_absent: wait for none, and follow the node as soon as there is one.
+        kept: newest messages of a topic that `aligned` and `nearest` find.
 
     Attributes:
         refusal: why the node does not let this client in.
@@ -85,6 +86,7 @@ class Receiver:
         paused: bool = False,
         patience: float | None = None,
         may_be_absent: bool = False,
+        kept: int = KEPT,
     ) -> None:
         wanted = [check_topic(name) for name in dict.fromkeys([*names, "status"])]
         rates = rates or {}
@@ -98,7 +100,7 @@ class Receiver:
         self._fresh = {topic.name: Freshness(rates.get(topic.name), topic.periodic) for topic in wanted}
         self._types = {topic.name: topic.type for topic in wanted}
         self._refused: dict[str, str] = {}  # topic: why the node does not make it
-        self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=KEPT) for topic in wanted}
+        self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=kept) for topic in wanted}
         self._arrived = threading.Condition()
         self._wakes: list[Callable[[], None]] = []
         self._stopping = threading.Event()

@@ -13,7 +13,7 @@ import yaml
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import UsageError
 from sags_node.files import check_folder, whole
-from sags_node.geometry import is_rotation
+from sags_node.geometry import is_rigid
 from sags_node.types import F64
 
 FILE = "hand_eye.yaml"
@@ -48,12 +48,7 @@ def read_hand_eye(file: Path) -> HandEye:
         offset_ns = round(float(said.get("offset_ms", 0.0)) * 1e6)
     except (KeyError, TypeError, ValueError, OverflowError):
         raise UsageError(f"{file}: T_hand_cam must be 4 rows of 4 numbers, offset_ms a number") from None
-    if (
-        T.shape != (4, 4)
-        or not np.isfinite(T).all()
-        or not is_rotation(T[:3, :3])
-        or np.any(T[3] != (0, 0, 0, 1))
-    ):
+    if not is_rigid(T):
         raise UsageError(f"{file}: T_hand_cam is no rotation and translation above a last row 0 0 0 1")
     if np.linalg.norm(T[:3, 3]) > LARGEST_DISTANCE:
         raise UsageError(

@@ -213,6 +213,7 @@ def test_anchors_are_pinned_listed_and_removed(beside_node: dict[str, Any]) -> N
     while first + 1 not in rows:  # it comes with the next frame
         rows = {row["id"]: row for row in figures_of("anchor", "list", "--json")}
     assert np.hypot(rows[first]["u"] - 160, rows[first]["v"] - 128) < 10 and rows[first]["z"] > 0
+    assert rows[first]["unit"] == "m"
     assert str(first) in sags("anchor", "list").stdout
     for anchor in rows:
         assert sags("anchor", "remove", anchor).stdout == f"anchor {anchor} is removed\n"

@@ -64,7 +64,11 @@ def test_every_message_says_that_lengths_have_no_unit_and_none_is_sure(
         assert (anchors.points["depth_confidence"] < SURE).all()
         status = subscriber.wait(STATUS, 20)
         assert status is not None and "no unit" in status.warnings()["uncalibrated"]
-    ipc = ("--endpoint", f"ipc://{node.run_dir}/sags.ipc")
+        ipc = ("--endpoint", f"ipc://{node.run_dir}/sags.ipc")
+        listed = figures_of("anchor", "list", *ipc, "--json")
+        assert [row["unit"] for row in listed] == [None]
+        assert "x y z have no unit" in sags("anchor", "list", *ipc).stdout
+        assert figures_of("topic", "echo", str(DEPTH), "--once", *ipc, "--json")["units"] == "relative"
     refused(1, "export", "--mesh", tmp_path / "now.ply", *ipc, said=("no calibration", "no unit"))
     bag = tmp_path / "bag"
     assert figures_of("bag", "record", "-o", bag, *ipc, "--seconds", "3", "--json")["messages"] > 0

@@ -18,13 +18,15 @@ import numpy as np
 import pytest
 from browsers import new_page
 from synthetic import plane_result, publisher
-from waiting import beside, until
+from waiting import beside, repeating, until
 
 from sags_node.clients.latency.code import NUMBERS, Reader, paint
 from sags_node.clients.latency.ledger import Ledger, Moment
-from sags_node.clients.latency.run import measure_latency
+from sags_node.clients.latency.run import WAITING, measure_latency
 from sags_node.clients.latency.shown import Codes, Page, Pushed
+from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.config.schema import PushSource
+from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8, Camera, FrameResult
@@ -133,7 +135,9 @@ def shows(left: U8, stamp_ns: int, frame_id: int) -> FrameResult:
 
 
 @contextmanager
-def measuring(codes: Codes, run_dir: Path, ended: Callable[[], object]) -> Iterator[dict[str, Any]]:
+def measuring(
+    codes: Codes, run_dir: Path, ended: Callable[[], object], overlay: NodeAddress | None = None
+) -> Iterator[dict[str, Any]]:
     """In a thread that is joined; gives what it finds."""
     found: dict[str, Any] = {}
     node, stop = NodeAddress(run_dir=run_dir), threading.Event()
@@ -141,7 +145,7 @@ def measuring(codes: Codes, run_dir: Path, ended: Callable[[], object]) -> Itera
     def measure() -> None:
         try:
             with codes:
-                found.update(measure_latency(node, None, codes, 2.0, print, stop))
+                found.update(measure_latency(node, overlay, codes, 2.0, print, stop))
         finally:
             ended()
 
@@ -170,6 +174,60 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
     assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD
     assert found["total_ms"]["p50"] >= 1e3 * HELD
     assert found["total_ms"]["max"] >= found["parts_ms"]["published"]["max"]
+
+
+class Painted(Codes):
+    """Of pictures that the test itself publishes."""
+
+    hint = "are codes painted?"
+
+    def __init__(self) -> None:
+        self.ledger = Ledger("sent")
+
+
+@contextmanager
+def overlaid(run_dir: Path, behind: int, codes: Painted) -> Iterator[NodeAddress]:
+    """Publishes coded pictures at up to 30 Hz, and an overlay `behind` pictures behind them; it is given."""
+    with publisher(run_dir) as node, OverlayStream("overlay", run_dir, (0, 0, 255)) as overlay:
+        stamps: list[int] = []
+
+        def step(number: int) -> None:
+            at = Moment.now()
+            stamps.append(at.wall)
+            codes.ledger.shown(number % NUMBERS, at)
+            node.publish_result(shows(numbered(number % NUMBERS), at.wall, number), dropped=0)
+            if number >= behind:
+                empty, old = np.zeros((256, 320, 4), np.uint8), number - behind
+                overlay.show({"left": empty}, old, stamps[old], 0)
+            overlay.serve()
+            node.poll(33)
+
+        with repeating(step):
+            yield NodeAddress("overlay", run_dir=run_dir)
+
+
+@pytest.mark.live
+def test_an_overlay_ten_pictures_behind_is_measured(tmp_path: Path) -> None:
+    codes, ended = Painted(), threading.Event()
+    with overlaid(tmp_path, 10, codes) as overlay, measuring(codes, tmp_path, ended.set, overlay) as found:
+        until(ended.is_set)
+    assert found["read"] > found["lost"] and found["unknown"] == found["unreadable"] == 0
+    assert found["parts_ms"]["drawn"]["p50"] >= 10 * 33 - 50  # the picture itself leaves up to so much later
+
+
+@pytest.mark.live
+def test_an_overlay_that_is_behind_all_pictures_is_named(tmp_path: Path) -> None:
+    codes, said, stop = Painted(), list[str](), threading.Event()
+    with overlaid(tmp_path, WAITING + 10, codes) as overlay:
+
+        def tell(why: str) -> None:
+            said.append(why)
+            if "pictures behind" in why or len(said) == 10:
+                stop.set()
+
+        with pytest.raises(SagsError, match="pictures behind"):
+            measure_latency(NodeAddress(run_dir=tmp_path), overlay, codes, 2.0, tell, stop)
+    assert "pictures behind" in said[-1]
 
 
 @pytest.mark.live

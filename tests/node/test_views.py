@@ -215,6 +215,19 @@ def test_a_static_view_is_sent_again_to_who_comes_later(node: RunningNode, contr
     assert collect(node, ["view/still/image"], timeout=0.5)["view/still/image"] == []
 
 
+def test_a_static_view_opened_again_with_less_sends_nothing_of_before(
+    node: RunningNode, control: ControlClient
+) -> None:
+    view = {"name": "less", "static": True, "width": 64, "height": 48}
+    old = [f"view/less/left/{kind}" for kind in ("image", "depth", "camera_info")]
+    control.request("open_view", view | {"stereo": True, "depth": True})
+    assert all(collect(node, old).values())
+    control.request("open_view", view)
+    assert collect(node, ["view/less/image"])["view/less/image"]
+    assert not any(collect(node, old, timeout=0.5).values())
+    control.request("close_view", {"name": "less"})
+
+
 def test_what_is_wrong_with_a_request_is_said(node: RunningNode, control: ControlClient) -> None:
     outside = {"x": 0.0, "y": 0.0, "z": 3.0}
     for op, args, message in (

@@ -250,6 +250,25 @@ def test_a_pose_on_its_way_is_waited_for() -> None:
         robot.close()
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        shifted(0.1).T,
+        np.diag([1.0, 1, -1, 1]),
+        np.diag([1000.0, 1000, 1000, 1]),
+        np.zeros((4, 4)),
+        np.full((4, 4), np.nan),
+        np.eye(4)[:3],
+    ],
+    ids=["transposed", "mirrored", "scaled", "zeros", "nan", "3x4"],
+)
+@pytest.mark.fault("robot: a program hands in a transposed, mirrored or scaled pose")
+def test_a_matrix_that_is_no_pose_is_not_sent(wrong: F64) -> None:
+    """A quaternion of it would be a good one, of another pose."""
+    with PoseSender("tcp://127.0.0.1:1") as sender, pytest.raises(ValueError, match="is it transposed"):
+        sender.send(wrong)
+
+
 def _known(track: PoseTrack, t_ns: int) -> bool:
     try:
         track.at(t_ns)

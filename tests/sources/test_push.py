@@ -23,11 +23,12 @@ from places import ROOT
 from stereo_sender import paint_number
 from waiting import until
 
-from sags_node.client import ClientKeys, FrameSender
+from sags_node.client import ClientKeys, FrameSender, PoseSender
 from sags_node.config.schema import PushSource
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.security import read_key_pair, write_key_pair
+from sags_node.messaging.sender import SILENT
 from sags_node.messaging.wire import Message, encode
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8
@@ -175,6 +176,35 @@ def test_a_sender_never_waits_for_a_node_that_is_away() -> None:
         for _ in range(100):
             sender.send(numbered(1), numbered(1))
         assert sender.left_out >= 200 - 4
+
+
+@pytest.mark.fault("network: the node that pictures are sent to is not there, or has gone")
+def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old() -> None:
+    with PushedPictures(PushSource(endpoint=ANYWHERE), (160, 120)) as source:
+        endpoint = source.endpoint
+    with FrameSender(endpoint) as sender, PoseSender(endpoint) as poses:
+        assert "no answer" in sent_until_told(sender, numbered(1), numbered(1))
+        assert "source.kind:=push" in str(sender.problem) and sender.left_out > 0
+        until(lambda: poses.send(np.eye(4)) or "robot.kind:=push" in str(poses.problem))
+        came = PushedPictures(PushSource(endpoint=endpoint), (160, 120))
+        with Taker(came) as taker:
+
+            def answered() -> bool:
+                sender.send(numbered(2), numbered(2))
+                return sender.problem is None and bool(taker.numbers)
+
+            until(answered)
+        assert set(taker.numbers) == {(2, 2)}
+        assert sender.receipt is not None and sender.receipt.refused == 0
+        assert "no answer" in sent_until_told(sender, numbered(3), numbered(3))
+
+
+def test_a_sender_that_sends_nothing_misses_no_answer(source: PushedPictures) -> None:
+    with FrameSender(source.endpoint) as sender:
+        assert sender.send(numbered(1), numbered(1))  # the first pair, too
+        until(lambda: sender.problem is None and sender.receipt)
+        time.sleep(SILENT + 0.5)
+        assert sender.problem is None
 
 
 def test_the_sender_of_the_phantom_ends_with_ctrl_c_and_explains_itself(tmp_path: Path) -> None:

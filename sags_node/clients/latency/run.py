@@ -14,7 +14,7 @@ from sags_node.clients.overlay.draw import over
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.received import Received, ReceivedImage, TopicName
-from sags_node.messaging.subscriber import Subscriber
+from sags_node.messaging.subscriber import KEPT, Subscriber
 
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)
 OVERLAY = TopicName("left/overlay/image", ReceivedImage)
@@ -22,6 +22,7 @@ SETTLED = 2.0  # s after the first code, from which on codes count: a model has 
 LAST = 1.0  # s that the last code has to be seen
 LOOK = 0.1  # s
 REMIND = 5.0  # s without a code, after which it is said
+WAITING = 64  # pictures that wait for their overlay: for `LAST`, at 60 Hz
 
 
 def measure_latency(
@@ -49,22 +50,28 @@ def measure_latency(
     ledger, reader = codes.ledger, Reader()
     newest: Received | None = None
     since, ends_at, remind_at = None, math.inf, time.monotonic() + REMIND
-    leading = (node, PICTURE) if overlay is None else (overlay, OVERLAY)
-    with Subscriber.at(node, [PICTURE]) as pictures, Subscriber.at(leading[0], [leading[1]]) as subscriber:
+    apart: str | None = None  # why an overlay that came has no picture
+    leading, kept = ((node, PICTURE), KEPT) if overlay is None else ((overlay, OVERLAY), WAITING)
+    with (
+        Subscriber.at(node, [PICTURE], kept=kept) as pictures,
+        Subscriber.at(leading[0], [leading[1]]) as subscriber,
+    ):
         while not stop.is_set() and (now := time.monotonic()) < ends_at + LAST:
             due = codes.step(now < ends_at)
             came = subscriber.wait(leading[1], min(LOOK, due), after=newest)
             if since is None and now > remind_at:
                 remind_at = now + REMIND
-                silent = codes.problem or pictures.problem(PICTURE) or subscriber.problem(leading[1])
+                silent = codes.problem or apart or pictures.problem(PICTURE) or subscriber.problem(leading[1])
                 tell(f"waiting: {silent or 'there is no code in the pictures'}")
             if came is None:
                 continue
             newest = came
             frame = pictures.aligned([PICTURE], came.stamp_ns, LOOK)
             if frame is None:
+                blank = came.meta.frame_id < 0
+                apart = "the overlay is blank" if blank else f"overlays are over {WAITING} pictures behind"
                 continue
-            picture = frame[PICTURE]
+            apart, picture = None, frame[PICTURE]
             stamps = {"captured": picture.stamp_ns, "published": picture.meta.publish_ns}
             if overlay is not None:
                 stamps["drawn"] = came.meta.publish_ns
@@ -75,5 +82,5 @@ def measure_latency(
             if number is not None and since is None:
                 since, ends_at = at.later(SETTLED), now + SETTLED + seconds
     if since is None:
-        raise SagsError(f"no code was seen: {codes.hint}")
+        raise SagsError(f"no code was seen: {codes.problem or apart or codes.hint}")
     return ledger.figures(since, Moment.now().later(-LAST))
