@@ -20,7 +20,7 @@ from waiting import beside, until
 from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
 from sags_node.clients.recording.backlog import Arrived, Backlog
-from sags_node.clients.recording.bag_writer import BagWriter
+from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
 from sags_node.clients.recording.recorder import Recorder, RecordOptions
@@ -31,6 +31,7 @@ from sags_node.findings import by_stage
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.cdr import Content
+from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, encode
 from sags_node.node.recorder_state import LOW_SECONDS, SILENT_SECONDS, findings
@@ -110,6 +111,68 @@ def test_lengths_without_a_unit_stay_so_in_a_bag_and_when_it_is_played(tmp_path:
         until((run_dir / "sags.json").exists)
         with Subscriber(["left/depth"], run_dir=run_dir) as subscriber:
             until(lambda: (got := subscriber.wait("left/depth", 1)) is not None and not got.metric)
+
+
+@pytest.mark.fault("node: started anew while it is recorded")
+@pytest.mark.parametrize("limits", [Limits(), Limits(bytes=60)], ids=["one file", "many"])
+def test_a_node_that_was_started_anew_is_played_as_such(limits: Limits, tmp_path: Path) -> None:
+    """Anchors of one number are other points then; so are stamps and Gaussians in a new epoch."""
+    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
+    options = RecordOptions(tmp_path / "bag", limits=limits, node=NodeAddress(endpoint=endpoint))
+    recorded = [("a", 0)] * 3 + [("a", 1)] * 2 + [("b", 0)] * 3
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(options) as (recorder, _):
+            socket.recv()
+            for seq, (session, epoch) in enumerate(recorded, 1):
+                said = cdr.string(f"{session}{epoch}")
+                socket.send_multipart(encode(message_of("status", said, seq, session=session, epoch=epoch)))
+            until(lambda: recorder.summary()["messages"] == len(recorded))
+    recover(tmp_path / "bag", tmp_path / "saved")
+    for folder in ("bag", "saved"):
+        assert [(m.session, m.epoch) for m in by_topic(tmp_path / folder)["status"]] == recorded
+    config = PublishConfig(data=(), control=None, run_dir=run_dir)
+    player = Player(tmp_path / "bag", PlayOptions(loop=True), config)
+    played: dict[tuple[str, int], str] = {}
+    with beside(player.play, player.stop):
+        until((run_dir / "sags.json").exists)
+        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["status"], 60.0):
+            if arrived is not None:
+                message, _ = arrived
+                key = message.meta.session, message.meta.epoch
+                assert played.setdefault(key, cdr.parse(message).data) == cdr.parse(message).data
+            if len(played) > 8:  # more than two passes
+                break
+    assert {"a0", "a1", "b0"} == set(played.values())
+    of_session: dict[str, str] = {}
+    assert all(of_session.setdefault(session, said[0]) == said[0] for (session, _), said in played.items())
+
+
+def test_a_prediction_stays_one_when_it_is_played(tmp_path: Path) -> None:
+    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
+    picture, aheads = cdr.image(np.ones((4, 4), np.uint8), "mono8", 1), (msgspec.UNSET, 93_400_000)
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))) as (recorder, _):
+            socket.recv()
+            for seq, ahead in enumerate(aheads, 1):
+                socket.send_multipart(encode(message_of("view/a/image", picture, seq, seq, ahead_ns=ahead)))
+            until(lambda: recorder.summary()["messages"] == 2)
+    recover(tmp_path / "bag", tmp_path / "saved")
+    for folder in ("bag", "saved"):
+        assert [message.ahead_ns for message in by_topic(tmp_path / folder)["view/a/image"]] == [
+            0,
+            100_000_000,
+        ]
+    player = Player(
+        tmp_path / "saved", PlayOptions(loop=True), PublishConfig(data=(), control=None, run_dir=run_dir)
+    )
+    came: set[object] = set()
+    with beside(player.play, player.stop):
+        until((run_dir / "sags.json").exists)
+        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["view/a/image"], 60.0):
+            came |= set() if arrived is None else {arrived[0].meta.ahead_ns}
+            if len(came) > 1:
+                break
+    assert came == {msgspec.UNSET, 100_000_000}
 
 
 def test_what_a_person_should_know_of_a_recording() -> None:

@@ -90,6 +90,8 @@ class Player:
         self._clock_due = 0.0
         self._frames: OrderedDict[int, int] = OrderedDict()  # original stamp -> number of the frame
         self._frame_count = 0
+        self._session = ""  # recorded one of the last message
+        self._epoch = 0  # newest one that was published
 
     def stop(self) -> None:
         self._stopping.set()
@@ -120,17 +122,18 @@ class Player:
         with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
             self._delay(publisher)
             while not self._stopping.is_set():
-                self._play_once(publisher, epoch=passes)
+                self._play_once(publisher)
                 passes += 1
+                self._epoch += 1
                 if not self._sent and not self._stopping.is_set():
                     raise SagsError(f"{self._path} holds no message that was asked for; see sags bag info")
                 if not self._options.loop:
                     break
         return {"messages": self._sent, "passes": passes, "seconds": round(time.monotonic() - began, 3)}
 
-    def _play_once(self, publisher: Publisher, epoch: int) -> None:
+    def _play_once(self, publisher: Publisher) -> None:
         options = self._options
-        first_ns = 0
+        first_ns, first_epoch = 0, self._epoch
         clock = PlayClock(0, options.rate)
         for message in read_messages(self._path):
             if not first_ns:
@@ -141,15 +144,22 @@ class Player:
                 continue
             if options.playback_duration is not None and after > options.playback_duration:
                 return
-            self._wait_for(message.log_ns, clock, publisher, epoch)
+            self._wait_for(message.log_ns, clock, publisher)
             if self._stopping.is_set():
                 return
+            if message.session != self._session:
+                if self._session:  # the node was started anew; a session that comes back is a second node
+                    publisher.start_anew(uuid.uuid4().hex)
+                self._session = message.session
+            epoch = first_epoch + message.epoch
+            self._epoch = max(self._epoch, epoch)
             original = original_stamp(message)
             stamp_ns = clock.wall_ns(original)
             name, content = outgoing(message, stamp_ns)
             number = self._frame_number(original) if content.type in FRAME_TYPES else -1
             name, content = self._plain(name), replace(content, relative=message.relative)
-            publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, epoch)
+            name, ahead_ns = options.remap.get(name, name), round(message.ahead_ns / options.rate)
+            publisher.publish_content(name, content, number, stamp_ns, epoch, ahead_ns)
             self._sent += 1
 
     def _delay(self, publisher: Publisher) -> None:
@@ -161,7 +171,7 @@ class Player:
                 return
             publisher.poll(int(min(POLL_SECONDS, left) * 1e3))
 
-    def _wait_for(self, recorded_ns: int, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+    def _wait_for(self, recorded_ns: int, clock: PlayClock, publisher: Publisher) -> None:
         """Serve subscriptions until a moment of the recording is due, and playing is not paused."""
         before = time.monotonic()
         while not self._stopping.is_set():
@@ -169,7 +179,7 @@ class Player:
             if self._paused:
                 clock.pause(now - before)
             before = now
-            self._tell_time(now, clock, publisher, epoch)
+            self._tell_time(now, clock, publisher)
             left = clock.until(recorded_ns, now)
             if left <= 0 and not self._paused:
                 return
@@ -178,7 +188,7 @@ class Player:
                 wait = min(wait, self._clock_due - now)
             publisher.poll(int(max(wait, 0.0) * 1e3))
 
-    def _tell_time(self, now: float, clock: PlayClock, publisher: Publisher, epoch: int) -> None:
+    def _tell_time(self, now: float, clock: PlayClock, publisher: Publisher) -> None:
         """Publish the clock when that is due, also while playing is paused."""
         hz = self._options.clock_hz
         if hz is None or now < self._clock_due:
@@ -187,7 +197,9 @@ class Player:
         if self._clock_due < now:  # the first time, or this machine is too busy for so many
             self._clock_due = now + 1 / hz
         moment_ns = clock.moment_ns(now)
-        publisher.publish_content(CLOCK_TOPIC, cdr.clock(moment_ns), -1, clock.wall_ns(moment_ns), epoch)
+        publisher.publish_content(
+            CLOCK_TOPIC, cdr.clock(moment_ns), -1, clock.wall_ns(moment_ns), self._epoch
+        )
 
     def _is_wanted(self, message: BagMessage) -> bool:
         name = self._plain(message.topic.removesuffix(COMPRESSED_SUFFIX))

@@ -17,10 +17,10 @@ from sags_node.bags.bag import (
     RECORDED,
     Channels,
     files_in,
+    marks_of,
     read_messages,
     records_of,
     storage_files,
-    unitless,
 )
 from sags_node.bags.mcap_file import HEAD, MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head
 from sags_node.clients.recording.bag_writer import BagWriter
@@ -89,12 +89,12 @@ class _Writer:
     def __init__(self, bag: BagWriter, done: Recovery) -> None:
         self._bag = bag
         self._done = done
-        self._known: dict[tuple[str, str, bytes, bool], int] = {}  # topic, type, schema, units: channel
+        self._known: dict[tuple[object, ...], int] = {}  # topic, type, schema, marks: channel
         self._attached: set[tuple[str, bytes]] = set()  # name and digest: each file of a bag has them all
 
     def write(self, entry: Entry, channel: Channel, schema: Schema) -> None:
-        metadata = channel.metadata
-        key = (channel.topic, schema.name, schema.data, unitless(channel))
+        metadata, marks = channel.metadata, marks_of(channel)
+        key = (channel.topic, schema.name, schema.data, *marks.items())
         if key not in self._known:
             latched = "transient_local" in metadata.get("offered_qos_profiles", "")
             self._known[key] = self._bag.add_topic(
@@ -103,7 +103,7 @@ class _Writer:
                 schema,
                 metadata.get("topic_type_hash", ""),
                 latched,
-                unitless(channel),
+                marks,
             )
         self._bag.write(self._known[key], entry.log_ns, entry.publish_ns, entry.sequence, entry.data)
         self._done.messages += 1
