@@ -28,8 +28,7 @@ def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
     if summary["rejected"]:
         yield Finding(
             "recording_rejects",
-            f"{summary['rejected']} messages are not in {folder}: they are not what they say, or of an "
-            "unknown type",
+            f"{summary['rejected']} messages are not in {folder}: {summary['rejected_why']}",
         )
     if free is not None and free < LOW_SECONDS * 1e6 * summary["mb_per_s"]:
         yield Finding(

@@ -181,7 +181,8 @@ def test_what_a_person_should_know_of_a_recording() -> None:
     assert not list(findings({**good, "free_bytes": 100e6 * LOW_SECONDS}))
     codes = {
         "recording_silent": {"silent_s": SILENT_SECONDS + 0.1}, "recording_loses": {"lost": 1},
-        "recording_rejects": {"rejected": 1}, "recording_disk_low": {"free_bytes": 1e9},
+        "recording_rejects": {"rejected": 1, "rejected_why": "it is damaged"},
+        "recording_disk_low": {"free_bytes": 1e9},
     }  # fmt: skip
     for code, wrong in codes.items():
         (told,) = findings({**good, "free_bytes": 1e15, **wrong})

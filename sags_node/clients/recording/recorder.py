@@ -21,7 +21,7 @@ from typing import Any
 from sags_node.clients.recording.backlog import Arrived, Backlog, Ring
 from sags_node.clients.recording.bag_writer import NO_LIMITS, Limits
 from sags_node.clients.recording.message_writer import Compression, MessageWriter, is_latched
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import THE_NODE, NodeAddress
@@ -75,6 +75,8 @@ class Recorder:
         self._snapshot_wanted = threading.Event()
         self._topics: dict[str, _Topic] = {}
         self._rejected = 0
+        self._why_rejected: str | None = None  # the first one
+        self._refused: set[str] = set()  # thin pictures that the node cannot make
         self._bytes = 0
         self._free: int | None = None  # bytes of the disk
         self._began = self._last_came = time.monotonic()
@@ -98,10 +100,14 @@ class Recorder:
             progress: called with the summary once a second.
 
         Raises:
-            UsageError: something is at the folder already, or an unknown topic.
-            SagsError: no node is known, it refuses this client, the disk is full, or what came was not
-                written for another reason.
+            UsageError: something is at the folder already, an unknown topic, or one that says nothing in a
+                bag.
+            SagsError: no node is known, it refuses this client or all that is recorded, the disk is full, or
+                what came was not written for another reason.
         """
+        for name in (topics.plain_name(self._options.node.ns, each) for each in self._options.topics):
+            if name.startswith(topics.THIN) and topics.is_scaled(whole := topics.thin_picture(name)):
+                raise UsageError(f"'{name}': a bag cannot say what its numbers mean; record {whole.topic}")
         self._began = self._last_came = time.monotonic()
         self._progress = progress
         if self._options.snapshot_seconds is None:
@@ -127,6 +133,7 @@ class Recorder:
             "silent_s": round(now - self._last_came, 3),
             **totals,
             "rejected": self._rejected,
+            "rejected_why": self._why_rejected,
             "bytes": self._bytes,
             "mb_per_s": round(self._bytes / 1e6 / recorded, 2),
             "free_bytes": self._free,
@@ -138,7 +145,7 @@ class Recorder:
         options = self._options
         thin = topics.full_name(options.node.ns, topics.THIN)
         next_tell = time.monotonic() + TELL_PERIOD
-        with closing(listen_to(options.node, options.topics, None, HIGH_WATER)) as heard:
+        with closing(listen_to(options.node, options.topics, None, HIGH_WATER, self._refuse)) as heard:
             for arrived in heard:
                 if self._stopping.is_set() or self._error is not None:
                     return
@@ -155,11 +162,24 @@ class Recorder:
                 if not options.topics and message.topic.startswith(thin):  # another's, of a whole one
                     continue
                 if not cdr.knows(message.meta.type):
-                    self._rejected += 1
+                    self._reject(f"{message.topic}: unknown type {message.meta.type!r}")
                     continue
                 topic = self._topics.setdefault(message.topic, _Topic())
                 if topic.fresh.accept(message.meta):  # a last value sent again is nothing new
                     yield Arrived(message, received_ns)
+
+    def _refuse(self, topic: str, why: str) -> None:
+        """The node cannot make a thin picture."""
+        self._refused.add(topic)
+        if not self._topics and len(self._refused) == len(set(self._options.topics)):
+            raise SagsError(why)  # nothing else is recorded
+        self._reject(why)
+
+    def _reject(self, why: str) -> None:
+        if not self._rejected:
+            log.warning("left out: %s", why)
+            self._why_rejected = why
+        self._rejected += 1
 
     def _writer(self, folder: Path) -> MessageWriter:
         options = self._options
@@ -208,9 +228,7 @@ class Recorder:
         try:
             writer.write(arrived)
         except SagsError as error:  # of this message alone
-            if not self._rejected:
-                log.warning("left out: %s", error)
-            self._rejected += 1
+            self._reject(str(error))
             return
         self._topics[arrived.message.topic].messages += 1
 
