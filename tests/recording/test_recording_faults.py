@@ -19,7 +19,7 @@ from waiting import beside, until
 
 from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
-from sags_node.clients.recording.backlog import Arrived, Backlog
+from sags_node.clients.recording.backlog import Arrived, Backlog, Ring
 from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
@@ -177,6 +177,7 @@ def test_a_prediction_stays_one_when_it_is_played(tmp_path: Path) -> None:
 
 def test_what_a_person_should_know_of_a_recording() -> None:
     good = {"folder": "bag", "silent_s": 0.1, "dropped": 0, "lost": 0, "rejected": 0, "mb_per_s": 100.0}
+    good |= {"snapshot_seconds": None, "kept_s": None}
     assert not list(findings({**good, "free_bytes": None}))
     assert not list(findings({**good, "free_bytes": 100e6 * LOW_SECONDS}))
     codes = {
@@ -188,6 +189,37 @@ def test_what_a_person_should_know_of_a_recording() -> None:
         (told,) = findings({**good, "free_bytes": 1e15, **wrong})
         assert told.code == code and by_stage([told])
     assert "full in 10 s at 100.0 MB/s" in told.text
+    ring = {**good, "free_bytes": None, "snapshot_seconds": 20.0, "dropped": 7}
+    (told,) = findings({**ring, "kept_s": 0.96})
+    assert "the last 20 s do not fit" in told.text and "0.96 s are kept" in told.text
+    assert "--max-cache" in told.text and "jpeg" not in told.text and "slow" not in told.text
+    assert not list(findings({**ring, "kept_s": 19.97}))  # they did not fit for a moment
+
+
+@pytest.mark.fault("memory: too little for the seconds of a snapshot")
+def test_a_ring_says_how_much_it_holds(tmp_path: Path) -> None:
+    """Messages come every 10 ms by their times of arrival; five of ten fit."""
+    message = text_message(1, "y" * 1000)
+    ring = Ring(0.1, 5 * Arrived(message, 0).size)
+    for number in range(10):
+        ring.add(Arrived(message, number * 10_000_000), latched=False)
+    assert ring.seconds == pytest.approx(0.04)
+    endpoint = f"ipc://{tmp_path / 'data'}"
+    options = RecordOptions(
+        tmp_path / "bag", snapshot_seconds=60, max_cache_mb=0.005, node=NodeAddress(endpoint=endpoint)
+    )
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket, recording(options) as (recorder, said):
+        socket.recv()
+        for seq in range(1, 20):
+            socket.send_multipart(encode(text_message(seq, "y" * 1000)))
+        until(lambda: recorder.summary()["dropped"] >= 15)
+        recorder.snapshot()
+        until(lambda: "snapshot" in said[-1])
+        summary = recorder.summary()
+    (taken,) = (each for each in said if "snapshot" in each)
+    times = [arrived.log_ns for arrived in by_topic(Path(taken["snapshot"]))["status"]]
+    assert taken["seconds"] == summary["kept_s"] == pytest.approx((times[-1] - times[0]) * 1e-9, abs=1e-3)
+    assert summary["snapshot_seconds"] == 60
 
 
 @pytest.mark.fault("node: killed while it is recorded")

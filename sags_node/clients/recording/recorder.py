@@ -61,7 +61,7 @@ class RecordOptions:
 @dataclass(slots=True)
 class _Topic:
     messages: int = 0  # written
-    dropped: int = 0  # no room in the backlog
+    dropped: int = 0  # no room in the backlog or the ring
     fresh: Freshness = field(default_factory=Freshness)
 
 
@@ -79,6 +79,7 @@ class Recorder:
         self._refused: set[str] = set()  # thin pictures that the node cannot make
         self._bytes = 0
         self._free: int | None = None  # bytes of the disk
+        self._kept_s = 0.0  # in the ring
         self._began = self._last_came = time.monotonic()
         self._error: SagsError | None = None
         self._progress: Tell = lambda said: None
@@ -96,7 +97,8 @@ class Recorder:
 
         Args:
             tell: called with `{"recording": folder}` when the file is open, and for every snapshot with
-                `{"snapshot": folder, "messages": count}`, or with `{"error": text}` where it failed.
+                `{"snapshot": folder, "messages": count, "seconds": held}`, or with `{"error": text}` where it
+                failed.
             progress: called with the summary once a second.
 
         Raises:
@@ -137,6 +139,8 @@ class Recorder:
             "bytes": self._bytes,
             "mb_per_s": round(self._bytes / 1e6 / recorded, 2),
             "free_bytes": self._free,
+            "snapshot_seconds": self._options.snapshot_seconds,
+            "kept_s": None if self._options.snapshot_seconds is None else round(self._kept_s, 3),
             "topics": rows,
         }
 
@@ -247,10 +251,11 @@ class Recorder:
                     latched = is_latched(arrived.message.topic, self._options.node.ns)
                     for pushed_out in ring.add(arrived, latched):
                         self._topics[pushed_out.message.topic].dropped += 1
+                    self._kept_s = ring.seconds
                 if self._snapshot_wanted.is_set():
                     self._snapshot_wanted.clear()
                     number = next(n for n in count(number) if not self._snapshot(n).exists())
-                    saved = self._snapshot(number), ring.content(), tell
+                    saved = self._snapshot(number), ring.content(), self._kept_s, tell
                     saving.append(threading.Thread(target=self._save, args=saved, daemon=True))
                     saving[-1].start()
                     number += 1
@@ -260,7 +265,7 @@ class Recorder:
     def _snapshot(self, number: int) -> Path:
         return self._options.folder / f"snapshot_{number:03d}"
 
-    def _save(self, folder: Path, messages: list[Arrived], tell: Tell) -> None:
+    def _save(self, folder: Path, messages: list[Arrived], seconds: float, tell: Tell) -> None:
         """A thread for each snapshot, so that receiving goes on. One that fails ends nothing: what the ring
         holds can be saved elsewhere."""
         try:
@@ -272,7 +277,7 @@ class Recorder:
             tell({"error": str(_told(folder, error))})
             return
         self._bytes += writer.bag.bytes
-        tell({"snapshot": str(folder), "messages": writer.bag.messages})
+        tell({"snapshot": str(folder), "messages": writer.bag.messages, "seconds": round(seconds, 3)})
 
 
 def _told(folder: Path, error: Exception) -> SagsError:
