@@ -59,7 +59,7 @@ def bag() -> None:
     "--compression",
     type=click.Choice(["none", "jpeg", "png"]),
     default="none",
-    help="Of 8-bit pictures. jpeg: alpha and masks become png, so that they stay exact.",
+    help="Of 8-bit pictures. jpeg: alpha, masks and color_key become png: they stay exact.",
 )
 @shown(
     *("--max-cache", "max_cache_mb"),

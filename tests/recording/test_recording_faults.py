@@ -17,6 +17,7 @@ from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher
 from waiting import beside, until
 
+from sags_node.bags.pictures import decode_picture
 from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
 from sags_node.clients.recording.backlog import Arrived, Backlog, Ring
@@ -173,6 +174,21 @@ def test_a_prediction_stays_one_when_it_is_played(tmp_path: Path) -> None:
             if len(came) > 1:
                 break
     assert came == {msgspec.UNSET, 100_000_000}
+
+
+def test_a_key_colour_stays_exact(tmp_path: Path) -> None:
+    """A display shows the camera where the pixel is the key, and nowhere else."""
+    endpoint, picture = f"ipc://{tmp_path / 'data'}", np.full((32, 32, 3), (0, 0, 255), np.uint8)
+    picture[10:20, 11:21] = 255, 120, 0
+    options = RecordOptions(tmp_path / "bag", compression="jpeg", node=NodeAddress("sags", endpoint=endpoint))
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(options) as (recorder, _):
+            socket.recv()
+            said = message_of("left/overlay/color_key", cdr.image(picture, "rgb8", 1))
+            socket.send_multipart(encode(said))
+            until(lambda: recorder.summary()["messages"])
+    (kept,) = by_topic(tmp_path / "bag")["left/overlay/color_key/compressed"]
+    assert np.array_equal(decode_picture(kept.data, kept.type, ""), picture)
 
 
 def test_what_a_person_should_know_of_a_recording() -> None:

@@ -39,8 +39,8 @@ class MessageWriter:
     """Writes messages as they came into a new bag.
 
     Args:
-        compression: of 8-bit pictures. `jpeg` takes colour pictures only: alpha and masks must stay exact and
-            become PNG. Depth is never compressed.
+        compression: of 8-bit pictures. `jpeg` takes colour pictures only: alpha, masks and what lies on a key
+            colour must stay exact and become PNG. Depth is never compressed.
         limits: of each file in the bag.
 
     Raises:
@@ -72,7 +72,10 @@ class MessageWriter:
             self._attach(arrived)
         name, kind, data = message.topic, meta.type, told_in_ros(meta, b"".join(message.parts))
         if self._compression != "none" and kind == IMAGE and meta.encoding in _COMPRESSIBLE:
-            form = "jpeg" if self._compression == "jpeg" and meta.encoding == "rgb8" else "png"
+            lossy = (
+                self._compression == "jpeg" and meta.encoding == "rgb8" and not name.endswith("/color_key")
+            )
+            form = "jpeg" if lossy else "png"
             name, kind, data = f"{name}/compressed", cdr.COMPRESSED, _compressed(message, data, form)
         marks = dict(RELATIVE) if relative else {}  # the node may be another one, calibrated by now
         if meta.ahead_ns:
