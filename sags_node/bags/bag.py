@@ -114,13 +114,8 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
             raise UsageError(f"{path} is not a recording; what is read: folders, {', '.join(SUFFIXES)}")
         return [path], False
     if not (path / METADATA).is_file():
-        files = (mcap := files_in(path, ".mcap")) or files_in(path, ".db3")
-        stems = {_stem(file.stem) for file in (*mcap, *files_in(path, ".db3"))}
-        if len(stems) > 1:
-            raise UsageError(
-                f"{path} holds {len(stems)} recordings and no {METADATA} that names one: "
-                f"{', '.join(sorted(stems)[:3])}; give one of its files"
-            )
+        check_one(path)
+        files = files_in(path, ".mcap") or files_in(path, ".db3")
         if not files:
             raise UsageError(
                 f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
@@ -138,6 +133,20 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
         if not file.is_file() or file.suffix not in (".mcap", ".db3"):
             raise UsageError(f"{path / METADATA} names {file.name}, which is not a .mcap or .db3 file there")
     return files, mode == "message"
+
+
+def check_one(folder: Path) -> None:
+    """Tell whether the files in a folder are of one recording, by their names.
+
+    Raises:
+        UsageError: they are of several.
+    """
+    stems = {_stem(file.stem) for suffix in (".mcap", ".db3") for file in files_in(folder, suffix)}
+    if len(stems) > 1:
+        raise UsageError(
+            f"{folder} holds {len(stems)} recordings and no {METADATA} that names one: "
+            f"{', '.join(sorted(stems)[:3])}; give one of its files"
+        )
 
 
 def files_in(folder: Path, suffix: str) -> list[Path]:

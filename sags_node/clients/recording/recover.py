@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -16,6 +17,7 @@ from sags_node.bags import mcap_file
 from sags_node.bags.bag import (
     RECORDED,
     Channels,
+    check_one,
     files_in,
     marks_of,
     read_messages,
@@ -54,10 +56,11 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
         The fields of `Recovery`, `lost` and the new folder.
 
     Raises:
-        UsageError: there is no MCAP file, or something is at `out` already.
+        UsageError: there is no MCAP file, the folder holds several recordings, or something is at `out`
+            already.
         SagsError: nothing can be saved, or the new bag cannot be written.
     """
-    files = files_in(path, ".mcap") if path.is_dir() else storage_files(path)[0]
+    files = _files(path)
     if not files or files[0].suffix != ".mcap":
         raise UsageError(
             f"{path}: only MCAP is recovered; for ROS 1 use rosbag reindex, for db3 sqlite3 .recover"
@@ -81,6 +84,18 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
     if read_back != done.messages:
         raise SagsError(f"{out} holds {read_back} of {done.messages} messages; is the disk sound?")
     return {"folder": str(out), **asdict(done), "lost": done.lost}
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of one recording: their names are alike, unless metadata.yaml names just those."""
+    if not path.is_dir():
+        return storage_files(path)[0]
+    files, named = files_in(path, ".mcap"), list[Path]()
+    with suppress(SagsError):
+        named = storage_files(path)[0]
+    if set(named) != set(files):
+        check_one(path)
+    return files
 
 
 class _Writer:
