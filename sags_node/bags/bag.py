@@ -87,6 +87,24 @@ def recorded_namespace(path: Path) -> str | None:
     return None
 
 
+def recorded_topics(path: Path) -> set[str]:
+    """The topics of a bag by the ends of its files; empty where one says nothing: it is cut off, or no MCAP.
+
+    Raises:
+        UsageError, SagsError: as `read_messages`.
+    """
+    there = set[str]()
+    for file in storage_files(path)[0]:
+        if file.suffix != ".mcap":
+            return set()
+        with _explained(file), open_file(file) as opened:
+            said = {each.topic for each in summary(opened, file.stat().st_size) if isinstance(each, Channel)}
+        if not said:
+            return set()
+        there |= said
+    return there
+
+
 def _recorded_node(file: BinaryIO, head: Head) -> dict[str, str] | None:
     """What a record of the file says of the node that was recorded; None: it is about something else."""
     if head.opcode != Opcode.METADATA or head.length > MAX_METADATA_BYTES:
@@ -252,6 +270,18 @@ def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
         record = mcap_file.parse(head.opcode, memoryview(mcap_file.read_content(file, head)), head.position)
         assert record is not None
         yield record
+
+
+def summary(file: BinaryIO, size: int) -> Iterator[Schema | Channel]:
+    """Schemas and channels that the end of an MCAP file repeats, if it is there."""
+    try:
+        for head in mcap_file.heads(file, size, mcap_file.summary_start(file, size)):
+            if head.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                for record in records_of(file, head):
+                    if not isinstance(record, Entry):
+                        yield record
+    except DamagedError:
+        return
 
 
 class Channels:

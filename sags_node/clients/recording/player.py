@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sags_node.bags.bag import BagMessage, read_messages, recorded_namespace
+from sags_node.bags.bag import BagMessage, read_messages, recorded_namespace, recorded_topics
 from sags_node.clients.recording.outgoing import COMPRESSED_SUFFIX, original_stamp, outgoing
 from sags_node.config.schema import PublishConfig
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_name
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.publisher import Publisher
@@ -29,7 +29,8 @@ class PlayOptions:
     """The flags of `ros2 bag play`. Seconds are those of the recording, but for `delay`.
 
     Attributes:
-        topics, exclude: without leading slash, with or without the namespace; no topics: all.
+        topics, exclude: as the bag has them, or without `/compressed`, leading slash or namespace; no topics:
+            all.
         remap: from old to new name, the same way, new ones without a namespace.
         clock_hz: how often to publish the recording's time; None: never.
     """
@@ -103,7 +104,8 @@ class Player:
         """Publish until the bag ends or `stop`; returns messages, passes and seconds.
 
         Raises:
-            UsageError: there is no bag, its name is no text, or an endpoint is open to others without keys.
+            UsageError: there is no bag, its name is no text, it has no topic of a name that was given, or an
+                endpoint is open to others without keys.
             SagsError: the bag is damaged, an endpoint is taken, or nothing in the bag was asked for.
         """
         began = time.monotonic()
@@ -112,13 +114,14 @@ class Player:
         session, recording = uuid.uuid4().hex, self._path.absolute()
         check_name(recording)
         self._recorded_ns = recorded_namespace(self._path) or self._ns
-        said, plain = self._options, self._plain
+        said, plain = self._options, self._name
         self._options = replace(
             said,
             topics=tuple(map(plain, said.topics)),
             exclude=tuple(map(plain, said.exclude)),
-            remap={plain(old): new for old, new in said.remap.items()},
+            remap={plain(old): new.removesuffix(COMPRESSED_SUFFIX) for old, new in said.remap.items()},
         )
+        self._check_names()
         with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
             self._delay(publisher)
             while not self._stopping.is_set():
@@ -158,7 +161,8 @@ class Player:
             name, content = outgoing(message, stamp_ns)
             number = self._frame_number(original) if content.type in FRAME_TYPES else -1
             name, content = self._plain(name), replace(content, relative=message.relative)
-            name, ahead_ns = options.remap.get(name, name), round(message.ahead_ns / options.rate)
+            name = options.remap.get(self._name(message.topic), name)
+            ahead_ns = round(message.ahead_ns / options.rate)
             publisher.publish_content(name, content, number, stamp_ns, epoch, ahead_ns)
             self._sent += 1
 
@@ -201,14 +205,28 @@ class Player:
             CLOCK_TOPIC, cdr.clock(moment_ns), -1, clock.wall_ns(moment_ns), self._epoch
         )
 
+    def _check_names(self) -> None:
+        """Refuse names that the bag does not have, as far as it says which it has."""
+        options, there = self._options, set(map(self._name, recorded_topics(self._path)))
+        named = {*options.topics, *options.exclude, *options.remap} - {CLOCK_TOPIC}
+        if there and (unknown := named - there):
+            raise UsageError(
+                f"{self._path} holds no message that was asked for as {', '.join(sorted(unknown))}; it has "
+                f"{', '.join(sorted(there))}"
+            )
+
     def _is_wanted(self, message: BagMessage) -> bool:
-        name = self._plain(message.topic.removesuffix(COMPRESSED_SUFFIX))
+        name = self._name(message.topic)
         options = self._options
         if not cdr.knows(message.type):
             return False  # it could not be described to anybody
         if options.clock_hz is not None and name == CLOCK_TOPIC:
             return False  # there is one clock
         return (not options.topics or name in options.topics) and name not in options.exclude
+
+    def _name(self, topic: str) -> str:
+        """The name under which a topic of the bag is published."""
+        return self._plain(topic.removesuffix(COMPRESSED_SUFFIX))
 
     def _plain(self, name: str) -> str:
         """A topic of the bag without the namespace that was recorded: ours takes its place."""

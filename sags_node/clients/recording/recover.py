@@ -23,6 +23,7 @@ from sags_node.bags.bag import (
     read_messages,
     records_of,
     storage_files,
+    summary,
 )
 from sags_node.bags.mcap_file import HEAD, MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head
 from sags_node.clients.recording.bag_writer import BagWriter
@@ -147,7 +148,7 @@ def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
         return
     with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         channels = Channels()
-        for record in _summary(file, size):
+        for record in summary(file, size):  # the first chunk of a channel may be damaged
             channels.add(record)
         position, in_data = len(MAGIC), True
         while True:
@@ -170,18 +171,6 @@ def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
                 return
             done.bytes_skipped += following - position
             position = following
-
-
-def _summary(file: BinaryIO, size: int) -> Iterator[Schema | Channel]:
-    """Schemas and channels that the end of the file repeats, if it is there: their first chunk may not be."""
-    try:
-        for head in mcap_file.heads(file, size, mcap_file.summary_start(file, size)):
-            if head.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                for record in records_of(file, head):
-                    if not isinstance(record, Entry):
-                        yield record
-    except DamagedError:
-        return
 
 
 def _copy(file: BinaryIO, head: Head, channels: Channels, writer: _Writer, done: Recovery) -> None:
