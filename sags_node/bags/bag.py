@@ -27,8 +27,9 @@ from sags_node.messaging import cdr
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
-RECORDED = "sags"  # metadata of a bag that says which node was recorded
+RECORDED = "sags"  # metadata of a bag that says which node was recorded from here on
 RELATIVE = {"sags_units": "relative"}  # metadata of a channel whose lengths have no unit
+AHEAD = "sags_ahead_ms"  # metadata of a channel whose content is predicted: how far ahead of the stamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,9 @@ class BagMessage:
     sequence: int  # 0 where the format has none
     data: bytes | memoryview  # CDR
     relative: bool = False  # its lengths have no unit: it is of a node that nobody has calibrated
+    ahead_ns: int = 0  # it shows what is expected so long after its stamp
+    session: str = ""  # of the node that was recorded; empty: the bag does not say it
+    epoch: int = 0  # of that node
 
 
 def read_messages(
@@ -78,12 +82,35 @@ def recorded_namespace(path: Path) -> str | None:
             for head in mcap_file.heads(opened, file.stat().st_size, len(MAGIC)):
                 if head.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
                     break  # it stands before the first message
-                if head.opcode == Opcode.METADATA and head.length <= MAX_METADATA_BYTES:
-                    said = mcap_file.read_metadata(mcap_file.read_content(opened, head))
-                    if said is not None and said.name == RECORDED:
-                        ns: str | None = said.metadata.get("ns")
-                        return ns
+                if (said := _recorded_node(opened, head)) is not None:
+                    return said.get("ns")
     return None
+
+
+def recorded_topics(path: Path) -> set[str]:
+    """The topics of a bag by the ends of its files; empty where one says nothing: it is cut off, or no MCAP.
+
+    Raises:
+        UsageError, SagsError: as `read_messages`.
+    """
+    there = set[str]()
+    for file in storage_files(path)[0]:
+        if file.suffix != ".mcap":
+            return set()
+        with _explained(file), open_file(file) as opened:
+            said = {each.topic for each in summary(opened, file.stat().st_size) if isinstance(each, Channel)}
+        if not said:
+            return set()
+        there |= said
+    return there
+
+
+def _recorded_node(file: BinaryIO, head: Head) -> dict[str, str] | None:
+    """What a record of the file says of the node that was recorded; None: it is about something else."""
+    if head.opcode != Opcode.METADATA or head.length > MAX_METADATA_BYTES:
+        return None
+    said = mcap_file.read_metadata(mcap_file.read_content(file, head))
+    return said.metadata if said is not None and said.name == RECORDED else None
 
 
 def storage_files(path: Path) -> tuple[list[Path], bool]:
@@ -105,13 +132,8 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
             raise UsageError(f"{path} is not a recording; what is read: folders, {', '.join(SUFFIXES)}")
         return [path], False
     if not (path / METADATA).is_file():
-        files = (mcap := files_in(path, ".mcap")) or files_in(path, ".db3")
-        stems = {_stem(file.stem) for file in (*mcap, *files_in(path, ".db3"))}
-        if len(stems) > 1:
-            raise UsageError(
-                f"{path} holds {len(stems)} recordings and no {METADATA} that names one: "
-                f"{', '.join(sorted(stems)[:3])}; give one of its files"
-            )
+        check_one(path)
+        files = files_in(path, ".mcap") or files_in(path, ".db3")
         if not files:
             raise UsageError(
                 f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
@@ -131,6 +153,20 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
     return files, mode == "message"
 
 
+def check_one(folder: Path) -> None:
+    """Tell whether the files in a folder are of one recording, by their names.
+
+    Raises:
+        UsageError: they are of several.
+    """
+    stems = {_stem(file.stem) for suffix in (".mcap", ".db3") for file in files_in(folder, suffix)}
+    if len(stems) > 1:
+        raise UsageError(
+            f"{folder} holds {len(stems)} recordings and no {METADATA} that names one: "
+            f"{', '.join(sorted(stems)[:3])}; give one of its files"
+        )
+
+
 def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
     return sorted(folder.glob(f"{SHOWN}{suffix}"), key=lambda file: (_number(file.stem), file.name))
@@ -143,7 +179,11 @@ def _stem(stem: str) -> str:
 
 
 def _number(stem: str) -> int:
-    digits = stem.rpartition("_")[2]
+    return _whole(stem.rpartition("_")[2])
+
+
+def _whole(digits: str) -> int:
+    """The number that is written there; 0 where none is, or one that nobody means."""
     return int(digits) if digits.isdecimal() and len(digits) < 10 else 0
 
 
@@ -174,7 +214,7 @@ def _explained(file: Path) -> Iterator[None]:
 
 def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
     size = file.stat().st_size
-    channels = Channels()
+    channels, session, epoch = Channels(), "", 0
     with open_file(file) as opened:
         if opened.read(len(MAGIC)) != MAGIC:
             raise DamagedError(0, "it does not begin as an MCAP file")
@@ -183,6 +223,8 @@ def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Ite
                 # Its channels may be needed later: they stand only where they are first used.
                 channels.missed.append(head)
                 continue
+            if (said := _recorded_node(opened, head)) is not None:
+                session, epoch = said.get("session", ""), _whole(said.get("epoch", ""))
             for record in records_of(opened, head):
                 if not isinstance(record, Entry):
                     channels.add(record)
@@ -203,13 +245,16 @@ def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Ite
                         record.publish_ns,
                         record.sequence,
                         record.data,
-                        unitless(channel),
+                        RELATIVE.items() <= channel.metadata.items(),
+                        _whole(channel.metadata.get(AHEAD, "")) * 1_000_000,
+                        session,
+                        epoch,
                     )
 
 
-def unitless(channel: Channel) -> bool:
-    """Tell whether lengths have no unit in the messages of a channel."""
-    return bool(RELATIVE.items() <= channel.metadata.items())
+def marks_of(channel: Channel) -> dict[str, str]:
+    """What the metadata of a channel says of its messages that ROS has no word for."""
+    return {key: said for key, said in channel.metadata.items() if key in (*RELATIVE, AHEAD)}
 
 
 def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
@@ -225,6 +270,18 @@ def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
         record = mcap_file.parse(head.opcode, memoryview(mcap_file.read_content(file, head)), head.position)
         assert record is not None
         yield record
+
+
+def summary(file: BinaryIO, size: int) -> Iterator[Schema | Channel]:
+    """Schemas and channels that the end of an MCAP file repeats, if it is there."""
+    try:
+        for head in mcap_file.heads(file, size, mcap_file.summary_start(file, size)):
+            if head.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                for record in records_of(file, head):
+                    if not isinstance(record, Entry):
+                        yield record
+    except DamagedError:
+        return
 
 
 class Channels:

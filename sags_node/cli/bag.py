@@ -59,14 +59,14 @@ def bag() -> None:
     "--compression",
     type=click.Choice(["none", "jpeg", "png"]),
     default="none",
-    help="Of 8-bit pictures. jpeg: alpha and masks become png, so that they stay exact.",
+    help="Of 8-bit pictures. jpeg: alpha, masks and color_key become png: they stay exact.",
 )
 @shown(
     *("--max-cache", "max_cache_mb"),
     type=positive,
     default=256.0,
     metavar="MB",
-    help="What may wait for the disk; beyond it messages are dropped and counted.",
+    help="What may wait for the disk, or be kept for a snapshot; beyond it messages are dropped and counted.",
 )
 @shown(
     *("-b", "--max-bag-size"),
@@ -86,7 +86,7 @@ def bag() -> None:
     *("--snapshot-mode", "snapshot_seconds"),
     type=positive,
     metavar="SECONDS",
-    help="Keep only the last seconds in memory; write them on SIGUSR1.",
+    help="Keep only the last seconds, as far as --max-cache holds them; write them on SIGUSR1.",
 )
 @click.option("--stdin", "from_stdin", is_flag=True, help="A line on stdin is as SIGUSR1, its end as Ctrl-C.")
 @data_options
@@ -119,7 +119,7 @@ def record(
     sags bag record -o out/case1 --compression jpeg
     sags bag record --topics left/image_rect_color right/image_rect_color
     sags bag record -o out/case2 --max-bag-size 4000000000
-    sags bag record -o out/last --snapshot-mode 20 & kill -USR1 $!
+    sags bag record -o out/last --snapshot-mode 20 --max-cache 6000 & kill -USR1 $!
     sags bag record launch/d4d_pull.yaml -o out/case3 mapping.budget_ms:=100
     """
     from datetime import datetime

@@ -166,6 +166,11 @@ class Publisher(Closes):
             counts["control"] |= self._control.refused
         return counts
 
+    def start_anew(self, session: str) -> None:
+        """Go on as a node that was started anew: nobody gets again what the one before said."""
+        self.session = session
+        self._kept.clear()
+
     # ---- out -------------------------------------------------------------------------------------------
 
     def publish_picture(self, pair: RectifiedPair, epoch: int) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import difflib
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 
 import zmq
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging import topics, wire
+from sags_node.messaging import cdr, topics, wire
 from sags_node.messaging.address import Address, HandshakeWatch, NodeAddress, connect
 from sags_node.messaging.sockets import HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS, receive_frames
 
@@ -67,8 +67,16 @@ def receive(socket: zmq.Socket[bytes]) -> wire.Message:
     return wire.decode([frame.buffer for frame in receive_frames(socket, wire.MAX_PARTS)])
 
 
+def _refuse(topic: str, why: str) -> None:
+    raise SagsError(why)
+
+
 def listen_to(
-    node: NodeAddress, names: Sequence[str], seconds: float | None, high_water: int = RECEIVE_HIGH_WATER
+    node: NodeAddress,
+    names: Sequence[str],
+    seconds: float | None,
+    high_water: int = RECEIVE_HIGH_WATER,
+    refused: Callable[[str, str], None] = _refuse,
 ) -> Generator[tuple[wire.Message, int] | None, None, None]:
     """Give every message of some topics and its time of arrival, for up to `seconds`.
 
@@ -76,15 +84,17 @@ def listen_to(
     when the caller is slow.
 
     Yields None at least every `POLL_MS` while none of them arrives, so that a caller can keep time. What
-    is no message is left out.
+    is no message is left out. So is why a thin picture cannot be made, which its topic says: `refused`
+    gets both.
 
     Raises:
         UsageError: an unknown topic.
-        SagsError: no endpoint is known, or the node refuses this client.
+        SagsError: no endpoint is known, the node refuses this client, or it says why it cannot make a thin
+            picture.
     """
     ns = node.ns
     known = [check_topic(topics.plain_name(ns, name)) for name in names]
-    wanted = {topics.full_name(ns, topic.name) for topic in known}
+    wanted = {topics.full_name(ns, topic.name): topic.type for topic in known}
     prefixes = sorted(wanted) or [f"{ns}/"]
     deadline = None if seconds is None else time.monotonic() + seconds
     with data_socket(node.data(), prefixes, high_water) as (socket, watch):
@@ -96,6 +106,10 @@ def listen_to(
                 continue
             try:
                 message = receive(socket)
+                if message.meta.type == topics.STRING and wanted.get(message.topic) == cdr.COMPRESSED:
+                    refused(message.topic, cdr.parse(message).data)
+                    yield None
+                    continue
             except wire.WireError:
                 continue
             # A subscription is a prefix: that to a depth brings its confidence too.

@@ -143,6 +143,11 @@ def thin_picture(name: str) -> ThinPicture:
     return ThinPicture(topic, form, every, (x, y, width, height))
 
 
+def is_scaled(thin: ThinPicture) -> bool:
+    """Tell whether its numbers are steps of a depth or a confidence, which `scale` in `meta` says."""
+    return thin.form == "png" and thin.topic.endswith(("/depth", "/depth_confidence"))
+
+
 def find(name: str) -> Topic | None:
     """The entry of a topic named without the namespace, also of a player or an overlay, of a view that a
     consumer may have opened, or of a thin picture."""

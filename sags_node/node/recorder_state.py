@@ -9,6 +9,7 @@ from sags_node.types import Finding
 
 SILENT_SECONDS = 3.0  # without a message; a node says its status once a second
 LOW_SECONDS = 300.0  # that the disk has room for
+WHOLE = 0.9  # of the seconds asked for a snapshot: the oldest message came after their beginning
 
 
 def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
@@ -19,7 +20,16 @@ def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
             "recording_silent",
             f"nothing has come to {folder} for {silent:.0f} s: does the node run, and do frames come?",
         )
-    if missing := summary["dropped"] + summary["lost"]:
+    missing, asked, kept = summary["lost"], summary["snapshot_seconds"], summary["kept_s"]
+    if asked is None:
+        missing += summary["dropped"]
+    elif summary["dropped"] and kept < WHOLE * asked:
+        yield Finding(
+            "recording_loses",
+            f"the last {asked:g} s do not fit into memory, {kept:.2f} s are kept for a snapshot: raise "
+            "--max-cache (max_cache_mb), or record fewer topics",
+        )
+    if missing:
         yield Finding(
             "recording_loses",
             f"{missing} messages are missing in {folder}: the disk or the machine is too slow; record fewer "
@@ -28,8 +38,7 @@ def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
     if summary["rejected"]:
         yield Finding(
             "recording_rejects",
-            f"{summary['rejected']} messages are not in {folder}: they are not what they say, or of an "
-            "unknown type",
+            f"{summary['rejected']} messages are not in {folder}: {summary['rejected_why']}",
         )
     if free is not None and free < LOW_SECONDS * 1e6 * summary["mb_per_s"]:
         yield Finding(

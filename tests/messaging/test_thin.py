@@ -12,21 +12,23 @@ import numpy as np
 import pytest
 from independent_client import collect
 from places import SESSION
+from recorded_plane import by_topic, recording
 from running_node import RunningNode
 from synthetic import HEIGHT, WIDTH, plane_result
 from thin_sender import making, node_sockets
 from waiting import heard, until
 
 from sags_node.clients.recording.recorder import Recorder, RecordOptions
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import content, thin, topics
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.introspection import topic_echo, topic_figures
+from sags_node.messaging.introspection import topic_echo, topic_figures, topic_info
 from sags_node.messaging.publisher import MAX_THIN, Publisher
 from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
+from sags_node.node.recorder_state import findings
 
 pytestmark = pytest.mark.live
 
@@ -208,6 +210,41 @@ def test_a_wrong_request_hears_why(name: str, said: str, tmp_path: Path) -> None
         count = len(made)
         until(lambda: len(made) > count + 3)
     assert running.thin == {} or name in running.thin
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("thin/full/90,0,10,10/left/depth/png", "leaves the picture"),  # said with each frame
+        ("thin/half/right/render/image/jpeg", "no right eye"),  # said once
+    ],
+)
+def test_why_there_is_no_picture_is_not_taken_for_one(name: str, said: str, tmp_path: Path) -> None:
+    """It has neither a rate nor a place in a recording."""
+    with node_sockets(tmp_path) as running, making(running, plane_result()):
+        node = NodeAddress(endpoint=running.connection.data[-1])
+        for listen in (
+            partial(topic_figures, "hz"), partial(topic_figures, "bw"), topic_info,
+            lambda name, node: list(topic_echo(name, node, count=1)),
+        ):  # fmt: skip
+            with pytest.raises(SagsError, match=said):
+                listen(name, node=node)
+        name = name.replace("left/depth/png", "left/image_rect_color/jpeg")
+        with pytest.raises(SagsError, match=said):
+            Recorder(RecordOptions(tmp_path / "none", topics=(name,), node=node)).run()
+        options = RecordOptions(tmp_path / "bag", topics=("tf", name), node=node)
+        with recording(options) as (recorder, summaries):
+            until(lambda: min(recorder.summary()[key] for key in ("messages", "rejected")))
+    assert list(summaries[-1]["topics"]) == ["sags/tf"] and list(by_topic(tmp_path / "bag")) == ["tf"]
+    (told,) = (each.text for each in findings(summaries[-1]) if each.code == "recording_rejects")
+    assert said in told and name in told
+
+
+def test_a_thin_depth_is_not_recorded_without_its_scale(tmp_path: Path) -> None:
+    """ROS takes 16-bit depth for millimetres."""
+    for name in ("thin/half/left/render/depth/png", "/sags/thin/full/left/render/depth_confidence/png"):
+        with pytest.raises(UsageError, match="record left/render/depth"):
+            Recorder(RecordOptions(tmp_path / "bag", topics=(name,))).run()
 
 
 def test_no_more_are_made_than_may_be(tmp_path: Path) -> None:

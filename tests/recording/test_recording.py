@@ -7,6 +7,7 @@ import shutil
 import time
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
 from sags_node.clients.recording.recorder import RecordOptions
 from sags_node.config.schema import PublishConfig
+from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.topics import TOPICS
@@ -104,6 +106,32 @@ def test_compressed_pictures(compression: str, tmp_path: Path) -> None:
     assert "left/depth" in found and "left/depth/compressed" not in found  # metres stay exact
     stamp = cdr.decode(picture.data, picture.type).header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == picture.publish_ns
+
+
+def test_played_topics_are_named_as_info_prints_them(tmp_path: Path) -> None:
+    path, summary = record_plane(tmp_path, seconds=0.4, compression="jpeg")
+    config = PublishConfig(data=(), control=None, run_dir=tmp_path / "played")
+    name = "/sags/left/image_rect_color/compressed"
+    pictures = len(by_topic(path)["left/image_rect_color/compressed"])
+
+    def played(**options: Any) -> int:
+        return Player(path, PlayOptions(rate=50.0, **options), config).play()["messages"]
+
+    assert name in {row["topic"] for row in bag_info(path)["topics"]}
+    for said in (name, "left/image_rect_color", "sags/left/image_rect_color/compressed"):
+        assert played(topics=(said,)) == pictures
+        assert played(exclude=(said,)) == summary["messages"] - pictures
+        assert played(topics=(said,), remap={said: "left/depth/compressed"}) == pictures
+    assert played(topics=(name, "clock"), clock_hz=50.0) == pictures
+    (file,) = path.glob("*.mcap")
+    for bag in (path, file):
+        for options in (
+            {"topics": (name, "left/dept")},
+            {"exclude": ("left/dept",)},
+            {"remap": {"left/dept": "a"}},
+        ):
+            with pytest.raises(UsageError, match=r"asked for as left/dept; it has .*left/depth"):
+                Player(bag, PlayOptions(**options), config).play()
 
 
 def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:

@@ -17,10 +17,11 @@ from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher
 from waiting import beside, until
 
+from sags_node.bags.pictures import decode_picture
 from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
-from sags_node.clients.recording.backlog import Arrived, Backlog
-from sags_node.clients.recording.bag_writer import BagWriter
+from sags_node.clients.recording.backlog import Arrived, Backlog, Ring
+from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
 from sags_node.clients.recording.recorder import Recorder, RecordOptions
@@ -31,6 +32,7 @@ from sags_node.findings import by_stage
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.cdr import Content
+from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, encode
 from sags_node.node.recorder_state import LOW_SECONDS, SILENT_SECONDS, findings
@@ -112,18 +114,128 @@ def test_lengths_without_a_unit_stay_so_in_a_bag_and_when_it_is_played(tmp_path:
             until(lambda: (got := subscriber.wait("left/depth", 1)) is not None and not got.metric)
 
 
+@pytest.mark.fault("node: started anew while it is recorded")
+@pytest.mark.parametrize("limits", [Limits(), Limits(bytes=60)], ids=["one file", "many"])
+def test_a_node_that_was_started_anew_is_played_as_such(limits: Limits, tmp_path: Path) -> None:
+    """Anchors of one number are other points then; so are stamps and Gaussians in a new epoch."""
+    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
+    options = RecordOptions(tmp_path / "bag", limits=limits, node=NodeAddress(endpoint=endpoint))
+    recorded = [("a", 0)] * 3 + [("a", 1)] * 2 + [("b", 0)] * 3
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(options) as (recorder, _):
+            socket.recv()
+            for seq, (session, epoch) in enumerate(recorded, 1):
+                said = cdr.string(f"{session}{epoch}")
+                socket.send_multipart(encode(message_of("status", said, seq, session=session, epoch=epoch)))
+            until(lambda: recorder.summary()["messages"] == len(recorded))
+    recover(tmp_path / "bag", tmp_path / "saved")
+    for folder in ("bag", "saved"):
+        assert [(m.session, m.epoch) for m in by_topic(tmp_path / folder)["status"]] == recorded
+    config = PublishConfig(data=(), control=None, run_dir=run_dir)
+    player = Player(tmp_path / "bag", PlayOptions(loop=True), config)
+    played: dict[tuple[str, int], str] = {}
+    with beside(player.play, player.stop):
+        until((run_dir / "sags.json").exists)
+        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["status"], 60.0):
+            if arrived is not None:
+                message, _ = arrived
+                key = message.meta.session, message.meta.epoch
+                assert played.setdefault(key, cdr.parse(message).data) == cdr.parse(message).data
+            if len(played) > 8:  # more than two passes
+                break
+    assert {"a0", "a1", "b0"} == set(played.values())
+    of_session: dict[str, str] = {}
+    assert all(of_session.setdefault(session, said[0]) == said[0] for (session, _), said in played.items())
+
+
+def test_a_prediction_stays_one_when_it_is_played(tmp_path: Path) -> None:
+    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
+    picture, aheads = cdr.image(np.ones((4, 4), np.uint8), "mono8", 1), (msgspec.UNSET, 93_400_000)
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))) as (recorder, _):
+            socket.recv()
+            for seq, ahead in enumerate(aheads, 1):
+                socket.send_multipart(encode(message_of("view/a/image", picture, seq, seq, ahead_ns=ahead)))
+            until(lambda: recorder.summary()["messages"] == 2)
+    recover(tmp_path / "bag", tmp_path / "saved")
+    for folder in ("bag", "saved"):
+        assert [message.ahead_ns for message in by_topic(tmp_path / folder)["view/a/image"]] == [
+            0,
+            100_000_000,
+        ]
+    player = Player(
+        tmp_path / "saved", PlayOptions(loop=True), PublishConfig(data=(), control=None, run_dir=run_dir)
+    )
+    came: set[object] = set()
+    with beside(player.play, player.stop):
+        until((run_dir / "sags.json").exists)
+        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["view/a/image"], 60.0):
+            came |= set() if arrived is None else {arrived[0].meta.ahead_ns}
+            if len(came) > 1:
+                break
+    assert came == {msgspec.UNSET, 100_000_000}
+
+
+def test_a_key_colour_stays_exact(tmp_path: Path) -> None:
+    """A display shows the camera where the pixel is the key, and nowhere else."""
+    endpoint, picture = f"ipc://{tmp_path / 'data'}", np.full((32, 32, 3), (0, 0, 255), np.uint8)
+    picture[10:20, 11:21] = 255, 120, 0
+    options = RecordOptions(tmp_path / "bag", compression="jpeg", node=NodeAddress("sags", endpoint=endpoint))
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
+        with recording(options) as (recorder, _):
+            socket.recv()
+            said = message_of("left/overlay/color_key", cdr.image(picture, "rgb8", 1))
+            socket.send_multipart(encode(said))
+            until(lambda: recorder.summary()["messages"])
+    (kept,) = by_topic(tmp_path / "bag")["left/overlay/color_key/compressed"]
+    assert np.array_equal(decode_picture(kept.data, kept.type, ""), picture)
+
+
 def test_what_a_person_should_know_of_a_recording() -> None:
     good = {"folder": "bag", "silent_s": 0.1, "dropped": 0, "lost": 0, "rejected": 0, "mb_per_s": 100.0}
+    good |= {"snapshot_seconds": None, "kept_s": None}
     assert not list(findings({**good, "free_bytes": None}))
     assert not list(findings({**good, "free_bytes": 100e6 * LOW_SECONDS}))
     codes = {
         "recording_silent": {"silent_s": SILENT_SECONDS + 0.1}, "recording_loses": {"lost": 1},
-        "recording_rejects": {"rejected": 1}, "recording_disk_low": {"free_bytes": 1e9},
+        "recording_rejects": {"rejected": 1, "rejected_why": "it is damaged"},
+        "recording_disk_low": {"free_bytes": 1e9},
     }  # fmt: skip
     for code, wrong in codes.items():
         (told,) = findings({**good, "free_bytes": 1e15, **wrong})
         assert told.code == code and by_stage([told])
     assert "full in 10 s at 100.0 MB/s" in told.text
+    ring = {**good, "free_bytes": None, "snapshot_seconds": 20.0, "dropped": 7}
+    (told,) = findings({**ring, "kept_s": 0.96})
+    assert "the last 20 s do not fit" in told.text and "0.96 s are kept" in told.text
+    assert "--max-cache" in told.text and "jpeg" not in told.text and "slow" not in told.text
+    assert not list(findings({**ring, "kept_s": 19.97}))  # they did not fit for a moment
+
+
+@pytest.mark.fault("memory: too little for the seconds of a snapshot")
+def test_a_ring_says_how_much_it_holds(tmp_path: Path) -> None:
+    """Messages come every 10 ms by their times of arrival; five of ten fit."""
+    message = text_message(1, "y" * 1000)
+    ring = Ring(0.1, 5 * Arrived(message, 0).size)
+    for number in range(10):
+        ring.add(Arrived(message, number * 10_000_000), latched=False)
+    assert ring.seconds == pytest.approx(0.04)
+    endpoint = f"ipc://{tmp_path / 'data'}"
+    options = RecordOptions(
+        tmp_path / "bag", snapshot_seconds=60, max_cache_mb=0.005, node=NodeAddress(endpoint=endpoint)
+    )
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket, recording(options) as (recorder, said):
+        socket.recv()
+        for seq in range(1, 20):
+            socket.send_multipart(encode(text_message(seq, "y" * 1000)))
+        until(lambda: recorder.summary()["dropped"] >= 15)
+        recorder.snapshot()
+        until(lambda: "snapshot" in said[-1])
+        summary = recorder.summary()
+    (taken,) = (each for each in said if "snapshot" in each)
+    times = [arrived.log_ns for arrived in by_topic(Path(taken["snapshot"]))["status"]]
+    assert taken["seconds"] == summary["kept_s"] == pytest.approx((times[-1] - times[0]) * 1e-9, abs=1e-3)
+    assert summary["snapshot_seconds"] == 60
 
 
 @pytest.mark.fault("node: killed while it is recorded")

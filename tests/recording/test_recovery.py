@@ -130,6 +130,26 @@ def test_recovery_that_is_broken_off_leaves_nothing(
     assert not any(tmp_path.iterdir())
 
 
+def test_two_recordings_are_not_joined(plane_bag: Path, tmp_path: Path) -> None:
+    """As `info` refuses them; also where metadata.yaml names one. If it names all, names may be any."""
+    (file,), both, out = plane_bag.glob("*.mcap"), tmp_path / "both", tmp_path / "out"
+    both.mkdir()
+    for name in ("case1_0.mcap", "case2_0.mcap"):
+        (both / name).write_bytes(file.read_bytes())
+    described = (plane_bag / "metadata.yaml").read_text()
+    for names in (None, "- case1_0.mcap", "- gone_0.mcap"):
+        if names is not None:
+            (both / "metadata.yaml").write_text(described.replace(f"- {file.name}", names))
+        refused(
+            2, "bag", "recover", both, "-o", out, said=("2 recordings", "case1, case2", "one of its files")
+        )
+        assert not out.exists()
+    (both / "metadata.yaml").write_text(
+        described.replace(f"  - {file.name}", "  - case1_0.mcap\n  - case2_0.mcap")
+    )
+    assert recover(both, out)["messages"] == 2 * bag_info(plane_bag)["messages"]
+
+
 def test_recover_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
     (file,) = plane_bag.glob("*.mcap")
     cut = tmp_path / "cut.mcap"

@@ -91,6 +91,11 @@ class Ring:
             self._latched[arrived.message.topic] = arrived
         return pushed_out
 
+    @property
+    def seconds(self) -> float:
+        """From the oldest message that is kept to the newest; latched ones may be older."""
+        return (self._kept[-1].received_ns - self._kept[0].received_ns) * 1e-9 if self._kept else 0.0
+
     def content(self) -> list[Arrived]:
         """All that is kept, oldest first."""
         since = self._kept[0].received_ns if self._kept else 2**63 - 1

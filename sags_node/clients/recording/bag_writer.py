@@ -6,7 +6,7 @@ recovered up to there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self, TypeVar
@@ -16,7 +16,7 @@ from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 
 from sags_node import __version__
-from sags_node.bags.bag import METADATA, RELATIVE
+from sags_node.bags.bag import METADATA
 from sags_node.clients.recording.bag_metadata import Part, Topic, describe, quality
 from sags_node.errors import UsageError
 from sags_node.files import writing
@@ -57,6 +57,7 @@ class BagWriter:
         self._limits = limits
         self._topics: dict[int, Topic] = {}  # by channel, the same number in every file
         self._beginning: list[Callable[[Writer], object]] = []  # what every file has to say first
+        self._notes: dict[str, dict[str, str]] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._parts: list[Part] = []
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -73,7 +74,7 @@ class BagWriter:
         schema: Schema,
         type_hash: str = "",
         latched: bool = False,
-        relative: bool = False,
+        marks: Mapping[str, str] | None = None,
     ) -> int:
         """Announce a topic; its number for `write`.
 
@@ -81,7 +82,7 @@ class BagWriter:
             kind: ROS 2 name of the type.
             schema: its definition; the number in it is not used.
             latched: late subscribers get the last message too (durability transient_local).
-            relative: its lengths have no unit.
+            marks: more metadata of its channel, see `bag.marks_of`.
         """
         key = (schema.name, schema.encoding, schema.data)
         if key not in self._schemas:
@@ -89,7 +90,7 @@ class BagWriter:
         metadata = {
             "offered_qos_profiles": yaml.safe_dump(quality(latched), sort_keys=False),
             "topic_type_hash": type_hash,
-            **(RELATIVE if relative else {}),
+            **(marks or {}),
         }
         schema_id = self._schemas[key]
         channel: int = self._say_first(
@@ -119,8 +120,10 @@ class BagWriter:
         self._say_first(lambda writer: writer.add_attachment(log_ns, log_ns, name, media_type, data))
 
     def note(self, name: str, values: dict[str, str]) -> None:
-        """Put key-value metadata into the bag."""
-        self._say_first(lambda writer: writer.add_metadata(name, values))
+        """Put key-value metadata into the bag: it holds for the messages that follow, until the next one."""
+        self._notes[name] = values
+        self._writer.flush()  # else it would stand before messages that were written before it
+        self._writer.add_metadata(name, values)
 
     def flush(self) -> None:
         """Hand everything over to the operating system."""
@@ -180,6 +183,8 @@ class BagWriter:
         self._writer.start(profile="ros2", library=f"sags-node {__version__}")
         for say in self._beginning:
             say(self._writer)
+        for name, values in self._notes.items():
+            self._writer.add_metadata(name, values)
 
     def _end_file(self) -> None:
         description = describe(self._parts[-1:], self._topics)

@@ -10,7 +10,7 @@ import msgspec
 from mcap.records import Schema
 
 from sags_node import __version__
-from sags_node.bags.bag import RECORDED
+from sags_node.bags.bag import AHEAD, RECORDED, RELATIVE
 from sags_node.bags.camera_info import read_eye
 from sags_node.bags.pictures import encode_file
 from sags_node.clients.recording.backlog import Arrived
@@ -25,6 +25,7 @@ from sags_node.rig import eye_text
 
 Compression = Literal["none", "jpeg", "png"]
 JPEG_QUALITY = 92
+AHEAD_STEP_MS = 10  # how exactly a bag says how far ahead a prediction is: each value is a channel
 _COMPRESSIBLE = ("rgb8", "rgba8", "mono8")
 
 
@@ -38,8 +39,8 @@ class MessageWriter:
     """Writes messages as they came into a new bag.
 
     Args:
-        compression: of 8-bit pictures. `jpeg` takes colour pictures only: alpha and masks must stay exact and
-            become PNG. Depth is never compressed.
+        compression: of 8-bit pictures. `jpeg` takes colour pictures only: alpha, masks and what lies on a key
+            colour must stay exact and become PNG. Depth is never compressed.
         limits: of each file in the bag.
 
     Raises:
@@ -51,9 +52,9 @@ class MessageWriter:
         self.bag = BagWriter(folder, limits)
         self._ns = ns
         self._compression = compression
-        self._channels: dict[tuple[str, str, bool], int] = {}  # topic, type, and whether lengths have no unit
+        self._channels: dict[tuple[object, ...], int] = {}  # topic, type, marks
         self._attached: set[str] = set()
-        self._session = ""
+        self._source: tuple[str, int] | None = None  # session and epoch of the node
 
     def write(self, arrived: Arrived) -> None:
         """Write one message.
@@ -62,28 +63,32 @@ class MessageWriter:
             WireError: its content is not what it says.
         """
         message, meta = arrived.message, arrived.message.meta
-        if meta.session != self._session:
-            self._session = meta.session
-            self.bag.note(
-                RECORDED,
-                {"session": meta.session, "protocol": PROTOCOL, "ns": self._ns, "version": __version__},
-            )
+        if (meta.session, meta.epoch) != self._source:
+            self._source = meta.session, meta.epoch
+            said = {"session": meta.session, "epoch": str(meta.epoch), "protocol": PROTOCOL}
+            self.bag.note(RECORDED, {**said, "ns": self._ns, "version": __version__})
         relative = meta.units is not msgspec.UNSET
         if not (relative and meta.type == CAMERA_INFO):
             self._attach(arrived)
         name, kind, data = message.topic, meta.type, told_in_ros(meta, b"".join(message.parts))
         if self._compression != "none" and kind == IMAGE and meta.encoding in _COMPRESSIBLE:
-            form = "jpeg" if self._compression == "jpeg" and meta.encoding == "rgb8" else "png"
+            lossy = (
+                self._compression == "jpeg" and meta.encoding == "rgb8" and not name.endswith("/color_key")
+            )
+            form = "jpeg" if lossy else "png"
             name, kind, data = f"{name}/compressed", cdr.COMPRESSED, _compressed(message, data, form)
-        key = name, kind, relative  # the node may be another one, calibrated by now
+        marks = dict(RELATIVE) if relative else {}  # the node may be another one, calibrated by now
+        if meta.ahead_ns:
+            marks[AHEAD] = str(-(-meta.ahead_ns // (AHEAD_STEP_MS * 1_000_000)) * AHEAD_STEP_MS)  # up
+        key = name, kind, *marks.items()
         if key not in self._channels:
-            self._channels[key] = self._announce(*key)
+            self._channels[key] = self._announce(name, kind, marks)
         self.bag.write(self._channels[key], arrived.received_ns, meta.stamp_ns, meta.seq, data)
 
-    def _announce(self, name: str, kind: str, relative: bool) -> int:
+    def _announce(self, name: str, kind: str, marks: dict[str, str]) -> int:
         schema = Schema(id=0, name=kind, encoding="ros2msg", data=cdr.definition(kind).encode())
         latched = is_latched(name, self._ns)
-        return self.bag.add_topic(f"/{name}", kind, schema, cdr.type_hash(kind), latched, relative)
+        return self.bag.add_topic(f"/{name}", kind, schema, cdr.type_hash(kind), latched, marks)
 
     def _attach(self, arrived: Arrived) -> None:
         """Calibration and parameters lie in the file as files too, for people who open it years later."""

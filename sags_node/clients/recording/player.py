@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from sags_node.bags.bag import BagMessage, read_messages, recorded_namespace
+from sags_node.bags.bag import BagMessage, read_messages, recorded_namespace, recorded_topics
 from sags_node.clients.recording.outgoing import COMPRESSED_SUFFIX, original_stamp, outgoing
 from sags_node.config.schema import PublishConfig
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_name
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.freshness import STALE_AFTER
@@ -35,7 +35,8 @@ class PlayOptions:
     """The flags of `ros2 bag play`. Seconds are those of the recording, but for `delay`.
 
     Attributes:
-        topics, exclude: without leading slash, with or without the namespace; no topics: all.
+        topics, exclude: as the bag has them, or without `/compressed`, leading slash or namespace; no topics:
+            all.
         remap: from old to new name, the same way, new ones without a namespace.
         clock_hz: how often to publish the recording's time; None: never.
     """
@@ -103,10 +104,13 @@ class Player:
         self._paused = paused
         self._sent = 0
         self._clock_due = 0.0
-        self._epoch = 0  # grows with each pass, and where the wall clock is set back
+        self._epoch = (
+            0  # newest one that was published; grows with each pass, and where the wall clock is set back
+        )
         self._frames: OrderedDict[int, tuple[int, int]] = OrderedDict()  # original stamp -> as `_frame_at`
         self._frame_count = 0
         self._same_clock: dict[str, bool] = {}  # by topic: the recorder's clock stamped its first message
+        self._session = ""  # recorded one of the last message
 
     def stop(self) -> None:
         self._stopping.set()
@@ -118,7 +122,8 @@ class Player:
         """Publish until the bag ends or `stop`; returns messages, passes and seconds.
 
         Raises:
-            UsageError: there is no bag, its name is no text, or an endpoint is open to others without keys.
+            UsageError: there is no bag, its name is no text, it has no topic of a name that was given, or an
+                endpoint is open to others without keys.
             SagsError: the bag is damaged, an endpoint is taken, or nothing in the bag was asked for.
         """
         began = time.monotonic()
@@ -127,13 +132,14 @@ class Player:
         session, recording = uuid.uuid4().hex, self._path.absolute()
         check_name(recording)
         self._recorded_ns = recorded_namespace(self._path) or self._ns
-        said, plain = self._options, self._plain
+        said, plain = self._options, self._name
         self._options = replace(
             said,
             topics=tuple(map(plain, said.topics)),
             exclude=tuple(map(plain, said.exclude)),
-            remap={plain(old): new for old, new in said.remap.items()},
+            remap={plain(old): new.removesuffix(COMPRESSED_SUFFIX) for old, new in said.remap.items()},
         )
+        self._check_names()
         with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
             self._delay(publisher)
             while not self._stopping.is_set():
@@ -147,7 +153,7 @@ class Player:
 
     def _play_once(self, publisher: Publisher) -> None:
         options = self._options
-        first_ns = began_ns = 0
+        first_ns, began_ns, first_epoch = 0, 0, self._epoch
         self._frames.clear()
         clock = PlayClock(0, options.rate, self._wall_ns)
         for message in read_messages(self._path):
@@ -162,12 +168,20 @@ class Player:
             self._wait_for(message.log_ns, clock, publisher)
             if self._stopping.is_set():
                 return
+            if message.session != self._session:
+                if self._session:  # the node was started anew; a session that comes back is a second node
+                    publisher.start_anew(uuid.uuid4().hex)
+                self._session = message.session
             before_ns, began_ns = began_ns, clock.wall_ns(first_ns)
-            self._epoch += began_ns < before_ns
+            first_epoch += began_ns < before_ns
+            epoch = first_epoch + message.epoch
+            self._epoch = max(self._epoch, epoch)
             number, stamp_ns = self._frame_at(message, clock)
             name, content = outgoing(message, stamp_ns)
             name, content = self._plain(name), replace(content, relative=message.relative)
-            publisher.publish_content(options.remap.get(name, name), content, number, stamp_ns, self._epoch)
+            name = options.remap.get(self._name(message.topic), name)
+            ahead_ns = round(message.ahead_ns / options.rate)
+            publisher.publish_content(name, content, number, stamp_ns, epoch, ahead_ns)
             self._sent += 1
 
     def _delay(self, publisher: Publisher) -> None:
@@ -208,14 +222,28 @@ class Player:
         stamp_ns = clock.wall_ns(moment_ns)
         publisher.publish_content(CLOCK_TOPIC, cdr.clock(moment_ns), -1, stamp_ns, self._epoch)
 
+    def _check_names(self) -> None:
+        """Refuse names that the bag does not have, as far as it says which it has."""
+        options, there = self._options, set(map(self._name, recorded_topics(self._path)))
+        named = {*options.topics, *options.exclude, *options.remap} - {CLOCK_TOPIC}
+        if there and (unknown := named - there):
+            raise UsageError(
+                f"{self._path} holds no message that was asked for as {', '.join(sorted(unknown))}; it has "
+                f"{', '.join(sorted(there))}"
+            )
+
     def _is_wanted(self, message: BagMessage) -> bool:
-        name = self._plain(message.topic.removesuffix(COMPRESSED_SUFFIX))
+        name = self._name(message.topic)
         options = self._options
         if not cdr.knows(message.type):
             return False  # it could not be described to anybody
         if options.clock_hz is not None and name == CLOCK_TOPIC:
             return False  # there is one clock
         return (not options.topics or name in options.topics) and name not in options.exclude
+
+    def _name(self, topic: str) -> str:
+        """The name under which a topic of the bag is published."""
+        return self._plain(topic.removesuffix(COMPRESSED_SUFFIX))
 
     def _plain(self, name: str) -> str:
         """A topic of the bag without the namespace that was recorded: ours takes its place."""

@@ -21,7 +21,7 @@ from typing import Any
 from sags_node.clients.recording.backlog import Arrived, Backlog, Ring
 from sags_node.clients.recording.bag_writer import NO_LIMITS, Limits
 from sags_node.clients.recording.message_writer import Compression, MessageWriter, is_latched
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import THE_NODE, NodeAddress
@@ -61,7 +61,7 @@ class RecordOptions:
 @dataclass(slots=True)
 class _Topic:
     messages: int = 0  # written
-    dropped: int = 0  # no room in the backlog
+    dropped: int = 0  # no room in the backlog or the ring
     fresh: Freshness = field(default_factory=Freshness)
 
 
@@ -75,8 +75,11 @@ class Recorder:
         self._snapshot_wanted = threading.Event()
         self._topics: dict[str, _Topic] = {}
         self._rejected = 0
+        self._why_rejected: str | None = None  # the first one
+        self._refused: set[str] = set()  # thin pictures that the node cannot make
         self._bytes = 0
         self._free: int | None = None  # bytes of the disk
+        self._kept_s = 0.0  # in the ring
         self._began = self._last_came = time.monotonic()
         self._error: SagsError | None = None
         self._progress: Tell = lambda said: None
@@ -94,14 +97,19 @@ class Recorder:
 
         Args:
             tell: called with `{"recording": folder}` when the file is open, and for every snapshot with
-                `{"snapshot": folder, "messages": count}`, or with `{"error": text}` where it failed.
+                `{"snapshot": folder, "messages": count, "seconds": held}`, or with `{"error": text}` where it
+                failed.
             progress: called with the summary once a second.
 
         Raises:
-            UsageError: something is at the folder already, or an unknown topic.
-            SagsError: no node is known, it refuses this client, the disk is full, or what came was not
-                written for another reason.
+            UsageError: something is at the folder already, an unknown topic, or one that says nothing in a
+                bag.
+            SagsError: no node is known, it refuses this client or all that is recorded, the disk is full, or
+                what came was not written for another reason.
         """
+        for name in (topics.plain_name(self._options.node.ns, each) for each in self._options.topics):
+            if name.startswith(topics.THIN) and topics.is_scaled(whole := topics.thin_picture(name)):
+                raise UsageError(f"'{name}': a bag cannot say what its numbers mean; record {whole.topic}")
         self._began = self._last_came = time.monotonic()
         self._progress = progress
         if self._options.snapshot_seconds is None:
@@ -127,9 +135,12 @@ class Recorder:
             "silent_s": round(now - self._last_came, 3),
             **totals,
             "rejected": self._rejected,
+            "rejected_why": self._why_rejected,
             "bytes": self._bytes,
             "mb_per_s": round(self._bytes / 1e6 / recorded, 2),
             "free_bytes": self._free,
+            "snapshot_seconds": self._options.snapshot_seconds,
+            "kept_s": None if self._options.snapshot_seconds is None else round(self._kept_s, 3),
             "topics": rows,
         }
 
@@ -138,7 +149,7 @@ class Recorder:
         options = self._options
         thin = topics.full_name(options.node.ns, topics.THIN)
         next_tell = time.monotonic() + TELL_PERIOD
-        with closing(listen_to(options.node, options.topics, None, HIGH_WATER)) as heard:
+        with closing(listen_to(options.node, options.topics, None, HIGH_WATER, self._refuse)) as heard:
             for arrived in heard:
                 if self._stopping.is_set() or self._error is not None:
                     return
@@ -155,11 +166,24 @@ class Recorder:
                 if not options.topics and message.topic.startswith(thin):  # another's, of a whole one
                     continue
                 if not cdr.knows(message.meta.type):
-                    self._rejected += 1
+                    self._reject(f"{message.topic}: unknown type {message.meta.type!r}")
                     continue
                 topic = self._topics.setdefault(message.topic, _Topic())
                 if topic.fresh.accept(message.meta):  # a last value sent again is nothing new
                     yield Arrived(message, received_ns)
+
+    def _refuse(self, topic: str, why: str) -> None:
+        """The node cannot make a thin picture."""
+        self._refused.add(topic)
+        if not self._topics and len(self._refused) == len(set(self._options.topics)):
+            raise SagsError(why)  # nothing else is recorded
+        self._reject(why)
+
+    def _reject(self, why: str) -> None:
+        if not self._rejected:
+            log.warning("left out: %s", why)
+            self._why_rejected = why
+        self._rejected += 1
 
     def _writer(self, folder: Path) -> MessageWriter:
         options = self._options
@@ -208,9 +232,7 @@ class Recorder:
         try:
             writer.write(arrived)
         except SagsError as error:  # of this message alone
-            if not self._rejected:
-                log.warning("left out: %s", error)
-            self._rejected += 1
+            self._reject(str(error))
             return
         self._topics[arrived.message.topic].messages += 1
 
@@ -229,10 +251,11 @@ class Recorder:
                     latched = is_latched(arrived.message.topic, self._options.node.ns)
                     for pushed_out in ring.add(arrived, latched):
                         self._topics[pushed_out.message.topic].dropped += 1
+                    self._kept_s = ring.seconds
                 if self._snapshot_wanted.is_set():
                     self._snapshot_wanted.clear()
                     number = next(n for n in count(number) if not self._snapshot(n).exists())
-                    saved = self._snapshot(number), ring.content(), tell
+                    saved = self._snapshot(number), ring.content(), self._kept_s, tell
                     saving.append(threading.Thread(target=self._save, args=saved, daemon=True))
                     saving[-1].start()
                     number += 1
@@ -242,7 +265,7 @@ class Recorder:
     def _snapshot(self, number: int) -> Path:
         return self._options.folder / f"snapshot_{number:03d}"
 
-    def _save(self, folder: Path, messages: list[Arrived], tell: Tell) -> None:
+    def _save(self, folder: Path, messages: list[Arrived], seconds: float, tell: Tell) -> None:
         """A thread for each snapshot, so that receiving goes on. One that fails ends nothing: what the ring
         holds can be saved elsewhere."""
         try:
@@ -254,7 +277,7 @@ class Recorder:
             tell({"error": str(_told(folder, error))})
             return
         self._bytes += writer.bag.bytes
-        tell({"snapshot": str(folder), "messages": writer.bag.messages})
+        tell({"snapshot": str(folder), "messages": writer.bag.messages, "seconds": round(seconds, 3)})
 
 
 def _told(folder: Path, error: Exception) -> SagsError:

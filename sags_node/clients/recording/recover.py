@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -16,11 +17,13 @@ from sags_node.bags import mcap_file
 from sags_node.bags.bag import (
     RECORDED,
     Channels,
+    check_one,
     files_in,
+    marks_of,
     read_messages,
     records_of,
     storage_files,
-    unitless,
+    summary,
 )
 from sags_node.bags.mcap_file import HEAD, MAGIC, MAX_RECORD_BYTES, DamagedError, Entry, Head
 from sags_node.clients.recording.bag_writer import BagWriter
@@ -54,10 +57,11 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
         The fields of `Recovery`, `lost` and the new folder.
 
     Raises:
-        UsageError: there is no MCAP file, or something is at `out` already.
+        UsageError: there is no MCAP file, the folder holds several recordings, or something is at `out`
+            already.
         SagsError: nothing can be saved, or the new bag cannot be written.
     """
-    files = files_in(path, ".mcap") if path.is_dir() else storage_files(path)[0]
+    files = _files(path)
     if not files or files[0].suffix != ".mcap":
         raise UsageError(
             f"{path}: only MCAP is recovered; for ROS 1 use rosbag reindex, for db3 sqlite3 .recover"
@@ -83,18 +87,30 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
     return {"folder": str(out), **asdict(done), "lost": done.lost}
 
 
+def _files(path: Path) -> list[Path]:
+    """The files of one recording: their names are alike, unless metadata.yaml names just those."""
+    if not path.is_dir():
+        return storage_files(path)[0]
+    files, named = files_in(path, ".mcap"), list[Path]()
+    with suppress(SagsError):
+        named = storage_files(path)[0]
+    if set(named) != set(files):
+        check_one(path)
+    return files
+
+
 class _Writer:
     """Messages of the old file into the new one."""
 
     def __init__(self, bag: BagWriter, done: Recovery) -> None:
         self._bag = bag
         self._done = done
-        self._known: dict[tuple[str, str, bytes, bool], int] = {}  # topic, type, schema, units: channel
+        self._known: dict[tuple[object, ...], int] = {}  # topic, type, schema, marks: channel
         self._attached: set[tuple[str, bytes]] = set()  # name and digest: each file of a bag has them all
 
     def write(self, entry: Entry, channel: Channel, schema: Schema) -> None:
-        metadata = channel.metadata
-        key = (channel.topic, schema.name, schema.data, unitless(channel))
+        metadata, marks = channel.metadata, marks_of(channel)
+        key = (channel.topic, schema.name, schema.data, *marks.items())
         if key not in self._known:
             latched = "transient_local" in metadata.get("offered_qos_profiles", "")
             self._known[key] = self._bag.add_topic(
@@ -103,7 +119,7 @@ class _Writer:
                 schema,
                 metadata.get("topic_type_hash", ""),
                 latched,
-                unitless(channel),
+                marks,
             )
         self._bag.write(self._known[key], entry.log_ns, entry.publish_ns, entry.sequence, entry.data)
         self._done.messages += 1
@@ -132,7 +148,7 @@ def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
         return
     with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         channels = Channels()
-        for record in _summary(file, size):
+        for record in summary(file, size):  # the first chunk of a channel may be damaged
             channels.add(record)
         position, in_data = len(MAGIC), True
         while True:
@@ -155,18 +171,6 @@ def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
                 return
             done.bytes_skipped += following - position
             position = following
-
-
-def _summary(file: BinaryIO, size: int) -> Iterator[Schema | Channel]:
-    """Schemas and channels that the end of the file repeats, if it is there: their first chunk may not be."""
-    try:
-        for head in mcap_file.heads(file, size, mcap_file.summary_start(file, size)):
-            if head.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                for record in records_of(file, head):
-                    if not isinstance(record, Entry):
-                        yield record
-    except DamagedError:
-        return
 
 
 def _copy(file: BinaryIO, head: Head, channels: Channels, writer: _Writer, done: Recovery) -> None:
