@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1844,
     "sags_node/tools/importing": 1173,
     "sags_node/vision": 5517,
-    "tests": 49977,
+    "tests": 49981,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

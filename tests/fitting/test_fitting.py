@@ -568,7 +568,8 @@ def test_a_clip_of_a_public_data_set_is_fitted_from_its_path(tmp_path: Path, sch
             assert cv2.imwrite(str(folder / name / f"{number:06d}.png"), picture)
     matrix = np.column_stack([np.eye(3), np.zeros(3), [128, 160, 150.0]])
     np.save(folder / "poses_bounds.npy", np.tile(np.concatenate([matrix.ravel(), [60, 80]]), (10, 1)))
-    options = ["--schedule", schedule, "--warm-up", "40", "--iterations", "80", "--max-gaussians", "2000"]
+    options = ["--schedule", schedule, "--iterations", "80", "--max-gaussians", "2000"]
+    options += ["--warm-up", "40"] if schedule == "paper" else []
     found = figures_of("fit", folder, *options, "--out", tmp_path / "fit", "--json")
     assert found["session"] == "pulling" and found["depth"] is None and found["track"] is None
     assert found["heldout"]["frames"] == 2

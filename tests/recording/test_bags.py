@@ -183,7 +183,10 @@ def test_the_recordings_own_clock_and_a_gap_in_it(tmp_path: Path) -> None:
     now = [0.0]
     config = BagSource(path=path, pace="realtime")
     with Replay(
-        config, clock=lambda: now[0], wall_ns=lambda: 0, sleep=lambda s: now.__setitem__(0, now[0] + s)
+        config,
+        clock=lambda: now[0],
+        wall_ns=lambda: round(now[0] * 1e9),
+        sleep=lambda s: now.__setitem__(0, now[0] + s),
     ) as source:
         assert [frame.t_capture_ns // MS for frame in source] == [0, 40, 160, 200]
     assert now[0] == pytest.approx(0.2)
