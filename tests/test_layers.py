@@ -31,7 +31,7 @@ FOLDERS = sorted(PLACES)
 LINES = {
     "benchmarks": 10241,
     "sags_lab": 5028,
-    "sags_node": 1253,
+    "sags_node": 1259,
     "sags_node/bags": 987,
     "sags_node/cli": 3556,
     "sags_node/clients": 1,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1844,
     "sags_node/tools/importing": 1173,
     "sags_node/vision": 5517,
-    "tests": 49981,
+    "tests": 50004,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

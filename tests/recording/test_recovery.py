@@ -5,15 +5,18 @@ from __future__ import annotations
 import errno
 import json
 import random
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from command_line import refused, sags
+from mcap.opcode import Opcode
 from recorded_plane import content
 
-from sags_node.bags.bag import BagMessage, read_messages
+from sags_node.bags.bag import BagMessage, read_messages, records_of
+from sags_node.bags.mcap_file import MAGIC, Entry, heads
 from sags_node.clients.recording.bag_writer import BagWriter
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.recover import recover
@@ -32,6 +35,16 @@ def recovered(file: bytes, tmp_path: Path, name: str) -> tuple[dict[str, Any] | 
     return done, list(read_messages(out))
 
 
+def chunks(file: Path) -> list[tuple[int, int]]:
+    """Where each chunk ends, and how many messages it holds: how many there are depends on the machine."""
+    with file.open("rb") as opened:
+        return [
+            (head.end, sum(isinstance(record, Entry) for record in records_of(opened, head)))
+            for head in heads(opened, file.stat().st_size, len(MAGIC))
+            if head.opcode == Opcode.CHUNK
+        ]
+
+
 @pytest.mark.fault("file: a recording is cut off")
 def test_recovery_after_a_cut_keeps_all_before_it(plane_bag: Path, tmp_path: Path) -> None:
     (file,) = plane_bag.glob("*.mcap")
@@ -42,9 +55,9 @@ def test_recovery_after_a_cut_keeps_all_before_it(plane_bag: Path, tmp_path: Pat
         done, kept = recovered(whole[:length], tmp_path, f"cut{number}")
         assert done is None or done["lost"] or len(kept) == len(original)  # cut off within the index
         assert content(kept) == original[: len(kept)]
-        assert len(kept) >= len(original) * (length / len(whole)) * 0.9 - 40  # nearly all that is there
+        assert len(kept) >= sum(count for end, count in chunks(file) if end <= length)
         sizes.append(len(kept))
-    assert sizes == sorted(sizes) and sizes[-1] > len(original) / 2
+    assert sizes == sorted(sizes)
 
 
 def test_recovery_from_flipped_bits_keeps_only_what_is_right(plane_bag: Path, tmp_path: Path) -> None:
@@ -63,7 +76,7 @@ def test_recovery_from_flipped_bits_keeps_only_what_is_right(plane_bag: Path, tm
         assert done is not None and found <= original and len(kept) == len(found)
         assert done["lost"] or len(found) == len(original)
         if seed % 3 == 0:  # one flip costs one chunk
-            assert len(found) > 0.75 * len(original)
+            assert len(found) >= len(original) - max(count for _, count in chunks(file))
 
 
 def test_recovery_finds_the_chunks_behind_a_hole(plane_bag: Path, tmp_path: Path) -> None:
@@ -79,7 +92,9 @@ def test_recovery_finds_the_chunks_behind_a_hole(plane_bag: Path, tmp_path: Path
     ):
         done, kept = recovered(bytes(data), tmp_path, name)
         assert done is not None and done["lost"] and set(content(kept)) <= set(original)
-        assert content(kept)[-1] == original[-1] and len(kept) > 0.6 * len(original)
+        counts = [count for _, count in chunks(file)]
+        most = max(map(sum, pairwise([*counts, 0])))  # the damage may lie in two chunks
+        assert content(kept)[-1] == original[-1] and len(kept) >= len(original) - most
 
 
 def test_recovery_with_nothing_lost(plane_bag: Path, tmp_path: Path) -> None:

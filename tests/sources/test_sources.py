@@ -23,6 +23,7 @@ from sags_node.errors import UsageError
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
+from sags_node.wall_clock import WallClock
 
 
 class Clock:
@@ -121,6 +122,13 @@ def test_realtime_stamps_by_the_wall_clock_of_now(jump: int, folders: cfg.Folder
     loops = [frame.frame_id // 12 for frame in seen]
     back = [int(jump < 0 and frame.frame_id > 4) for frame in seen]
     assert [frame.epoch for frame in seen] == [sum(both) for both in zip(loops, back, strict=True)]
+
+
+def test_a_clock_that_was_read_slowly_is_read_again() -> None:
+    """Another process comes between for 5 ms: an hour that is 2.5 ms off would later be set back."""
+    times = iter([1.0, 1.005, 2.0, 2.0])
+    wall = WallClock()
+    assert wall.at(0.0, times.__next__, lambda: 9_000_000_000) == 7_000_000_000
 
 
 def test_realtime_leaves_out_what_comes_too_late(folders: cfg.FoldersSource) -> None:
