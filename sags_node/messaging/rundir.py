@@ -23,6 +23,10 @@ MAX_CONNECTION_FILE_BYTES = 16384
 MAX_UNIX_SOCKET_PATH = 107  # bytes, sun_path of Linux without its final zero
 
 
+class NoNodeError(SagsError):
+    """No node with that name runs here."""
+
+
 class Connection(msgspec.Struct, frozen=True, kw_only=True):
     """What a client needs to reach a node."""
 
@@ -155,7 +159,8 @@ def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
 
     Raises:
         UsageError: others may have written the file.
-        SagsError: no node with that name runs here, or its file is damaged.
+        NoNodeError: no node with that name runs here.
+        SagsError: its file is damaged.
     """
     folder = run_dir or default_run_dir()
     file = connection_path(folder, ns)
@@ -165,7 +170,7 @@ def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
             _check_ours(file, info := os.fstat(opened.fileno()), info.st_uid)
             content = opened.read(MAX_CONNECTION_FILE_BYTES)
     except OSError:
-        raise SagsError(f"no node runs as '{ns}' (no {file}); start one with: sags run") from None
+        raise NoNodeError(f"no node runs as '{ns}' (no {file}); start one with: sags run") from None
     try:
         return msgspec.json.decode(content, type=Connection)
     except (msgspec.MsgspecError, UnicodeError):

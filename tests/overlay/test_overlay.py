@@ -21,15 +21,19 @@ import pytest
 from command_line import RUN_HERE
 from places import ROOT
 from ports import free_port
+from synthetic import plane_result
 from test_overlay_drawing import KEY, centre
 from waiting import until
 
 from sags_node.client import FrameSender
 from sags_node.clients.overlay.draw import color_key
+from sags_node.clients.overlay.frame import NEEDED
 from sags_node.clients.overlay.run import UNSEEN, OverlayOptions, run_overlay
+from sags_node.config.schema import PublishConfig
 from sags_node.geometry import project
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
+from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
@@ -155,6 +159,18 @@ def test_it_waits_for_a_node_that_is_started_later(run_dir: Path, request: pytes
         assert len(running.said) == 1 and "waiting (Ctrl-C ends)" in running.said[0]
         request.getfixturevalue("node")
         assert watcher.pictures(3, drawn=True, seconds=START_SECONDS)
+
+
+@pytest.mark.fault("node: ends before its first frame has reached an overlay")
+def test_a_node_that_has_ended_as_its_first_frame_comes_is_waited_for(tmp_path: Path) -> None:
+    waiting = "waiting for the node"
+    with Publisher(PublishConfig(run_dir=tmp_path), "sags", "session-1") as node:
+        with overlay(tmp_path) as (running, watcher):
+            until(lambda: not node.poll(0) and node.wanted(str(NEEDED[0])))
+            connection_path(tmp_path, "sags").unlink()
+            node.publish_result(plane_result(), 0)
+            until(lambda: watcher.status().get("reason", waiting) != waiting)
+            assert running.is_alive()
 
 
 @pytest.mark.usefixtures("node")

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -38,6 +39,7 @@ from sags_node.messaging.control import ControlClient
 from sags_node.messaging.freezes import Freezes
 from sags_node.messaging.node_clock import NodeClock
 from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, TopicName
+from sags_node.messaging.rundir import NoNodeError
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import NO_RIGHT_EYE
 from sags_node.types import U8
@@ -165,7 +167,8 @@ class _Overlay:
             received = self._node.wait(leading, WAIT_FOR_FRAME, after=last)
             if received is not None:
                 if last is None:  # a node without a control socket: better said now than never
-                    options.node.control_socket()
+                    with suppress(NoNodeError):  # it has ended since, and may come again
+                        options.node.control_socket()
                 last = received
                 self._take(received)
             elif last is None and self._node.absent is not None:
