@@ -25,6 +25,7 @@ RETREAT = 10  # looks in a row without anything near, after which the limit goes
 ROOM = 0.7  # of the nearest depth that was found: tissue moves between two looks
 LEAST_SHARE = 0.02  # of the tissue that both eyes see: fewer pixels may be wrong matches, or an instrument's
 BEYOND, BEYOND_SHARE = 0.004, 0.1  # m: what is nearer than can be matched is looked for as far as this
+SEARCHED = 96  # disparities at most: more cost too much, and are found in a smaller picture as well
 WINDOW = 9  # px of the small picture
 MATCHES = 0.8  # correlation of two windows; 99 % stay below in pictures that do not belong together
 PLAIN = 2.0  # grey levels, standard deviation in a window: less cannot be matched
@@ -99,14 +100,15 @@ def nearest_tissue(
         focal_baseline: px m, of the whole picture.
         end: m, nearer is not searched.
     """
-    halvings = 0
-    while halvings < len(left.halves) and left.full.shape[1] >> halvings > GUESS_WIDTH:
+    halvings, most = 0, focal_baseline / end
+    while halvings < len(left.halves) and (
+        left.full.shape[1] >> halvings > GUESS_WIDTH or most / (1 << halvings) > SEARCHED
+    ):
         halvings += 1
     scale = 1 << halvings
     eyes = level(left, halvings), level(right, halvings)
     height, width = (side - 2 * BORDER for side in eyes[0].shape)
-    most = min(focal_baseline / scale / end, width - 1.0)
-    disparity = coarse_disparity(*eyes, 0.0, most)
+    disparity = coarse_disparity(*eyes, 0.0, min(most / scale, width - 1.0))
     first, second = (np.ascontiguousarray(inner(eye)) for eye in eyes)
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     there = columns - disparity
