@@ -100,10 +100,8 @@ def nearest_tissue(
         focal_baseline: px m, of the whole picture.
         end: m, nearer is not searched.
     """
-    halvings, most = 0, focal_baseline / end
-    while halvings < len(left.halves) and (
-        left.full.shape[1] >> halvings > GUESS_WIDTH or most / (1 << halvings) > SEARCHED
-    ):
+    width, halvings, most = left.full.shape[1], 0, focal_baseline / end
+    while halvings < len(left.halves) and (width >> halvings > GUESS_WIDTH or most > SEARCHED << halvings):
         halvings += 1
     scale = 1 << halvings
     eyes = level(left, halvings), level(right, halvings)

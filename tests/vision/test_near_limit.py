@@ -86,10 +86,13 @@ def test_a_limit_that_is_set_stays_and_is_told_of() -> None:
 
 @pytest.mark.fault("depth: tissue is nearer than 10 mm")
 @pytest.mark.parametrize("depths", [(5,), (6.5,), (8,), (9,), (20, 6), (6, 30), (8, 15), (15,), (60,)])
-def test_what_is_too_near_to_be_matched_is_told_and_never_surely_farther(depths: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("width", [320, 480])  # the second is searched in two sizes
+def test_what_is_too_near_to_be_matched_is_told_and_never_surely_farther(
+    width: int, depths: tuple[float, ...]
+) -> None:
     """Planes below each other, mm; a scope that moves along them."""
-    width, height, focal, baseline = 320, 256, 288.0, 4.3e-3
-    K = np.array([[focal, 0, 159.5], [0, focal, 127.5], [0, 0, 1]])
+    height, focal, baseline = width * 4 // 5, 0.9 * width, 4.3e-3
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     config = LaunchConfig.model_validate({"vision": {"tissue": {"method": "none"}, "scale": 1.0}})
     pipeline = Pipeline(config, rectified_rig("planes", width, height, K, baseline))
     rng = np.random.default_rng(len(depths))
