@@ -12,7 +12,7 @@ from typing import Self
 
 from command_line import RUN_HERE
 
-START_SECONDS = 90  # the first start on a machine compiles kernels
+START_SECONDS = 240  # a guard: the first start on a busy machine compiles kernels
 
 
 class RunningNode:

@@ -166,10 +166,11 @@ def test_a_node_that_has_ended_as_its_first_frame_comes_is_waited_for(tmp_path: 
     waiting = "waiting for the node"
     with Publisher(PublishConfig(run_dir=tmp_path), "sags", "session-1") as node:
         with overlay(tmp_path) as (running, watcher):
-            until(lambda: not node.poll(0) and node.wanted(str(NEEDED[0])))
+            until(lambda: not node.poll(0) and all(node.wanted(str(name)) for name in NEEDED))
             connection_path(tmp_path, "sags").unlink()
             node.publish_result(plane_result(), 0)
             until(lambda: watcher.status().get("reason", waiting) != waiting)
+            until(lambda: watcher.status()["reason"].startswith("stale"))  # whatever it was at first
             assert running.is_alive()
 
 

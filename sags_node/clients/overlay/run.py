@@ -324,7 +324,8 @@ class _Overlay:
         """Take the overlay away when what it shows has become too old."""
         shown_ns = self._stream.shown_ns
         if shown_ns is None:
-            self._stream.blank(self._stream.reason or "waiting for the node")
+            stale = self._stale() if self._source is not None else None  # before, nothing could be
+            self._stream.blank(stale or self._stream.reason or "waiting for the node")
         elif (self._node.now_ns() - shown_ns) * 1e-9 > self._options.max_age:
             self._stream.blank(self._stale() or "no whole frame came")
 
