@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from command_line import RUN_HERE, START_SECONDS, sags, start, stopped, wait_for
+from command_line import RUN_HERE, sags, start, stopped, wait_for
 from llvmlite import binding as llvm
-from waiting import until
+from waiting import START_SECONDS, until
 
 from sags_node.cli.main import main
 from sags_node.messaging.publisher import Publisher

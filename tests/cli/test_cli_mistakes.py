@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import RUN_HERE, START_SECONDS, refused, sags, start
+from command_line import RUN_HERE, refused, sags, start
 from places import ROOT
 from user_files import SHORT, videos
+from waiting import START_SECONDS
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
 

@@ -16,12 +16,12 @@ from typing import Any, TypeVar
 import click
 import pytest
 from click.testing import CliRunner, Result
+from waiting import START_SECONDS
 
 from sags_node.cli.main import main
 
 S = TypeVar("S", str, bytes)
 
-START_SECONDS = 120  # the first start on a machine compiles kernels
 # For a node that a test starts: ports that are free, and pictures of one size, however busy the machine is.
 RUN_HERE = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*", "vision.scale:=1")
 

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Self
 
 from command_line import RUN_HERE
-
-START_SECONDS = 240  # a guard: the first start on a busy machine compiles kernels
+from waiting import START_SECONDS
 
 
 class RunningNode:

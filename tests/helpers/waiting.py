@@ -14,6 +14,7 @@ from sags_node.errors import SagsError
 T = TypeVar("T")
 
 LONGEST_LISTENING = 60.0  # s
+START_SECONDS = 240  # a guard for a node's start: the first on a busy machine compiles kernels
 
 
 def until(done: Callable[[], T], seconds: float = 60.0) -> T:

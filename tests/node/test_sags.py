@@ -8,8 +8,8 @@ from pathlib import Path
 import independent_client as client
 import numpy as np
 import pytest
-from running_node import START_SECONDS, RunningNode
-from waiting import until
+from running_node import RunningNode
+from waiting import START_SECONDS, until
 
 from sags_node.messaging.control import ControlClient
 

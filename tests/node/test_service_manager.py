@@ -13,8 +13,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from command_line import RUN_HERE, START_SECONDS, killed, sags, start
+from command_line import RUN_HERE, killed, sags, start
 from places import SESSION
+from waiting import START_SECONDS
 
 from sags_node.node import service_manager
 from sags_node.node.node import Node

@@ -15,9 +15,9 @@ import msgpack
 import numpy as np
 import pytest
 from engine_scenes import rasterize
-from running_node import START_SECONDS, RunningNode
+from running_node import RunningNode
 from synthetic import at_frame, plane_result
-from waiting import until
+from waiting import START_SECONDS, until
 from warp_on_cpu import use_warp_on_cpu
 
 from sags_node.engine.gpu.rasterizer import DeviceRasterizer

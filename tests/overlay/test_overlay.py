@@ -23,7 +23,7 @@ from places import ROOT
 from ports import free_port
 from synthetic import plane_result
 from test_overlay_drawing import KEY, centre
-from waiting import until
+from waiting import START_SECONDS, until
 
 from sags_node.client import FrameSender
 from sags_node.clients.overlay.draw import color_key
@@ -46,7 +46,6 @@ MAX_AGE = 0.5  # s
 NOTICED = 0.1  # s more until it is noticed: what docs/wire.md promises
 FROZEN = 0.3  # s after the last new picture, from which on the node shows nothing
 BUSY = 1.0  # s that a busy machine may take on top
-START_SECONDS = 90  # the first start on a machine compiles kernels
 
 
 @contextmanager

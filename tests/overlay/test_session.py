@@ -14,9 +14,9 @@ import yaml
 from command_line import RUN_HERE, figures_of
 from places import ROOT
 from ports import free_port
-from test_overlay import START_SECONDS, overlay, process
+from test_overlay import overlay, process
 from test_registration import AWAY, HEIGHT, WIDTH, Organ, written
-from waiting import repeating, until
+from waiting import START_SECONDS, repeating, until
 
 from sags_node.client import MEASURING, FrameSender, ReceivedCloud, ReceivedImage, TopicName, measure
 from sags_node.clients.overlay.scene import read_scene

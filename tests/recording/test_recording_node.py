@@ -15,11 +15,11 @@ from typing import cast
 
 import numpy as np
 import pytest
-from command_line import RUN_HERE, START_SECONDS, killed, pure_json, refused, sags, start, stopped, wait_for
+from command_line import RUN_HERE, killed, pure_json, refused, sags, start, stopped, wait_for
 from mcap.reader import make_reader
 from recorded_plane import by_topic
 from rosbags.highlevel import AnyReader
-from waiting import until
+from waiting import START_SECONDS, until
 
 from sags_node.bags.bag import read_messages
 from sags_node.clients.recording.info import bag_info

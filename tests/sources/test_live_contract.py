@@ -22,10 +22,9 @@ from command_line import RUN_HERE
 from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer
 from live_taking import Taker
 from places import ROOT
-from running_node import START_SECONDS
 from sending import sending, stereo_sender
 from stereo_sender import read_number
-from waiting import until
+from waiting import START_SECONDS, until
 
 from sags_node.config.schema import PushSource, Ros2Source
 from sags_node.node.node import Node

@@ -24,6 +24,7 @@ import pytest
 from browsers import new_page
 from click.testing import CliRunner
 from command_line import killed
+from waiting import START_SECONDS
 
 from sags_node.cli.main import main
 from sags_node.clients.viewer import splats as viewer_splats
@@ -42,7 +43,6 @@ from sags_node.types import SH_DEGREE_0, Camera
 
 pytestmark = [pytest.mark.live, pytest.mark.alone]
 
-START_SECONDS = 90  # the first start on a machine compiles kernels
 # Keeps what the page reports as an error.
 KEEP_ERRORS = """
     window.errors = [];

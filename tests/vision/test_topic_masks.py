@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from command_line import RUN_HERE
 from places import ROOT
-from waiting import until
+from waiting import START_SECONDS, until
 
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
@@ -28,7 +28,6 @@ from sags_node.messaging.subscriber import Subscriber
 pytestmark = pytest.mark.live
 
 EXAMPLES = ROOT / "examples"
-START_SECONDS = 120  # the first start on a machine compiles kernels
 PICTURE, MASK = (TopicName(f"left/{name}", ReceivedImage) for name in ("image_rect_color", "tissue_mask"))
 DEPTH = TopicName("left/render/depth", ReceivedImage)
 TOLERANCE = 0.25  # s
