@@ -27,8 +27,8 @@ LIVE = {
     "Hamlyn heart, 25 Hz": "hamlyn_realtime",
 }  # fmt: skip
 LIVE_ROW = (
-    "{shown:.1%} | {latency_ms[p50]:.0f}; {latency_ms[p99]:.0f} | {gaussians[mean]:.0f} "
-    "| {online[test][psnr]:.1f} | {predict[test][copy_psnr]:.1f} | {depth[test][median_mm]:.2f}"
+    "{share:.1%} | {latency_ms[p50]:.0f}; {latency_ms[p99]:.0f} | {gaussians[mean]:.0f} "
+    "| {shown[test][psnr]:.1f} | {predict[test][copy_psnr]:.1f} | {depth[test][median_mm]:.2f}"
 )
 LADDER_ROW = (
     "{d4d[frame_ms][p50]:.1f} | {d4d[cpu_ms][p50]:.0f} | {d4d[gaussians][mean]:,.0f} "
@@ -48,7 +48,7 @@ def result(file: str) -> dict[str, Any]:
     """A committed result. FileNotFoundError: there is none of that name."""
     found: dict[str, Any] = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8"))
     if "processed" in found:
-        found["shown"] = found["processed"] / found["frames"]
+        found["share"] = found["processed"] / found["frames"]
     return found
 
 
@@ -158,7 +158,7 @@ def _live() -> str:
     rows = [
         f"{clip} | " + filled(re.sub(r"\{(\w+)", rf"{{{name}[\1]", LIVE_ROW)) for clip, name in LIVE.items()
     ]
-    titles = " three runs each | frames shown | latency p50; p99, ms | Gaussians | dB"
+    titles = " three runs each | frames shown | latency p50; p99, ms | Gaussians | the frame as shown, dB"
     return table(f"{titles} | the picture before, dB | depth, median, mm", rows)
 
 
