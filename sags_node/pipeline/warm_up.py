@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from sags_node.config.schema import LaunchConfig, MappingConfig, VisionConfig
-from sags_node.instruments.instruments import Instruments
 from sags_node.kernels.cache import is_cold
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
@@ -19,7 +18,7 @@ from sags_node.mapping.devices import device_of
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.processes import end
 from sags_node.rig import rectified_rig
-from sags_node.types import U8, StereoFrame, StereoRig
+from sags_node.types import U8, Bool, StereoFrame, StereoRig
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.inverse_search import spread_patches
 from sags_node.vision.pyramid import pyramids
@@ -51,7 +50,8 @@ def warm_up(config: LaunchConfig) -> None:
         }
     )
     pipeline = Pipeline(small, _rig())
-    request = FrameRequest(left=True, right=config.publish.right is not False)  # somebody may look
+    right = config.publish.right is not False
+    request = FrameRequest(left=True, right=right, instruments=True)  # somebody may look
     budget = StepBudget(2)  # the first on the whole picture, the second where it is worst
     frames = _frames()
     with _vision_beside():
@@ -60,10 +60,6 @@ def warm_up(config: LaunchConfig) -> None:
     for frame in frames[3:]:
         result = pipeline.process(frame, budget, request)
     InstrumentFinder()(frames[-1].left, result.views["left"])  # for sessions without masks
-    view, gray = result.views["left"], result.observation.gray
-    tools = np.zeros((_HEIGHT, _WIDTH), np.bool_)
-    tools[: _HEIGHT // 2, : _WIDTH // 8] = True
-    Instruments(np.ones_like(tools)).update(tools, gray, gray, view.camera, _BASELINE, view)  # if asked for
 
 
 def prepare(config: LaunchConfig) -> None:
@@ -103,19 +99,28 @@ def _vision_beside() -> Iterator[None]:
 
 
 def _frames() -> list[StereoFrame]:
-    """Six of a picture that moves by a pixel a frame; the first three bring their depth."""
+    """Six of a picture that moves by a pixel a frame. The first three bring their depth; in the last three
+    it is the scope that moves, and an instrument hides tissue."""
     coarse: U8 = np.random.default_rng(0).integers(40, 220, (_HEIGHT // 4, _WIDTH // 4 + 16, 3), np.uint8)
     texture = cv2.resize(coarse, (_WIDTH + 64, _HEIGHT))
-    tissue = np.ones((_HEIGHT, _WIDTH), np.bool_)
+    tissue, free = ~_instrument(), np.ones((_HEIGHT, _WIDTH), np.bool_)
     depth = np.full((_HEIGHT, _WIDTH), np.float32(_FOCAL * _BASELINE / _DISPARITY))
     frames = []
     for i in range(6):
         left = np.ascontiguousarray(texture[:, i : i + _WIDTH])
         right = np.ascontiguousarray(texture[:, i + _DISPARITY : i + _DISPARITY + _WIDTH])
         stamp = i * 33_000_000
-        own = depth if i < 3 else None
-        frames.append(StereoFrame(i, stamp, stamp, left, right, depth=own, tissue=tissue))
+        own, seen = (depth, free) if i < 3 else (None, tissue)
+        pose = np.eye(4)
+        pose[0, 3] = max(0, i - 2) * _BASELINE / _DISPARITY
+        frames.append(StereoFrame(i, stamp, stamp, left, right, T_world_cam=pose, depth=own, tissue=seen))
     return frames
+
+
+def _instrument() -> Bool:
+    covered = np.zeros((_HEIGHT, _WIDTH), np.bool_)
+    covered[_HEIGHT // 3 : _HEIGHT // 2, : _WIDTH // 2] = True
+    return covered
 
 
 def _rig() -> StereoRig:

@@ -396,7 +396,6 @@ def test_the_cpu_is_ready_to_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(warm_up, "Pipeline", Noted)
     monkeypatch.setattr(warm_up, "InstrumentFinder", lambda: lambda left, view: None)
-    monkeypatch.setattr(warm_up.Instruments, "update", lambda *_: None)
     warm_up.warm_up(LaunchConfig(device="cuda"))
     assert made == ["cpu", "cuda"]
 
