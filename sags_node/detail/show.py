@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, paste, trace
-from sags_node.detail.memory import hidden_source
+from sags_node.detail.memory import HiddenSource, hidden_source
 from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.share import Share
@@ -43,6 +43,9 @@ class Detail:
     def __init__(self, lessons: Lessons) -> None:
         self._lessons = lessons
         self._small = SmallDrawings()
+        self._newest: SeenFrame | None = None  # of the frames from which was chosen
+        self._chosen: SeenFrame | None = None  # of them: shows what is hidden
+        self._unsure = 0.0  # of each pixel that hidden tissue has moved, the part that nobody saw
 
     # ---- views -----------------------------------------------------------------------------------------
 
@@ -79,16 +82,29 @@ class Detail:
             return now_ns
         wanted = cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3])  # pixels lie between two places
         there = gaussians_at(now.gaussians, small, wanted)
-        source = hidden_source(there, now_ns, older)
+        source = self._source(there, now, older, rgb)
         if source is None:
             return now_ns
         frame, lent = source.frame, source.frame.lent(float(camera.K[0, 0]), sure=True)
         motion = self._small.motion(there, camera, frame)
         depth = every_fourth(depth, small)
-        unsure = UNSURE * _loss_by_pixel(now, rgb)
-        traced = trace(depth, small, frame, lent, motion, unsure=unsure, wanted=wanted)
+        traced = trace(depth, small, frame, lent, motion, unsure=self._unsure, wanted=wanted)
         carry(rgb, taken, traced, lent, source.gain)
         return frame.t_capture_ns if traced.share.any() else now_ns
+
+    def _source(
+        self, hidden: Gaussians, now: SeenFrame, older: Sequence[SeenFrame], drawn: U8
+    ) -> HiddenSource | None:
+        """`hidden_source`, chosen anew with every frame that is new to the memory: looking into all of them
+        takes as long as drawing the motion."""
+        source = None
+        if self._newest is older[0] and self._chosen is not None:
+            source = hidden_source(hidden, now.t_capture_ns, [self._chosen])
+        if source is None:
+            source = hidden_source(hidden, now.t_capture_ns, older)
+            self._unsure = UNSURE * _loss_by_pixel(now, drawn)
+        self._newest, self._chosen = older[0], None if source is None else source.frame
+        return source
 
     def view(
         self,

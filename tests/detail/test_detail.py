@@ -10,11 +10,20 @@ import pytest
 from places import SESSION
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
-from sags_node.detail.memory import EVERY, MATCHED, MOST, OLDEST, Matched, Memory, hidden_source
+from sags_node.detail.memory import (
+    EVERY,
+    MATCHED,
+    MOST,
+    OLDEST,
+    HiddenSource,
+    Matched,
+    Memory,
+    hidden_source,
+)
 from sags_node.detail.motion import SmallDrawings, gaussians_at
 from sags_node.detail.seen import SAME, MatchedDepth, SeenFrame
 from sags_node.detail.share import Share
-from sags_node.detail.show import Detail
+from sags_node.detail.show import Detail, Lessons
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.requests import ViewRequest
@@ -25,7 +34,7 @@ from sags_node.pipeline.session import open_session
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
-from sags_node.types import F32, U8, Camera, Gaussians, Shown
+from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown
 
 MOVED = ((1.0, 0.0, 0.0, 0.005), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # m, right
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
@@ -279,6 +288,34 @@ def test_what_is_seen_is_the_picture_and_what_is_hidden_comes_from_before() -> N
     far[90:160, 110:190] = False
     agree = (view.shown.rgb == truth).all(-1)[far]
     assert agree.mean() > 0.9  # the rest lies at seams
+
+
+def test_a_source_of_hidden_tissue_is_kept_while_the_memory_is_the_same_and_it_saw_enough(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looked_into: list[list[int]] = []
+
+    def noted(hidden: Gaussians, now_ns: int, frames: list[SeenFrame]) -> HiddenSource | None:
+        looked_into.append([frame.t_capture_ns for frame in frames])
+        return hidden_source(hidden, now_ns, frames)
+
+    monkeypatch.setattr("sags_node.detail.show.hidden_source", noted)
+    left = np.ones((HEIGHT, WIDTH), np.bool_)
+    left[:, WIDTH // 2 :] = False
+    detail, drawn = Detail(Lessons()), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+
+    def oldest(stamp_ns: int, mask: Bool, older: list[SeenFrame]) -> int:
+        now = replace(seen(stamp_ns), mask=mask)
+        return detail.left(drawn, now.depth, CAMERA, now, older).oldest_ns
+
+    farther_left = np.roll(left, -8, axis=1) & left  # the seam lies in none of them
+    memory = [replace(seen(2), mask=farther_left), replace(seen(1), mask=~left)]
+    assert [oldest(stamp, ~left, memory) for stamp in (10, 11)] == [2, 2]
+    assert looked_into == [[2, 1], [2]]
+    assert oldest(12, left, memory) == 1  # another part is hidden now
+    assert looked_into[2:] == [[2], [2, 1]]
+    assert oldest(21, left, [seen(20), *memory]) == 20
+    assert looked_into[4:] == [[20, 2, 1]]
 
 
 def test_lessons_cost_nothing_until_a_view_that_needs_them_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
