@@ -169,6 +169,16 @@ class GrayPyramid:
 
 
 @dataclass(frozen=True, slots=True)
+class RectifiedPictures:
+    """What a frame's pair is made of before anybody knows where its camera is: all that takes time."""
+
+    left: U8  # [H, W, 3] RGB
+    right: U8 | None  # [H, W, 3] RGB
+    gray: tuple[GrayPyramid, GrayPyramid | None]
+    ms: float  # that it took
+
+
+@dataclass(frozen=True, slots=True)
 class Published:
     """How a frame is seen from outside: in a size that no machine's speed changes (`messaging.published`)."""
 

@@ -19,13 +19,13 @@ from sags_node.config.schema import MappingConfig
 from sags_node.mapping.budget import TimeBudget
 from sags_node.node.health import TOO_SLOW, why_missed
 from sags_node.node.node import Node
-from sags_node.pipeline.pipeline import FrameRequest, Pipeline
+from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig
 from sags_node.sources.clock import MEASURED, FrameRate
 from sags_node.types import FrameResult, StereoFrame
 
-PICTURE = np.zeros((4, 4, 3), np.uint8)
+PICTURE = np.zeros((256, 320, 3), np.uint8)  # as the calibration says
 
 
 def frame(number: int, seconds: float, epoch: int = 0) -> StereoFrame:
@@ -52,7 +52,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time, ms, that each frame got; nothing is made of it."""
     times, plane = [], plane_result()
 
-    def process(self: Pipeline, one: StereoFrame, budget: TimeBudget, request: FrameRequest) -> FrameResult:
+    def process(self: Pipeline, one: StereoFrame, budget: TimeBudget, *_: object) -> FrameResult:
         times.append(1e3 * budget.ladder.seconds)
         return at_frame(plane, one.frame_id, one.t_capture_ns)
 

@@ -738,7 +738,7 @@ class EngineConfig(Section):
     """What draws the Gaussians."""
 
     threads: int | None = Field(
-        None, ge=1, le=64, description="of the kernels; default: all cores of this process"
+        None, ge=1, le=64, description="of the kernels; default: all cores, of a running node all but one"
     )
 
 

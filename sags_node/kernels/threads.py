@@ -14,13 +14,15 @@ Place: left to the system. Some schedulers pack threads that were asleep onto on
 after a pause then takes twice as long. Pinning a thread and its workers to cores of their own fixes that for
 a kernel alone, but cost the whole node 5 to 25 % of its rate: its other threads want the same cores.
 
-Count: Numba keeps it per Python thread, and a new thread starts with all cores of the process.
+Count: Numba keeps it per Python thread, and a new thread starts with all cores of the process. OpenCV's is
+one for the whole process, and its workers spin while they wait.
 """
 
 from __future__ import annotations
 
 import os
 
+import cv2
 import numba
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -37,6 +39,13 @@ def configure_threads(threads: int | None) -> int:
     count = cores if threads is None else max(1, min(threads, cores))
     numba.set_num_threads(count)
     return count
+
+
+def leave_a_core(threads: int | None) -> None:
+    """Do as `configure_threads` in a thread beside which others work: `None` leaves them one core, and OpenCV
+    gets as many as the kernels. Of two cores, one that is shared costs more than it gives."""
+    cores = int(numba.config.NUMBA_NUM_THREADS)
+    cv2.setNumThreads(configure_threads(max(1, cores - 1) if threads is None else threads))
 
 
 def thread_count() -> int:

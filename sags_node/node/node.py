@@ -25,7 +25,7 @@ from sags_node.config.schema import LaunchConfig, LiveSource
 from sags_node.detail.seen import SeenFrame
 from sags_node.errors import SagsError
 from sags_node.findings import by_code, by_stage
-from sags_node.kernels.threads import configure_threads
+from sags_node.kernels.threads import configure_threads, leave_a_core
 from sags_node.mapping.devices import backend_of
 from sags_node.messaging import content
 from sags_node.messaging.cdr import Content
@@ -43,7 +43,15 @@ from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.sources.clock import CaptureClock, FrameRate
 from sags_node.sources.source import Source, findings_of
-from sags_node.types import DrawnView, FrameResult, NodeHealth, RectifiedPair, StereoFrame, StereoRig
+from sags_node.types import (
+    DrawnView,
+    FrameResult,
+    NodeHealth,
+    RectifiedPair,
+    RectifiedPictures,
+    StereoFrame,
+    StereoRig,
+)
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +109,7 @@ class Node:
         self._clock = CaptureClock()  # of live pictures
         self._manager = manager or ServiceManager({})
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
-        self._frames: Latest[tuple[StereoFrame, float]] = Latest()  # and when it came
+        self._frames: Latest[tuple[StereoFrame, float, RectifiedPictures]] = Latest()  # and when it came
         self._results: Latest[FrameResult] = Latest(on_put=self._wake_publishing)
         self._scenes: Latest[tuple[FrameResult, tuple[SeenFrame, ...]]] = Latest()
         self._whole: Latest[tuple[FrameResult, Mapping[str, ThinPicture]]] = Latest()  # and what is asked for
@@ -244,17 +252,20 @@ class Node:
     # ---- the five threads ----------------------------------------------------------------------------
 
     def _capture(self) -> None:
+        configure_threads(1)
         give = self._frames.put if self._live else self._frames.hand_over
+        rectifier = self._state.pipeline.rectifier
         with self._source:
             for frame in self._source:
                 if self._stopping.is_set():
                     return
                 if frame.t_device_ns and frame.t_arrival_ns:
                     self._clock.add(frame.t_device_ns, frame.t_arrival_ns)
-                give((frame, time.monotonic()))
+                at = time.monotonic()
+                give((frame, at, rectifier.pictures(frame)))  # here: mapping has more to do than this thread
 
     def _map(self) -> None:
-        configure_threads(self._state.config.engine.threads)
+        leave_a_core(self._state.config.engine.threads)
         give = self._results.put if self._live else self._results.hand_over
         dropped = 0
         while not self._frames.closed:
@@ -266,7 +277,7 @@ class Node:
                 continue
             came = self._frames.get(timeout=REQUEST_WAIT)
             if came is not None and not self._state.paused.is_set():
-                frame, at = came
+                frame, at, pictures = came
                 if self._rate is not None and self._rate.add(frame):
                     self._state.pipeline.rate = self._rate.hz
                     self._operations.reconfigure()
@@ -276,7 +287,7 @@ class Node:
                     waited, self._left_is_watched, self._right_is_watched, latency, self._instruments_asked
                 )
                 self._working_since = time.monotonic()
-                result = self._state.pipeline.process(frame, self._state.budget, request)
+                result = self._state.pipeline.process(frame, self._state.budget, request, pictures)
                 self._working_since = None
                 if frame.warm_up:
                     continue

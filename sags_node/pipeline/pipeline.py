@@ -46,6 +46,7 @@ from sags_node.types import (
     InstrumentStates,
     Observation,
     RectifiedPair,
+    RectifiedPictures,
     RenderedView,
     StereoFrame,
     StereoRig,
@@ -243,19 +244,24 @@ class Pipeline:
         return make_budget(self._config, camera.width, camera.height, speed, self.rate, self._skips)
 
     def process(
-        self, frame: StereoFrame, budget: Budget, request: FrameRequest = NOTHING_ASKED
-    ) -> FrameResult:
-        """Everything that happens to one frame."""
-        result = replace(self._processed(frame, budget, request), recorded_s=frame.recorded_s)
+        self, frame: StereoFrame, budget: Budget, request: FrameRequest = NOTHING_ASKED,
+        pictures: RectifiedPictures | None = None,
+    ) -> FrameResult:  # fmt: skip
+        """Everything that happens to one frame; `pictures`: of `rectifier.pictures`, where another thread
+        made them ahead."""
+        result = replace(self._processed(frame, budget, request, pictures), recorded_s=frame.recorded_s)
         self.held = result.held
         return result if self.may_be_sure else unsure(result)
 
-    def _processed(self, frame: StereoFrame, budget: Budget, request: FrameRequest) -> FrameResult:
+    def _processed(
+        self, frame: StereoFrame, budget: Budget, request: FrameRequest, pictures: RectifiedPictures | None
+    ) -> FrameResult:
         plan, clock = budget.start(request.waited), Stopwatch()
         self._note_gap(frame.t_capture_ns)
         self._tools = frame.tools
         with clock("rectify"):
-            pair = self._rectified(frame)
+            pair = self._rectified(frame, pictures)
+        clock.timings_ms["rectify"] += 0.0 if pictures is None else pictures.ms
         self._on_rectified(pair, self._epoch(frame))
         # 1. Watch: may this frame be trusted? One that may not is held, an equal one is the last again.
         right = pair.right is not None and (request.right or self._config.publish.right is True)
@@ -312,9 +318,9 @@ class Pipeline:
         )  # fmt: skip
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
-    def _rectified(self, frame: StereoFrame) -> RectifiedPair:
+    def _rectified(self, frame: StereoFrame, pictures: RectifiedPictures | None) -> RectifiedPair:
         """Until its pose is found, its camera is where it was last, or as it is given."""
-        return self.rectifier(replace(frame, T_world_cam=self._camera.guess(frame.T_world_cam)))
+        return self.rectifier(replace(frame, T_world_cam=self._camera.guess(frame.T_world_cam)), pictures)
 
     def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool, instruments: bool) -> Judgement:
         """Return what all watchers together say of a frame."""

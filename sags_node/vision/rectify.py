@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import cache
 
 import cv2
@@ -10,7 +11,19 @@ import numpy as np
 from sags_node import geometry
 from sags_node.errors import SagsError, UsageError
 from sags_node.rig import rectified_camera, wrong_size
-from sags_node.types import F32, F64, U8, Bool, Camera, Eye, Published, RectifiedPair, StereoFrame, StereoRig
+from sags_node.types import (
+    F32,
+    F64,
+    U8,
+    Bool,
+    Camera,
+    Eye,
+    Published,
+    RectifiedPair,
+    RectifiedPictures,
+    StereoFrame,
+    StereoRig,
+)
 from sags_node.vision.pyramid import gray_pyramid
 
 
@@ -98,19 +111,34 @@ class Rectifier:
         self._right = _EyeMap(rig.right, K_rectified, self.camera)
         self._published = None if published in (None, self._size) else Rectifier(rig, *published)
 
-    def __call__(self, frame: StereoFrame) -> RectifiedPair:
-        """Rectify one frame, and make its gray pictures; the camera takes the frame's pose, or stays at the
-        world's origin.
+    def pictures(self, frame: StereoFrame) -> RectifiedPictures:
+        """Rectify the pictures of one frame, and make its gray ones. Any thread may do it ahead.
 
         Raises:
             SagsError: the pictures do not have the calibration's size.
-            UsageError: the pose is none.
         """
+        started = time.perf_counter()
         height, width = frame.left.shape[:2]
         if wrong := wrong_size(self.path, self.raw_size, (width, height)):
             raise SagsError(f"{wrong.what}; {wrong.fix}")
         if frame.right is not None:
             self._check(frame.right, "right picture")
+        left = self._left.image(frame.left)
+        right = None if frame.right is None else self._right.image(frame.right)
+        gray = gray_pyramid(left), None if right is None else gray_pyramid(right)
+        return RectifiedPictures(left, right, gray, 1e3 * (time.perf_counter() - started))
+
+    def __call__(self, frame: StereoFrame, made: RectifiedPictures | None = None) -> RectifiedPair:
+        """Rectify one frame; the camera takes its pose, or stays at the world's origin.
+
+        Args:
+            made: its `pictures`, where they are made already.
+
+        Raises:
+            SagsError: the pictures do not have the calibration's size.
+            UsageError: the pose is none.
+        """
+        made = made or self.pictures(frame)
         camera = self.camera
         if frame.T_world_cam is not None:
             if not np.isfinite(frame.T_world_cam).all():
@@ -119,16 +147,14 @@ class Rectifier:
                     f"the pose of frame {number} holds NaN or infinity; check the source's poses"
                 )
             camera = Camera(camera.width, camera.height, camera.K, frame.T_world_cam)
-        left = self._left.image(frame.left)
-        right = None if frame.right is None else self._right.image(frame.right)
         return RectifiedPair(
             frame_id=frame.frame_id,
             t_capture_ns=frame.t_capture_ns,
             camera=camera,
             baseline=self.baseline,
-            left=left,
-            right=right,
-            gray=(gray_pyramid(left), None if right is None else gray_pyramid(right)),
+            left=made.left,
+            right=made.right,
+            gray=made.gray,
             published=None if self._published is None else self._published.later(frame),
         )
 

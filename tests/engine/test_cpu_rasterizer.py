@@ -8,6 +8,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
+import cv2
 import numba
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH, make_rasterizer, to_view
 from sags_node.errors import UsageError
 from sags_node.kernels.jit import parallel_kernel, take
-from sags_node.kernels.threads import configure_threads
+from sags_node.kernels.threads import configure_threads, leave_a_core, thread_count
 from sags_node.pipeline.warm_up import warm_up
 from sags_node.types import I64, Bool, Camera, Gaussians
 
@@ -258,6 +259,18 @@ def test_threads_with_rasterizers_of_their_own() -> None:
         thread.join(60)
     assert not any(thread.is_alive() for thread in threads)
     assert not failures, failures[0]
+
+
+def test_beside_others_one_core_is_left_for_kernels_and_for_opencv() -> None:
+    every, of_opencv = configure_threads(None), cv2.getNumThreads()
+    try:
+        leave_a_core(None)
+        assert thread_count() == cv2.getNumThreads() == max(1, every - 1)
+        leave_a_core(every)
+        assert thread_count() == cv2.getNumThreads() == every
+    finally:
+        configure_threads(None)
+        cv2.setNumThreads(of_opencv)
 
 
 def test_kernels_compile_once_and_warm_up_has_done_it() -> None:

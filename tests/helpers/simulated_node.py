@@ -145,6 +145,10 @@ class Pipeline:
         self.warnings: dict[str, Any] = {}
         self.newest: FrameResult | None = None
         self.seen = ()  # nothing lends its detail
+        self.rectifier = SimpleNamespace(pictures=self._pictures)
+
+    def _pictures(self, _: StereoFrame) -> None:
+        self._run.world.sleep(1e-3 * self._machine * 3.0)
 
     @staticmethod
     def _no_anchor(_: int) -> None:
@@ -158,7 +162,9 @@ class Pipeline:
     def reset(self) -> None:
         self._resets += 1
 
-    def process(self, frame: StereoFrame, budget: TimeBudget, request: FrameRequest) -> FrameResult:
+    def process(
+        self, frame: StereoFrame, budget: TimeBudget, request: FrameRequest, pictures: None
+    ) -> FrameResult:
         world, chance = self._run.world, self._run.world.random
         self._run.taken += 1
         rung = budget.start(request.waited).rung

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from frames import make_frame
 from places import ROOT
 
 from sags_node import geometry
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.rig import check_rig, load_rig, read_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.types import U8, Eye, StereoFrame, StereoRig
@@ -49,6 +50,20 @@ def test_a_point_lands_where_the_rectified_cameras_see_it(
     np.testing.assert_allclose(centroid(pair.left), expected, atol=0.1)
     expected[0] -= rectifier.camera.K[0, 0] * rig.baseline / point[2]
     np.testing.assert_allclose(centroid(pair.right), expected, atol=0.1)
+
+
+def test_pictures_that_are_made_ahead_are_the_same_and_of_that_frame_alone() -> None:
+    rectifier = Rectifier(load_rig(ROOT / "calib/v4l2_example"), 240, 180)
+    rng = np.random.default_rng(2)
+    first, second = (make_frame(*rng.integers(0, 256, (2, 480, 640, 3), np.uint8)) for _ in range(2))
+    made = rectifier.pictures(first)
+    for given, frame in ((made, first), (rectifier.pictures(second), second)):
+        ahead, now = rectifier(frame, given), rectifier(frame)
+        assert np.array_equal(ahead.left, now.left) and np.array_equal(ahead.right, now.right)
+        assert ahead.gray is not None and np.array_equal(ahead.gray[0].full, now.gray[0].full)
+    posed = replace(first, T_world_cam=np.full((4, 4), np.nan))
+    with pytest.raises(UsageError, match="NaN"):
+        rectifier(posed, made)
 
 
 def test_rows_of_a_real_unrectified_pair_become_equal(data_folder: Path) -> None:
