@@ -113,7 +113,8 @@ int main(int argc, char** argv) {
 
     zmq::context_t context;
     zmq::socket_t socket(context, zmq::socket_type::dealer);
-    socket.set(zmq::sockopt::sndhwm, 4);  // two pairs: a node that is slow or away gets new ones, not old ones
+    socket.set(zmq::sockopt::sndhwm, 4);  // two pairs: a node that is slow gets new ones, not old ones
+    socket.set(zmq::sockopt::immediate, true);  // one that is away gets none, also once it is there
     socket.set(zmq::sockopt::linger, 500);
     socket.connect(endpoint);
 
@@ -130,7 +131,7 @@ int main(int argc, char** argv) {
             message.addstr(meta(stamp_ns, seq, width, height));
             message.addstr(image_head(stamp_ns, width, height));
             message.addmem(picture.data(), picture.size());
-            message.send(socket, static_cast<int>(zmq::send_flags::dontwait));  // false: the queue is full
+            message.send(socket, static_cast<int>(zmq::send_flags::dontwait));  // false: no node, or a full queue
         }
         listen(socket, said);
         due += std::chrono::milliseconds(33);

@@ -46,6 +46,11 @@ class Strain:
             self._patches = cell_centres(self._places, PATCH)
             self._index, self._weight, _ = nearest_nodes(self._places, self._patches)
 
+    @property
+    def knows_nothing(self) -> bool:
+        """True where no depth was sure at that moment, so that all strain stays unknown."""
+        return len(self._ids) == 0
+
     def followed(self, snapshot: Snapshot) -> Strain:
         """It in the next frame. What was not sure by itself, as behind an instrument, may have slid, however
         sure it is again. Where most is not, as after a gap, tissue in sight is found again by its motion."""

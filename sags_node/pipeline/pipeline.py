@@ -20,6 +20,7 @@ from sags_node.detail.memory import Matched, Memory
 from sags_node.detail.seen import SeenFrame
 from sags_node.detail.show import ASIDE_EVERY, Detail, Lessons
 from sags_node.engine.rasterizer.rasterize import to_view
+from sags_node.errors import SagsError
 from sags_node.findings import Findings, by_stage
 from sags_node.instruments.instruments import Instruments
 from sags_node.mapping.anchors import Anchors
@@ -35,7 +36,7 @@ from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import LEARN_EVERY, RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging import published
-from sags_node.model.strain import Strain
+from sags_node.model.strain import SURE, Strain
 from sags_node.pipeline.repeats import doubted, repeated, unseen
 from sags_node.pipeline.uncalibrated import FINDING, MOST, unsure
 from sags_node.types import (
@@ -194,11 +195,20 @@ class Pipeline:
         return sure if self.may_be_sure else min(sure, MOST)
 
     def start_strain(self) -> int:
-        """From now on frames say how tissue is stretched since the newest one; returns its stamp."""
+        """From now on frames say how tissue is stretched since the newest one; returns its stamp.
+
+        Raises:
+            SagsError: no depth is sure enough to tell strain from noise.
+        """
         assert self.newest is not None  # else there is no tissue
-        self._strain = Strain(replace(self.newest.snapshot, t_capture_ns=self._mapped_ns))
-        self.newest = replace(self.newest, strain=self._strain)
-        return self._strain.since_ns
+        strain = Strain(replace(self.newest.snapshot, t_capture_ns=self._mapped_ns))
+        if strain.knows_nothing:
+            raise SagsError(
+                f"no depth here is sure to {1e3 * SURE:g} mm, so no strain could be told; with one "
+                "camera none ever is, else begin when the tissue is seen well"
+            )
+        self._strain, self.newest = strain, replace(self.newest, strain=strain)
+        return strain.since_ns
 
     def stop_strain(self) -> dict[str, Any]:
         """Frames say no more of it."""

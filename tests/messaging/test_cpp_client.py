@@ -173,7 +173,7 @@ def test_pictures_are_handed_in_and_a_wrong_size_is_told(examples: Path) -> None
     """push_frames, written from docs/inputs.md alone."""
     source = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), (320, 240))
     with source:
-        with running(examples / "push_frames", source.endpoint, "5", "320", "240") as process:
+        with running(examples / "push_frames", source.endpoint, "30", "320", "240") as process:
             frames = list(islice(source, 3))
             assert process.wait(30) == 0
         with running(examples / "push_frames", source.endpoint, "-1", "64", "48") as process:

@@ -10,6 +10,7 @@ import pytest
 from flat_scene import camera_in_front
 
 from sags_node.config.schema import LaunchConfig
+from sags_node.errors import SagsError
 from sags_node.mapping.budget import StepBudget
 from sags_node.model.strain import FULL, SURE, UNKNOWN, Strain, painted
 from sags_node.phantom.instruments import NOTHING
@@ -119,6 +120,20 @@ def test_tissue_that_was_pulled_and_is_back_is_not_said_to_be_strained() -> None
     told = told[np.isfinite(told[:, 0])]
     assert len(told) > 0.3 * len(result.snapshot.gaussians)
     assert np.quantile(told, 0.99) < FULL / 2
+
+
+def test_where_no_depth_is_sure_strain_is_refused_and_not_silently_unknown() -> None:
+    scene = PhantomScene(seconds=1.0, width=160, height=128, seed=1)
+    phantom = Phantom(scene)
+    pipeline = Pipeline(LaunchConfig(source=scene), phantom.rig, rate=10)
+    shown = phantom.frame(0, 10, tools=NOTHING)
+    result = pipeline.process(StereoFrame(0, S, S, shown.left, shown.right), StepBudget(1))
+    far_off = np.full(len(result.snapshot.gaussians), 3 * SURE, np.float32)
+    unsure = replace(result.snapshot.gaussians, depth_errors=far_off)
+    pipeline.newest = replace(result, snapshot=replace(result.snapshot, gaussians=unsure))
+    with pytest.raises(SagsError, match=r"sure to 2 mm.*one camera"):
+        pipeline.start_strain()
+    assert pipeline.newest.strain is None
 
 
 def test_colours_go_with_the_largest_strain_and_grey_is_not_known() -> None:
