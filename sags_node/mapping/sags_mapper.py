@@ -12,13 +12,12 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sags_node.engine.interface import Rasterizer
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.field.decoder import Decoder
@@ -143,7 +142,7 @@ class SagsMapper:
         self.step = 0
         self._field: WindowModel | None = None  # its rows are the map's, by their ids
         self.kept: deque[Kept] = deque()
-        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
+        self._rasterizer_of = cache(partial(make_rasterizer, "numba"))  # by width and height, px
         self._now_ns = self._ahead_ns = 0  # the field's clock, and by how much it is ahead of the stamps
         self._frames = self._first_steps = 0
         self._loss = 0.0
@@ -282,7 +281,7 @@ class SagsMapper:
         """One step on a frame: Adam on field, decoder and canonical Gaussians; on their colours the step in
         closed form of `optimiser.Optimiser`. With Adam on colours the phantom loses 3 dB."""
         field, seen = self.field, frame.drawn
-        rasterizer = self._rasterizer(seen.camera)
+        rasterizer = self._rasterizer_of(seen.camera.width, seen.camera.height)
         drawing = field.draw(rasterizer, frame.t_ns, seen.camera, deformed, whole=frame.camera)
         planes = drawing.planes.detach().numpy()
         v_planes, weight = np.zeros_like(planes), np.zeros_like(planes[0])
@@ -359,13 +358,7 @@ class SagsMapper:
 
     def _draw(self, frame: Kept) -> F32:
         camera = frame.drawn.camera
-        return self._rasterizer(camera).forward(self.model.gaussians(), camera)
-
-    def _rasterizer(self, camera: Camera) -> Rasterizer:
-        size = camera.width, camera.height
-        if size not in self._rasterizers:
-            self._rasterizers[size] = make_rasterizer("numba", *size)
-        return self._rasterizers[size]
+        return self._rasterizer_of(camera.width, camera.height).forward(self.model.gaussians(), camera)
 
     def _limit(self, budget: Budget) -> int:
         """How many Gaussians this machine can afford."""
