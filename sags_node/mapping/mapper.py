@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import Enum, auto
 from functools import partial
 
 import numpy as np
@@ -36,15 +35,6 @@ UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame
 NODE_STEP_PX = 0.08
 
 
-class Kind(Enum):
-    """What a frame is to the mapper."""
-
-    FIRST = auto()  # there is no model yet
-    ODD = auto()  # its colours are not the tissue's: the model only follows the motion
-    STILL = auto()  # nothing has moved, and it is drawn as large as the frame before
-    MOVED = auto()  # as most are
-
-
 class Mapper:
     """Builds and refines the map while the video runs.
 
@@ -63,14 +53,12 @@ class Mapper:
         refiner: Refiner,
         tissue_map: TissueMap,
         smoothing: bool = True,
-        unhurried: bool = False,
         focus: float = FOCUS,
     ) -> None:
         """
         Args:
             refiner: draws and refines the model.
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
-            unhurried: see `pace`.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
         """
         self.map = tissue_map
@@ -78,7 +66,7 @@ class Mapper:
         self._refiner = refiner
         self._smoothing = smoothing
         self._focus = focus
-        self.pace(unhurried)
+        self.pace(False)
         self._view: RenderedView | None = None  # the model as it was drawn last
         self._scale = 1.0  # of the pictures' size: at which the model was drawn last
         self._first_steps = 0  # that a new model has had
@@ -107,15 +95,14 @@ class Mapper:
         self._frames += 1
         before, self._scale = self._scale, budget.plan.rung.scale
         self._note_depth(observation)
-        match self._kind(learn, still and self._scale == before):
-            case Kind.FIRST:
-                counts = self._initialise(observation, budget)
-            case Kind.ODD:
-                counts = self._follow_only(observation, tracks)
-            case Kind.STILL:
-                counts = self._touch_up(observation, budget, most_steps(still, self._frames))
-            case Kind.MOVED:
-                counts = self._follow(observation, tracks, budget)
+        if self.map.deformation is None:  # there is no model yet
+            counts = self._initialise(observation, budget)
+        elif not learn:
+            counts = self._follow_only(observation, tracks)
+        elif still and self._scale == before:  # it is drawn as large as the frame before
+            counts = self._touch_up(observation, budget, most_steps(still, self._frames))
+        else:
+            counts = self._follow(observation, tracks, budget)
         assert self._view is not None
         forecast = self._forecast(observation.t_capture_ns, still > 0)
         snapshot = snapshot_of(
@@ -126,13 +113,6 @@ class Mapper:
             limit = self._limit(budget)
             self._split = split_where_room(self.model, observation, self._view, limit) > 0
         return mapped
-
-    def _kind(self, learn: bool, still: int | bool) -> Kind:
-        if self.map.deformation is None:
-            return Kind.FIRST
-        if not learn:
-            return Kind.ODD
-        return Kind.STILL if still else Kind.MOVED
 
     def pace(self, unhurried: bool) -> None:
         """Tell whether there is time for several steps a frame. They are shorter then."""

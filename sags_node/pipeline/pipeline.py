@@ -122,17 +122,16 @@ class Pipeline:
         self._on_rectified = on_rectified
         self.depth = DepthChoice(vision, self.rectifier)
         self._refiner = make_refiner(config, width, height)
-        self._config = config
         self.map = TissueMap(affordable(config, width, height), field=config.mapping.field is True)
-        unhurried = config.mapping.frame_ms(rate) >= UNHURRIED_MS
         self.mapper: Mapper | SagsMapper
         if config.mapping.method == "sags":
             from sags_node.mapping.sags_mapper import SagsMapper  # and torch, which takes a second
 
             self.mapper = SagsMapper(self.map)
         else:
-            self.mapper = Mapper(self._refiner, self.map, unhurried=unhurried)
-        self._surface = SurfaceTracker(unhurried)
+            self.mapper = Mapper(self._refiner, self.map)
+        self._surface = SurfaceTracker()
+        self.reconfigure(config)
         self._detail = Detail(Lessons()) if config.publish.detail else None
         self._memory, self._matched = Memory(), Matched()
         self._right, self._right_views = RightView(), 0
