@@ -101,8 +101,8 @@ def scene_of(gaussians: Gaussians, degree: int, filtered: bool, seed: int = 0) -
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(
     ("degree", "filtered", "antialias", "moved"),
-    [(0, False, True, False), (0, False, True, True), (1, True, False, True), (2, False, True, True),
-     (3, True, True, True)],
+    [(0, False, True, False), (0, False, True, True), (0, False, False, True), (1, True, False, True),
+     (2, False, True, True), (3, True, True, True)],
 )  # fmt: skip
 def test_agrees_with_the_float64_twin(
     backend: Backend, seed: int, degree: int, filtered: bool, antialias: bool, moved: bool
@@ -197,26 +197,19 @@ def test_quaternions_of_any_length_are_the_same_turn(backend: Backend) -> None:
 def test_just_in_front_of_the_near_plane_and_not_behind_it(
     backend: Backend, height: float, scale: float
 ) -> None:
-    """On the axis, beside the picture, far outside; then at the plane, on the camera and behind it."""
+    """On the axis, beside the picture, far outside; then in the plane, on the camera and behind it."""
     view = backend.camera()
-    z = NEAR_PLANE * np.array([height, height, height, 0.999, 1e-3, -1e-3, -1.0, -1e12])
-    means = np.stack([z * [0, 0.45, 30, 0, 0, 0, 0, 0], z * [0, 0.1, -20, 0, 0, 0, 0, 0], z], 1)
+    z = NEAR_PLANE * np.array([height, height, height, 1.0, 0.999, 1e-3, 0.0, -1e-3, -1.0, -1e12])
+    means = np.stack([z, z, z], 1)
+    means[:, :2] *= [(0, 0), (0.45, 0.1), (30, -20), *[(0, 0)] * 7]
     gaussians = dataclasses.replace(
-        with_view_dependence(random_gaussians(1, 8, view), 3),
+        with_view_dependence(random_gaussians(1, 10, view), 3),
         means=means.astype(np.float32),
-        scales=np.full((8, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
+        scales=np.full((10, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
     )
     planes, found = backend.draw(gaussians, view)
     truth(gaussians, view).check(planes, found)
     assert not any(found[name][3:].any() for name in DERIVATIVES)
-
-
-@pytest.mark.parametrize("z", [NEAR_PLANE, 1e-6, 0.0, -1e-6, -0.05, -1e9])
-def test_at_or_behind_the_near_plane_nothing_is_drawn(backend: Backend, z: float) -> None:
-    gaussians = with_view_dependence(one_gaussian(np.array([0.001, 0.0, z]), 0.01), 3)
-    planes, found = backend.draw(gaussians, backend.camera())
-    assert not planes.any()
-    assert not any(found[name].any() for name in DERIVATIVES)
 
 
 @pytest.mark.parametrize("factor", [0.03, 1e3, 1e6, 1e9])
@@ -441,18 +434,6 @@ def test_active_tiles_are_those_of_the_whole_drawing(backend: Backend, seed: int
     assert 2 < untouched < len(gaussians) - 2
     for now, all_of_it, then in zip(part.median(), *medians, strict=True):
         np.testing.assert_array_equal(now, np.where(drawn, all_of_it, then))
-
-
-def test_tiles_agree_with_the_twin(backend: Backend) -> None:
-    gaussians = rows(wide_scene(), slice(80))
-    tiles, drawn = some_tiles(3)
-    v_planes, weight = cotangents(WIDE, 0)
-    rasterizer = backend.rasterizer(WIDE)
-    rasterizer.forward(random_gaussians(9, 10, WIDE, spread=0.5), WIDE)
-    planes = rasterizer.forward(gaussians, WIDE, tiles).copy()
-    true = truth(gaussians, WIDE, given=(np.where(drawn, v_planes, 0), np.where(drawn, weight, 0)))
-    planes = np.where(drawn, planes, true.planes)  # elsewhere is what was there before
-    true.check(planes, copies(rasterizer.backward(v_planes, weight)))
 
 
 def test_without_active_tiles_nothing_happens(backend: Backend) -> None:
