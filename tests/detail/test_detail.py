@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from places import SESSION
+from recorded_session import frames_of, opened
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import (
@@ -30,7 +31,6 @@ from sags_node.messaging.requests import ViewRequest
 from sags_node.node.allowance import Allowance
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
-from sags_node.pipeline.session import open_session
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
@@ -257,22 +257,21 @@ def test_gaussians_of_wanted_places_are_chosen_by_where_they_project() -> None:
 
 def test_what_is_seen_is_the_picture_and_what_is_hidden_comes_from_before() -> None:
     """A box is hidden for the last four frames; beside it the model alone. Nothing else changes by it."""
-    asked = ["source.pace:=step", "source.frames:=12", "mapping.max_gaussians:=3000"]
-    session = open_session(SESSION, asked)
+    asked = "source.frames:=12", "mapping.max_gaussians:=3000"
+    session = opened(*asked)
     pipeline = Pipeline(session.config, session.rig)
-    plain = Pipeline(open_session(SESSION, [*asked, "publish.detail:=false"]).config, session.rig)
+    plain = Pipeline(opened(*asked, "publish.detail:=false").config, session.rig)
     box = np.s_[100:150, 120:180]
-    with session.source as source:
-        for number, frame in enumerate(source):
-            tissue = np.ones(frame.left.shape[:2], np.bool_) if frame.tissue is None else frame.tissue.copy()
-            true = tissue.copy()
-            if number >= 8:
-                tissue[box] = False
-            given = replace(frame, tissue=tissue)
-            result = pipeline.process(given, StepBudget(1), FrameRequest(left=True))
-            alone = plain.process(given, StepBudget(1), FrameRequest(left=True))
-            assert alone.views["left"].shown is None
-            assert np.array_equal(alone.views["left"].rgb, result.views["left"].rgb)
+    for number, frame in enumerate(frames_of(session)):
+        tissue = np.ones(frame.left.shape[:2], np.bool_) if frame.tissue is None else frame.tissue.copy()
+        true = tissue.copy()
+        if number >= 8:
+            tissue[box] = False
+        given = replace(frame, tissue=tissue)
+        result = pipeline.process(given, StepBudget(1), FrameRequest(left=True))
+        alone = plain.process(given, StepBudget(1), FrameRequest(left=True))
+        assert alone.views["left"].shown is None
+        assert np.array_equal(alone.views["left"].rgb, result.views["left"].rgb)
     view, truth = result.views["left"], result.pair.left
     assert view.shown is not None
     inner = np.zeros(truth.shape[:2], np.bool_)
@@ -322,17 +321,16 @@ def test_lessons_cost_nothing_until_a_view_that_needs_them_is_drawn(monkeypatch:
     learnt = []
     for kind in ("learn_ahead", "learn_aside"):
         monkeypatch.setattr(Detail, kind, lambda *_, kind=kind: learnt.append(kind))
-    session = open_session(SESSION, ["source.pace:=step", "source.frames:=12", "mapping.max_gaussians:=3000"])
+    session = opened("source.frames:=12", "mapping.max_gaussians:=3000")
     seconds = itertools.count()
     pipeline = Pipeline(session.config, session.rig)
     views = Views(Allowance(), clock=lambda: float(next(seconds)), detail=True)
-    with session.source as source:
-        for number, frame in enumerate(source):
-            scene = pipeline.process(frame, StepBudget(1), FrameRequest())
-            if number == 6:
-                views.open(ViewRequest("aside", fov=60, T_left_cam=MOVED), None)
-            drawn = dict(views.draw_due(scene, {"aside"}, pipeline.seen))
-            assert bool(drawn) == bool(learnt) == (number >= 6)
+    for number, frame in enumerate(frames_of(session)):
+        scene = pipeline.process(frame, StepBudget(1), FrameRequest())
+        if number == 6:
+            views.open(ViewRequest("aside", fov=60, T_left_cam=MOVED), None)
+        drawn = dict(views.draw_due(scene, {"aside"}, pipeline.seen))
+        assert bool(drawn) == bool(learnt) == (number >= 6)
     assert set(learnt) == {"learn_aside"}  # nobody looked ahead
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import islice
 
 import numpy as np
 import pytest
-from places import SESSION
+from recorded_session import frames_of, opened
 
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.motion_field import HORIZONS, STEADY, MotionField
 from sags_node.model.forecast import gaussians_ahead, points_ahead, reached
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import open_session
 from sags_node.types import F32, Camera, Forecast, Gaussians, MotionState, Snapshot
 
 FRAME_S = 1 / 30
@@ -150,14 +148,11 @@ def test_motion_is_remembered_once_somebody_wants_it_predicted() -> None:
     """What nobody asks for costs nothing; and `mapping.field:=false` forbids it."""
     expected = {"null": [False, True], "false": [False, False], "true": [True, True]}
     for said, found in expected.items():
-        session = open_session(
-            SESSION, ["source.pace:=step", "mapping.max_gaussians:=2000", f"mapping.field:={said}"]
-        )
+        session = opened("source.frames:=20", "mapping.max_gaussians:=2000", f"mapping.field:={said}")
         pipeline = Pipeline(session.config, session.rig)
         forecasts = []
-        with session.source as source:
-            for number, frame in enumerate(islice(source, 20)):
-                if number == 10:
-                    pipeline.predict_motion()
-                forecasts.append(pipeline.process(frame, StepBudget(1)).snapshot.forecast is not None)
+        for number, frame in enumerate(frames_of(session)):
+            if number == 10:
+                pipeline.predict_motion()
+            forecasts.append(pipeline.process(frame, StepBudget(1)).snapshot.forecast is not None)
         assert [any(forecasts[:10]), any(forecasts[10:])] == found, said

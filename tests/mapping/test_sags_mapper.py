@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -271,12 +269,3 @@ def test_what_does_not_work_with_it_is_refused_at_the_start(
 ) -> None:
     with pytest.raises(UsageError, match=said):
         open_session(phantom_session, [SAGS, override])
-
-
-def test_without_it_torch_is_not_loaded() -> None:
-    code = (
-        "import sys; from sags_node.pipeline.session import open_session; "
-        "from sags_node.pipeline.pipeline import Pipeline; "
-        f"s = open_session({str(SESSION)!r}); Pipeline(s.config, s.rig); sys.exit('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], timeout=120, check=False).returncode == 0
