@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from engine_scenes import round_gaussians
+from flat_scene import camera_in_front
 from places import SESSION
 from recorded_session import frames_of, opened
 
@@ -38,19 +40,13 @@ from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown
 
 MOVED = ((1.0, 0.0, 0.0, 0.005), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # m, right
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
-CAMERA = Camera(
-    WIDTH, HEIGHT, np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]]), np.eye(4)
-)
+CAMERA = camera_in_front(WIDTH, HEIGHT, FOCAL)
 
 
 def gaussians(count: int = 30, first_id: int = 0) -> Gaussians:
     rng = np.random.default_rng(3)
     means = rng.uniform((-0.04, -0.03, 0.1), (0.04, 0.03, 0.1), (count, 3)).astype(np.float32)
-    return Gaussians(
-        means, np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.full((count, 3), 0.004, np.float32),
-        np.full(count, 0.9, np.float32), np.full((count, 3), 0.5, np.float32), first_id + np.arange(count),
-    )  # fmt: skip
+    return replace(round_gaussians(means, 0.004), ids=first_id + np.arange(count))
 
 
 def seen(stamp_ns: int = 0, depth: F32 | None = None, camera: Camera = CAMERA) -> SeenFrame:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from engine_scenes import (
     DERIVATIVES,
     INPUTS,
@@ -24,10 +25,12 @@ from engine_scenes import (
 from numpy.typing import NDArray
 from rounding import after
 
+from benchmarks.kernels import reference
 from sags_node import geometry
 from sags_node.engine.rasterizer import smoothing
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.kernels.jit import read_only
 from sags_node.types import F64, Camera
 
 VIEW = camera(moved=True)
@@ -61,18 +64,12 @@ def smooth_scene() -> tuple[Camera, list[F64], F64]:
 
 
 def twin_planes(view: Camera, inputs: Sequence[Any], variance: F64) -> Any:
-    import torch
-
-    from benchmarks.kernels import reference
-
     tensors = [torch.as_tensor(array) for array in inputs]
     splats = reference.project(view, tensors, torch.tensor(variance))
     return reference.blend(splats, view.width, view.height)
 
 
 def test_twin_agrees_with_finite_differences() -> None:
-    import torch
-
     view, inputs, variance = smooth_scene()
     weights = torch.tensor(np.random.default_rng(6).normal(size=(5, view.height, view.width)))
     tensors = [torch.tensor(array, requires_grad=True) for array in inputs]
@@ -109,14 +106,9 @@ def basis(directions: F64) -> NDArray[np.float32]:
         colors = np.zeros((len(means), 3), np.float32)
         centre = (np.float32(0), np.float32(0), np.float32(0))
         seen = np.empty_like(colors)
-        harmonics.color(*(array_for_kernel(a) for a in (means, colors, sh_rest)), centre, seen)
+        harmonics.color(*map(read_only, (means, colors, sh_rest)), centre, seen)
         found[:, k : k + 3] = seen
     return found
-
-
-def array_for_kernel(array: NDArray[np.float32]) -> NDArray[np.float32]:
-    array.flags.writeable = False
-    return array
 
 
 def test_basis_is_orthonormal_on_the_sphere() -> None:

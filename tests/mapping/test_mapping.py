@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flat_scene import Scene, camera_in_front, flat_scene
 from recorded_session import both, frames_of, opened, psnr
 
 from sags_node.mapping import densify, initialise
@@ -14,33 +15,25 @@ from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.quality.metrics import as_float
-from sags_node.types import Bool, Camera, Colours, FrameResult, Observation, RenderedView
+from sags_node.types import Bool, Camera, FrameResult, Observation
 from sags_node.vision.margin import ClearOfInstruments, clear_of_instruments
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 64, 48, 60.0, 0.08
 
 
 def camera(T: np.ndarray | None = None) -> Camera:
-    K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
-    return Camera(WIDTH, HEIGHT, K, np.eye(4) if T is None else T)
+    return replace(camera_in_front(WIDTH, HEIGHT, FOCAL), T_world_cam=np.eye(4) if T is None else T)
+
+
+def plane(depth: float, T: np.ndarray | None = None) -> Scene:
+    """All of it tissue, without a model."""
+    gray = np.zeros((HEIGHT, WIDTH), np.uint8)
+    return flat_scene(camera(T), np.zeros((0, 3), np.float32), gray, depth, 1, 33_000_000)
 
 
 def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0) -> Observation:
-    rng = np.random.default_rng(seed)
-    image = rng.integers(51, 205, (HEIGHT, WIDTH, 3), np.uint8)
-    shape = (HEIGHT, WIDTH)
-    return Observation(
-        1, 33_000_000, camera(T), image, np.zeros(shape, np.uint8), np.ones(shape, bool),
-        np.full(shape, depth, np.float32), np.ones(shape, np.float32),
-    )  # fmt: skip
-
-
-def view(depth: float = DEPTH) -> RenderedView:
-    shape = (HEIGHT, WIDTH)
-    return RenderedView(
-        0, 0, camera(), Colours(np.zeros((*shape, 3), np.uint8)), np.full(shape, depth, np.float32),
-        np.ones(shape, np.float32),
-    )  # fmt: skip
+    image = np.random.default_rng(seed).integers(51, 205, (HEIGHT, WIDTH, 3), np.uint8)
+    return replace(plane(depth, T)[0], image=image)
 
 
 def pruned(model: GaussianModel, frame: Observation) -> Bool:
@@ -85,7 +78,7 @@ def flow_of(
     """The scene flow from the plane, all of it `tissue` by default, to a later frame."""
     tissue = np.ones((HEIGHT, WIDTH), np.bool_) if tissue is None else tissue
     before, now = (clear_of_instruments(mask, HALVINGS) for mask in (tissue, after.tissue))
-    return scene_flow(means, found(means, view(), before, flow, now), after, 0.4)
+    return scene_flow(means, found(means, plane(DEPTH)[2], before, flow, now), after, 0.4)
 
 
 def test_scene_flow_of_a_sideways_shift() -> None:
