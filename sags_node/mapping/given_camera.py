@@ -24,16 +24,14 @@ class Localizer(Protocol):
     Attributes:
         lost: why the camera is lost; None: it is not.
         unsure: why the picture could not tell in the last frame; empty: it could, or it was not asked.
+        pose: `T_world_cam` [4, 4] of the last frame.
         by_picture: the pose follows from the pictures, so that it tells nothing that they do not.
     """
 
     lost: str | None
     unsure: str
+    pose: F64
     by_picture: bool
-
-    @property
-    def pose(self) -> F64:
-        """`T_world_cam` [4, 4] of the last frame."""
 
     def guess(self, given: F64 | None) -> F64 | None:
         """The pose of a frame before it is looked at; None: that of a camera that stands still.
@@ -99,13 +97,8 @@ class PoseRefiner:
         self._tissue = RestingTissue(tissue_map)
         self._correction: F64 = np.eye(4)  # of given poses, from the left
         self._given: F64 = np.eye(4)  # pose of the last frame
-        self._pose: F64 = np.eye(4)
+        self.pose: F64 = np.eye(4)
         self._stamp_ns: int | None = None  # of the last frame
-
-    @property
-    def pose(self) -> F64:
-        """`T_world_cam` [4, 4] of the last frame."""
-        return self._pose
 
     def guess(self, given: F64 | None) -> F64 | None:
         """The pose of a frame before it is looked at."""
@@ -122,7 +115,7 @@ class PoseRefiner:
         """
         guess = observation.camera.T_world_cam
         before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
-        self._pose, self.unsure = guess, ""
+        self.pose, self.unsure = guess, ""
         if before is None or last is None or tracks is None:
             return tracks
         fit = self._tissue.fit(observation, last, tracks, guess)
@@ -130,8 +123,8 @@ class PoseRefiner:
             self.unsure = fit
             return tracks
         seconds = watched_ns(before, self._stamp_ns) * 1e-9
-        self._pose = towards(guess, fit.at_rest, seconds / SECONDS)
-        self._correction = self._pose @ invert(self._given)
+        self.pose = towards(guess, fit.at_rest, seconds / SECONDS)
+        self._correction = self.pose @ invert(self._given)
         return tracks
 
     def learn(self, observation: Observation, view: RenderedView) -> None:
