@@ -219,15 +219,6 @@ def test_filter_enlarges_the_covariance_and_keeps_the_mass_on_the_surface() -> N
     np.testing.assert_allclose(rasterizer.forward(gaussians, VIEW), expected, rtol=0, atol=within)
 
 
-def test_what_is_exported_draws_the_same() -> None:
-    gaussians = with_filter(random_gaussians(5, 60, VIEW))
-    exported = smoothing.bake_filter(gaussians)
-    assert exported.smoothing is None
-    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
-    expected = rasterizer.forward(gaussians, VIEW).copy()
-    np.testing.assert_array_equal(rasterizer.forward(exported, VIEW), expected)
-
-
 def test_filter_of_vanishing_scales() -> None:
     scales = np.array([[1e-7, 1e-7, 1e-7], [1e-7, 1e-3, 1.0], [1e-7, 1e-7, 1e-7]], np.float32)
     slopes = np.full((3, 3), 0.1, np.float32)
