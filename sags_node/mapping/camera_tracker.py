@@ -82,14 +82,8 @@ class CameraTracker:
         return self.pose
 
     def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
-        """Find the pose of a frame, whatever its camera says, or be `lost`.
-
-        Args:
-            last: the frame before, and `tracks` from it to this one; None: there is no model yet.
-
-        Returns:
-            Where the Gaussians are found in it: `tracks`, or those from where the camera was found again.
-        """
+        """Find the pose of a frame, whatever its camera says, or be `lost`; returns `tracks`, or those from
+        where the camera was found again."""
         if self._map.model.count == 0:
             self.lost, self._motion = None, np.eye(4)
             return None  # the model begins where the camera was last

@@ -108,11 +108,7 @@ class PoseRefiner:
         return self._correction @ given
 
     def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
-        """Find the pose of a frame whose camera is as guessed; it is never lost.
-
-        Args:
-            last: the frame before, and `tracks` from it to this one; None: there is no model yet.
-        """
+        """Find the pose of a frame whose camera is as guessed; it is never lost."""
         guess = observation.camera.T_world_cam
         before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
         self.pose, self.unsure = guess, ""
