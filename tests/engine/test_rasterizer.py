@@ -197,19 +197,26 @@ def test_quaternions_of_any_length_are_the_same_turn(backend: Backend) -> None:
 def test_just_in_front_of_the_near_plane_and_not_behind_it(
     backend: Backend, height: float, scale: float
 ) -> None:
-    """On the axis, beside the picture, far outside; then in the plane, on the camera and behind it."""
+    """On the axis, beside the picture, far outside; then at the plane, on the camera and behind it."""
     view = backend.camera()
-    z = NEAR_PLANE * np.array([height, height, height, 1.0, 0.999, 1e-3, 0.0, -1e-3, -1.0, -1e12])
-    means = np.stack([z, z, z], 1)
-    means[:, :2] *= [(0, 0), (0.45, 0.1), (30, -20), *[(0, 0)] * 7]
+    z = NEAR_PLANE * np.array([height, height, height, 0.999, 1e-3, -1e-3, -1.0, -1e12])
+    means = np.stack([z * [0, 0.45, 30, 0, 0, 0, 0, 0], z * [0, 0.1, -20, 0, 0, 0, 0, 0], z], 1)
     gaussians = dataclasses.replace(
-        with_view_dependence(random_gaussians(1, 10, view), 3),
+        with_view_dependence(random_gaussians(1, 8, view), 3),
         means=means.astype(np.float32),
-        scales=np.full((10, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
+        scales=np.full((8, 3), scale, np.float32) * np.array([1, 0.5, 0.7], np.float32),
     )
     planes, found = backend.draw(gaussians, view)
     truth(gaussians, view).check(planes, found)
     assert not any(found[name][3:].any() for name in DERIVATIVES)
+
+
+@pytest.mark.parametrize("z", [NEAR_PLANE, 1e-6, 0.0, -1e-6, -0.05, -1e9])
+def test_at_or_behind_the_near_plane_nothing_is_drawn(backend: Backend, z: float) -> None:
+    gaussians = with_view_dependence(one_gaussian(np.array([0.001, 0.0, z]), 0.01), 3)
+    planes, found = backend.draw(gaussians, backend.camera())
+    assert not planes.any()
+    assert not any(found[name].any() for name in DERIVATIVES)
 
 
 @pytest.mark.parametrize("factor", [0.03, 1e3, 1e6, 1e9])
