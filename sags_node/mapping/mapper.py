@@ -20,7 +20,6 @@ from sags_node.mapping.split import split_where_room
 from sags_node.mapping.surface import surface_at
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import narrow
-from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Bool, Forecast, Observation, RenderedView
 from sags_node.vision.observe import resized
@@ -173,7 +172,7 @@ class Mapper:
             iterations = 1
         # 5. Densify: new Gaussians in the holes. A full model gives up what shows least for them.
         pixels, inserted, given_up = densify.fill(
-            self.model, self._deformation, planes, drawn, 7 * self._frames, limit, self._smoothing,
+            self.model, self.map.nodes, planes, drawn, 7 * self._frames, limit, self._smoothing,
             partial(self._give_up, drawn),
         )  # fmt: skip
         self._refiner.take(slice(self.model.count - inserted, self.model.count))
@@ -234,7 +233,7 @@ class Mapper:
 
     def _begin(self, observation: Observation) -> None:
         step = NODE_STEP_PX * self._metres_per_px
-        self._refiner.begin(self.model, self._deformation, observation, step)
+        self._refiner.begin(self.model, self.map.nodes, observation, step)
 
     def _next_rates(self) -> LearningRates:
         """The rates of the next step."""
@@ -251,12 +250,6 @@ class Mapper:
     def _all_rows(self) -> slice:
         return slice(0, self.model.count)
 
-    @property
-    def _deformation(self) -> NodeDeformation:
-        """The deformation of a map that has tissue."""
-        assert self.map.deformation is not None
-        return self.map.deformation
-
     def _predict(self, observation: Observation, tracks: Tracks | None) -> F32:
         """Move all Gaussians to where flow and depth saw the tissue go; `surface_at` there."""
         if tracks is None:
@@ -270,9 +263,9 @@ class Mapper:
         start = self.model.means.copy()
         motion = self.map.motion
         if motion is None:
-            self._deformation.follow(self.model, displacements, seen)
+            self.map.nodes.follow(self.model, displacements, seen)
         else:
-            self._deformation.follow(self.model, displacements, seen, motion.recalled)
+            self.map.nodes.follow(self.model, displacements, seen, motion.recalled)
         if tracks.seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(tracks.seconds)
         surface = surface_at(self.model.means, observation)

@@ -109,9 +109,6 @@ class CpuRefiner(Refiner):
         """`make_rasterizer`: one for pictures of that width and height, px."""
         self._rasterizer_of, self._viewer_of = cache(make_rasterizer), cache(make_rasterizer)
         self._optimiser = Optimiser()
-        # [rows, columns] what `focus.sum_residuals` says of each tile, and where it is of an older drawing
-        self._sums: F32 = np.zeros((1, 1), np.float32)
-        self._old: Bool = np.ones((1, 1), np.bool_)
         # [5, H, W] and [H, W]; the planes are the rasteriser's memory: what it drew last
         self._planes: F32 = np.zeros((5, 1, 1), np.float32)
         self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros_like(self._planes[0])
@@ -122,8 +119,9 @@ class CpuRefiner(Refiner):
         self._model, self._deformation, self._observation = model, deformation, observation
         self._node_step = node_step
         self._rasterizer = self._rasterizer_of(observation.camera.width, observation.camera.height)
-        self._old = ~tile_grid(observation.tissue)
-        self._sums = np.zeros(self._old.shape, np.float32)
+        # [rows, columns] what `focus.sum_residuals` says of each tile, and where it is of an older drawing
+        self._old: Bool = ~tile_grid(observation.tissue)
+        self._sums: F32 = np.zeros(self._old.shape, np.float32)
 
     def take(self, rows: slice) -> None:
         pass
