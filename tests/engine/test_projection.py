@@ -111,21 +111,9 @@ def basis(directions: F64) -> NDArray[np.float32]:
     return found
 
 
-def test_basis_is_orthonormal_on_the_sphere() -> None:
-    """By a quadrature that is exact for products of two harmonics of degree 3."""
-    heights, weights = np.polynomial.legendre.leggauss(8)
-    angles = np.arange(16) * (2 * np.pi / 16)
-    z, angle = (grid.ravel() for grid in np.meshgrid(heights, angles, indexing="ij"))
-    flat = np.sqrt(1 - z**2)
-    found = basis(np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)).astype(np.float64)
-    areas = weights.repeat(16) * (2 * np.pi / 16)
-    # a harmonic has ten roundings, and values up to 1.8: as many as the sphere has in its area
-    np.testing.assert_allclose(found.T * areas @ found, np.eye(15), atol=2 * 1.8 * after(10))
-    np.testing.assert_allclose(areas @ found, 0, atol=1.8 * 4 * np.pi * after(10))  # nor the constant
-
-
 def test_basis_has_the_order_and_the_signs_of_3d_gaussian_splatting() -> None:
-    """Degree by degree, order from -l to l, with the Condon-Shortley phase: Legendre's polynomials."""
+    """Degree by degree, order from -l to l, with the Condon-Shortley phase, orthonormal on the sphere:
+    Legendre's polynomials."""
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]

@@ -59,13 +59,6 @@ def test_capacity_is_never_exceeded_and_ids_are_never_reused() -> None:
     assert model.ids[0] == 60
 
 
-def test_frozen_copies_do_not_change_with_the_model() -> None:
-    model = filled_model(patch(20))
-    frozen = model.snapshot()
-    model.means[:] += 1
-    assert not np.any(frozen.means == model.means)
-
-
 def test_a_translation_seen_by_some_moves_all() -> None:
     """Half of the sheet is hidden; it must follow its neighbours."""
     model, deformation = filled_model_with_nodes(200)
