@@ -215,7 +215,8 @@ def test_filter_of_vanishing_scales() -> None:
     found_scales, found_opacities, found_slopes = (
         np.empty_like(array) for array in (scales, opacities, slopes)
     )
-    smoothing.smooth(scales, opacities, variance, slopes, found_scales, found_opacities, found_slopes)
+    given = map(read_only, (scales, opacities, variance, slopes))
+    smoothing.smooth(*given, found_scales, found_opacities, found_slopes)
     true_scales = np.sqrt(scales.astype(np.float64) ** 2 + variance[:, None])
     true_opacities = opacities * np.sort(scales / true_scales)[:, 1:].prod(1)
     np.testing.assert_allclose(found_scales, true_scales, rtol=after(3))
