@@ -33,7 +33,8 @@ def plane(depth: float, T: np.ndarray | None = None) -> Scene:
 
 def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0) -> Observation:
     image = np.random.default_rng(seed).integers(51, 205, (HEIGHT, WIDTH, 3), np.uint8)
-    return replace(plane(depth, T)[0], image=image)
+    sure = np.ones((HEIGHT, WIDTH), np.float32)
+    return replace(plane(depth, T)[0], image=image, depth_confidence=sure)
 
 
 def pruned(model: GaussianModel, frame: Observation) -> Bool:
