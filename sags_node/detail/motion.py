@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -19,7 +21,9 @@ class SmallDrawings:
     """Draws smooth properties of Gaussians at a quarter of a view's size. For one thread."""
 
     def __init__(self) -> None:
-        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
+        # by width and height, px
+        self.rasterizer: Callable[[int, int], Rasterizer]
+        self.rasterizer = lru_cache(SIZES)(partial(make_rasterizer, "numba"))
 
     def __call__(self, gaussians: Gaussians, values: F32, camera: Camera) -> F32:
         """Draw `values` [N, 3] in the place of colours, for a camera of the view's size.
@@ -35,15 +39,6 @@ class SmallDrawings:
         found[3] = coverage
         np.divide(planes[:3], coverage, out=found[:3], where=coverage > LEAST_COVERED)
         return found
-
-    def rasterizer(self, width: int, height: int) -> Rasterizer:
-        """The one for pictures of that size, px."""
-        size = width, height
-        if size not in self._rasterizers:
-            if len(self._rasterizers) == SIZES:
-                del self._rasterizers[next(iter(self._rasterizers))]
-            self._rasterizers[size] = make_rasterizer("numba", width, height)
-        return self._rasterizers[size]
 
     def motion(
         self, gaussians: Gaussians, camera: Camera, since: SeenFrame, trust: F32 | None = None

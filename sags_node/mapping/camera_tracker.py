@@ -64,7 +64,7 @@ class CameraTracker:
         self._surface = surface
         self._draw = draw
         self._tissue = RestingTissue(tissue_map)
-        self._pose: F64 = np.eye(4)
+        self.pose: F64 = np.eye(4)  # of the last frame that was tracked
         self._motion: F64 = np.eye(4)  # of the camera in its own axes, from the frame before to the last one
         self._keyframes = Keyframes()
         self._restarts = tissue_map.restarts
@@ -77,24 +77,13 @@ class CameraTracker:
         self._looked_ns = 0
         self._disagreed = 0  # looks in a row
 
-    @property
-    def pose(self) -> F64:
-        """`T_world_cam` [4, 4] of the last frame that was tracked."""
-        return self._pose
-
     def guess(self, given: F64 | None) -> F64 | None:
         """The pose of a frame before it is looked at, whatever its session says."""
-        return self._pose
+        return self.pose
 
     def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
-        """Find the pose of a frame, whatever its camera says, or be `lost`.
-
-        Args:
-            last: the frame before, and `tracks` from it to this one; None: there is no model yet.
-
-        Returns:
-            Where the Gaussians are found in it: `tracks`, or those from where the camera was found again.
-        """
+        """Find the pose of a frame, whatever its camera says, or be `lost`; returns `tracks`, or those from
+        where the camera was found again."""
         if self._map.model.count == 0:
             self.lost, self._motion = None, np.eye(4)
             return None  # the model begins where the camera was last
@@ -108,14 +97,14 @@ class CameraTracker:
             self.lost, self._motion = fit, np.eye(4)
             self._trial, self._passed, self._unknown = None, 0, None
             return None
-        self._pose, self._motion = fit, invert(self._pose) @ fit
+        self.pose, self._motion = fit, invert(self.pose) @ fit
         return tracks
 
     def _follow(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> F64 | str:
         """The pose of a frame that follows one that was tracked, or why the camera is lost."""
         if last is None or tracks is None:
             return "hardly any tissue in view"
-        start = self._pose @ self._motion
+        start = self.pose @ self._motion
         fit = self._tissue.fit(observation, last, tracks, start)
         if isinstance(fit, str):
             return fit
@@ -157,7 +146,7 @@ class CameraTracker:
         self.lost = f"verifying where it is, {self._passed} of {TRIAL} frames"
         if self._passed < TRIAL:
             return None
-        self._pose, self._motion = tried.T_world_rest, np.eye(4)
+        self.pose, self._motion = tried.T_world_rest, np.eye(4)
         self.lost = None
         self._found_ns, self._before = observation.t_capture_ns, self._map.learnt()
         self._looked_ns, self._disagreed = observation.t_capture_ns, 0
@@ -190,7 +179,7 @@ class CameraTracker:
 
     def _best_candidate(self, observation: Observation) -> _Candidate | None:
         """Find where the model agrees best with a frame: near the last pose or those by the keyframes."""
-        starts = [self._pose, *self._keyframes.find(observation)[:TRIED]]
+        starts = [self.pose, *self._keyframes.find(observation)[:TRIED]]
         tried = [self._tried(observation, self._seen_from(observation, start)) for start in starts]
         found = [each for each in tried if each is not None]
         best = max(found, key=lambda each: each.agreement.rank, default=None)

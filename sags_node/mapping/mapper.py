@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import Enum, auto
 from functools import partial
 
 import numpy as np
@@ -21,7 +20,6 @@ from sags_node.mapping.split import split_where_room
 from sags_node.mapping.surface import surface_at
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import narrow
-from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Bool, Forecast, Observation, RenderedView
 from sags_node.vision.observe import resized
@@ -34,15 +32,6 @@ FOCUS = 0.2  # of the picture: shows most for its time on pulled tissue and on a
 FIRST_RATES = LearningRates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
 NODE_STEP_PX = 0.08
-
-
-class Kind(Enum):
-    """What a frame is to the mapper."""
-
-    FIRST = auto()  # there is no model yet
-    ODD = auto()  # its colours are not the tissue's: the model only follows the motion
-    STILL = auto()  # nothing has moved, and it is drawn as large as the frame before
-    MOVED = auto()  # as most are
 
 
 class Mapper:
@@ -63,14 +52,12 @@ class Mapper:
         refiner: Refiner,
         tissue_map: TissueMap,
         smoothing: bool = True,
-        unhurried: bool = False,
         focus: float = FOCUS,
     ) -> None:
         """
         Args:
             refiner: draws and refines the model.
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
-            unhurried: see `pace`.
             focus: share of the picture, where it is worst, for the steps after the first of a frame.
         """
         self.map = tissue_map
@@ -78,7 +65,7 @@ class Mapper:
         self._refiner = refiner
         self._smoothing = smoothing
         self._focus = focus
-        self.pace(unhurried)
+        self.pace(False)
         self._view: RenderedView | None = None  # the model as it was drawn last
         self._scale = 1.0  # of the pictures' size: at which the model was drawn last
         self._first_steps = 0  # that a new model has had
@@ -107,15 +94,14 @@ class Mapper:
         self._frames += 1
         before, self._scale = self._scale, budget.plan.rung.scale
         self._note_depth(observation)
-        match self._kind(learn, still and self._scale == before):
-            case Kind.FIRST:
-                counts = self._initialise(observation, budget)
-            case Kind.ODD:
-                counts = self._follow_only(observation, tracks)
-            case Kind.STILL:
-                counts = self._touch_up(observation, budget, most_steps(still, self._frames))
-            case Kind.MOVED:
-                counts = self._follow(observation, tracks, budget)
+        if self.map.deformation is None:  # there is no model yet
+            counts = self._initialise(observation, budget)
+        elif not learn:
+            counts = self._follow_only(observation, tracks)
+        elif still and self._scale == before:  # it is drawn as large as the frame before
+            counts = self._touch_up(observation, budget, most_steps(still, self._frames))
+        else:
+            counts = self._follow(observation, tracks, budget)
         assert self._view is not None
         forecast = self._forecast(observation.t_capture_ns, still > 0)
         snapshot = snapshot_of(
@@ -126,13 +112,6 @@ class Mapper:
             limit = self._limit(budget)
             self._split = split_where_room(self.model, observation, self._view, limit) > 0
         return mapped
-
-    def _kind(self, learn: bool, still: int | bool) -> Kind:
-        if self.map.deformation is None:
-            return Kind.FIRST
-        if not learn:
-            return Kind.ODD
-        return Kind.STILL if still else Kind.MOVED
 
     def pace(self, unhurried: bool) -> None:
         """Tell whether there is time for several steps a frame. They are shorter then."""
@@ -193,7 +172,7 @@ class Mapper:
             iterations = 1
         # 5. Densify: new Gaussians in the holes. A full model gives up what shows least for them.
         pixels, inserted, given_up = densify.fill(
-            self.model, self._deformation, planes, drawn, 7 * self._frames, limit, self._smoothing,
+            self.model, self.map.nodes, planes, drawn, 7 * self._frames, limit, self._smoothing,
             partial(self._give_up, drawn),
         )  # fmt: skip
         self._refiner.take(slice(self.model.count - inserted, self.model.count))
@@ -254,7 +233,7 @@ class Mapper:
 
     def _begin(self, observation: Observation) -> None:
         step = NODE_STEP_PX * self._metres_per_px
-        self._refiner.begin(self.model, self._deformation, observation, step)
+        self._refiner.begin(self.model, self.map.nodes, observation, step)
 
     def _next_rates(self) -> LearningRates:
         """The rates of the next step."""
@@ -271,12 +250,6 @@ class Mapper:
     def _all_rows(self) -> slice:
         return slice(0, self.model.count)
 
-    @property
-    def _deformation(self) -> NodeDeformation:
-        """The deformation of a map that has tissue."""
-        assert self.map.deformation is not None
-        return self.map.deformation
-
     def _predict(self, observation: Observation, tracks: Tracks | None) -> F32:
         """Move all Gaussians to where flow and depth saw the tissue go; `surface_at` there."""
         if tracks is None:
@@ -290,9 +263,9 @@ class Mapper:
         start = self.model.means.copy()
         motion = self.map.motion
         if motion is None:
-            self._deformation.follow(self.model, displacements, seen)
+            self.map.nodes.follow(self.model, displacements, seen)
         else:
-            self._deformation.follow(self.model, displacements, seen, motion.recalled)
+            self.map.nodes.follow(self.model, displacements, seen, motion.recalled)
         if tracks.seconds > 0:
             self.model.velocities[:] = (self.model.means - start) / np.float32(tracks.seconds)
         surface = surface_at(self.model.means, observation)

@@ -48,9 +48,9 @@ class Tracks(NamedTuple):
 class SurfaceTracker:
     """Finds the Gaussians of one frame in the next, by optical flow."""
 
-    def __init__(self, unhurried: bool = False) -> None:
+    def __init__(self) -> None:
         self._clear = ClearOfInstruments(HALVINGS)
-        self.pace(unhurried)
+        self.pace(False)
 
     def pace(self, unhurried: bool) -> None:
         """Tell whether there is time for a finer flow."""

@@ -122,10 +122,6 @@ class MotionField:
     # ---- inside --------------------------------------------------------------------------------------------
 
     @property
-    def _has_memory(self) -> bool:
-        return self._frame_s > 0 and self._count > MATCHED + HORIZONS + self._nearest
-
-    @property
     def _nearest(self) -> int:
         """Frames."""
         return int(np.ceil(NEAREST / self._frame_s))
@@ -202,7 +198,7 @@ class MotionField:
         basis[:, 0] = frames * self._steps[last]
         basis[:, 1] = frames * self._steps[last - 1]
         basis[:, 2] = STEADY * basis[:, 0]
-        if self._has_memory:
+        if self._frame_s > 0 and self._count > MATCHED + HORIZONS + self._nearest:
             followed, trust = self._followed(last)
             basis[:, 2] = followed + np.float32(1 - trust) * basis[:, 2]
         mixed = np.empty((HORIZONS, nodes, 3), np.float32)

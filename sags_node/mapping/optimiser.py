@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -26,9 +26,12 @@ class LearningRates:
     opacity_logit: float = 0.0075
 
     def scaled(self, factor: float) -> LearningRates:
-        return LearningRates(
-            factor * self.mean_px, factor * self.quat, factor * self.log_scale, factor * self.opacity_logit
-        )
+        return LearningRates(*(factor * length for length in astuple(self)))
+
+    @property
+    def of_columns(self) -> list[float]:
+        """Those of each of Adam's columns of a row."""
+        return [self.mean_px] * 3 + [self.quat] * 4 + [self.log_scale] * 3 + [self.opacity_logit]
 
 
 COLOUR_RELAXATION = 0.9  # of the SIRT step on colours and slopes
@@ -69,16 +72,13 @@ class Optimiser:
         state is not finite sits the step out, with its state made anew."""
         self._steps += 1
         corrections = 1.0 / (1.0 - np.array([BETA1, BETA2]) ** self._steps)
-        lengths = np.array(
-            [rates.mean_px] * 3 + [rates.quat] * 4 + [rates.log_scale] * 3 + [rates.opacity_logit], np.float32
-        )
-        viewmat = camera.viewmat[2]
         _step(
             model.means, model.quats, model.log_scales, model.opacity_logits,
             model.scales, model.opacities, model.colors, model.slopes, model.adam_m, model.adam_v,
             gradients.means, gradients.quats, gradients.scales, gradients.opacities,
             gradients.colors, gradients.slopes, gradients.contribution, gradients.spread,
-            lengths, viewmat.astype(np.float32), float(camera.K[0, 0]), corrections.astype(np.float32),
+            np.array(rates.of_columns, np.float32), camera.viewmat[2].astype(np.float32),
+            float(camera.K[0, 0]), corrections.astype(np.float32),
         )  # fmt: skip
 
 

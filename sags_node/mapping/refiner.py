@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -24,19 +25,16 @@ class Refiner(Protocol):
 
     Between `begin` and `download` the refiner owns the rows that it was given: what it did to them, and to
     the nodes, is seen in the model only after `download`. Rows may be appended meanwhile (`take`).
+
+    Attributes:
+        loss: mean absolute colour residual before the last step that was given back.
+        share: how much of the model's capacity it can refine, 0..1.
+        problem: what is wrong with it and how to fix it; None: nothing. May be read from any thread.
     """
 
-    @property
-    def loss(self) -> float:
-        """Mean absolute colour residual before the last step that was given back."""
-
-    @property
-    def share(self) -> float:
-        """How much of the model's capacity it can refine, 0..1."""
-
-    @property
-    def problem(self) -> Finding | None:
-        """Return what is wrong with it and how to fix it; None: nothing. May be read from any thread."""
+    loss: float = 0.0
+    share: float = 1.0
+    problem: Finding | None = None
 
     def begin(
         self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
@@ -60,6 +58,9 @@ class Refiner(Protocol):
             tiles: [rows, columns] that are drawn; the others keep what was drawn before. None: all are drawn.
             share: of the picture, drawn too, where it was worst before the steps; 1: all of it.
         """
+        if tiles is not None and share > 0:
+            tiles = None if share >= 1 else tiles | self._worst_tiles(share)
+        self._forward(tiles)
 
     def planes(self) -> F32:
         """[5, H, W] as they were drawn last; overwritten by the next drawing."""
@@ -79,31 +80,35 @@ class Refiner(Protocol):
         Returns:
             The tiles [rows, columns] that were drawn.
         """
+        tiles = self._worst_tiles(share)
+        self._forward(tiles)
+        self._step(rates, nodes)
+        return tiles
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
         """Planes [5, H, W] of any Gaussians for any camera, in memory of their own; overwritten by the next
         `show`. As `Rasterizer.forward`."""
 
+    def _forward(self, tiles: Bool | None) -> None:
+        """Draw these tiles."""
+
+    def _worst_tiles(self, share: float) -> Bool:
+        """See `focus.largest`."""
+
+    def _step(self, rates: LearningRates, nodes: bool = True) -> object:
+        """Take a step on what was drawn last; `nodes`: move them, too."""
+
 
 MakeRasterizer = Callable[[int, int], Rasterizer]
 
 
-class CpuRefiner:
+class CpuRefiner(Refiner):
     """The refiner that works on the model's own arrays."""
-
-    share = 1.0
-    problem: Finding | None = None
 
     def __init__(self, make_rasterizer: MakeRasterizer) -> None:
         """`make_rasterizer`: one for pictures of that width and height, px."""
-        self.loss = 0.0
-        self._make_rasterizer = make_rasterizer
-        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}  # by the size of their pictures
-        self._viewers: dict[tuple[int, int], Rasterizer] = {}  # those of `show`
+        self._rasterizer_of, self._viewer_of = cache(make_rasterizer), cache(make_rasterizer)
         self._optimiser = Optimiser()
-        # [rows, columns] what `focus.sum_residuals` says of each tile, and where it is of an older drawing
-        self._sums: F32 = np.zeros((1, 1), np.float32)
-        self._old: Bool = np.ones((1, 1), np.bool_)
         # [5, H, W] and [H, W]; the planes are the rasteriser's memory: what it drew last
         self._planes: F32 = np.zeros((5, 1, 1), np.float32)
         self._v_planes, self._weight = np.zeros_like(self._planes), np.zeros_like(self._planes[0])
@@ -113,9 +118,10 @@ class CpuRefiner:
     ) -> None:
         self._model, self._deformation, self._observation = model, deformation, observation
         self._node_step = node_step
-        self._rasterizer = self._rasterizer_for(observation.camera, self._rasterizers)
-        self._old = ~tile_grid(observation.tissue)
-        self._sums = np.zeros(self._old.shape, np.float32)
+        self._rasterizer = self._rasterizer_of(observation.camera.width, observation.camera.height)
+        # [rows, columns] what `focus.sum_residuals` says of each tile, and where it is of an older drawing
+        self._old: Bool = ~tile_grid(observation.tissue)
+        self._sums: F32 = np.zeros(self._old.shape, np.float32)
 
     def take(self, rows: slice) -> None:
         pass
@@ -123,43 +129,26 @@ class CpuRefiner:
     def download(self) -> None:
         pass
 
-    def draw(self, tiles: Bool | None = None, share: float = 0.0) -> None:
-        if tiles is not None and share > 0:
-            tiles = None if share >= 1 else tiles | self._worst_tiles(share)
-        self._forward(tiles)
-
     def planes(self) -> F32:
         return self._planes
 
     def refine(self, rates: LearningRates) -> None:
         self._model.contribution[:] = self._step(rates).contribution
 
-    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
-        tiles = self._worst_tiles(share)
-        self._forward(tiles)
-        self._step(rates, nodes)
-        return tiles
-
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
-        return self._rasterizer_for(camera, self._viewers).forward(gaussians, camera)
+        return self._viewer_of(camera.width, camera.height).forward(gaussians, camera)
 
     def _forward(self, tiles: Bool | None) -> None:
         self._planes = self._rasterizer.forward(self._model.gaussians(), self._observation.camera, tiles)
         self._old |= True if tiles is None else tiles
 
     def _worst_tiles(self, share: float) -> Bool:
-        """See `focus.largest`. Only tiles that were drawn since are looked at again."""
+        """Only tiles that were drawn since are looked at again."""
         if self._old.any():
             seen = self._observation
             sum_residuals(self._planes, seen.image, seen.tissue, self._old, self._sums)
             self._old[:] = False
         return largest(self._sums, share)
-
-    def _rasterizer_for(self, camera: Camera, made: dict[tuple[int, int], Rasterizer]) -> Rasterizer:
-        size = camera.width, camera.height
-        if size not in made:
-            made[size] = self._make_rasterizer(*size)
-        return made[size]
 
     def _step(self, rates: LearningRates, nodes: bool = True) -> Gradients:
         planes, observation = self._planes, self._observation

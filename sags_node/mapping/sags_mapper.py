@@ -12,13 +12,12 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sags_node.engine.interface import Rasterizer
 from sags_node.engine.losses.tissue import tissue_loss
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.field.decoder import Decoder
@@ -47,7 +46,6 @@ from sags_node.mapping.split import split_where_room
 from sags_node.mapping.surface import surface_at
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model import columns
-from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, F64, Camera, Gaussians, Observation, RenderedView
 from sags_node.vision.observe import resized
@@ -134,6 +132,7 @@ class SagsMapper:
     Attributes:
         map: what is published of it.
         step: how many steps were taken.
+        field: of a map that has tissue; its rows are the map's, by their ids.
         kept: frames that are learnt again, oldest first; the newest is always there.
     """
 
@@ -141,9 +140,8 @@ class SagsMapper:
         torch.set_num_threads(1)  # results do not depend on it then; so few nodes gain little from more
         self.map = tissue_map
         self.step = 0
-        self._field: WindowModel | None = None  # its rows are the map's, by their ids
         self.kept: deque[Kept] = deque()
-        self._rasterizers: dict[tuple[int, int], Rasterizer] = {}
+        self._rasterizer_of = cache(partial(make_rasterizer, "numba"))  # by width and height, px
         self._now_ns = self._ahead_ns = 0  # the field's clock, and by how much it is ahead of the stamps
         self._frames = self._first_steps = 0
         self._loss = 0.0
@@ -189,7 +187,7 @@ class SagsMapper:
             return {"inserted": 0}
         depths = self.map.begin(drawn, self._limit(budget), NODES)
         self._deltas = self._make_deltas(model.means, frame.t_ns)
-        self._field = WindowModel(rows_of(model), NodeField(self._deltas, self._nodes.nodes.copy()))
+        self.field = WindowModel(rows_of(model), NodeField(self._deltas, self.map.nodes.nodes.copy()))
         self._ids, self._written = model.ids.copy(), rows_of(model)
         self.kept = deque([frame])
         pixel = float(np.median(depths)) / float(drawn.camera.K[0, 0])  # m
@@ -239,7 +237,7 @@ class SagsMapper:
                     return self._restart(observation, frame, budget)
                 split_where_room(model, observation, as_view(planes, model, observation), limit)
                 _, inserted, given_up = densify.fill(
-                    model, self._nodes, planes, frame.drawn, 7 * self._frames, limit, smoothing=True,
+                    model, self.map.nodes, planes, frame.drawn, 7 * self._frames, limit, smoothing=True,
                     give_up=partial(densify.give_up, model, frame.drawn),
                 )  # fmt: skip
                 removed += given_up
@@ -282,7 +280,7 @@ class SagsMapper:
         """One step on a frame: Adam on field, decoder and canonical Gaussians; on their colours the step in
         closed form of `optimiser.Optimiser`. With Adam on colours the phantom loses 3 dB."""
         field, seen = self.field, frame.drawn
-        rasterizer = self._rasterizer(seen.camera)
+        rasterizer = self._rasterizer_of(seen.camera.width, seen.camera.height)
         drawing = field.draw(rasterizer, frame.t_ns, seen.camera, deformed, whole=frame.camera)
         planes = drawing.planes.detach().numpy()
         v_planes, weight = np.zeros_like(planes), np.zeros_like(planes[0])
@@ -303,7 +301,7 @@ class SagsMapper:
     def _write(self, frame: Kept) -> None:
         """The map becomes what the field says of a frame's time."""
         model, now = self.model, self.field.at(frame.t_ns, [frame.camera])
-        self._nodes.accompany(model, now.means - model.means)
+        self.map.nodes.accompany(model, now.means - model.means)
         model.means[:], model.quats[:], model.colors[:] = now.means, now.quats, now.colors
         model.scales[:], model.opacities[:] = now.scales, now.opacities
         model.log_scales[:] = np.log(now.scales)
@@ -359,29 +357,11 @@ class SagsMapper:
 
     def _draw(self, frame: Kept) -> F32:
         camera = frame.drawn.camera
-        return self._rasterizer(camera).forward(self.model.gaussians(), camera)
-
-    def _rasterizer(self, camera: Camera) -> Rasterizer:
-        size = camera.width, camera.height
-        if size not in self._rasterizers:
-            self._rasterizers[size] = make_rasterizer("numba", *size)
-        return self._rasterizers[size]
+        return self._rasterizer_of(camera.width, camera.height).forward(self.model.gaussians(), camera)
 
     def _limit(self, budget: Budget) -> int:
         """How many Gaussians this machine can afford."""
         return min(budget.plan.rung.gaussians, self.model.capacity)
-
-    @property
-    def field(self) -> WindowModel:
-        """The field, of a map that has tissue."""
-        assert self._field is not None
-        return self._field
-
-    @property
-    def _nodes(self) -> NodeDeformation:
-        """That go with the Gaussians; of a map that has tissue."""
-        assert self.map.deformation is not None
-        return self.map.deformation
 
 
 def rows_of(model: GaussianModel) -> F32:

@@ -46,6 +46,12 @@ class TissueMap:
         self.lamp: F64 | None = None
         self.restarts = 0
 
+    @property
+    def nodes(self) -> NodeDeformation:
+        """The deformation of a map that has tissue."""
+        assert self.deformation is not None
+        return self.deformation
+
     def begin(self, observation: Observation, limit: int, nodes: int, smoothing: bool = True) -> F32:
         """Make the first model of a map from a frame; returns the depths of its Gaussians [N] m.
 

@@ -30,7 +30,7 @@ from sags_node.model.ply import write_ply
 from sags_node.node.health import Statistics
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.uncalibrated import unsure
+from sags_node.pipeline.results import unsure
 from sags_node.types import DrawnView, FrameResult
 
 

@@ -28,17 +28,15 @@ from sags_node.mapping.budget import Budget, FramePlan
 from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, make_refiner
-from sags_node.mapping.given_camera import GivenCamera, Localizer
+from sags_node.mapping.given_camera import GivenCamera, Localizer, PoseRefiner
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
-from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import LEARN_EVERY, RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging import published
 from sags_node.model.strain import SURE, Strain
-from sags_node.pipeline.repeats import doubted, repeated, unseen
-from sags_node.pipeline.uncalibrated import FINDING, MOST, unsure
+from sags_node.pipeline.results import FINDING, MOST, doubted, repeated, unseen, unsure
 from sags_node.types import (
     Bool,
     Camera,
@@ -125,17 +123,16 @@ class Pipeline:
         self._on_rectified = on_rectified
         self.depth = DepthChoice(vision, self.rectifier)
         self._refiner = make_refiner(config, width, height)
-        self._config = config
         self.map = TissueMap(affordable(config, width, height), field=config.mapping.field is True)
-        unhurried = config.mapping.frame_ms(rate) >= UNHURRIED_MS
         self.mapper: Mapper | SagsMapper
         if config.mapping.method == "sags":
             from sags_node.mapping.sags_mapper import SagsMapper  # and torch, which takes a second
 
             self.mapper = SagsMapper(self.map)
         else:
-            self.mapper = Mapper(self._refiner, self.map, unhurried=unhurried)
-        self._surface = SurfaceTracker(unhurried)
+            self.mapper = Mapper(self._refiner, self.map)
+        self._surface = SurfaceTracker()
+        self.reconfigure(config)
         self._detail = Detail(Lessons()) if config.publish.detail else None
         self._memory, self._matched = Memory(), Matched()
         self._right, self._right_views = RightView(), 0

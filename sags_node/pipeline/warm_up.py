@@ -18,7 +18,7 @@ from sags_node.mapping.devices import device_of
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.processes import end
 from sags_node.rig import rectified_rig
-from sags_node.types import U8, Bool, StereoFrame, StereoRig
+from sags_node.types import U8, StereoFrame, StereoRig
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.inverse_search import spread_patches
 from sags_node.vision.pyramid import pyramids
@@ -103,7 +103,8 @@ def _frames() -> list[StereoFrame]:
     it is the scope that moves, and an instrument hides tissue."""
     coarse: U8 = np.random.default_rng(0).integers(40, 220, (_HEIGHT // 4, _WIDTH // 4 + 16, 3), np.uint8)
     texture = cv2.resize(coarse, (_WIDTH + 64, _HEIGHT))
-    tissue, free = ~_instrument(), np.ones((_HEIGHT, _WIDTH), np.bool_)
+    tissue, free = np.ones((2, _HEIGHT, _WIDTH), np.bool_)
+    tissue[_HEIGHT // 3 : _HEIGHT // 2, : _WIDTH // 2] = False
     depth = np.full((_HEIGHT, _WIDTH), np.float32(_FOCAL * _BASELINE / _DISPARITY))
     frames = []
     for i in range(6):
@@ -115,12 +116,6 @@ def _frames() -> list[StereoFrame]:
         pose[0, 3] = max(0, i - 2) * _BASELINE / _DISPARITY
         frames.append(StereoFrame(i, stamp, stamp, left, right, T_world_cam=pose, depth=own, tissue=seen))
     return frames
-
-
-def _instrument() -> Bool:
-    covered = np.zeros((_HEIGHT, _WIDTH), np.bool_)
-    covered[_HEIGHT // 3 : _HEIGHT // 2, : _WIDTH // 2] = True
-    return covered
 
 
 def _rig() -> StereoRig:

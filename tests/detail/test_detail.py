@@ -7,7 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from engine_scenes import round_gaussians
+from flat_scene import camera_in_front
 from places import SESSION
+from recorded_session import frames_of, opened
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import (
@@ -30,7 +33,6 @@ from sags_node.messaging.requests import ViewRequest
 from sags_node.node.allowance import Allowance
 from sags_node.node.views import Views
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
-from sags_node.pipeline.session import open_session
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
@@ -38,19 +40,13 @@ from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown
 
 MOVED = ((1.0, 0.0, 0.0, 0.005), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # m, right
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
-CAMERA = Camera(
-    WIDTH, HEIGHT, np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]]), np.eye(4)
-)
+CAMERA = camera_in_front(WIDTH, HEIGHT, FOCAL)
 
 
 def gaussians(count: int = 30, first_id: int = 0) -> Gaussians:
     rng = np.random.default_rng(3)
     means = rng.uniform((-0.04, -0.03, 0.1), (0.04, 0.03, 0.1), (count, 3)).astype(np.float32)
-    return Gaussians(
-        means, np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.full((count, 3), 0.004, np.float32),
-        np.full(count, 0.9, np.float32), np.full((count, 3), 0.5, np.float32), first_id + np.arange(count),
-    )  # fmt: skip
+    return replace(round_gaussians(means, 0.004), ids=first_id + np.arange(count))
 
 
 def seen(stamp_ns: int = 0, depth: F32 | None = None, camera: Camera = CAMERA) -> SeenFrame:
@@ -257,22 +253,21 @@ def test_gaussians_of_wanted_places_are_chosen_by_where_they_project() -> None:
 
 def test_what_is_seen_is_the_picture_and_what_is_hidden_comes_from_before() -> None:
     """A box is hidden for the last four frames; beside it the model alone. Nothing else changes by it."""
-    asked = ["source.pace:=step", "source.frames:=12", "mapping.max_gaussians:=3000"]
-    session = open_session(SESSION, asked)
+    asked = "source.frames:=12", "mapping.max_gaussians:=3000"
+    session = opened(*asked)
     pipeline = Pipeline(session.config, session.rig)
-    plain = Pipeline(open_session(SESSION, [*asked, "publish.detail:=false"]).config, session.rig)
+    plain = Pipeline(opened(*asked, "publish.detail:=false").config, session.rig)
     box = np.s_[100:150, 120:180]
-    with session.source as source:
-        for number, frame in enumerate(source):
-            tissue = np.ones(frame.left.shape[:2], np.bool_) if frame.tissue is None else frame.tissue.copy()
-            true = tissue.copy()
-            if number >= 8:
-                tissue[box] = False
-            given = replace(frame, tissue=tissue)
-            result = pipeline.process(given, StepBudget(1), FrameRequest(left=True))
-            alone = plain.process(given, StepBudget(1), FrameRequest(left=True))
-            assert alone.views["left"].shown is None
-            assert np.array_equal(alone.views["left"].rgb, result.views["left"].rgb)
+    for number, frame in enumerate(frames_of(session)):
+        tissue = np.ones(frame.left.shape[:2], np.bool_) if frame.tissue is None else frame.tissue.copy()
+        true = tissue.copy()
+        if number >= 8:
+            tissue[box] = False
+        given = replace(frame, tissue=tissue)
+        result = pipeline.process(given, StepBudget(1), FrameRequest(left=True))
+        alone = plain.process(given, StepBudget(1), FrameRequest(left=True))
+        assert alone.views["left"].shown is None
+        assert np.array_equal(alone.views["left"].rgb, result.views["left"].rgb)
     view, truth = result.views["left"], result.pair.left
     assert view.shown is not None
     inner = np.zeros(truth.shape[:2], np.bool_)
@@ -322,17 +317,16 @@ def test_lessons_cost_nothing_until_a_view_that_needs_them_is_drawn(monkeypatch:
     learnt = []
     for kind in ("learn_ahead", "learn_aside"):
         monkeypatch.setattr(Detail, kind, lambda *_, kind=kind: learnt.append(kind))
-    session = open_session(SESSION, ["source.pace:=step", "source.frames:=12", "mapping.max_gaussians:=3000"])
+    session = opened("source.frames:=12", "mapping.max_gaussians:=3000")
     seconds = itertools.count()
     pipeline = Pipeline(session.config, session.rig)
     views = Views(Allowance(), clock=lambda: float(next(seconds)), detail=True)
-    with session.source as source:
-        for number, frame in enumerate(source):
-            scene = pipeline.process(frame, StepBudget(1), FrameRequest())
-            if number == 6:
-                views.open(ViewRequest("aside", fov=60, T_left_cam=MOVED), None)
-            drawn = dict(views.draw_due(scene, {"aside"}, pipeline.seen))
-            assert bool(drawn) == bool(learnt) == (number >= 6)
+    for number, frame in enumerate(frames_of(session)):
+        scene = pipeline.process(frame, StepBudget(1), FrameRequest())
+        if number == 6:
+            views.open(ViewRequest("aside", fov=60, T_left_cam=MOVED), None)
+        drawn = dict(views.draw_due(scene, {"aside"}, pipeline.seen))
+        assert bool(drawn) == bool(learnt) == (number >= 6)
     assert set(learnt) == {"learn_aside"}  # nobody looked ahead
 
 

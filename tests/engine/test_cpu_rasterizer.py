@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -23,6 +22,7 @@ from engine_scenes import (
     on_one_thread,
     random_gaussians,
     rasterize,
+    rows,
     truth,
     with_filter,
     with_view_dependence,
@@ -109,27 +109,6 @@ def test_rounding_changes_no_more_than_whether_a_splat_is_cut(
     assert min(shown_off, cut_off) <= 1 < max(shown_off, cut_off)
 
 
-def test_subpixel_splats_dim_with_the_square_of_the_distance() -> None:
-    """The 2D Mip filter keeps the light of a splat smaller than a pixel: coverage * z^2 stays the same."""
-    view = camera(width=160, height=160, focal=160.0)
-    rng = np.random.default_rng(3)
-    light = []
-    for distance in (0.05, 0.1):
-        grid = np.stack(np.meshgrid(np.arange(5, 155, 10.0), np.arange(5, 155, 10.0)), -1).reshape(-1, 2)
-        means = geometry.unproject(
-            view, grid + rng.uniform(-0.5, 0.5, grid.shape), np.full(len(grid), distance)
-        )
-        gaussians = random_gaussians(0, len(grid), view)
-        gaussians = dataclasses.replace(
-            gaussians,
-            means=means.astype(np.float32),
-            scales=np.full((len(grid), 3), 0.5 * 0.05 / 160, np.float32),  # half a pixel, then a quarter
-            opacities=np.full(len(grid), 0.9, np.float32),
-        )
-        light.append(float(rasterize(gaussians, view).alpha.sum()) * distance**2)
-    assert light[1] / light[0] == pytest.approx(1.0, abs=0.06)
-
-
 def test_view_is_normalised_by_coverage() -> None:
     view = camera(width=4, height=3)
     planes = np.zeros((5, 3, 4), np.float32)
@@ -175,32 +154,20 @@ def test_buffers_grow_when_a_picture_needs_more_pairs() -> None:
     truth(gaussians, view, moves=1).check(planes, found, ["colors", "contribution"])
 
 
-def crowd(corner: Sequence[float]) -> Gaussians:
-    """2000 Gaussians on a few pixels."""
-    gaussians = random_gaussians(3, 2000, WIDE)
-    rng = np.random.default_rng(4)
-    pixels = np.asarray(corner) + rng.uniform(-3, 3, (2000, 2))
-    gaussians.means[:] = geometry.unproject(WIDE, pixels, rng.uniform(0.05, 0.09, 2000))
-    return gaussians
-
-
 @pytest.mark.parametrize("corner", [(2.0, 2.0), (97.0, 74.0), (47.5, 31.5)])
 def test_a_crowd_in_one_corner(corner: tuple[float, float]) -> None:
-    """All pairs in one or four tiles; the storage order does not matter either."""
-    gaussians = crowd(corner)
+    """2000 Gaussians on a few pixels, all pairs in one or four tiles; the storage order does not matter
+    either."""
+    gaussians = random_gaussians(3, 2000, WIDE)
+    rng = np.random.default_rng(4)
+    pixels = corner + rng.uniform(-3, 3, (2000, 2))
+    gaussians.means[:] = geometry.unproject(WIDE, pixels, rng.uniform(0.05, 0.09, 2000))
     planes = make_rasterizer("numba", 100, 77).forward(gaussians, WIDE).copy()
     assert planes[4].max() > 0.99
     true = reference.ReferenceRasterizer().forward(gaussians, WIDE)
     # a tile stops at a transmittance of 1e-4
     np.testing.assert_allclose(planes, true, rtol=0, atol=1e-4 + 2 * EXPONENTIAL)
-    order = np.random.default_rng(5).permutation(2000)
-    shuffled = Gaussians(
-        *(
-            getattr(gaussians, name)[order]
-            for name in ("means", "quats", "scales", "opacities", "colors", "ids")
-        ),
-        slopes=gaussians.slopes[order],
-    )
+    shuffled = rows(gaussians, np.random.default_rng(5).permutation(2000))
     np.testing.assert_array_equal(make_rasterizer("numba", 100, 77).forward(shuffled, WIDE), planes)
 
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 import warp as wp
 from click.testing import CliRunner
+from places import SESSION
 
 from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
@@ -111,13 +112,15 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
 
 
 def test_machines_without_a_gpu_never_wait_for_torch_or_warp() -> None:
-    """`auto` looks for the hardware first, and the frame path needs no torch."""
-    code = """
+    """`auto` looks for the hardware first, and neither a session nor the frame path needs torch."""
+    code = f"""
 import sys
 from sags_node.engine import device
 device.has_gpu = lambda: False
 from sags_node.config.schema import LaunchConfig
+from sags_node.pipeline.session import open_session
 from sags_node.pipeline.warm_up import warm_up
+open_session({str(SESSION)!r})
 warm_up(LaunchConfig())
 assert "sags_node.mapping.mapper" in sys.modules
 print([name for name in ("torch", "warp") if name in sys.modules])

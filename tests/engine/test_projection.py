@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from engine_scenes import (
     DERIVATIVES,
     INPUTS,
@@ -24,10 +25,12 @@ from engine_scenes import (
 from numpy.typing import NDArray
 from rounding import after
 
+from benchmarks.kernels import reference
 from sags_node import geometry
 from sags_node.engine.rasterizer import smoothing
 from sags_node.engine.rasterizer import spherical_harmonics as harmonics
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.kernels.jit import read_only
 from sags_node.types import F64, Camera
 
 VIEW = camera(moved=True)
@@ -61,18 +64,12 @@ def smooth_scene() -> tuple[Camera, list[F64], F64]:
 
 
 def twin_planes(view: Camera, inputs: Sequence[Any], variance: F64) -> Any:
-    import torch
-
-    from benchmarks.kernels import reference
-
     tensors = [torch.as_tensor(array) for array in inputs]
     splats = reference.project(view, tensors, torch.tensor(variance))
     return reference.blend(splats, view.width, view.height)
 
 
 def test_twin_agrees_with_finite_differences() -> None:
-    import torch
-
     view, inputs, variance = smooth_scene()
     weights = torch.tensor(np.random.default_rng(6).normal(size=(5, view.height, view.width)))
     tensors = [torch.tensor(array, requires_grad=True) for array in inputs]
@@ -109,31 +106,14 @@ def basis(directions: F64) -> NDArray[np.float32]:
         colors = np.zeros((len(means), 3), np.float32)
         centre = (np.float32(0), np.float32(0), np.float32(0))
         seen = np.empty_like(colors)
-        harmonics.color(*(array_for_kernel(a) for a in (means, colors, sh_rest)), centre, seen)
+        harmonics.color(*map(read_only, (means, colors, sh_rest)), centre, seen)
         found[:, k : k + 3] = seen
     return found
 
 
-def array_for_kernel(array: NDArray[np.float32]) -> NDArray[np.float32]:
-    array.flags.writeable = False
-    return array
-
-
-def test_basis_is_orthonormal_on_the_sphere() -> None:
-    """By a quadrature that is exact for products of two harmonics of degree 3."""
-    heights, weights = np.polynomial.legendre.leggauss(8)
-    angles = np.arange(16) * (2 * np.pi / 16)
-    z, angle = (grid.ravel() for grid in np.meshgrid(heights, angles, indexing="ij"))
-    flat = np.sqrt(1 - z**2)
-    found = basis(np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)).astype(np.float64)
-    areas = weights.repeat(16) * (2 * np.pi / 16)
-    # a harmonic has ten roundings, and values up to 1.8: as many as the sphere has in its area
-    np.testing.assert_allclose(found.T * areas @ found, np.eye(15), atol=2 * 1.8 * after(10))
-    np.testing.assert_allclose(areas @ found, 0, atol=1.8 * 4 * np.pi * after(10))  # nor the constant
-
-
 def test_basis_has_the_order_and_the_signs_of_3d_gaussian_splatting() -> None:
-    """Degree by degree, order from -l to l, with the Condon-Shortley phase: Legendre's polynomials."""
+    """Degree by degree, order from -l to l, with the Condon-Shortley phase, orthonormal on the sphere:
+    Legendre's polynomials."""
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -227,15 +207,6 @@ def test_filter_enlarges_the_covariance_and_keeps_the_mass_on_the_surface() -> N
     np.testing.assert_allclose(rasterizer.forward(gaussians, VIEW), expected, rtol=0, atol=within)
 
 
-def test_what_is_exported_draws_the_same() -> None:
-    gaussians = with_filter(random_gaussians(5, 60, VIEW))
-    exported = smoothing.bake_filter(gaussians)
-    assert exported.smoothing is None
-    rasterizer = make_rasterizer("numba", VIEW.width, VIEW.height)
-    expected = rasterizer.forward(gaussians, VIEW).copy()
-    np.testing.assert_array_equal(rasterizer.forward(exported, VIEW), expected)
-
-
 def test_filter_of_vanishing_scales() -> None:
     scales = np.array([[1e-7, 1e-7, 1e-7], [1e-7, 1e-3, 1.0], [1e-7, 1e-7, 1e-7]], np.float32)
     slopes = np.full((3, 3), 0.1, np.float32)
@@ -244,7 +215,8 @@ def test_filter_of_vanishing_scales() -> None:
     found_scales, found_opacities, found_slopes = (
         np.empty_like(array) for array in (scales, opacities, slopes)
     )
-    smoothing.smooth(scales, opacities, variance, slopes, found_scales, found_opacities, found_slopes)
+    given = map(read_only, (scales, opacities, variance, slopes))
+    smoothing.smooth(*given, found_scales, found_opacities, found_slopes)
     true_scales = np.sqrt(scales.astype(np.float64) ** 2 + variance[:, None])
     true_opacities = opacities * np.sort(scales / true_scales)[:, 1:].prod(1)
     np.testing.assert_allclose(found_scales, true_scales, rtol=after(3))

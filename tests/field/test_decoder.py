@@ -63,18 +63,6 @@ def test_it_is_the_equation_of_the_paper(tokens: Tokens) -> None:
 
 
 @every_choice
-def test_gradients_against_finite_differences(tokens: Tokens) -> None:
-    decoder = trained(tokens, width=8, heads=2)
-    names, values = zip(*decoder.named_parameters(), strict=True)
-
-    def decode(f: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
-        named = dict(zip(names, weights, strict=True))
-        return torch.func.functional_call(decoder, named, (f,))  # type: ignore[no-any-return]
-
-    assert torch.autograd.gradcheck(decode, (features(5).requires_grad_(), *values))
-
-
-@every_choice
 def test_a_new_decoder_changes_nothing_but_can_learn(tokens: Tokens) -> None:
     decoder = Decoder(20, tokens)
     deltas = decoder(features(50).float())

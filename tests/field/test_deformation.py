@@ -1,9 +1,11 @@
 """Gaussians that follow control nodes, against the formula for each Gaussian and node in float64."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
-from engine_scenes import on_one_thread
+from engine_scenes import on_one_thread, relative_error
 
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, FieldRates, product, skin
@@ -26,13 +28,22 @@ def of_each(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return product(a.flatten(0, 1), b.flatten(0, 1)).view_as(a)
 
 
-def skinned_and_gradients(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """As `twin_and_gradients`, of the model's own."""
+Skin = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
+
+
+def skinned_and_gradients(*arrays: np.ndarray, by: Skin = skin) -> tuple[np.ndarray, ...]:
+    """Of rows, nodes, deltas, index, weight and a cotangent; the gradients by rows and by deltas."""
     rows, nodes, deltas, index, weight, cotangent = map(torch.tensor, arrays)
     inputs = rows.requires_grad_(), deltas.requires_grad_()
-    skinned = skin(inputs[0], nodes, inputs[1], index.long(), weight)
+    skinned = by(inputs[0], nodes, inputs[1], index.long(), weight)
     found = torch.autograd.grad(skinned, inputs, cotangent)
     return skinned.detach().numpy(), *(gradient.numpy() for gradient in found)
+
+
+def twin_and_gradients(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The same of the twin, in float64."""
+    exact = (a if a.dtype.kind == "i" else a.astype(np.float64) for a in arrays)
+    return skinned_and_gradients(*exact, by=twin)
 
 
 def twin(
@@ -51,27 +62,6 @@ def twin(
     plain = rows + (w * own).sum(1)
     quat = product((w * turn).sum(1), rows[:, columns.QUAT])
     return torch.cat([mean, plain[:, columns.LOG_SCALE], quat, plain[:, 10:]], 1)
-
-
-def twin_and_gradients(
-    rows: np.ndarray,
-    nodes: np.ndarray,
-    deltas: np.ndarray,
-    index: np.ndarray,
-    weight: np.ndarray,
-    v: np.ndarray,
-) -> tuple[np.ndarray, ...]:
-    """What the twin makes of it in float64, and its gradients by rows and by deltas."""
-    x, n, d, w, v_skinned = (torch.tensor(a, dtype=torch.float64) for a in (rows, nodes, deltas, weight, v))
-    x.requires_grad_()
-    d.requires_grad_()
-    skinned = twin(x, n, d, torch.tensor(index, dtype=torch.int64), w)
-    gradients = torch.autograd.grad(skinned, [x, d], v_skinned)
-    return skinned.detach().numpy(), *(gradient.numpy() for gradient in gradients)
-
-
-def relative_error(got: np.ndarray, want: np.ndarray) -> float:
-    return float(np.linalg.norm(got - want) / np.linalg.norm(want))
 
 
 @pytest.mark.parametrize("seed", range(3))

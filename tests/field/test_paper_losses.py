@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sags_node.field.losses import LossWeights, compare, dissimilarity, total_variation
+from sags_node.field.losses import LossWeights, compare, dissimilarity
 from sags_node.quality import metrics
 
 HEIGHT, WIDTH = 17, 23
@@ -116,15 +116,6 @@ def test_similarity_is_that_of_the_metric() -> None:
     found = dissimilarity(*map(torch.from_numpy, (drawn, truth, everywhere)))
     similarity = metrics.ssim(np.moveaxis(drawn, 0, 2), np.moveaxis(truth, 0, 2), everywhere)
     assert float(found) / truth.size == pytest.approx(1 - similarity, abs=1e-4)
-
-
-def test_total_variation_of_a_step_is_its_height_times_its_length() -> None:
-    picture = torch.zeros(1, 6, 8)
-    picture[:, :, 4:] = 2.0
-    everywhere = torch.ones(6, 8, dtype=torch.bool)
-    assert total_variation(picture, everywhere, everywhere) == 12
-    assert total_variation(picture, ~everywhere, everywhere) == 0
-    assert total_variation(picture, everywhere, everywhere & (torch.arange(6)[:, None] > 1)) == 8
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

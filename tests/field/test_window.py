@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sags_node.field.decoder import Decoder
-from sags_node.field.deformation import Deltas, FieldRates, NodeField, PointField
+from sags_node.field.deformation import Deltas, Field, FieldRates, NodeField, PointField
 from sags_node.field.hexplane import HexPlane
 from sags_node.field.window import AnchoredField, WindowModel
 from sags_node.kernels.threads import configure_threads
@@ -40,24 +40,25 @@ def some_rows(count: int = 300, seed: int = 0, box: np.ndarray = BOX) -> F32:
     return rows
 
 
-def moving_deltas(tokens: str, seed: int = 0) -> Deltas:
-    """A field whose slots differ, so that tissue moves by millimetres and turns by tenths of a radian."""
-    hexplane = HexPlane(BOX, 0, SLOT_NS, SLOTS, cells=5, levels=2, channels=16, seed=seed)
+def fresh_field(tokens: str, rows: F32) -> Field:
+    hexplane = HexPlane(BOX, 0, SLOT_NS, SLOTS, cells=5, levels=2, channels=16)
     hexplane.advance(NEWEST_NS, _never)
-    decoder = Decoder(hexplane.features, tokens, seed=seed)
-    decoder.awaken(seed)
+    deltas = Deltas(hexplane, Decoder(hexplane.features, tokens))
+    deltas.decoder.awaken(0)
+    nodes = spread_nodes(rows[:, columns.MEAN], 40)
+    return NodeField(deltas, nodes) if tokens == "nodes" else PointField(deltas)
+
+
+def moving_model(tokens: str) -> WindowModel:
+    """Of a field whose slots differ, so that tissue moves by millimetres and turns by tenths of a radian."""
+    field = fresh_field(tokens, some_rows())
+    hexplane = field.deltas.hexplane
     with torch.no_grad():
-        for weights in decoder.head_out:
+        for weights in field.deltas.decoder.head_out:
             weights.mul_(5)
     in_time = hexplane.cells.detach().numpy()[hexplane.slot(0).start :]
-    in_time[:] = np.random.default_rng(seed).uniform(0.2, 2.0, in_time.shape)
-    return Deltas(hexplane, decoder)
-
-
-def moving_model(tokens: str, seed: int = 0) -> WindowModel:
-    rows, deltas = some_rows(seed=seed), moving_deltas(tokens, seed)
-    nodes = spread_nodes(rows[:, columns.MEAN], 40)
-    return WindowModel(rows, NodeField(deltas, nodes) if tokens == "nodes" else PointField(deltas))
+    in_time[:] = np.random.default_rng(0).uniform(0.2, 2.0, in_time.shape)
+    return WindowModel(some_rows(), field)
 
 
 def _never(t_ns: int) -> None:
@@ -189,13 +190,7 @@ def test_at_the_oldest_slot_the_field_has_nothing_to_learn(tokens: str) -> None:
 @pytest.mark.parametrize("tokens", TOKENS)
 def test_a_fresh_field_learns_a_motion_and_leaves_the_oldest_slot_alone(tokens: str) -> None:
     rows = torch.from_numpy(some_rows())
-    hexplane = HexPlane(BOX, 0, SLOT_NS, SLOTS, cells=5, levels=2, channels=16)
-    hexplane.advance(NEWEST_NS, _never)
-    deltas = Deltas(hexplane, Decoder(hexplane.features, tokens))
-    deltas.decoder.awaken(0)
-    means = rows[:, columns.MEAN].numpy()
-    inner = NodeField(deltas, spread_nodes(means, 40)) if tokens == "nodes" else PointField(deltas)
-    field = AnchoredField(inner, means)
+    field = AnchoredField(fresh_field(tokens, rows.numpy()), rows[:, columns.MEAN].numpy())
     assert torch.allclose(field.deform(rows, NEWEST_NS), rows, rtol=0, atol=ROUNDING)
     shift = torch.tensor([0.002, -0.001, 0.001])
 
@@ -204,7 +199,7 @@ def test_a_fresh_field_learns_a_motion_and_leaves_the_oldest_slot_alone(tokens: 
 
     for _ in range(150):
         left().sum().backward()
-        deltas.step(FieldRates(cells=5e-3, lines=5e-3))
+        field.deltas.step(FieldRates(cells=5e-3, lines=5e-3))
     assert left().mean() < 0.3 * shift.abs().mean()
     assert torch.allclose(field.deform(rows, 0), rows, rtol=0, atol=ROUNDING)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from sags_node.types import Camera, Colours, Gaussians, Observation, RenderedView, Snapshot
+import numpy as np
+from engine_scenes import round_gaussians
+
+from sags_node.types import Camera, Colours, Observation, RenderedView, Snapshot
 
 Scene = tuple[Observation, Snapshot, RenderedView]
 
@@ -32,15 +35,9 @@ def flat_scene(
     first_id: int = 0,
 ) -> Scene:
     """What was seen, the model and what it shows: all of it tissue, at the depth `drawn` (m)."""
-    shape, count = (camera.height, camera.width), len(means)
-    gaussians = Gaussians(
-        means,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        np.full((count, 3), 1e-3, np.float32),
-        np.ones(count, np.float32),
-        np.ones((count, 3), np.float32),
-        np.arange(count) + first_id,
-    )
+    shape = camera.height, camera.width
+    gaussians = round_gaussians(means, 1e-3, 1.0, 1.0)
+    gaussians = replace(gaussians, ids=gaussians.ids + first_id)
     depth = np.full(shape, drawn, np.float32)
     tissue = np.ones(shape, bool)
     dark = Colours(np.zeros((*shape, 3), np.uint8))

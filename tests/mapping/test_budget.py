@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from places import SESSION
+from recorded_session import frames_of, opened
 
 from sags_node.config.launch_file import with_parameters
 from sags_node.config.schema import LaunchConfig, MappingConfig
@@ -14,7 +14,6 @@ from sags_node.mapping.budget import FIRST_SECONDS, LEAST_FIRST_STEPS, Budget, S
 from sags_node.mapping.devices import make_budget
 from sags_node.mapping.ladder import FULL, Ladder, Rung
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import open_session
 
 BUDGET, PERIOD = 0.033, 1 / 30  # s
 USUAL = Rung(10_000)
@@ -175,14 +174,14 @@ def test_a_budget_that_is_changed_while_running_is_as_if_it_had_been_so() -> Non
     """With time for several steps these are shorter and the flow is finer, whenever that became so."""
 
     def play(*budgets: float) -> list[np.ndarray]:
-        settings = ["source.pace:=step", "mapping.max_gaussians:=4000", f"mapping.budget_ms:={budgets[0]}"]
-        session = open_session(SESSION, settings)
+        session = opened(
+            "source.frames:=3", "mapping.max_gaussians:=4000", f"mapping.budget_ms:={budgets[0]}"
+        )
         pipeline = Pipeline(session.config, session.rig)
         for budget in budgets[1:]:
             pipeline.reconfigure(with_parameters(session.config, {"mapping.budget_ms": budget}))
-        with session.source as source:
-            frames = [frame for frame, _ in zip(source, range(3), strict=False)]
-        return [pipeline.process(frame, StepBudget(2)).snapshot.gaussians.means for frame in frames]
+        results = [pipeline.process(frame, StepBudget(2)) for frame in frames_of(session)]
+        return [result.snapshot.gaussians.means for result in results]
 
     changed, patient, hurried = play(33, 100), play(100), play(100, 33)
     assert all(np.array_equal(a, b) for a, b in zip(changed, patient, strict=True))

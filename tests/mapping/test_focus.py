@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_scenes import worst_tiles
-from places import SESSION
+from recorded_session import frames_of, opened
 
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
@@ -18,7 +18,6 @@ from sags_node.mapping.focus import EVERY, largest, with_neighbours
 from sags_node.mapping.ladder import Rung
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import open_session
 from sags_node.types import F32, U8, Bool
 
 HEIGHT, WIDTH = 3 * TILE_HEIGHT + 7, 5 * TILE_WIDTH + 3  # no tile divides it
@@ -126,9 +125,8 @@ def test_the_worst_tiles_are_those_of_what_was_drawn_last(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(CpuRefiner, "begin", noted)
     monkeypatch.setattr(refiner, "largest", compared)
-    session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=4000"])
+    session = opened("mapping.max_gaussians:=4000", "source.frames:=4")
     pipeline = Pipeline(session.config, session.rig)
-    with session.source as source:
-        for frame, _ in zip(source, range(4), strict=False):
-            pipeline.process(frame, StepBudget(3, Rung(4000, redraw=0.4)))
+    for frame in frames_of(session):
+        pipeline.process(frame, StepBudget(3, Rung(4000, redraw=0.4)))
     assert asked == 3 * 3  # two steps on what is worst, and what is shown; not in the first frame

@@ -27,7 +27,7 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.devices import Skips
 from sags_node.mapping.gpu.device_map import REFINED, DeviceMap
 from sags_node.mapping.gpu.refiner import GpuRefiner
-from sags_node.mapping.mapper import FOCUS, Mapper
+from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import CpuRefiner, Refiner
 from sags_node.mapping.tissue_map import TissueMap
@@ -168,17 +168,6 @@ def test_follows_the_tissue_as_the_cpu_does() -> None:
     assert 0 < device[5] < 1.05 * loss  # the CPU's counts what it did not draw anew
 
 
-def test_as_many_steps_as_the_budget_gives() -> None:
-    losses = []
-    for steps in (1, 3):
-        played = on_device()
-        played.take(frame(0))
-        snapshot, _ = played.take(frame(1), steps=steps)
-        assert snapshot.counts["iterations"] == steps
-        losses.append(snapshot.loss)
-    assert losses[1] < losses[0]  # before the last step
-
-
 def test_the_model_is_the_devices_until_it_is_fetched_and_adams_moments_stay_there() -> None:
     played = on_device()
     played.take(frame(0))
@@ -208,16 +197,6 @@ def test_adams_moments_follow_their_gaussians() -> None:
     slopes = cpu.row("adam_m")
     np.testing.assert_allclose(moments, slopes, atol=1e-4 * np.abs(slopes).max())
     assert not moments[-1].any() and moments[3].any()
-
-
-def test_still_frames_touch_the_same_tiles() -> None:
-    found = []
-    for played in (on_cpu(), on_device()):
-        played.take(frame(0))
-        played.begin(frame(0))
-        found.append(played.refiner.refine_worst(FOCUS, LearningRates(), nodes=False))
-    assert found[0].sum() == 1
-    np.testing.assert_array_equal(found[1], found[0])
 
 
 def test_a_still_frame_that_rests_changes_nothing() -> None:

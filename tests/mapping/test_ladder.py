@@ -104,10 +104,6 @@ def test_every_rung_costs_more_than_the_one_below(rungs: Sequence[Rung], prices:
     assert all(a < b for a, b in itertools.pairwise(costs)), costs
 
 
-def test_the_lowest_rung_is_for_slow_machines_and_the_highest_leaves_nothing_out() -> None:
-    assert RUNGS[0].gaussians <= 5000 and RUNGS[0].scale == 0.5 and RUNGS[-1] == Rung(RUNGS[-1].gaussians)
-
-
 @pytest.mark.parametrize("slow", [0.3, 0.7, 1.0, 1.3, 1.6, 2.0])
 @pytest.mark.parametrize("start", [0.5, 1.0, 2.0])
 def test_the_cameras_rate_is_held_after_the_first_second_on_any_machine(slow: float, start: float) -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flat_scene import Scene, camera_in_front, flat_scene
 from recorded_session import both, frames_of, opened, psnr
 
 from sags_node.mapping import densify, initialise
@@ -14,33 +15,26 @@ from sags_node.mapping.surface import surface_at
 from sags_node.model.gaussians import GaussianModel
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.quality.metrics import as_float
-from sags_node.types import Bool, Camera, Colours, FrameResult, Observation, RenderedView
+from sags_node.types import Bool, Camera, FrameResult, Observation
 from sags_node.vision.margin import ClearOfInstruments, clear_of_instruments
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 64, 48, 60.0, 0.08
 
 
 def camera(T: np.ndarray | None = None) -> Camera:
-    K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
-    return Camera(WIDTH, HEIGHT, K, np.eye(4) if T is None else T)
+    return replace(camera_in_front(WIDTH, HEIGHT, FOCAL), T_world_cam=np.eye(4) if T is None else T)
+
+
+def plane(depth: float, T: np.ndarray | None = None) -> Scene:
+    """All of it tissue, without a model."""
+    gray = np.zeros((HEIGHT, WIDTH), np.uint8)
+    return flat_scene(camera(T), np.zeros((0, 3), np.float32), gray, depth, 1, 33_000_000)
 
 
 def observation(depth: float = DEPTH, T: np.ndarray | None = None, seed: int = 0) -> Observation:
-    rng = np.random.default_rng(seed)
-    image = rng.integers(51, 205, (HEIGHT, WIDTH, 3), np.uint8)
-    shape = (HEIGHT, WIDTH)
-    return Observation(
-        1, 33_000_000, camera(T), image, np.zeros(shape, np.uint8), np.ones(shape, bool),
-        np.full(shape, depth, np.float32), np.ones(shape, np.float32),
-    )  # fmt: skip
-
-
-def view(depth: float = DEPTH) -> RenderedView:
-    shape = (HEIGHT, WIDTH)
-    return RenderedView(
-        0, 0, camera(), Colours(np.zeros((*shape, 3), np.uint8)), np.full(shape, depth, np.float32),
-        np.ones(shape, np.float32),
-    )  # fmt: skip
+    image = np.random.default_rng(seed).integers(51, 205, (HEIGHT, WIDTH, 3), np.uint8)
+    sure = np.ones((HEIGHT, WIDTH), np.float32)
+    return replace(plane(depth, T)[0], image=image, depth_confidence=sure)
 
 
 def pruned(model: GaussianModel, frame: Observation) -> Bool:
@@ -55,63 +49,77 @@ def grid_points(depth: float = DEPTH) -> np.ndarray:
     return np.stack([x, y, np.full(x.size, depth)], 1).astype(np.float32)
 
 
+def planes_of(image: np.ndarray, coverage: float, depth: float = 1.0) -> np.ndarray:
+    """[5, H, W] that show a picture, at that depth."""
+    ones = np.ones(image.shape[:2], np.float32)
+    picture = np.stack([*np.moveaxis(as_float(image), -1, 0), np.float32(depth) * ones, ones])
+    return np.float32(coverage) * picture
+
+
+def add_to(model: GaussianModel, points: np.ndarray) -> None:
+    """Grey Gaussians of 0.2 mm."""
+    size, grey = (np.full((len(points), 3), value, np.float32) for value in (2e-4, 0.5))
+    model.append(points, size, grey, 0.9)
+
+
+def model_of(points: np.ndarray, capacity: int | None = None) -> GaussianModel:
+    model = GaussianModel(capacity or len(points))
+    add_to(model, points)
+    return model
+
+
+def flow_by(x: float = 0.0, y: float = 0.0) -> np.ndarray:
+    """The same everywhere, px."""
+    return np.full((HEIGHT, WIDTH, 2), [x, y], np.float32)
+
+
 def flow_of(
-    means: np.ndarray, before: RenderedView, tissue: np.ndarray, flow: np.ndarray, after: Observation
+    means: np.ndarray, flow: np.ndarray, after: Observation, tissue: Bool | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    clear = (clear_of_instruments(mask, HALVINGS) for mask in (tissue, after.tissue))
-    return scene_flow(means, found(means, before, next(clear), flow, next(clear)), after, 0.4)
+    """The scene flow from the plane, all of it `tissue` by default, to a later frame."""
+    tissue = np.ones((HEIGHT, WIDTH), np.bool_) if tissue is None else tissue
+    before, now = (clear_of_instruments(mask, HALVINGS) for mask in (tissue, after.tissue))
+    return scene_flow(means, found(means, plane(DEPTH)[2], before, flow, now), after, 0.4)
 
 
 def test_scene_flow_of_a_sideways_shift() -> None:
-    means = grid_points()
-    flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-    flow[..., 0], flow[..., 1] = 3.0, -2.0
-    moved, seen = flow_of(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation())
+    moved, seen = flow_of(grid_points(), flow_by(3.0, -2.0), observation())
     assert seen.all()
     assert np.allclose(moved, [3 * DEPTH / FOCAL, -2 * DEPTH / FOCAL, 0], atol=1e-6)
 
 
 def test_scene_flow_is_pulled_to_the_measured_depth_but_not_across_a_gap() -> None:
-    means = grid_points()
-    tissue = np.ones((HEIGHT, WIDTH), bool)
-    still = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-    near, _ = flow_of(means, view(), tissue, still, observation(depth=0.082))
+    near, _ = flow_of(grid_points(), flow_by(), observation(depth=0.082))
     assert np.all(near[:, 2] > 0.4e-3) and np.all(near[:, 2] < 1.6e-3)
-    other_surface, _ = flow_of(means, view(), tissue, still, observation(depth=0.12))
+    other_surface, _ = flow_of(grid_points(), flow_by(), observation(depth=0.12))
     assert np.allclose(other_surface, 0, atol=1e-7)
 
 
 def test_a_moving_camera_alone_moves_no_tissue() -> None:
     """The flow that a camera motion causes must give zero displacement in the world."""
-    means = grid_points()
     T = np.eye(4)
     T[:3, 3] = [0.002, -0.001, 0.0]
-    flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-    flow[..., 0], flow[..., 1] = -0.002 * FOCAL / DEPTH, 0.001 * FOCAL / DEPTH
-    moved, seen = flow_of(means, view(), np.ones((HEIGHT, WIDTH), bool), flow, observation(T=T))
+    flow = flow_by(-0.002 * FOCAL / DEPTH, 0.001 * FOCAL / DEPTH)
+    moved, seen = flow_of(grid_points(), flow, observation(T=T))
     assert seen.mean() > 0.9
     assert np.abs(moved[seen > 0]).max() < 1e-6
 
 
 def test_hidden_and_covered_gaussians_are_not_seen() -> None:
-    behind = grid_points(depth=0.095)
-    still = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-    tissue = np.ones((HEIGHT, WIDTH), bool)
-    _, seen = flow_of(behind, view(), tissue, still, observation())
+    _, seen = flow_of(grid_points(depth=0.095), flow_by(), observation())
     assert not seen.any()
-    _, seen = flow_of(grid_points(), view(), ~tissue, still, observation())
+    _, seen = flow_of(grid_points(), flow_by(), observation(), np.zeros((HEIGHT, WIDTH), np.bool_))
     assert not seen.any()
 
 
 def test_the_motion_of_an_instrument_is_not_taken_for_that_of_the_tissue_beside_it() -> None:
     """Flow near a mask's edge belongs to the instrument: those Gaussians follow their nodes instead."""
-    flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    flow = flow_by()
     flow[:, :32] = 5.0
     tissue = np.ones((HEIGHT, WIDTH), bool)
     tissue[:, :31] = False
-    means = grid_points()
-    moved, seen = flow_of(means, view(), tissue, flow, observation())
-    assert 0 < seen.sum() < len(means) / 2
+    moved, seen = flow_of(grid_points(), flow, observation(), tissue)
+    assert 0 < seen.sum() < len(moved) / 2
     assert np.allclose(moved[seen > 0], 0, atol=1e-7)
 
 
@@ -127,9 +135,7 @@ def test_what_is_clear_of_instruments_is_worked_out_once_for_a_mask_and_anew_for
 
 def test_candidates_fill_holes_first() -> None:
     frame = observation()
-    planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
-    planes[:3] = np.moveaxis(as_float(frame.image), -1, 0)
-    planes[3], planes[4] = DEPTH, 1.0
+    planes = planes_of(frame.image, 1.0, DEPTH)
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:, 10:30, 20:40] = 0
     pixels, _, _ = densify.candidates(planes, frame, 0)
@@ -150,9 +156,7 @@ def test_a_hole_without_depth_takes_that_of_its_neighbours() -> None:
 
 def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_believed() -> None:
     frame = observation()
-    planes = np.zeros((5, HEIGHT, WIDTH), np.float32)
-    planes[:3] = np.moveaxis(as_float(frame.image), -1, 0)
-    planes[3], planes[4] = 1.2 * DEPTH, 1.0  # the model is far behind, but the picture agrees
+    planes = planes_of(frame.image, 1.0, 1.2 * DEPTH)  # the model is far behind, but the picture agrees
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:3] = 1 - planes[:3]
     planes[0] += 0.3
@@ -160,12 +164,7 @@ def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_bel
 
 
 def test_free_space_is_cleared_only_after_several_frames() -> None:
-    model = GaussianModel(200)
-    floating = grid_points(depth=0.06)
-    model.append(
-        floating, np.full((len(floating), 3), 2e-4, np.float32), np.zeros((len(floating), 3), np.float32), 0.9
-    )
-    frame = observation()
+    model, frame = model_of(grid_points(depth=0.06), 200), observation()
     for _ in range(densify.FRONT_FRAMES - 1):
         assert not pruned(model, frame).any()
     assert pruned(model, frame).all()
@@ -173,28 +172,23 @@ def test_free_space_is_cleared_only_after_several_frames() -> None:
 
 def test_what_is_not_finite_or_transparent_goes_at_once_and_what_left_the_view_when_it_is_crowded() -> None:
     points = grid_points()
-    model = GaussianModel(len(points))
-    size, grey = np.full((len(points), 3), 2e-4, np.float32), np.full((len(points), 3), 0.5, np.float32)
-    model.append(points[:50], size[:50], grey[:50], 0.9)
+    model = model_of(points[:50], len(points))
     model.means[0, 1] = np.nan
     model.colors[1, 2] = np.inf
     model.opacities[2] = 0.01
     model.means[3, 0] = 1.0
     assert np.flatnonzero(pruned(model, observation())).tolist() == [0, 1, 2]
-    model.append(points[50:], size[50:], grey[50:], 0.9)
+    add_to(model, points[50:])
     assert np.flatnonzero(pruned(model, observation())).tolist() == [0, 1, 2, 3]
 
 
 def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_has_just_come() -> None:
     """What was inserted in this frame was drawn by no step yet: nobody knows how much it shows."""
     points = grid_points()
-    size, grey = np.full((len(points), 3), 2e-4, np.float32), np.full((len(points), 3), 0.5, np.float32)
-    model = GaussianModel(10 * len(points))
-    for _ in range(5):
-        model.append(points, size, grey, 0.9)
+    model = model_of(np.tile(points, (5, 1)), 10 * len(points))
     old = model.count
     model.contribution[:] = np.random.default_rng(0).uniform(2, 20, old)
-    model.append(points, size, grey, 0.9)
+    add_to(model, points)
     ids, shown, area = model.ids.copy(), model.contribution.copy(), shown_area(model)
     assert densify.prune_to_budget(model, model.contribution, len(ids)) == 0
     removed = densify.prune_to_budget(model, model.contribution, old // 2)
@@ -210,11 +204,7 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
 
 def test_where_the_machine_affords_fewer_hidden_tissue_stays_as_likely_as_what_is_seen() -> None:
     """A third of the picture lies under an instrument: none of it shows, and each is as good as the mean."""
-    points = grid_points()
-    size, grey = np.full((len(points), 3), 2e-4, np.float32), np.full((len(points), 3), 0.5, np.float32)
-    model = GaussianModel(len(points))
-    model.append(points, size, grey, 0.9)
-    seen = observation()
+    model, seen = model_of(grid_points()), observation()
     tissue = seen.tissue.copy()
     tissue[:, : tissue.shape[1] // 3] = False
     now = replace(seen, tissue=tissue, depth=np.where(tissue, seen.depth, np.float32(0)))
@@ -238,15 +228,9 @@ def shown_area(model: GaussianModel) -> float:
 
 
 def test_a_full_model_gives_up_what_shows_least_and_nothing_that_shows_much() -> None:
-    points = grid_points()
-    size, grey = np.full((len(points), 3), 2e-4, np.float32), np.full((len(points), 3), 0.5, np.float32)
-    model = GaussianModel(len(points))
-    model.append(points, size, grey, 0.9)
-    model.contribution[:] = np.linspace(10, 1, len(points))
-    prune_mask = densify.least_shown(model.contribution, 10)
-    assert np.flatnonzero(prune_mask).tolist() == list(range(len(points) - 10, len(points)))
-    model.contribution[:] = np.linspace(10, 5, len(points))
-    assert not densify.least_shown(model.contribution, 10).any()
+    prune_mask = densify.least_shown(np.linspace(10, 1, 96), 10)
+    assert np.flatnonzero(prune_mask).tolist() == list(range(96 - 10, 96))
+    assert not densify.least_shown(np.linspace(10, 5, 96), 10).any()
 
 
 def test_first_pixels_respect_the_limit_and_the_mask_and_fill_gaps() -> None:
@@ -268,11 +252,6 @@ def test_first_pixels_respect_the_limit_and_the_mask_and_fill_gaps() -> None:
 
 SIZE = 96
 ALL = np.ones((SIZE, SIZE), bool)
-
-
-def planes_of(image: np.ndarray, coverage: float) -> np.ndarray:
-    picture = np.concatenate([image.transpose(2, 0, 1) / 255, np.ones((2, SIZE, SIZE))]) * coverage
-    return picture.astype(np.float32)
 
 
 @pytest.fixture()

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import islice
 
 import numpy as np
 import pytest
-from places import SESSION
+from engine_scenes import round_gaussians
+from recorded_session import frames_of, opened
 
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.motion_field import HORIZONS, STEADY, MotionField
 from sags_node.model.forecast import gaussians_ahead, points_ahead, reached
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import open_session
-from sags_node.types import F32, Camera, Forecast, Gaussians, MotionState, Snapshot
+from sags_node.types import F32, Camera, Forecast, MotionState, Snapshot
 
 FRAME_S = 1 / 30
 PERIOD = 31.4  # frames: no whole number
@@ -122,11 +121,7 @@ def snapshot(reach: float) -> Snapshot:
         MotionState(None, 0.9, reach), FRAME_S, nodes, moves,
         np.zeros((5, 4), np.int32), np.full((5, 4), 0.25, np.float32),
     )  # fmt: skip
-    gaussians = Gaussians(
-        np.zeros((5, 3), np.float32), np.tile(np.eye(1, 4, dtype=np.float32), (5, 1)),
-        np.ones((5, 3), np.float32),
-        np.ones(5, np.float32), np.ones((5, 3), np.float32), np.arange(5),
-    )  # fmt: skip
+    gaussians = round_gaussians(np.zeros((5, 3), np.float32), 1.0)
     camera = Camera(64, 48, np.eye(3), np.eye(4))
     return Snapshot(0, 0, 0, gaussians, np.zeros((5, 3), np.float32), camera, 0.0, forecast=forecast)
 
@@ -150,14 +145,11 @@ def test_motion_is_remembered_once_somebody_wants_it_predicted() -> None:
     """What nobody asks for costs nothing; and `mapping.field:=false` forbids it."""
     expected = {"null": [False, True], "false": [False, False], "true": [True, True]}
     for said, found in expected.items():
-        session = open_session(
-            SESSION, ["source.pace:=step", "mapping.max_gaussians:=2000", f"mapping.field:={said}"]
-        )
+        session = opened("source.frames:=20", "mapping.max_gaussians:=2000", f"mapping.field:={said}")
         pipeline = Pipeline(session.config, session.rig)
         forecasts = []
-        with session.source as source:
-            for number, frame in enumerate(islice(source, 20)):
-                if number == 10:
-                    pipeline.predict_motion()
-                forecasts.append(pipeline.process(frame, StepBudget(1)).snapshot.forecast is not None)
+        for number, frame in enumerate(frames_of(session)):
+            if number == 10:
+                pipeline.predict_motion()
+            forecasts.append(pipeline.process(frame, StepBudget(1)).snapshot.forecast is not None)
         assert [any(forecasts[:10]), any(forecasts[10:])] == found, said

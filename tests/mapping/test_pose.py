@@ -114,6 +114,7 @@ def test_trajectories_are_aligned_at_the_first_frame_and_their_errors_are_those_
 
 # ---- the moving phantom ----------------------------------------------------------------------------------
 
+Given = tuple[list[StereoFrame], Pipeline, list[FrameResult]]
 RATE = 15.0  # frames per second: the scope moves by up to 0.6 mm and 0.5 degrees from frame to frame
 
 
@@ -152,6 +153,13 @@ def followed(still: Path) -> tuple[list[StereoFrame], list[FrameResult]]:
     """All of `still`, with the pose estimated."""
     session, frames = opened(still)
     return frames, play(session, frames)[1]
+
+
+@pytest.fixture(scope="module")
+def given(still: Path) -> Given:
+    """Its first frames, with the poses of the session."""
+    session, frames = opened(still, "session")
+    return frames[:7], *play(session, frames[:7])
 
 
 def errors(results: list[FrameResult], frames: list[StereoFrame]) -> dict[str, float]:
@@ -292,10 +300,9 @@ def test_a_keyframe_finds_the_camera_again_where_flow_cannot(
 
 
 def test_how_the_tissue_was_seen_first_says_where_the_camera_is_though_places_at_rest_crept(
-    still: Path,
+    given: Given,
 ) -> None:
-    session, frames = opened(still, "session")
-    pipeline, results = play(session, frames[:7])
+    _, pipeline, results = given
     first, last = results[0].observation, results[-1].observation
     views = FirstViews(pipeline.map)
     assert views.pose(first, first.camera.T_world_cam) is None
@@ -308,9 +315,8 @@ def test_how_the_tissue_was_seen_first_says_where_the_camera_is_though_places_at
     assert mm < 0.3 and degrees < 0.2, (mm, degrees)
 
 
-def test_of_several_pictures_the_oldest_says_where_the_camera_is(still: Path) -> None:
-    session, frames = opened(still, "session")
-    pipeline, results = play(session, frames[:3])
+def test_of_several_pictures_the_oldest_says_where_the_camera_is(given: Given) -> None:
+    _, pipeline, results = given
     seen = results[-1].observation
     pose, aside, drifted = (seen.camera.T_world_cam.copy() for _ in range(3))
     aside[0, 3] += 0.012  # m: so far that the next picture is kept beside it
@@ -327,9 +333,8 @@ def test_of_several_pictures_the_oldest_says_where_the_camera_is(still: Path) ->
     assert errors[0] < 0.3 and errors[1] > 0.7
 
 
-def test_a_picture_of_other_tissue_tells_no_pose(still: Path) -> None:
-    session, frames = opened(still, "session")
-    pipeline, results = play(session, frames[:3])
+def test_a_picture_of_other_tissue_tells_no_pose(given: Given) -> None:
+    _, pipeline, results = given
     seen, views = results[-1].observation, FirstViews(pipeline.map)
     views.offer(seen, seen.camera.T_world_cam)
     other = replace(seen, gray=np.ascontiguousarray(seen.gray[::-1]))
@@ -359,8 +364,6 @@ def test_a_scope_known_to_be_fixed_changes_nothing_where_it_is() -> None:
         assert np.array_equal(given.views["left"].rgb, fixed.views["left"].rgb)
 
 
-def test_without_an_estimate_asked_for_the_pose_is_the_sessions(still: Path) -> None:
-    session, frames = opened(still, "session")
-    _, results = play(session, frames[:4])
-    for result, frame in zip(results, frames, strict=False):
+def test_without_an_estimate_asked_for_the_pose_is_the_sessions(given: Given) -> None:
+    for frame, result in zip(given[0], given[2], strict=True):
         assert np.array_equal(result.pair.camera.T_world_cam, frame.T_world_cam)

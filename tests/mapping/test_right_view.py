@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_scenes import rasterize
-from places import SESSION
+from recorded_session import frames_of, opened, play
 
 from sags_node.detail.show import Detail
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
@@ -18,22 +18,19 @@ from sags_node.mapping.right_eye import right_eye_mask
 from sags_node.mapping.right_view import FADING, LEARN_EVERY, RightView
 from sags_node.messaging import published
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
-from sags_node.pipeline.session import open_session
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.warp import warp_to_right
 from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians
 
 FRAMES = 10
-FEW = ["mapping.max_gaussians:=6000"]
+FEW = "mapping.max_gaussians:=6000"
 
 
 @pytest.fixture(scope="module")
 def played() -> tuple[Pipeline, list[FrameResult]]:
-    overrides = ["source.pace:=step", f"source.frames:={FRAMES}", "publish.right:=true"]
-    session = open_session(SESSION, [*overrides, *FEW])
-    pipeline = Pipeline(session.config, session.rig)
-    with session.source as source:
-        return pipeline, [pipeline.process(frame, StepBudget(1)) for frame in source]
+    session = opened(f"source.frames:={FRAMES}", "publish.right:=true", FEW)
+    results, _, pipeline = play(session, frames_of(session), steps=1)
+    return pipeline, results
 
 
 def quality(result: FrameResult, picture: F32 | U8, known: Bool | None = None) -> float:
@@ -76,20 +73,19 @@ def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
     """Nobody looks, then somebody does, goes, and comes again; beside it a run in which nobody ever does.
     The first picture that is seen is better than the model alone."""
     looks = [False] * 4 + [True] * 4 + [False] * 2 + [True] * 2
-    session = open_session(SESSION, ["source.pace:=step", f"source.frames:={len(looks)}", *FEW])
+    session = opened(f"source.frames:={len(looks)}", FEW)
     watched, alone = (Pipeline(session.config, session.rig) for _ in range(2))
     came, looked = 0, False
-    with session.source as source:
-        for frame, look in zip(source, looks, strict=True):
-            first, looked = look and not looked, look
-            result = watched.process(frame, StepBudget(1), FrameRequest(right=look))
-            other = alone.process(frame, StepBudget(1))
-            assert np.array_equal(result.views["left"].rgb, other.views["left"].rgb)
-            assert ("right" in result.views) == look == (result.snapshot.right_colors is not None)
-            assert "right" not in other.views
-            if first:
-                came += 1
-                assert quality(result, shown(result)) > quality(result, model_alone(result))
+    for frame, look in zip(frames_of(session), looks, strict=True):
+        first, looked = look and not looked, look
+        result = watched.process(frame, StepBudget(1), FrameRequest(right=look))
+        other = alone.process(frame, StepBudget(1))
+        assert np.array_equal(result.views["left"].rgb, other.views["left"].rgb)
+        assert ("right" in result.views) == look == (result.snapshot.right_colors is not None)
+        assert "right" not in other.views
+        if first:
+            came += 1
+            assert quality(result, shown(result)) > quality(result, model_alone(result))
     assert came == 2
 
 
@@ -103,12 +99,11 @@ def test_a_frame_is_drawn_before_its_right_picture_teaches(monkeypatch: pytest.M
             return inner(*args, **more)
 
         monkeypatch.setattr(kind, name, spied)
-    session = open_session(SESSION, ["source.pace:=step", "source.frames:=3", *FEW])
+    session = opened("source.frames:=3", FEW)
     pipeline = Pipeline(session.config, session.rig)
-    with session.source as source:
-        for frame in source:
-            called.append("frame")
-            pipeline.process(frame, StepBudget(1), FrameRequest(right=True))
+    for frame in frames_of(session):
+        called.append("frame")
+        pipeline.process(frame, StepBudget(1), FrameRequest(right=True))
     frames = " ".join(called).split("frame")[1:]
     assert all(calls.split()[:2] == ["draw", "view"] for calls in frames)
     assert "learn_aside" in called and "learn" in called
@@ -116,12 +111,9 @@ def test_a_frame_is_drawn_before_its_right_picture_teaches(monkeypatch: pytest.M
 
 def test_who_comes_while_the_input_is_frozen_sees_something() -> None:
     """Frames that equal their predecessor are not mapped again, and have nothing to learn the eye from."""
-    session = open_session(SESSION, ["source.pace:=step", "source.frames:=3", *FEW])
-    pipeline = Pipeline(session.config, session.rig)
-    with session.source as source:
-        frames = list(source)
-    for frame in frames:
-        pipeline.process(frame, StepBudget(1))
+    session = opened("source.frames:=3", FEW)
+    frames = frames_of(session)
+    _, _, pipeline = play(session, frames, steps=1)
     assert "frame" in pipeline.process(replace(frames[-1], frame_id=7), StepBudget(1)).skipped
     came, after = (
         pipeline.process(replace(frames[-1], frame_id=n), StepBudget(1), FrameRequest(right=True))

@@ -6,18 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from places import SESSION
+from recorded_session import frames_of, opened, play, psnr
 
 from sags_node.engine.losses.pieces import LEVEL
 from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.geometry import project, unproject
 from sags_node.mapping import densify, initialise, split
-from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.split import split_worst
 from sags_node.model.gaussians import GaussianModel
-from sags_node.pipeline.pipeline import Pipeline
-from sags_node.pipeline.session import open_session
-from sags_node.quality.metrics import as_float, psnr
 from sags_node.types import F32, F64, Bool, Camera, Colours, FrameResult, Observation, RenderedView
 
 HEIGHT, WIDTH, DEPTH = 60, 80, 0.08
@@ -152,20 +148,13 @@ def count(results: list[FrameResult]) -> int:
 def played(monkeypatch: pytest.MonkeyPatch) -> Played:
     """Plays a recording with so many Gaussians: PSNR* and all else, frame by frame."""
 
-    def play(most: int, splits: bool) -> tuple[F64, list[FrameResult]]:
+    def with_most(most: int, splits: bool) -> tuple[F64, list[FrameResult]]:
         monkeypatch.setattr(split, "split_worst", split_worst if splits else lambda *args: 0)
-        session = open_session(SESSION, ["source.pace:=step", f"mapping.max_gaussians:={most}"])
-        pipeline, budget = Pipeline(session.config, session.rig), StepBudget(1)
-        errors, results = [], []
-        with session.source as source:
-            for frame in source:
-                result = pipeline.process(frame, budget)
-                view, seen = result.views["left"], result.observation
-                errors.append(psnr(as_float(view.rgb), as_float(seen.image), seen.tissue))
-                results.append(result)
-        return np.array(errors), results
+        session = opened(f"mapping.max_gaussians:={most}")
+        results, _, _ = play(session, frames_of(session), steps=1)
+        return np.array([psnr(result) for result in results]), results
 
-    return play
+    return with_most
 
 
 def test_the_same_number_of_gaussians_shows_more(played: Played, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,6 +28,13 @@ def filled_model(means: np.ndarray) -> GaussianModel:
     return model
 
 
+def filled_model_with_nodes(nodes: int) -> tuple[GaussianModel, NodeDeformation]:
+    model = filled_model(patch())
+    deformation = NodeDeformation(model.means, nodes)
+    deformation.attach(model, slice(0, model.count))
+    return model, deformation
+
+
 def test_removal_keeps_every_row_with_its_identity() -> None:
     model = filled_model(patch(100))
     model.colors[:, 0] = np.arange(100)
@@ -52,18 +59,9 @@ def test_capacity_is_never_exceeded_and_ids_are_never_reused() -> None:
     assert model.ids[0] == 60
 
 
-def test_frozen_copies_do_not_change_with_the_model() -> None:
-    model = filled_model(patch(20))
-    frozen = model.snapshot()
-    model.means[:] += 1
-    assert not np.any(frozen.means == model.means)
-
-
 def test_a_translation_seen_by_some_moves_all() -> None:
     """Half of the sheet is hidden; it must follow its neighbours."""
-    model = filled_model(patch())
-    deformation = NodeDeformation(model.means, 200)
-    deformation.attach(model, slice(0, model.count))
+    model, deformation = filled_model_with_nodes(200)
     start = model.means.copy()
     move = np.array([1e-3, -5e-4, 2e-3], np.float32)
     seen = (start[:, 0] < 0.012).astype(np.float32)
@@ -79,9 +77,7 @@ def test_tissue_that_turns_takes_places_and_orientations_along(monkeypatch: pyte
 
     def follow() -> tuple[float, np.ndarray]:
         """How far the Gaussians away from the rim are from where they should be, and how they turned."""
-        model = filled_model(patch())
-        deformation = NodeDeformation(model.means, 200)
-        deformation.attach(model, slice(0, model.count))
+        model, deformation = filled_model_with_nodes(200)
         move = (model.means - model.means.mean(0)) @ gradient.T
         inner = np.abs(model.means[:, :2]).max(1) < 0.02  # nodes at the rim have neighbours on one side only
         there = model.means + move
@@ -97,9 +93,7 @@ def test_tissue_that_turns_takes_places_and_orientations_along(monkeypatch: pyte
 
 
 def test_nodes_average_noise_away() -> None:
-    model = filled_model(patch())
-    deformation = NodeDeformation(model.means, 100)
-    deformation.attach(model, slice(0, model.count))
+    model, deformation = filled_model_with_nodes(100)
     start = model.means.copy()
     noise = np.random.default_rng(1).normal(0, 1e-3, start.shape).astype(np.float32)
     deformation.follow(model, noise, np.ones(model.count, np.float32))
@@ -107,8 +101,7 @@ def test_nodes_average_noise_away() -> None:
 
 
 def test_new_tissue_far_away_gets_nodes_of_its_own() -> None:
-    model = filled_model(patch())
-    deformation = NodeDeformation(model.means, 100)
+    model, deformation = filled_model_with_nodes(100)
     nodes = len(deformation.nodes)
     model.remove(np.arange(model.count) < 10)
     far = patch(10) + np.array([0.2, 0, 0], np.float32)

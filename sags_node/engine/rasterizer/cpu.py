@@ -96,18 +96,8 @@ class CpuRasterizer:
         splats = self._splats[:n]
         self._project(gaussians, splats)
         self._bin(splats, tiles)
-        compositing.composite(
-            splats,
-            self._pairs,
-            self._tile_starts,
-            self._drawn,
-            self._next,
-            self._scratch,
-            self._width,
-            self._height,
-            self._planes.reshape(-1),
-            self._tile_ends,
-        )
+        lists = splats, self._pairs, self._tile_starts
+        compositing.composite(*lists, *self._work, self._planes.reshape(-1), self._tile_ends)
         self._given = gaussians
         return self._planes
 
@@ -184,21 +174,8 @@ class CpuRasterizer:
         v_planes, weight = checked_cotangents(v_planes, weight, self._width, self._height)
         if len(self._v_pairs) < RECORD * len(self._emitted):
             self._v_pairs = aligned((RECORD * len(self._emitted),))
-        compositing.composite_backward(
-            self._splats[: len(given)],
-            self._pairs,
-            self._tile_starts,
-            self._tile_ends,
-            self._drawn,
-            self._next,
-            self._scratch,
-            self._width,
-            self._height,
-            self._planes.reshape(-1),
-            v_planes.reshape(-1),
-            weight.reshape(-1),
-            self._v_pairs,
-        )
+        flat = self._planes.reshape(-1), v_planes.reshape(-1), weight.reshape(-1)
+        compositing.composite_backward(*self._blended(given), *self._work, *flat, self._v_pairs)
         return self._project_backward(given)
 
     def _project_backward(self, given: Gaussians) -> Gradients:
@@ -230,20 +207,19 @@ class CpuRasterizer:
         return found
 
     def median(self) -> tuple[F32, I32]:
-        median.median(
-            self._splats[: len(drawn(self._given, "median"))],
-            self._pairs,
-            self._tile_starts,
-            self._tile_ends,
-            self._drawn,
-            self._next,
-            self._scratch,
-            self._width,
-            self._height,
-            self._median_depths.reshape(-1),
-            self._median_rows.reshape(-1),
-        )
-        return self._median_depths, self._median_rows
+        found = self._median_depths, self._median_rows
+        blended = self._blended(drawn(self._given, "median"))
+        median.median(*blended, *self._work, *(array.reshape(-1) for array in found))
+        return found
+
+    @property
+    def _work(self) -> tuple[Any, Any, Any, Any, Any]:
+        """What the workers share that go from tile to tile."""
+        return self._drawn, self._next, self._scratch, self._width, self._height
+
+    def _blended(self, given: Gaussians) -> tuple[Any, Any, Any, Any]:
+        """What was blended of them, tile by tile."""
+        return self._splats[: len(given)], self._pairs, self._tile_starts, self._tile_ends
 
 
 def _integral(tiles: Bool) -> I32:

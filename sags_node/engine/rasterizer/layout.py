@@ -64,22 +64,7 @@ SLOTS = np.dtype([("first", "i4"), ("count", "i4")])
 # Sums over pixels of g = dL/d(log alpha): moments in the whitened coordinates u, v of the Gaussian.
 SPLAT_GRADIENT = np.dtype(
     {
-        "names": [
-            "sum",
-            "u",
-            "v",
-            "uu",
-            "uv",
-            "vv",
-            "red",
-            "green",
-            "blue",
-            "depth",
-            "contribution",
-            "slope_u",
-            "slope_v",
-            "spread",
-        ],
+        "names": "sum u v uu uv vv red green blue depth contribution slope_u slope_v spread".split(),
         "formats": ["f4"] * 14,
         "itemsize": 64,
     }

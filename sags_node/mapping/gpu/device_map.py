@@ -91,11 +91,10 @@ class DeviceMap:
     def optimise(self, gradients: dict[str, wp.array], rates: LearningRates, camera: Camera) -> None:
         """`optimiser.Optimiser.step`."""
         self._steps += 1
-        lengths = [rates.mean_px] * 3 + [rates.quat] * 4 + [rates.log_scale] * 3 + [rates.opacity_logit]
         corrections = [1.0 / (1.0 - beta**self._steps) for beta in (BETA1, BETA2)]
         names = [name for name in REFINED if name != "contribution"]
         self._launch(kernels.optimise, len(gradients["means"]), [
-            *(gradients[name] for name in DERIVED), kernels.parameters(*lengths),
+            *(gradients[name] for name in DERIVED), kernels.parameters(*rates.of_columns),
             wp.vec4(*camera.viewmat[2].astype(np.float32)), float(camera.K[0, 0]), *corrections,
             *(self._live(name) for name in names), self.adam_m, self.adam_v,
         ])  # fmt: skip

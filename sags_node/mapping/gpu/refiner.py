@@ -20,7 +20,7 @@ from sags_node.mapping.focus import largest, tile_grid
 from sags_node.mapping.gpu import kernels
 from sags_node.mapping.gpu.device_map import DeviceMap
 from sags_node.mapping.optimiser import LearningRates
-from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT, CpuRefiner
+from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT, CpuRefiner, Refiner
 from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, U8, Bool, Camera, Finding, Gaussians, Observation
@@ -44,13 +44,14 @@ def _or_on_the_cpu(
             except RuntimeError as error:  # Warp raises the driver's errors so, and those of memory
                 self._give_up(error)
         result: Result = getattr(self._cpu, method.__name__)(*args, **names)
+        self.loss = self._cpu.loss
         return result
 
     return guarded
 
 
-class GpuRefiner:
-    """`refiner.Refiner` on the current GPU.
+class GpuRefiner(Refiner):
+    """The refiner on the current GPU.
 
     A frame in which the GPU fails is finished on the CPU, which goes on for good: a CUDA error cannot be
     recovered from in the same process. The model still stands there as it was before the frame's steps, so
@@ -69,26 +70,19 @@ class GpuRefiner:
         Raises:
             UsageError: no GPU can be used.
         """
-        self.share = 1.0
-        self.problem: Finding | None = None
         self._cpu, self._cpu_share = cpu, cpu_share
         self._device = device.gpu()
         self.on_gpu = DeviceMap(self._device)
-        self._loss = 0.0
         self._frame: tuple[GaussianModel, NodeDeformation, Observation, float] | None = None
-        self._pictures: dict[tuple[int, int], Picture] = {}  # by their size
-        self._viewers: dict[tuple[int, int], Picture] = {}  # those of `show`
-
-    @property
-    def loss(self) -> float:
-        return self._loss if self.problem is None else self._cpu.loss
+        make = functools.partial(Picture, device=self._device)
+        self._picture_of, self._viewer_of = functools.cache(make), functools.cache(make)
 
     @_or_on_the_cpu
     def begin(
         self, model: GaussianModel, deformation: NodeDeformation, observation: Observation, node_step: float
     ) -> None:
         self._frame = model, deformation, observation, node_step
-        self._picture = self._picture_for(observation.camera, self._pictures)
+        self._picture = self._picture_of(observation.camera.width, observation.camera.height)
         self._picture.show(observation.image, observation.tissue, observation.depth)
         self._view = view_of(observation.camera)
         self._changed = False
@@ -103,13 +97,10 @@ class GpuRefiner:
         if self._changed:
             loss = self._picture.loss()
             self.on_gpu.download()
-            self._loss, self._changed = loss, False
+            self.loss, self._changed = loss, False
 
-    @_or_on_the_cpu
-    def draw(self, tiles: Bool | None = None, share: float = 0.0) -> None:
-        if tiles is not None and share > 0:
-            tiles = None if share >= 1 else tiles | self._worst_tiles(share)
-        self._draw(tiles)
+    draw = _or_on_the_cpu(Refiner.draw)
+    refine_worst = _or_on_the_cpu(Refiner.refine_worst)
 
     @_or_on_the_cpu
     def planes(self) -> F32:
@@ -120,15 +111,8 @@ class GpuRefiner:
         self.on_gpu.note_contribution(self._step(rates))
 
     @_or_on_the_cpu
-    def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
-        tiles = self._worst_tiles(share)
-        self._draw(tiles)
-        self._step(rates, nodes)
-        return tiles
-
-    @_or_on_the_cpu
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
-        picture = self._picture_for(camera, self._viewers)
+        picture = self._viewer_of(camera.width, camera.height)
         picture.rasterizer.forward(sent(gaussians, self._device), view_of(camera))
         return picture.fetched(anew=True)
 
@@ -146,7 +130,7 @@ class GpuRefiner:
             self._cpu.begin(*self._frame)
             self._cpu.draw()
 
-    def _draw(self, tiles: Bool | None) -> None:
+    def _forward(self, tiles: Bool | None) -> None:
         self._picture.rasterizer.forward(self.on_gpu.drawn(), self._view, tiles)
         self._picture.is_fetched = False
 
@@ -166,12 +150,6 @@ class GpuRefiner:
 
     def _worst_tiles(self, share: float) -> Bool:
         return largest(self._picture.residuals(), share)
-
-    def _picture_for(self, camera: Camera, made: dict[tuple[int, int], Picture]) -> Picture:
-        size = camera.width, camera.height
-        if size not in made:
-            made[size] = Picture(*size, self._device)
-        return made[size]
 
 
 class Picture:
