@@ -96,7 +96,8 @@ def _stamp(path: Path, message: BagMessage) -> int:
 
 
 class BagPairs(Pairs):
-    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough.
+    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough. Going back
+    begins to read it anew.
 
     Raises:
         UsageError: there is no bag, its topics are not clear, or nothing pairs.
@@ -119,26 +120,22 @@ class BagPairs(Pairs):
         self._layout = Layout(config.geometry)
         self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
         self._size: tuple[int, int] | None = None
-        self.seek(0)
-
-    def seek(self, index: int) -> None:
-        self._next = index
-        self._waiting: dict[tuple[int, Key], BagMessage] = {}
         self._messages: Iterator[BagMessage] | None = None
 
-    def read(self) -> RawPair | None:
-        if self._next >= self.count:
+    def at(self, index: int) -> RawPair | None:
+        if index >= self.count:
             return None
-        if self._messages is None:
-            start_ns = min(key[0] for keys in self._keys[self._next :] for key in keys)
+        if self._messages is None or index <= self._index:
+            self._waiting: dict[tuple[int, Key], BagMessage] = {}
+            start_ns = min(key[0] for keys in self._keys[index:] for key in keys)
             self._messages = read_messages(self._path, self._eyes, start_ns)
-        left_key, right_key = self._keys[self._next]
+        self._index = index
+        left_key, right_key = self._keys[index]
         if self._layout.shows_both:
             left, right = self._layout.eyes(self._picture(0, left_key))
         else:
             left = self._layout.eye(self._picture(0, left_key), "left")
             right = self._layout.eye(self._picture(1, right_key), "right")
-        self._next += 1
         return RawPair(left, right, None)
 
     def close(self) -> None:
@@ -155,7 +152,7 @@ class BagPairs(Pairs):
         if size != self._size:
             raise SagsError(
                 f"{where}: {size_text(*size)} px, but the pictures before are {size_text(*self._size)}; "
-                f"all pictures must have one size: play what is before with source.frames:={self._next}"
+                f"all pictures must have one size: play what is before with source.frames:={self._index}"
             )
         return picture
 
@@ -173,7 +170,7 @@ class BagPairs(Pairs):
             found = message.log_ns, _stamp(self._path, message)
             if (side, found) == (eye, key):
                 return message
-            if self._turns[side].get(found, -1) >= self._next:
+            if self._turns[side].get(found, -1) >= self._index:
                 self._waiting[side, found] = message
             if len(self._waiting) > MAX_WAITING:
                 raise SagsError(

@@ -77,7 +77,6 @@ class EndoNerfPairs(FolderPairs):
             K = _intrinsics(self._llff.width, self._llff.height, self._llff.focal)
             fits = None if self._depth_files is None else reading_that_fits(poses, K, self._look)
             axes = fits or "opencv"
-            self.seek(0)
         self._T_world_cam = READINGS[axes](poses)
         if said == "auto" and axes != "opencv":
             what = f"poses_bounds.npy: of two frames with depth the poses fit as {axes}, and are read so"
@@ -85,13 +84,12 @@ class EndoNerfPairs(FolderPairs):
             self.judged = (Finding("warning", what, fix),)
 
     def _look(self, index: int) -> Seen:
-        self.seek(index)
-        pair = self.read()
+        pair = self.at(index)
         assert pair is not None and pair.depth is not None and pair.tissue is not None  # `count` is checked
         return Seen(pair.left, pair.depth, pair.tissue)
 
-    def read(self) -> RawPair | None:
-        index, pair = self._next, super().read()
+    def at(self, index: int) -> RawPair | None:
+        pair = super().at(index)
         if pair is None:
             return None
         depth = None if self._depth_files is None else self._read_depth(self._depth_files[index])

@@ -183,7 +183,6 @@ class Replay:
             SagsError: a picture is damaged, or the right eye ends before the left one.
         """
         stride = self._config.stride
-        self.pairs.seek(self.first * stride)
         self._began = None
         self._dropped_in_a_row = 0
         epoch, index, frame_id, last = 0, self.first, self.first, 0
@@ -191,10 +190,10 @@ class Replay:
         while not self._stopped.is_set() and frame_id != limit:
             pair = None
             if self._is_too_late(frame_id):
-                ended = not self.pairs.skip()
+                ended = index * stride >= self.pairs.count
             else:
                 try:
-                    pair = self.pairs.read()
+                    pair = self.pairs.at(index * stride)
                     ended = pair is None
                 except LostPictureError as lost:
                     say(str(lost))
@@ -202,7 +201,6 @@ class Replay:
             if ended:
                 if not self._config.loop or index == self.first:
                     return
-                self.pairs.seek(self.first * stride)
                 epoch, index = epoch + 1, self.first
                 continue
             if pair is None:
@@ -240,8 +238,6 @@ class Replay:
                     recorded_s=self.seconds_of(index),
                     recorded_number=number,
                 )
-            for _ in range(stride - 1):
-                self.pairs.skip()
             index += 1
             frame_id += 1
 

@@ -82,17 +82,8 @@ class ScaredPairs(Pairs):
         stamps = self._pictures.stamps
         self.stamps = None if stamps is None else stamps[: self.count]
 
-    def seek(self, index: int) -> None:
-        self._pictures.seek(index)
-        self._next = index
-
-    def skip(self) -> bool:
-        self._next += 1
-        return self._next <= self.count and self._pictures.skip()
-
-    def read(self) -> RawPair | None:
-        index, self._next = self._next, self._next + 1
-        pair = self._pictures.read() if index < self.count else None
+    def at(self, index: int) -> RawPair | None:
+        pair = self._pictures.at(index) if index < self.count else None
         if pair is None:
             return None
         return pair._replace(

@@ -66,10 +66,9 @@ class VideoPairs(Pairs):
         self.reach = min(self.count, *(each.count for each in self._videos))
         self._compare_lengths()
 
-    def read(self) -> RawPair | None:
-        if self._next >= self.count:
+    def at(self, index: int) -> RawPair | None:
+        if index >= self.count:
             return None
-        index, self._next = self._next, self._next + 1
         of_left, of_right = (int(number) for number in self._numbers[index])
         left = self.left.read(of_left)
         if left is None:
@@ -227,10 +226,9 @@ class OneVideoPairs(Pairs):
         self.reach = self.count
         self.oddities = _oddities(video, layout)
 
-    def read(self) -> RawPair | None:
-        if self._next >= self.count:
+    def at(self, index: int) -> RawPair | None:
+        if index >= self.count:
             return None
-        index, self._next = self._next, self._next + 1
         pictures = [self._video.read(int(number)) for number in self._numbers[index]]
         first, last = pictures[0], pictures[-1]
         if first is None or last is None:
