@@ -336,7 +336,8 @@ def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int
             f"{log} holds messages that {file.name} lacks: its recorder was killed or still runs; "
             f'then: sqlite3 {shlex.quote(str(file))} "PRAGMA wal_checkpoint(TRUNCATE)"'
         )
-    positions = rosbag1_check.chunk_positions(file) if ros1 else frozenset()
+    seen = file.stat()
+    positions = rosbag1_check.chunk_positions(file, seen.st_size, seen.st_mtime_ns) if ros1 else frozenset()
     reader: Any = rosbag1.Reader(file) if ros1 else rosbag2.Reader(file)
     with _damage_as_one_error(), reader:
         if ros1 and not {info.pos for info in reader.chunk_infos} <= positions:

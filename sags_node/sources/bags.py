@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -35,18 +35,12 @@ STAMP_END = 12  # bytes: encoding and stamp of a message with a header
 MOST_INFOS = 10_000  # of one topic that differ: a zoom that moves all the time says enough
 
 
-@dataclass(slots=True)
-class _Topic:
-    type: str
-    keys: list[Key] = field(default_factory=list)
-
-
 @dataclass(frozen=True, slots=True)
 class Contents:
     """What one reading of a bag found."""
 
     types: dict[str, str]  # every topic
-    pictures: dict[str, _Topic]
+    pictures: dict[str, list[Key]]  # of each topic
     infos: dict[str, list[tuple[int, bytes]]]  # of each topic the camera_info that differ from those before
 
 
@@ -71,14 +65,13 @@ def read_contents(path: Path) -> Contents:
 @lru_cache(maxsize=1)
 def _read_contents(path: Path, changed: int) -> Contents:
     types: dict[str, str] = {}
-    pictures: dict[str, _Topic] = {}
+    pictures: dict[str, list[Key]] = {}
     infos: dict[str, list[tuple[int, bytes]]] = {}
     newest: dict[str, bytes] = {}
     for message in read_messages(path):
         types.setdefault(message.topic, message.type)
         if message.type in IMAGE_TYPES:
-            key = message.log_ns, _stamp(path, message)
-            pictures.setdefault(message.topic, _Topic(message.type)).keys.append(key)
+            pictures.setdefault(message.topic, []).append((message.log_ns, _stamp(path, message)))
         elif message.type == CAMERA_INFO:
             data, said = bytes(message.data), infos.setdefault(message.topic, [])
             if newest.get(message.topic) != data[STAMP_END:] and len(said) < MOST_INFOS:
@@ -108,7 +101,7 @@ class BagPairs(Pairs):
         self._path = config.path
         contents = read_contents(config.path)
         self._eyes = find_eyes(config, contents)
-        left, right = (contents.pictures[name].keys for name in self._eyes)
+        left, right = (contents.pictures[name] for name in self._eyes)
         self._keys, self.stamps = pair_messages(config, left, right)
         self.count = len(self._keys)
         numbers = {key: number for number, key in enumerate(left)}
@@ -121,6 +114,7 @@ class BagPairs(Pairs):
         self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
         self._size: tuple[int, int] | None = None
         self._messages: Iterator[BagMessage] | None = None
+        self._index = -1  # of the pair that was read last
 
     def at(self, index: int) -> RawPair | None:
         if index >= self.count:
@@ -158,7 +152,7 @@ class BagPairs(Pairs):
 
     def _is_sorted(self) -> bool:
         topics = read_contents(self._path).pictures
-        return all((np.diff([key[0] for key in topics[eye].keys]) >= 0).all() for eye in self._eyes)
+        return all((np.diff([key[0] for key in topics[eye]]) >= 0).all() for eye in self._eyes)
 
     def _find(self, eye: int, key: Key) -> BagMessage:
         """Read forward to one message; those of later pairs wait in memory."""
@@ -287,7 +281,7 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
 
 def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:
     """Stamps [N, 2] of the pairs that are played, ns."""
-    left, right = (contents.pictures[name].keys for name in eyes)
+    left, right = (contents.pictures[name] for name in eyes)
     stamps = pair_messages(config, left, right)[1][:: config.stride]
     first = int(np.searchsorted(stamps[:, 0], stamps[0, 0] + round(config.start * 1e9)))
     return stamps[first:][: config.frames]

@@ -146,12 +146,9 @@ class LiveStereo(LivePairs):
         joined = self._alternation.add(picture)
         if joined is None:
             return None
-        of = dict(zip(self._layout.order, joined, strict=True))
-        left, right = (_of(of[side], self._layout.eye(of[side].image, side)) for side in SIDES)
-        return left, right
-
-
-SIDES: tuple[Side, Side] = ("left", "right")
+        images = self._layout.in_turn(*(shot.image for shot in joined))
+        left, right = joined if self._layout.order[0] == "left" else joined[::-1]
+        return _of(left, images[0]), _of(right, images[1])
 
 
 def _of(shot: Shot, image: U8) -> Picture:

@@ -19,7 +19,7 @@ from sags_node.sources.endonerf import EndoNerfPairs
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import FolderPairs, Pairs, say
 from sags_node.sources.scared import ScaredPairs
-from sags_node.sources.truth import Poses, References
+from sags_node.sources.truth import References, read_poses
 from sags_node.sources.videos import OneVideoPairs, VideoPairs
 from sags_node.types import U8, StereoFrame
 from sags_node.wall_clock import WallClock
@@ -91,12 +91,12 @@ class Replay:
         self._clock = clock
         self._wall_ns = wall_ns
         self._sleep = sleep or self._stopped.wait
-        self._poses = None if config.poses is None else Poses(config.poses)
+        self._poses = None if config.poses is None else read_poses(config.poses)
         self._references = References(config.reference) if references else None
         self.pairs = open_pairs(config, references)
         lefts = self.pairs.count if self.pairs.left_count is None else self.pairs.left_count
         if self._poses is not None:
-            self._compare_poses(self._poses, lefts)
+            self._compare_poses(len(self._poses), lefts)
         if self._references is not None:
             self._compare_references(self._references, lefts)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
@@ -125,8 +125,7 @@ class Replay:
                 self.pairs.close()
                 raise UsageError(f"{self.pairs.cut_off}, or play what is there with source.frames:={there}")
 
-    def _compare_poses(self, poses: Poses, lefts: int) -> None:
-        there = len(poses)
+    def _compare_poses(self, there: int, lefts: int) -> None:
         if there == lefts or (self.pairs.cut_off and there > lefts):  # the pictures that it lost have poses
             return
         self.pairs.close()
@@ -210,7 +209,7 @@ class Replay:
                 self._dropped_in_a_row = 0
                 numbers = self.pairs.left_numbers
                 number = index * stride if numbers is None else int(numbers[index * stride])
-                pose = pair.T_world_cam if self._poses is None else self._poses.at(number)
+                pose = pair.T_world_cam if self._poses is None else self._poses[number]
                 reference = pair.reference
                 if reference is None and self._references is not None:
                     reference = self._references.at(number, pair.left.shape[1::-1])

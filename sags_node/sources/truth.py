@@ -24,40 +24,28 @@ _LARGEST = 2**31  # bytes
 FARTHEST = 1.0  # m that a scope moves: a millimetre that is taken for a metre
 
 
-class Poses:
-    """Camera poses of a recording, one per frame.
+def read_poses(file: Path) -> F64:
+    """`T_world_cam` [T, 4, 4] m of each frame of a recording.
 
     Raises:
-        UsageError: the file is missing, damaged, or does not hold `T_world_cam` [T, 4, 4].
+        UsageError: the file is missing, damaged, or does not hold that.
     """
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._poses = load_array(file, "T_world_cam", (None, 4, 4)).astype(np.float64)
-        if not np.isfinite(self._poses).all():
-            raise UsageError(f"{file}: T_world_cam holds values that are not finite")
-        rigid = is_rotation(self._poses[:, :3, :3]) & (self._poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
-        if not rigid.all():
-            raise UsageError(
-                f"{file}: T_world_cam of frame {int(np.argmin(rigid))} is no rotation and translation; "
-                "is it transposed, or scaled?"
-            )
-        moved = np.ptp(self._poses[:, :3, 3], axis=0).max(initial=0)
-        if moved > FARTHEST:
-            raise UsageError(
-                f"{file}: T_world_cam moves the camera by {moved:.3g} m, more than within a patient; "
-                "translations are in metres: of millimetres divide them by 1000"
-            )
-
-    def __len__(self) -> int:
-        return len(self._poses)
-
-    def at(self, index: int) -> F64:
-        """`T_world_cam` [4, 4] of one frame of the recording, metres."""
-        if index >= len(self._poses):
-            raise SagsError(f"{self._file} holds {len(self._poses)} poses, none for frame {index}")
-        pose: F64 = self._poses[index]
-        return pose
+    poses = load_array(file, "T_world_cam", (None, 4, 4)).astype(np.float64)
+    if not np.isfinite(poses).all():
+        raise UsageError(f"{file}: T_world_cam holds values that are not finite")
+    rigid = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
+    if not rigid.all():
+        raise UsageError(
+            f"{file}: T_world_cam of frame {int(np.argmin(rigid))} is no rotation and translation; "
+            "is it transposed, or scaled?"
+        )
+    moved = np.ptp(poses[:, :3, 3], axis=0).max(initial=0)
+    if moved > FARTHEST:
+        raise UsageError(
+            f"{file}: T_world_cam moves the camera by {moved:.3g} m, more than within a patient; "
+            "translations are in metres: of millimetres divide them by 1000"
+        )
+    return poses
 
 
 class References:

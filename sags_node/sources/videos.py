@@ -62,7 +62,7 @@ class VideoPairs(Pairs):
         self.left_count, self.left_numbers = self.left.count, self._numbers[:, 0]
         self.stamps = self._find_stamps()
         self.pixel_aspect = layout.pixel_aspect(*self.left.size, self.left.pixel_aspect)
-        self.cut_off = next((_cut_off(each) for each in self._videos if each.cut_off), "")
+        self.cut_off = next((each.cut_off for each in self._videos if each.cut_off), "")
         self.reach = min(self.count, *(each.count for each in self._videos))
         self._compare_lengths()
 
@@ -222,8 +222,7 @@ class OneVideoPairs(Pairs):
             of_eyes = video.stamps[self._numbers]
             self.stamps = np.stack([of_eyes[:, left], of_eyes[:, -1 - left]], axis=1)
         self.pixel_aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
-        self.cut_off = _cut_off(video) if video.cut_off else ""
-        self.reach = self.count
+        self.cut_off, self.reach = video.cut_off, self.count
         self.oddities = _oddities(video, layout)
 
     def at(self, index: int) -> RawPair | None:
@@ -234,8 +233,7 @@ class OneVideoPairs(Pairs):
         if first is None or last is None:
             return None
         if self._layout.is_sequential:
-            of = dict(zip(self._layout.order, (first, last), strict=True))
-            left, right = self._layout.eye(of["left"], "left"), self._layout.eye(of["right"], "right")
+            left, right = self._layout.in_turn(first, last)
         else:
             left, right = self._layout.eyes(first)
         painted = self._layout.tools(first)
@@ -250,10 +248,6 @@ def _oddities(video: Video, layout: Layout) -> list[str]:
     if not video.is_interlaced or layout.takes_fields:
         return video.oddities
     return [*video.oddities, f"{video.path}: {TORN}; set source.geometry.deinterlace:=top, or bottom"]
-
-
-def _cut_off(video: Video) -> str:
-    return f"{video.path} {video.cut_off}; copy it again"
 
 
 def _turns(video: Video) -> I64:

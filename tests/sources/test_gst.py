@@ -28,7 +28,7 @@ from waiting import beside, until
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import GeometryConfig, GstSource, LaunchConfig
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources import gst_child, gst_library
+from sags_node.sources import gst_child
 from sags_node.sources.gst import Sink, open_pipeline
 from sags_node.sources.gst_process import GstProcess, in_words
 from sags_node.tools.calibration.eyes import look
@@ -208,13 +208,13 @@ class Unstamped:
     def app_sink_try_pull_preroll(self, element: int, wait_ns: int) -> int:
         return 1
 
-    def picture(self, sample: int) -> gst_library.Picture:
-        return gst_library.Picture(gst_library.NONE, gst_library.NONE, 9216)
+    def picture(self, sample: int) -> gst_child.Picture:
+        return gst_child.Picture(gst_child.NONE, gst_child.NONE, 9216)
 
 
 def test_pictures_without_stamps_are_refused() -> None:
     sink = gst_child.Sink(Unstamped(), 1, WallClock(), "left", 0, None)
-    with pytest.raises(gst_library.GstError, match="pictures of left carry no time stamp") as raised:
+    with pytest.raises(gst_child.GstError, match="pictures of left carry no time stamp") as raised:
         sink.show_first()
     assert "add do-timestamp=true" in in_words(str(raised.value), raised.value.debug)
 

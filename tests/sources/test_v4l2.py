@@ -22,7 +22,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.sources import live
 from sags_node.sources.live import LiveStereo
 from sags_node.sources.pairing import Shot
-from sags_node.sources.v4l2 import STRANGE, Device, open_cameras, wall_stamp
+from sags_node.sources.v4l2 import STRANGE, Device, open_cameras
 
 pytestmark = pytest.mark.live
 
@@ -262,20 +262,6 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Dev
     return build
 
 
-@pytest.mark.parametrize(
-    ("driver_ns", "expected"),
-    [
-        (95_000_000_000, 995_000_000_000),  # 5 s old: it waited in the driver
-        (99_980_000_000, 999_980_000_000),  # 20 ms old
-        (100_060_000_000, 1_000_000_000_000),  # ahead of its arrival
-        (0, 1_000_000_000_000),  # the driver gives none
-        (1_000_000_000_000, 1_000_000_000_000),  # a wall clock stamp
-    ],
-)
-def test_wall_stamp(driver_ns: int, expected: int) -> None:
-    assert wall_stamp(driver_ns, 100_000_000_000, 1_000_000_000_000) == expected
-
-
 @pytest.fixture
 def told(device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[float]]:
     """How old pictures are said to be of which a driver says these ages, s."""
@@ -300,6 +286,11 @@ def test_what_waited_in_the_driver_keeps_its_age(
     """Four buffers of before a stop, also where they are the very first."""
     ages = before + [stopped_s] * 4
     assert told(ages) == pytest.approx(ages, abs=0.01)
+
+
+def test_no_picture_is_taken_after_it_arrived(told: Callable[..., list[float]]) -> None:
+    """vivid stamps ahead; a stamp of the wall clock is ahead by years."""
+    assert told([-0.06, 0.02, -1e9]) == pytest.approx([0.0, 0.02, 0.0], abs=1e-3)
 
 
 def test_stamps_of_a_clock_of_its_own_are_found_out(told: Callable[..., list[float]]) -> None:
