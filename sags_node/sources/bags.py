@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sags_node.bags.bag import BagMessage, read_messages
-from sags_node.bags.camera_info import Said, changes, in_force, read_eye
+from sags_node.bags.camera_info import Said, changes, in_force, read_eye, topic_of
 from sags_node.bags.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
@@ -260,10 +260,8 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
     contents = read_contents(config.path)
     eyes = find_eyes(config, contents)
     found = [
-        _info(config, contents, key, name, topic)
-        for key, name, topic in zip(
-            ("left_info", "right_info"), (config.left_info, config.right_info), eyes, strict=True
-        )
+        _info(config, contents, "left_info", config.left_info, eyes.left),
+        _info(config, contents, "right_info", config.right_info, eyes.right),
     ]
     played = _played(config, contents, eyes)
     left, right = (
@@ -314,8 +312,7 @@ def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> E
 
 def _info(config: BagSource, contents: Contents, key: str, name: str | None, topic: str) -> str | None:
     if name is None:
-        beside = topic.removesuffix(COMPRESSED).rpartition("/")[0] + "/camera_info"
-        return beside if beside in contents.infos else None
+        return topic_of(topic) if topic_of(topic) in contents.infos else None
     for candidate in (name, f"/{name}", name.lstrip("/")):
         if candidate in contents.infos:
             return candidate
