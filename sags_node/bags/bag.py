@@ -169,17 +169,14 @@ def check_one(folder: Path) -> None:
 
 def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
-    return sorted(folder.glob(f"{SHOWN}{suffix}"), key=lambda file: (_number(file.stem), file.name))
+    found = folder.glob(f"{SHOWN}{suffix}")
+    return sorted(found, key=lambda file: (_whole(file.stem.rpartition("_")[2]), file.name))
 
 
 def _stem(stem: str) -> str:
     """The name of a recording whose files are numbered: case_0, case_1."""
     name, _, digits = stem.rpartition("_")
     return name if digits.isdecimal() else stem
-
-
-def _number(stem: str) -> int:
-    return _whole(stem.rpartition("_")[2])
 
 
 def _whole(digits: str) -> int:

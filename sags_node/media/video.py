@@ -211,9 +211,8 @@ class Video:
             late = self.stamps - self.stamps[0] - np.arange(self.count) * (1e9 / rate)
             if np.abs(late).max() <= min(SAME, 0.25e9 / rate):
                 return rate, True
-        usual = 1e9 / float(
-            np.mean(steps[steps < 1.5 * np.median(steps)])
-        )  # stamps may be whole milliseconds
+        # The mean of usual steps, as stamps may be whole milliseconds.
+        usual = 1e9 / float(np.mean(steps[steps < 1.5 * np.median(steps)]))
         return next((rate for rate in reversed(told) if abs(rate - usual) < 0.01 * usual), usual), False
 
     def _restart(self) -> av.VideoFrame | None:

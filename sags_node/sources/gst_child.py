@@ -63,8 +63,7 @@ class GstError(Exception):
 class Picture(NamedTuple):
     """What is known of a buffer."""
 
-    pts: int  # ns, `NONE` where it has no stamp
-    running: int  # ns since the pipeline's base time, `NONE` where that cannot be said
+    running: int  # ns since the pipeline's base time, `NONE` where it has no stamp or that cannot be said
     bytes: int
 
 
@@ -188,7 +187,7 @@ class Gst:
         running = NONE
         if pts != NONE:
             running = self.segment_to_running_time(self.sample_get_segment(sample), TIME, pts)
-        return Picture(pts, running, self.buffer_get_size(buffer))
+        return Picture(running, self.buffer_get_size(buffer))
 
     def caps(self, sample: int) -> Caps:
         structure = self.caps_get_structure(self.sample_get_caps(sample), 0)
@@ -275,7 +274,7 @@ class Sink:
 
     def _look(self, sample: int, picture: Picture, live: bool) -> None:
         """Refuse what cannot be handed over; of the first picture, say what kind it is."""
-        if NONE in (picture.pts, picture.running):
+        if picture.running == NONE:
             raise GstError(
                 f"the pictures of {self.name} carry no time stamp",
                 "add do-timestamp=true to the source, or a parser (h264parse) before the decoder",
