@@ -99,13 +99,6 @@ def test_pictures_of_two_senders_are_not_mixed(source: PushedPictures) -> None:
     assert set(taker.numbers) == {(1, 1), (2, 2)}
 
 
-def test_a_wrong_size_is_told(source: PushedPictures) -> None:
-    with FrameSender(source.endpoint) as sender:
-        said = sent_until_told(sender, numbered(1, 320), numbered(1, 320))
-        assert "320x120 px" in said and "160x120" in said
-        assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
-
-
 def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures) -> None:
     wrong = {
         "pictures come on NAME/left/image_raw": ("middle/image_raw", numbered(1), "rgb8"),
@@ -132,12 +125,15 @@ def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures
             assert words in problem and "\n" not in problem
 
 
-def test_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
+def test_wrong_sizes_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
     with zmq_socket(zmq.DEALER, source.endpoint) as stranger:
         for parts in ([b""], [b"x"] * 9, [b"a/left/image_raw", b"\xc1", b"data"], [b"t"] * 100):
             stranger.send_multipart(parts)
         with FrameSender(source.endpoint) as sender:
             assert "damaged" in sent_until_told(sender, b"\xff\xd8 no JPEG", b"\xff\xd8 no JPEG")
+        with FrameSender(source.endpoint) as sender:
+            assert "320x120 px, it must be 160x120" in sent_until_told(sender, *[numbered(1, 320)] * 2)
+            assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
         assert stranger.poll(60_000)
 
 
