@@ -164,27 +164,24 @@ def test_gray_pictures_of_sixteen_bit_in_every_kind_that_has_them(tmp_path: Path
 # ---- what is no file -------------------------------------------------------------------------------------
 
 
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
 def bound_socket(path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as made:
         made.bind(os.path.relpath(path))
 
 
-def device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-Maker = Callable[[Path], None]
-NO_FILES: list[Maker] = [pipe, bound_socket, device, Path.mkdir]
+NO_FILES: dict[str, Callable[[Path], None]] = {
+    "pipe": os.mkfifo,
+    "socket": bound_socket,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "folder": Path.mkdir,
+}
 
 
 @pytest.mark.fault("file: a pipe, socket, device or folder in its place")
-@pytest.mark.parametrize("make", NO_FILES, ids=["pipe", "socket", "device", "folder"])
-def test_what_is_no_file_is_not_waited_for(make: Maker, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", NO_FILES)
+def test_what_is_no_file_is_not_waited_for(kind: str, tmp_path: Path) -> None:
     recordings(tmp_path)
+    make = NO_FILES[kind]
     make(tmp_path / "r/000a.png")
     with pytest.raises(UsageError, match=r"r/000a\.png has a picture's name but is no file; remove it"):
         open_source(cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r"))

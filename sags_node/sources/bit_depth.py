@@ -46,7 +46,7 @@ class EightBits:
         Raises:
             SagsError: it is brighter than what was taken for white.
         """
-        from sags_node.sources.tones import spread  # a kernel: other pictures need no place for one
+        from sags_node.sources.pixels import spread  # a kernel: other pictures need no place for one
 
         if picture.max() > self.white:
             raise SagsError(

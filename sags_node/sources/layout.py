@@ -7,7 +7,7 @@ import numpy as np
 
 from sags_node.config.schema import Box, GeometryConfig
 from sags_node.errors import UsageError
-from sags_node.types import U8, Samples, Side
+from sags_node.types import U8, Bool, Samples, Side
 
 _FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}  # OpenCV's codes
 FIELD_ROWS = {"top": 0, "bottom": 1}
@@ -83,9 +83,13 @@ class Layout:
         """The picture [H, W, 3] of one eye; the argument itself where there is nothing to do."""
         return self._finish(picture, 0, self._crops[side])
 
-    def tools(self, picture: Samples) -> U8 | None:
-        """The pane [H, W, 3] beside those of the eyes, None where there is none."""
-        return None if self._tools is None else self._finish(picture, 0, self._tools)
+    def tissue(self, picture: Samples, left: U8) -> Bool | None:
+        """[H, W] True where the pane of the tools shows the left eye's picture; None: there is no pane."""
+        if self._tools is None:
+            return None
+        from sags_node.sources.pixels import unpainted  # a kernel: other videos need no place for one
+
+        return unpainted(self._finish(picture, 0, self._tools), left)
 
     def eyes(self, picture: Samples) -> tuple[U8, U8]:
         """Left and right of a picture [H, W, 3] that shows both; views of it where that does."""
@@ -125,7 +129,7 @@ class Layout:
     def _eight_bits(self, picture: Samples) -> U8:
         if picture.dtype == np.uint8 and self._config.levels == (0.0, 1.0):
             return np.ascontiguousarray(picture, np.uint8)
-        from sags_node.sources.tones import spread  # a kernel: other pictures need no place for one
+        from sags_node.sources.pixels import spread  # a kernel: other pictures need no place for one
 
         return spread(picture, self._config.levels)
 

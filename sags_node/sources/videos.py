@@ -13,7 +13,7 @@ from sags_node.media.video import Video
 from sags_node.sources.layout import Layout
 from sags_node.sources.pairing import NEAR, pair
 from sags_node.sources.pictures import Pairs, RawPair, size_text
-from sags_node.types import I64, U8, Bool
+from sags_node.types import I64
 
 log = logging.getLogger(__name__)
 
@@ -236,8 +236,7 @@ class OneVideoPairs(Pairs):
             left, right = self._layout.in_turn(first, last)
         else:
             left, right = self._layout.eyes(first)
-        painted = self._layout.tools(first)
-        return RawPair(left, right, None if painted is None else _unpainted(painted, left))
+        return RawPair(left, right, self._layout.tissue(first, left))
 
     def close(self) -> None:
         self._video.close()
@@ -258,9 +257,3 @@ def _turns(video: Video) -> I64:
         steps = np.maximum(1, np.rint(np.diff(video.stamps) * (video.rate * 1e-9))).astype(np.int64)
         turns = np.concatenate([[0], np.cumsum(steps)])
     return turns
-
-
-def _unpainted(painted: U8, left: U8) -> Bool:
-    from sags_node.sources.painted import unpainted  # a kernel: other videos need no place for one
-
-    return unpainted(painted, left)

@@ -13,6 +13,7 @@ from contextlib import ExitStack
 from ctypes.util import find_library
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -196,21 +197,13 @@ def test_wrong_sizes_are_refused() -> None:
         open_pipeline(GstSource(left=SMALL, right=other))
 
 
-class Unstamped:
-    """Stands for GStreamer: sinks that give pictures without a stamp."""
-
-    def bin_get_by_name(self, pipeline: int, name: bytes) -> int:
-        return 1
-
-    def app_sink_try_pull_preroll(self, element: int, wait_ns: int) -> int:
-        return 1
-
-    def picture(self, sample: int) -> gst_child.Picture:
-        return gst_child.Picture(gst_child.NONE, 9216)
-
-
 def test_pictures_without_stamps_are_refused() -> None:
-    sink = gst_child.Sink(Unstamped(), 1, WallClock(), "left", 0, None)
+    unstamped: Any = SimpleNamespace(
+        bin_get_by_name=lambda pipeline, name: 1,
+        app_sink_try_pull_preroll=lambda element, wait_ns: 1,
+        picture=lambda sample: gst_child.Picture(gst_child.NONE, 9216),
+    )
+    sink = gst_child.Sink(unstamped, 1, WallClock(), "left", 0, None)
     with pytest.raises(gst_child.GstError, match="pictures of left carry no time stamp") as raised:
         sink.show_first()
     assert "add do-timestamp=true" in in_words(str(raised.value), raised.value.debug)
