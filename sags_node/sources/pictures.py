@@ -132,10 +132,11 @@ class FolderPairs(Pairs):
         self.files = [files[0] for files in self._files]
         times = times_in(self.files)
         if times is not None and len(times) > 1:
+            period = float(np.median(np.diff(times)))
             others = times if right is None else times_in([files[1] for files in self._files])
-            if others is None or not _are_near(times, others):
+            if others is None or np.abs(others - times).max() > NEAR * period:
                 others = times
-            self.stamps, self.rate = np.stack([times, others], axis=1), 1e9 / float(np.median(np.diff(times)))
+            self.stamps, self.rate = np.stack([times, others], axis=1), 1e9 / period
             self.judged = judge_skew(self.stamps)
         self.oddities = gaps_in(self.files, times is not None)
         self._has_right = right is not None
@@ -310,10 +311,6 @@ def _at_one_time(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
         (folders[0][at], *(files[each[at]] for files, each in zip(folders[1:], partners, strict=True)))
         for at in shared
     ]
-
-
-def _are_near(times: I64, others: I64) -> bool:
-    return bool(np.abs(others - times).max() <= NEAR * float(np.median(np.diff(times))))
 
 
 def _spread(files: Sequence[F]) -> Sequence[F]:

@@ -167,16 +167,12 @@ def open_cameras(
     """
     sides: dict[str, Side | None] = {config.left: None}
     if config.geometry.layout == "separate":
-        sides = {config.left: "left", _right_path(config): "right"}
+        if config.right is None:
+            raise UsageError("source.right names no camera; name one, or set source.geometry.layout")
+        if os.path.realpath(config.left) == os.path.realpath(config.right):
+            raise UsageError(f"source.left and source.right are the same camera, {config.right}")
+        sides = {config.left: "left", config.right: "right"}
     inputs = [
         Input(path, side, partial(open_device, path, config), config.deadline) for path, side in sides.items()
     ]
     return LiveStereo(inputs, config, size)
-
-
-def _right_path(config: V4l2Source) -> str:
-    if config.right is None:
-        raise UsageError("source.right names no camera; name one, or set source.geometry.layout")
-    if os.path.realpath(config.left) == os.path.realpath(config.right):
-        raise UsageError(f"source.left and source.right are the same camera, {config.right}")
-    return config.right

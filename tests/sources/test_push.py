@@ -28,7 +28,6 @@ from sags_node.config.schema import PushSource
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.security import read_key_pair, write_key_pair
-from sags_node.messaging.sender import SILENT
 from sags_node.messaging.wire import Message, encode
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8
@@ -43,6 +42,13 @@ def source() -> Iterator[PushedPictures]:
     made = PushedPictures(PushSource(endpoint=ANYWHERE), (160, 120))
     with made:
         yield made
+
+
+@pytest.fixture
+def short_silence(monkeypatch: pytest.MonkeyPatch) -> float:
+    """s: a little more than between two receipts."""
+    monkeypatch.setattr("sags_node.messaging.sender.SILENT", 1.2)
+    return 1.2
 
 
 def numbered(number: int, width: int = 160) -> U8:
@@ -175,7 +181,7 @@ def test_a_sender_never_waits_for_a_node_that_is_away() -> None:
 
 
 @pytest.mark.fault("network: the node that pictures are sent to is not there, or has gone")
-def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old() -> None:
+def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old(short_silence: float) -> None:
     with PushedPictures(PushSource(endpoint=ANYWHERE), (160, 120)) as source:
         endpoint = source.endpoint
     with FrameSender(endpoint) as sender, PoseSender(endpoint) as poses:
@@ -195,11 +201,11 @@ def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old() -> None:
         assert "no answer" in sent_until_told(sender, numbered(3), numbered(3))
 
 
-def test_a_sender_that_sends_nothing_misses_no_answer(source: PushedPictures) -> None:
+def test_a_sender_that_sends_nothing_misses_no_answer(source: PushedPictures, short_silence: float) -> None:
     with FrameSender(source.endpoint) as sender:
         assert sender.send(numbered(1), numbered(1))  # the first pair, too
         until(lambda: sender.problem is None and sender.receipt)
-        time.sleep(SILENT + 0.5)
+        time.sleep(short_silence + 0.5)
         assert sender.problem is None
 
 

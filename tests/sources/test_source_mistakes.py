@@ -25,19 +25,11 @@ from sags_node.sources.replay import Recording
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
 
-HALVES = cfg.GeometryConfig(layout="side_by_side")
-
 # ---- at opening ------------------------------------------------------------------------------------------
 
 
 def folders_of(folder: Path, left: str = "l", right: str = "r", **said: Any) -> Recording:
     return cfg.FoldersSource(left=folder / left, right=folder / right, **said)
-
-
-def video(folder: Path, left: str, right: str | None = None) -> Recording:
-    if right is None:
-        return cfg.VideosSource(left=folder / left, geometry=HALVES)
-    return cfg.VideosSource(left=folder / left, right=folder / right)
 
 
 def posed(folder: Path, **arrays: np.ndarray) -> Recording:
@@ -81,14 +73,7 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: write_png(at / "tools/000.png", picture(0)) or folders_of(at, tools=at / "tools"),
      "l holds 8 pictures but .*tools holds 1; pairing"),
     (lambda at: folders_of(at, start=60), "source.start 60.0 s lies behind the recording's end at 0.27 s"),
-    (lambda at: video(at, "none.mp4"), "none.mp4 does not exist; check the path"),
-    (lambda at: (at / "text.mp4").write_text("hello") and video(at, "text.mp4"),
-     "text.mp4 cannot be read as a video"),
     (beyond, r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
-    (lambda at: video(at, "l.avi", "lr.avi"),
-     "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
-    (lambda at: write_video(at / "slow.avi", [picture(0)], rate=10) and video(at, "l.avi", "slow.avi"),
-     r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
     (lambda at: folders_of(at, poses=at / "poses.npz"), "poses.npz does not exist; check the path"),
     (lambda at: posed(at, T_world_cam=np.eye(4)),
      r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
@@ -191,15 +176,6 @@ def test_a_wrong_picture_in_the_middle_is_named(
     damage(folders.left / "L7.png")
     frames, message = frames_until_error(folders)
     assert len(frames) == 7 and said in message
-
-
-def test_shorter_right_video_says_where_it_ends(tmp_path: Path) -> None:
-    left = write_video(tmp_path / "l.avi", [picture(n) for n in range(8)])
-    right = write_video(tmp_path / "r.avi", [picture(n, eye=1) for n in range(6)])
-    config = cfg.VideosSource(left=left, right=right, pace="step")
-    refused_at_opening(lambda: config, r"r.avi has 6 pictures, .*l.avi 8; .* with source.frames:=6")
-    with open_source(config.model_copy(update={"frames": 6})) as source:  # the way out that the message names
-        assert len(list(source)) == 6
 
 
 @pytest.mark.parametrize(("count", "stride"), [(4, 1), (48, 1), (11, 1), (13, 1), (6, 2)])
