@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 from pathlib import Path
 
@@ -14,8 +13,6 @@ from sags_node.sources.layout import Layout
 from sags_node.sources.pairing import NEAR, pair
 from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64
-
-log = logging.getLogger(__name__)
 
 PARTNERED = 0.5  # share of the pictures that have a partner, where stamps of two files tell it
 TORN = (
@@ -73,14 +70,16 @@ class VideoPairs(Pairs):
         left = self.left.read(of_left)
         if left is None:
             return None
-        right = None if self.right is None else self.right.read(of_right)
-        if self.right is not None and right is None:
+        seen = self._layout.eye(left, "left")
+        if self.right is None:
+            return RawPair(seen, None, None)
+        right = self.right.read(of_right)
+        if right is None:
             raise SagsError(
                 f"{self.right.path} ends at frame {index} but {self.left.path} goes on; set source.frames "
                 "to stop there"
             )
-        seen = None if right is None else self._layout.eye(right, "right")
-        return RawPair(self._layout.eye(left, "left"), seen, None)
+        return RawPair(seen, self._layout.eye(right, "right"), None)
 
     def close(self) -> None:
         for video in self._videos:
@@ -116,12 +115,14 @@ class VideoPairs(Pairs):
         period = 1e9 / left.rate
         late, ends_late = (int(right.stamps[at] - left.stamps[at]) for at in (0, -1))
         of_one_clock = min(abs(late), abs(ends_late)) <= NEAR * period
-        if is_even and (not of_one_clock or abs(late) <= NEAR * period):
-            if not of_one_clock:
-                self._tell_late(late)
-            return self._drifted(left, right, period) if of_one_clock else None
         if not of_one_clock:  # two recorders, each with its own zero
-            self._tell_late(late)
+            self.oddities.append(
+                f"the stamps of the right video begin {abs(late) * 1e-9:.3f} s "
+                f"{'after' if late > 0 else 'before'} those of the left one; their first pictures are taken "
+                "for one moment: is an eye late, cut its beginning off"
+            )
+        if is_even and (not of_one_clock or abs(late) <= NEAR * period):
+            return self._drifted(left, right, period) if of_one_clock else None
         self._late = 0 if of_one_clock else late
         found = pair(left.stamps, right.stamps - self._late, NEAR * period * 1e-9)
         alone = left.count - len(found), right.count - len(found)
@@ -170,13 +171,6 @@ class VideoPairs(Pairs):
             f"number get {apart * 1e-9:.2f} s apart; they are paired by {how}, which is right if both {fits}"
         )
         return pair(left.stamps, right.stamps, NEAR * period * 1e-9) if by_time else None
-
-    def _tell_late(self, late_ns: int) -> None:
-        self.oddities.append(
-            f"the stamps of the right video begin {abs(late_ns) * 1e-9:.3f} s "
-            f"{'after' if late_ns > 0 else 'before'} those of the left one; their first pictures are taken "
-            "for one moment: is an eye late, cut its beginning off"
-        )
 
     def _find_stamps(self) -> I64 | None:
         left, right = self.left, self.right
