@@ -7,12 +7,11 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from live_taking import Taker
-from places import ROOT
+from places import ROOT, SESSION
 from ros_peers import DOMAIN, rclpy_python
 from sending import sending, stereo_sender
 from stereo_sender import paint_number
@@ -34,24 +33,20 @@ pytestmark = pytest.mark.live
 SIZE = 1280, 1024
 
 
-def dds(session: Path, seconds: float, *settings: str) -> list[object]:
-    return stereo_sender("dds", DOMAIN, session, seconds, *settings)
-
-
 def config() -> Ros2Source:
     return Ros2Source(domain=DOMAIN, left="stereo/left/image_raw", right="/stereo/right/image_raw")
 
 
-def test_the_calibration_and_the_tf_of_a_graph_are_taken(phantom_session: Path) -> None:
+def test_the_calibration_and_the_tf_of_a_graph_are_taken() -> None:
     robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, base="world", hand="left_optical_frame")))
     try:
-        with sending(dds(phantom_session, 60, "size=640x512")):
+        with sending(stereo_sender("dds", DOMAIN, "size=640x512")):
             rig = read_rig(config(), seconds=60)
             stamp = until(lambda: robot.track.newest_ns)
             assert robot.track.at(stamp)[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
     finally:
         robot.close()
-    want = resized_rig(load_rig(phantom_session / "calib"), 2)
+    want = resized_rig(load_rig(SESSION / "calib"), 2)
     assert rig is not None and (rig.left.width, rig.left.height) == (640, 512)
     assert rig.baseline == pytest.approx(want.baseline)
     assert rig.left.distortion == pytest.approx(want.left.distortion)
@@ -63,12 +58,12 @@ def test_a_missing_calibration_is_said() -> None:
 
 
 def test_a_wrong_size_and_a_wrong_name_are_said(
-    phantom_session: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ros2, "QUIET_S", 0.5)
     said = config().model_copy(update={"right": "/stereo/rihgt/image_raw"})
     with caplog.at_level(logging.WARNING), Taker(RosCameras(said, SIZE)) as taker:
-        with sending(dds(phantom_session, 60, "size=640x512")):
+        with sending(stereo_sender("dds", DOMAIN, "size=640x512")):
             until(lambda: "640x512 px, it must be 1280x1024" in caplog.text)
             until(lambda: "nobody publishes /stereo/rihgt/image_raw" in caplog.text)
     assert f"domain {DOMAIN}, interface lo" in caplog.text
