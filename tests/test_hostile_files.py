@@ -136,8 +136,11 @@ def test_bytes_behind_the_end_of_a_picture_harm_nothing(suffix: str, behind: byt
     options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2] if suffix == ".jpg" else []
     whole = cv2.imencode(suffix, PIXELS, options)[1].tobytes()
     if suffix == ".jpg":
-        preview = jpeg()
-        whole = whole[:2] + b"\xff\xe1" + struct.pack(">H", len(preview) + 2) + preview + whole[2:]
+        preview = jpeg(16, 8)
+        before = b"\xff\xe1" + struct.pack(">H", len(preview) + 2) + preview
+        before += 3 * (b"\xff\xe2" + struct.pack(">H", 65535) + bytes(65533))  # a long profile
+        whole = whole[:2] + before + whole[2:]
+    assert claimed_size(memoryview(whole)) == (WIDTH, HEIGHT)
     file = tmp_path / f"one{suffix}"
     file.write_bytes(whole)
     alone = read_picture(file)
@@ -158,17 +161,7 @@ def test_gray_pictures_of_sixteen_bit_in_every_kind_that_has_them(tmp_path: Path
     assert not is_whole(memoryview(commented[:-1]))
 
 
-def test_progressive_jpegs_with_long_profiles_have_a_size() -> None:
-    file = cv2.imencode(".jpg", PIXELS, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
-    profile = b"\xff\xe2" + struct.pack(">H", 65535) + bytes(65533)
-    assert claimed_size(memoryview(file[:2] + 3 * profile + file[2:])) == (WIDTH, HEIGHT)
-
-
 # ---- what is no file -------------------------------------------------------------------------------------
-
-
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
 
 
 def bound_socket(path: Path) -> None:
@@ -176,18 +169,19 @@ def bound_socket(path: Path) -> None:
         made.bind(os.path.relpath(path))
 
 
-def device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-Maker = Callable[[Path], None]
-NO_FILES: list[Maker] = [pipe, bound_socket, device, Path.mkdir]
+NO_FILES: dict[str, Callable[[Path], None]] = {
+    "pipe": os.mkfifo,
+    "socket": bound_socket,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "folder": Path.mkdir,
+}
 
 
 @pytest.mark.fault("file: a pipe, socket, device or folder in its place")
-@pytest.mark.parametrize("make", NO_FILES, ids=["pipe", "socket", "device", "folder"])
-def test_what_is_no_file_is_not_waited_for(make: Maker, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", NO_FILES)
+def test_what_is_no_file_is_not_waited_for(kind: str, tmp_path: Path) -> None:
     recordings(tmp_path)
+    make = NO_FILES[kind]
     make(tmp_path / "r/000a.png")
     with pytest.raises(UsageError, match=r"r/000a\.png has a picture's name but is no file; remove it"):
         open_source(cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r"))

@@ -169,17 +169,14 @@ def check_one(folder: Path) -> None:
 
 def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
-    return sorted(folder.glob(f"{SHOWN}{suffix}"), key=lambda file: (_number(file.stem), file.name))
+    found = folder.glob(f"{SHOWN}{suffix}")
+    return sorted(found, key=lambda file: (_whole(file.stem.rpartition("_")[2]), file.name))
 
 
 def _stem(stem: str) -> str:
     """The name of a recording whose files are numbered: case_0, case_1."""
     name, _, digits = stem.rpartition("_")
     return name if digits.isdecimal() else stem
-
-
-def _number(stem: str) -> int:
-    return _whole(stem.rpartition("_")[2])
 
 
 def _whole(digits: str) -> int:
@@ -336,7 +333,8 @@ def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int
             f"{log} holds messages that {file.name} lacks: its recorder was killed or still runs; "
             f'then: sqlite3 {shlex.quote(str(file))} "PRAGMA wal_checkpoint(TRUNCATE)"'
         )
-    positions = rosbag1_check.chunk_positions(file) if ros1 else frozenset()
+    seen = file.stat()
+    positions = rosbag1_check.chunk_positions(file, seen.st_size, seen.st_mtime_ns) if ros1 else frozenset()
     reader: Any = rosbag1.Reader(file) if ros1 else rosbag2.Reader(file)
     with _damage_as_one_error(), reader:
         if ros1 and not {info.pos for info in reader.chunk_infos} <= positions:

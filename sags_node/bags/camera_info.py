@@ -52,6 +52,11 @@ def read_eye(data: bytes | memoryview, where: str) -> Eye | None:
     return part_of_sensor(eye, part, (message.binning_x, message.binning_y), where)
 
 
+def topic_of(pictures: str) -> str:
+    """The topic on which a camera says it, beside that of its pictures."""
+    return pictures.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+
+
 def changes(said: Sequence[Said]) -> list[Said]:
     """Return what is said, in order of time, without what says the same again."""
     kept: list[Said] = []

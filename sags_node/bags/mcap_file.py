@@ -30,12 +30,8 @@ HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, CRC
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, unpacked size, CRC, length of the next string
-_BAD_BYTES = (
-    McapError,
-    struct.error,
-    UnicodeError,
-    ValueError,
-)  # what mcap raises for content it cannot read
+# What mcap raises for content it cannot read.
+_BAD_BYTES = (McapError, struct.error, UnicodeError, ValueError)
 
 
 class DamagedError(SagsError):

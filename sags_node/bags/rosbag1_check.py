@@ -19,18 +19,13 @@ CHUNK_OP = b"\x05"
 _LENGTH = struct.Struct("<I")
 
 
-def chunk_positions(file: Path) -> frozenset[int]:
-    """Find where the chunks of a bag begin; the last file's are remembered until it changes.
+@lru_cache(maxsize=1)  # a bag is opened again for every loop, and unpacking all of it takes seconds
+def chunk_positions(file: Path, size: int, mtime_ns: int) -> frozenset[int]:
+    """Find where the chunks of a bag begin, which is told from an older one by its size (bytes) and time.
 
     Raises:
         DamagedError: it is no ROS 1 bag, a length does not fit, or a chunk unpacks to too much.
     """
-    found = file.stat()
-    return _chunk_positions(file, found.st_size, found.st_mtime_ns)
-
-
-@lru_cache(maxsize=1)  # a bag is opened again for every loop, and unpacking all of it takes seconds
-def _chunk_positions(file: Path, size: int, changed: int) -> frozenset[int]:
     positions = set()
     with open_file(file) as bag:
         if bag.read(len(MAGIC)) != MAGIC:

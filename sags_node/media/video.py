@@ -67,7 +67,7 @@ class _Index:
     pts: I64 | None  # [count] rising; None: they do not say when pictures are shown
     keys: I64  # [K, 3] pts, dts and size (bytes), rising, of the packets at which decoding can begin
     unused: str = ""  # why the stamps are not used
-    cut_off: str = ""  # why the file must have been longer
+    cut_off: str = ""  # as of `Video`
 
 
 class Video:
@@ -80,7 +80,7 @@ class Video:
         rate: Hz, while none is missing; None: not known.
         is_even: stamps say no more than the rate.
         pixel_aspect: width of a pixel over its height.
-        cut_off: why the file must have been longer; "": it is whole.
+        cut_off: why the file must have been longer, with a remedy after a semicolon; "": it is whole.
         tracks: how many there are; the first is read.
         is_interlaced: the file says so of its first picture.
         oddities: what is to be said of the file, each with a remedy after a semicolon.
@@ -181,7 +181,7 @@ class Video:
         """
         if number >= self.count:
             if self.cut_off:
-                log.warning("%s %s; copy it again", self.path, self.cut_off)
+                log.warning("%s", self.cut_off)
             return None
         is_past = number < self._at or (number == self._at and self._frame is None)
         if is_past or self._key_of(number) > self._at + FAR:
@@ -211,9 +211,8 @@ class Video:
             late = self.stamps - self.stamps[0] - np.arange(self.count) * (1e9 / rate)
             if np.abs(late).max() <= min(SAME, 0.25e9 / rate):
                 return rate, True
-        usual = 1e9 / float(
-            np.mean(steps[steps < 1.5 * np.median(steps)])
-        )  # stamps may be whole milliseconds
+        # The mean of usual steps, as stamps may be whole milliseconds.
+        usual = 1e9 / float(np.mean(steps[steps < 1.5 * np.median(steps)]))
         return next((rate for rate in reversed(told) if abs(rate - usual) < 0.01 * usual), usual), False
 
     def _restart(self) -> av.VideoFrame | None:
@@ -373,11 +372,12 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
             missing = container.duration * 1e-6 - ends - SHORT
         cut_off = ""
         if named > total:
-            cut_off = f"is cut off: of {named} pictures it holds {total}"
+            cut_off = f"of {named} pictures it holds {total}"
         elif missing > float(0.5 * base) or is_short:
-            cut_off = "is cut off: its end is missing"
+            cut_off = "its end is missing"
         elif is_broken:
-            cut_off = "is cut off: of its last picture a part is there"
+            cut_off = "of its last picture a part is there"
+        cut_off = cut_off and f"{path} is cut off: {cut_off}; copy it again"
         return _Index(len(shown), pts, np.array(sorted(keys), np.int64).reshape(-1, 3), unused, cut_off)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sags_node.bags.bag import BagMessage, read_messages
-from sags_node.bags.camera_info import Said, changes, in_force, read_eye
+from sags_node.bags.camera_info import Said, changes, in_force, read_eye, topic_of
 from sags_node.bags.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
@@ -35,18 +35,12 @@ STAMP_END = 12  # bytes: encoding and stamp of a message with a header
 MOST_INFOS = 10_000  # of one topic that differ: a zoom that moves all the time says enough
 
 
-@dataclass(slots=True)
-class _Topic:
-    type: str
-    keys: list[Key] = field(default_factory=list)
-
-
 @dataclass(frozen=True, slots=True)
 class Contents:
     """What one reading of a bag found."""
 
     types: dict[str, str]  # every topic
-    pictures: dict[str, _Topic]
+    pictures: dict[str, list[Key]]  # of each topic
     infos: dict[str, list[tuple[int, bytes]]]  # of each topic the camera_info that differ from those before
 
 
@@ -71,14 +65,13 @@ def read_contents(path: Path) -> Contents:
 @lru_cache(maxsize=1)
 def _read_contents(path: Path, changed: int) -> Contents:
     types: dict[str, str] = {}
-    pictures: dict[str, _Topic] = {}
+    pictures: dict[str, list[Key]] = {}
     infos: dict[str, list[tuple[int, bytes]]] = {}
     newest: dict[str, bytes] = {}
     for message in read_messages(path):
         types.setdefault(message.topic, message.type)
         if message.type in IMAGE_TYPES:
-            key = message.log_ns, _stamp(path, message)
-            pictures.setdefault(message.topic, _Topic(message.type)).keys.append(key)
+            pictures.setdefault(message.topic, []).append((message.log_ns, _stamp(path, message)))
         elif message.type == CAMERA_INFO:
             data, said = bytes(message.data), infos.setdefault(message.topic, [])
             if newest.get(message.topic) != data[STAMP_END:] and len(said) < MOST_INFOS:
@@ -96,7 +89,8 @@ def _stamp(path: Path, message: BagMessage) -> int:
 
 
 class BagPairs(Pairs):
-    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough.
+    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough. Going back
+    begins to read it anew.
 
     Raises:
         UsageError: there is no bag, its topics are not clear, or nothing pairs.
@@ -107,7 +101,7 @@ class BagPairs(Pairs):
         self._path = config.path
         contents = read_contents(config.path)
         self._eyes = find_eyes(config, contents)
-        left, right = (contents.pictures[name].keys for name in self._eyes)
+        left, right = (contents.pictures[name] for name in self._eyes)
         self._keys, self.stamps = pair_messages(config, left, right)
         self.count = len(self._keys)
         numbers = {key: number for number, key in enumerate(left)}
@@ -119,26 +113,23 @@ class BagPairs(Pairs):
         self._layout = Layout(config.geometry)
         self._turns = [{keys[eye]: turn for turn, keys in enumerate(self._keys)} for eye in (0, 1)]
         self._size: tuple[int, int] | None = None
-        self.seek(0)
-
-    def seek(self, index: int) -> None:
-        self._next = index
-        self._waiting: dict[tuple[int, Key], BagMessage] = {}
         self._messages: Iterator[BagMessage] | None = None
+        self._index = -1  # of the pair that was read last
 
-    def read(self) -> RawPair | None:
-        if self._next >= self.count:
+    def at(self, index: int) -> RawPair | None:
+        if index >= self.count:
             return None
-        if self._messages is None:
-            start_ns = min(key[0] for keys in self._keys[self._next :] for key in keys)
+        if self._messages is None or index <= self._index:
+            self._waiting: dict[tuple[int, Key], BagMessage] = {}
+            start_ns = min(key[0] for keys in self._keys[index:] for key in keys)
             self._messages = read_messages(self._path, self._eyes, start_ns)
-        left_key, right_key = self._keys[self._next]
+        self._index = index
+        left_key, right_key = self._keys[index]
         if self._layout.shows_both:
             left, right = self._layout.eyes(self._picture(0, left_key))
         else:
             left = self._layout.eye(self._picture(0, left_key), "left")
             right = self._layout.eye(self._picture(1, right_key), "right")
-        self._next += 1
         return RawPair(left, right, None)
 
     def close(self) -> None:
@@ -155,13 +146,13 @@ class BagPairs(Pairs):
         if size != self._size:
             raise SagsError(
                 f"{where}: {size_text(*size)} px, but the pictures before are {size_text(*self._size)}; "
-                f"all pictures must have one size: play what is before with source.frames:={self._next}"
+                f"all pictures must have one size: play what is before with source.frames:={self._index}"
             )
         return picture
 
     def _is_sorted(self) -> bool:
         topics = read_contents(self._path).pictures
-        return all((np.diff([key[0] for key in topics[eye].keys]) >= 0).all() for eye in self._eyes)
+        return all((np.diff([key[0] for key in topics[eye]]) >= 0).all() for eye in self._eyes)
 
     def _find(self, eye: int, key: Key) -> BagMessage:
         """Read forward to one message; those of later pairs wait in memory."""
@@ -173,7 +164,7 @@ class BagPairs(Pairs):
             found = message.log_ns, _stamp(self._path, message)
             if (side, found) == (eye, key):
                 return message
-            if self._turns[side].get(found, -1) >= self._next:
+            if self._turns[side].get(found, -1) >= self._index:
                 self._waiting[side, found] = message
             if len(self._waiting) > MAX_WAITING:
                 raise SagsError(
@@ -269,10 +260,8 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
     contents = read_contents(config.path)
     eyes = find_eyes(config, contents)
     found = [
-        _info(config, contents, key, name, topic)
-        for key, name, topic in zip(
-            ("left_info", "right_info"), (config.left_info, config.right_info), eyes, strict=True
-        )
+        _info(config, contents, "left_info", config.left_info, eyes.left),
+        _info(config, contents, "right_info", config.right_info, eyes.right),
     ]
     played = _played(config, contents, eyes)
     left, right = (
@@ -290,7 +279,7 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
 
 def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:
     """Stamps [N, 2] of the pairs that are played, ns."""
-    left, right = (contents.pictures[name].keys for name in eyes)
+    left, right = (contents.pictures[name] for name in eyes)
     stamps = pair_messages(config, left, right)[1][:: config.stride]
     first = int(np.searchsorted(stamps[:, 0], stamps[0, 0] + round(config.start * 1e9)))
     return stamps[first:][: config.frames]
@@ -323,8 +312,7 @@ def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> E
 
 def _info(config: BagSource, contents: Contents, key: str, name: str | None, topic: str) -> str | None:
     if name is None:
-        beside = topic.removesuffix(COMPRESSED).rpartition("/")[0] + "/camera_info"
-        return beside if beside in contents.infos else None
+        return topic_of(topic) if topic_of(topic) in contents.infos else None
     for candidate in (name, f"/{name}", name.lstrip("/")):
         if candidate in contents.infos:
             return candidate

@@ -28,20 +28,17 @@ class EightBits:
     """
 
     def __init__(self, some: Iterable[NDArray[Any]], levels: Levels | None = None) -> None:
-        from sags_node.sources.tones import Tones  # a kernel: other pictures need no place for one
-
         brightest = 0.0
         self.dtype: np.dtype[Any] = np.dtype(np.uint8)
         for picture in some:
             brightest, self.dtype = max(brightest, float(picture.max())), picture.dtype
         is_float = self.dtype == np.float32
-        counted = np.dtype(np.uint16) if is_float else self.dtype
-        self._full = int(np.iinfo(counted).max)
+        self._full = int(np.iinfo(np.uint16 if is_float else self.dtype).max)
         whites = (1, *WHITES) if is_float else WHITES
         self.white = next((white for white in whites if brightest <= white), WHITES[-1])
         if levels is not None and not is_float:
             self.white = self._full
-        self._tones = Tones(levels or (0.0, 1.0 if is_float else self.white / self._full), counted)
+        self._levels = levels or (0.0, 1.0 if is_float else self.white / self._full)
 
     def __call__(self, picture: NDArray[Any], file: Path) -> U8:
         """A new picture.
@@ -49,6 +46,8 @@ class EightBits:
         Raises:
             SagsError: it is brighter than what was taken for white.
         """
+        from sags_node.sources.pixels import spread  # a kernel: other pictures need no place for one
+
         if picture.max() > self.white:
             raise SagsError(
                 f"{file} holds {picture.max():g}, but by others {self.white} is white; set source.levels, or "
@@ -56,7 +55,7 @@ class EightBits:
             )
         if picture.dtype == np.float32:
             picture = np.rint(np.clip(picture, 0, None) * (self._full / self.white)).astype(np.uint16)
-        return self._tones(picture)
+        return spread(picture, self._levels)
 
     def tell(self, folder: Path) -> None:
         """Say in the log what was taken for white, where that is not the brightest value of the type."""

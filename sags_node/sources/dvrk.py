@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 
 from sags_node.config.launch_file import SIDECAR_TYPE
-from sags_node.config.schema import DvrkSource
+from sags_node.config.schema import DvrkSource, GeometryConfig
 from sags_node.errors import UsageError
 from sags_node.files import read_file
 from sags_node.media.video import Video
-from sags_node.sources.layout import side_by_side
+from sags_node.sources.layout import Layout
 from sags_node.sources.pairing import nearest
 from sags_node.sources.videos import OneVideoPairs
 from sags_node.types import I64
@@ -81,7 +81,8 @@ class DvrkPairs(OneVideoPairs):
                 f"{file} does not say that the video is stereo; set source.side_by_side to LR or RL"
             )
         video = Video(file.parent / Path(sidecar.video_file).name)  # a name cannot lead out of the folder
-        super().__init__(video, side_by_side(order))
+        first = GeometryConfig(layout="side_by_side", first="left" if order == "LR" else "right")
+        super().__init__(video, Layout(first))
         self.pixel_aspect, self.oddities = 1.0, ()  # the sidecar knows better how the video was made
         try:
             self.stamps = _stamps(file, sidecar, video)

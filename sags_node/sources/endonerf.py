@@ -41,6 +41,12 @@ class Llff(NamedTuple):
     focal: float  # px
     T_world_cam: F64  # [N, 4, 4] m, or its inverse, with whatever axes the file has
 
+    @property
+    def K(self) -> F64:
+        """[3, 3] px; principal point in the picture's middle: the centre of the first pixel is (0, 0)."""
+        x, y = (self.width - 1) / 2, (self.height - 1) / 2
+        return np.array([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]])
+
 
 class EndoNerfPairs(FolderPairs):
     """The frames of a clip, in order of the files' names (numbers in names sort as numbers).
@@ -74,10 +80,9 @@ class EndoNerfPairs(FolderPairs):
         """Read the poses as it is said, or as they explain the pictures."""
         poses, axes = self._llff.T_world_cam, said
         if said == "auto":
-            K = _intrinsics(self._llff.width, self._llff.height, self._llff.focal)
-            fits = None if self._depth_files is None else reading_that_fits(poses, K, self._look)
+            has_depth = self._depth_files is not None
+            fits = reading_that_fits(poses, self._llff.K, self._look) if has_depth else None
             axes = fits or "opencv"
-            self.seek(0)
         self._T_world_cam = READINGS[axes](poses)
         if said == "auto" and axes != "opencv":
             what = f"poses_bounds.npy: of two frames with depth the poses fit as {axes}, and are read so"
@@ -85,13 +90,12 @@ class EndoNerfPairs(FolderPairs):
             self.judged = (Finding("warning", what, fix),)
 
     def _look(self, index: int) -> Seen:
-        self.seek(index)
-        pair = self.read()
+        pair = self.at(index)
         assert pair is not None and pair.depth is not None and pair.tissue is not None  # `count` is checked
         return Seen(pair.left, pair.depth, pair.tissue)
 
-    def read(self) -> RawPair | None:
-        index, pair = self._next, super().read()
+    def at(self, index: int) -> RawPair | None:
+        pair = super().at(index)
         if pair is None:
             return None
         depth = None if self._depth_files is None else self._read_depth(self._depth_files[index])
@@ -184,9 +188,9 @@ def read_llff(config: EndoNerfSource) -> Llff:
     if (matrices[:, :, 4] != matrices[0, :, 4]).any():
         raise UsageError(f"{file}: size and focal length must be the same for all frames")
     height, width, focal = int(matrices[0, 0, 4]), int(matrices[0, 1, 4]), float(matrices[0, 2, 4])
-    findings = check_intrinsics("camera", _intrinsics(width, height, focal), width, height)
-    refuse_errors(findings[:1], file)  # fx and fy are one number
     poses = np.tile(np.eye(4), (len(table), 1, 1))
+    llff = Llff(width, height, focal, poses)
+    refuse_errors(check_intrinsics("camera", llff.K, width, height)[:1], file)  # fx and fy are one number
     poses[:, :3] = matrices[:, :, :4]
     wrong = ~geometry.is_rotation(poses[:, :3, :3])
     if wrong.any():
@@ -195,7 +199,7 @@ def read_llff(config: EndoNerfSource) -> Llff:
             "camera that does not move has the identity"
         )
     poses[:, :3, 3] *= config.depth_unit
-    return Llff(width, height, focal, poses)
+    return llff
 
 
 def read_rig(config: EndoNerfSource) -> StereoRig:
@@ -204,9 +208,8 @@ def read_rig(config: EndoNerfSource) -> StereoRig:
     Raises:
         UsageError: as `read_llff`.
     """
-    width, height, focal, _ = read_llff(config)
-    K = _intrinsics(width, height, focal)
-    return rectified_rig(config.folder.name, width, height, K, baseline_of(config) or NOMINAL_BASELINE)
+    llff, baseline = read_llff(config), baseline_of(config) or NOMINAL_BASELINE
+    return rectified_rig(config.folder.name, llff.width, llff.height, llff.K, baseline)
 
 
 def baseline_of(config: EndoNerfSource) -> float | None:
@@ -228,8 +231,3 @@ def is_published(config: EndoNerfSource) -> bool:
     """
     width, height, focal, _ = read_llff(config)
     return (width, height, round(focal, 4)) == PUBLISHED
-
-
-def _intrinsics(width: int, height: int, focal: float) -> F64:
-    """Principal point in the picture's middle; the centre of the first pixel is (0, 0)."""
-    return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
-
 import cv2
 import numpy as np
 
 from sags_node.config.schema import Box, GeometryConfig
 from sags_node.errors import UsageError
-from sags_node.types import U8, Samples, Side
-
-if TYPE_CHECKING:
-    from sags_node.sources.tones import Tones
-
+from sags_node.types import U8, Bool, Samples, Side
 
 _FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}  # OpenCV's codes
 FIELD_ROWS = {"top": 0, "bottom": 1}
+# How many eyes a picture shows beside and above each other; else one.
+EYES = {"side_by_side": (2, 1), "over_under": (1, 2), "row_interleaved": (1, 2)}
 WIDEST = 2.2  # times as wide as high: one eye is at most 1.9 (17:9)
 
 
@@ -32,7 +28,6 @@ class Layout:
         self._config = config
         self._crops = {"left": config.crop, "right": config.crop_right or config.crop}
         self._tools = tools
-        self._tones: Tones | None = None  # for the depth of the last picture
         self.is_sequential = config.layout == "frame_sequential"
         self.shows_both = config.layout not in ("separate", "frame_sequential")
         self.takes_fields = config.layout == "row_interleaved" or config.deinterlace != "none"
@@ -45,14 +40,12 @@ class Layout:
             UsageError: it cannot be split or cropped as asked.
         """
         layout = self._config.layout
-        if layout == "side_by_side" and width % 2:
+        beside, above = EYES.get(layout, (1, 1))
+        if width % beside:
             raise UsageError(f"{name} is {width} px wide, which is odd: it cannot hold two eyes side by side")
-        if layout in ("over_under", "row_interleaved") and height % 2:
+        if height % above:
             raise UsageError(f"{name} is {height} px high, which is odd: it cannot hold two eyes, {layout}")
-        if layout == "side_by_side":
-            width //= 2
-        elif layout in ("over_under", "row_interleaved"):
-            height //= 2
+        width, height = width // beside, height // above
         sizes = [_cropped(width, height, crop, name) for crop in self._crops.values()]
         if sizes[0] != sizes[1]:
             raise UsageError(
@@ -90,15 +83,24 @@ class Layout:
         """The picture [H, W, 3] of one eye; the argument itself where there is nothing to do."""
         return self._finish(picture, 0, self._crops[side])
 
-    def tools(self, picture: Samples) -> U8 | None:
-        """The pane [H, W, 3] beside those of the eyes, None where there is none."""
-        return None if self._tools is None else self._finish(picture, 0, self._tools)
+    def tissue(self, picture: Samples, left: U8) -> Bool | None:
+        """[H, W] True where the pane of the tools shows the left eye's picture; None: there is no pane."""
+        if self._tools is None:
+            return None
+        from sags_node.sources.pixels import unpainted  # a kernel: other videos need no place for one
+
+        return unpainted(self._finish(picture, 0, self._tools), left)
 
     def eyes(self, picture: Samples) -> tuple[U8, U8]:
         """Left and right of a picture [H, W, 3] that shows both; views of it where that does."""
         of = dict(zip(self.order, self._apart(picture), strict=True))
         left, right = (self._finish(*of[side], self._crops[side]) for side in ("left", "right"))
         return left, right
+
+    def in_turn(self, first: Samples, second: Samples) -> tuple[U8, U8]:
+        """Left and right of two pictures [H, W, 3] of eyes that come one after the other."""
+        of = dict(zip(self.order, (first, second), strict=True))
+        return self.eye(of["left"], "left"), self.eye(of["right"], "right")
 
     def _apart(self, picture: Samples) -> tuple[tuple[Samples, int], tuple[Samples, int]]:
         """First and second eye, as views, and in which row of the picture each begins."""
@@ -127,16 +129,9 @@ class Layout:
     def _eight_bits(self, picture: Samples) -> U8:
         if picture.dtype == np.uint8 and self._config.levels == (0.0, 1.0):
             return np.ascontiguousarray(picture, np.uint8)
-        from sags_node.sources.tones import Tones  # a kernel: other pictures need no place for one
+        from sags_node.sources.pixels import spread  # a kernel: other pictures need no place for one
 
-        if self._tones is None or self._tones.dtype != picture.dtype:
-            self._tones = Tones(self._config.levels, picture.dtype)
-        return self._tones(picture)
-
-
-def side_by_side(order: Literal["LR", "RL"]) -> Layout:
-    """Both eyes in the halves of a picture; LR: the left one in the left half."""
-    return Layout(GeometryConfig(layout="side_by_side", first="left" if order == "LR" else "right"))
+        return spread(picture, self._config.levels)
 
 
 def _cropped(width: int, height: int, crop: Box | None, name: str) -> tuple[int, int]:

@@ -83,8 +83,7 @@ class LiveStereo(LivePairs):
         self._readers: list[DeviceReader] = []
         try:
             for one in inputs:
-                opened = self._checked(one)
-                self._readers.append(DeviceReader(one, self._checked, opened, self._put, self.stopped))
+                self._readers.append(DeviceReader(one, self._checked, self._put, self.stopped))
         except SagsError:
             self.close()
             raise
@@ -135,23 +134,13 @@ class LiveStereo(LivePairs):
         side = picture.side or side
         if side is not None:
             self.add(side, _of(picture, self._layout.eye(picture.image, side)))
-        elif (pair := self._both(picture)) is not None:
-            self.add_both(*pair)
-
-    def _both(self, picture: Shot) -> tuple[Picture, Picture] | None:
-        """Left and right of an input that shows both, once they are there."""
-        if self._alternation is None:
-            images = self._layout.eyes(picture.image)
-            return _of(picture, images[0]), _of(picture, images[1])
-        joined = self._alternation.add(picture)
-        if joined is None:
-            return None
-        of = dict(zip(self._layout.order, joined, strict=True))
-        left, right = (_of(of[side], self._layout.eye(of[side].image, side)) for side in SIDES)
-        return left, right
-
-
-SIDES: tuple[Side, Side] = ("left", "right")
+        elif self._alternation is None:
+            left, right = self._layout.eyes(picture.image)
+            self.add_both(_of(picture, left), _of(picture, right))
+        elif (joined := self._alternation.add(picture)) is not None:
+            left, right = self._layout.in_turn(joined[0].image, joined[1].image)
+            shots = joined if self._layout.order[0] == "left" else joined[::-1]
+            self.add_both(_of(shots[0], left), _of(shots[1], right))
 
 
 def _of(shot: Shot, image: U8) -> Picture:
@@ -166,12 +155,12 @@ class DeviceReader:
         self,
         one: Input,
         open_device: Callable[[Input], CaptureDevice],
-        device: CaptureDevice,
         put: Callable[[Shot | None, Side | None], None],
         stopped: threading.Event,
     ) -> None:
         self._input = one
         self._open_device = open_device
+        device = open_device(one)
         self._device: CaptureDevice | None = device
         self._put = put
         self._stopped = stopped

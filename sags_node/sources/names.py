@@ -16,9 +16,8 @@ log = logging.getLogger(__name__)
 
 EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
 _LAST = re.compile(r"(\d+)(?:\.(\d+))?(?=\D*$)")  # the last number of a name, and what may be its fraction
-_CLOCK = re.compile(
-    r"(?<!\d)([01]\d|2[0-3])([-_:h]?)([0-5]\d)[-_:m]?([0-5]\d)(?!\d)"
-)  # hours, minutes, seconds
+# Hours, minutes, seconds.
+_CLOCK = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_:h]?)([0-5]\d)[-_:m]?([0-5]\d)(?!\d)")
 HALF_DAY = 12 * 3600  # s
 CLEARLY = 2.0  # times as uneven as the other order
 EPOCH = 10**9, 2 * 10**9  # s since 1970: a time from 2001 to 2033; dates as 20260101120000 are none

@@ -53,7 +53,7 @@ class RawPair(NamedTuple):
 
 
 class Pairs:
-    """A reader of a recording: its pairs in order, from any start.
+    """A reader of a recording.
 
     Attributes:
         count: pairs as announced; a video may end earlier.
@@ -78,7 +78,6 @@ class Pairs:
     cut_off = ""
     reach: int
     judged: tuple[Finding, ...] = ()
-    _next = 0
 
     @property
     def findings(self) -> list[Finding]:
@@ -90,19 +89,8 @@ class Pairs:
         fix = "calibrate pictures as they are played; a camera that is guessed has such pixels"
         return [*found, Finding("warning", what, fix, {"pixel_aspect": self.pixel_aspect})]
 
-    def seek(self, index: int) -> None:
-        """Make `index` the next pair."""
-        self._next = index
-
-    def skip(self) -> bool:
-        """Pass over one pair as cheaply as possible; False at the end."""
-        if self._next >= self.count:
-            return False
-        self._next += 1
-        return True
-
-    def read(self) -> RawPair | None:
-        """The next pair, None at the end.
+    def at(self, index: int) -> RawPair | None:
+        """The pair of this number, None behind the end. Those that follow each other are read fastest.
 
         Raises:
             LostPictureError: it cannot be read; those behind it may be.
@@ -144,10 +132,11 @@ class FolderPairs(Pairs):
         self.files = [files[0] for files in self._files]
         times = times_in(self.files)
         if times is not None and len(times) > 1:
+            period = float(np.median(np.diff(times)))
             others = times if right is None else times_in([files[1] for files in self._files])
-            if others is None or not _are_near(times, others):
+            if others is None or np.abs(others - times).max() > NEAR * period:
                 others = times
-            self.stamps, self.rate = np.stack([times, others], axis=1), 1e9 / float(np.median(np.diff(times)))
+            self.stamps, self.rate = np.stack([times, others], axis=1), 1e9 / period
             self.judged = judge_skew(self.stamps)
         self.oddities = gaps_in(self.files, times is not None)
         self._has_right = right is not None
@@ -165,14 +154,11 @@ class FolderPairs(Pairs):
             self._eight_bits = EightBits(map(self._samples, _spread(eyes)), levels)
             if levels is None:
                 self._eight_bits.tell(left)
-        self.read()  # the first pair shows whether the eyes fit each other
-        self.seek(0)
+        self.at(0)  # the first pair shows whether the eyes fit each other
 
-    def read(self) -> RawPair | None:
-        index = self._next
+    def at(self, index: int) -> RawPair | None:
         if index >= self.count:
             return None
-        self._next += 1
         files = self._files[index]
         left = self._eye(files[0])
         right = self._eye(files[1]) if self._has_right else None
@@ -325,10 +311,6 @@ def _at_one_time(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
         (folders[0][at], *(files[each[at]] for files, each in zip(folders[1:], partners, strict=True)))
         for at in shared
     ]
-
-
-def _are_near(times: I64, others: I64) -> bool:
-    return bool(np.abs(others - times).max() <= NEAR * float(np.median(np.diff(times))))
 
 
 def _spread(files: Sequence[F]) -> Sequence[F]:

@@ -60,8 +60,8 @@ class _Edge:
         self._jumps: list[int] = []
 
     @property
-    def newest(self) -> int | None:
-        return self._stamps[-1] if self._stamps else None
+    def newest(self) -> int:
+        return self._stamps[-1]
 
     def add(self, stamp_ns: int, sample: Sample) -> None:
         if self._stamps and stamp_ns < self._stamps[-1] - LATE_NS:
@@ -118,13 +118,10 @@ class _Edge:
 class _Fixed(NamedTuple):
     parent: str
     T: F64
+    newest: int = 0
 
     def at(self, t_ns: int) -> F64:
         return self.T
-
-    @property
-    def newest(self) -> None:
-        return None
 
 
 class PoseTrack:
@@ -206,7 +203,7 @@ class PoseTrack:
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest sample; 0 before the first."""
-        return max((edge.newest or 0 for edge in self._edges.values()), default=0)
+        return max((edge.newest for edge in self._edges.values()), default=0)
 
     def _at(self, t_ns: int) -> F64:
         base, hand = self._chain(self._base), self._chain(self._hand)

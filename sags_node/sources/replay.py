@@ -19,7 +19,7 @@ from sags_node.sources.endonerf import EndoNerfPairs
 from sags_node.sources.layout import Layout
 from sags_node.sources.pictures import FolderPairs, Pairs, say
 from sags_node.sources.scared import ScaredPairs
-from sags_node.sources.truth import Poses, References
+from sags_node.sources.truth import References, read_poses
 from sags_node.sources.videos import OneVideoPairs, VideoPairs
 from sags_node.types import U8, StereoFrame
 from sags_node.wall_clock import WallClock
@@ -91,12 +91,12 @@ class Replay:
         self._clock = clock
         self._wall_ns = wall_ns
         self._sleep = sleep or self._stopped.wait
-        self._poses = None if config.poses is None else Poses(config.poses)
+        self._poses = None if config.poses is None else read_poses(config.poses)
         self._references = References(config.reference) if references else None
         self.pairs = open_pairs(config, references)
         lefts = self.pairs.count if self.pairs.left_count is None else self.pairs.left_count
         if self._poses is not None:
-            self._compare_poses(self._poses, lefts)
+            self._compare_poses(len(self._poses), lefts)
         if self._references is not None:
             self._compare_references(self._references, lefts)
         self._count = -(-self.pairs.count // config.stride)  # rounded up
@@ -125,8 +125,7 @@ class Replay:
                 self.pairs.close()
                 raise UsageError(f"{self.pairs.cut_off}, or play what is there with source.frames:={there}")
 
-    def _compare_poses(self, poses: Poses, lefts: int) -> None:
-        there = len(poses)
+    def _compare_poses(self, there: int, lefts: int) -> None:
         if there == lefts or (self.pairs.cut_off and there > lefts):  # the pictures that it lost have poses
             return
         self.pairs.close()
@@ -183,7 +182,6 @@ class Replay:
             SagsError: a picture is damaged, or the right eye ends before the left one.
         """
         stride = self._config.stride
-        self.pairs.seek(self.first * stride)
         self._began = None
         self._dropped_in_a_row = 0
         epoch, index, frame_id, last = 0, self.first, self.first, 0
@@ -191,10 +189,10 @@ class Replay:
         while not self._stopped.is_set() and frame_id != limit:
             pair = None
             if self._is_too_late(frame_id):
-                ended = not self.pairs.skip()
+                ended = index * stride >= self.pairs.count
             else:
                 try:
-                    pair = self.pairs.read()
+                    pair = self.pairs.at(index * stride)
                     ended = pair is None
                 except LostPictureError as lost:
                     say(str(lost))
@@ -202,7 +200,6 @@ class Replay:
             if ended:
                 if not self._config.loop or index == self.first:
                     return
-                self.pairs.seek(self.first * stride)
                 epoch, index = epoch + 1, self.first
                 continue
             if pair is None:
@@ -212,7 +209,7 @@ class Replay:
                 self._dropped_in_a_row = 0
                 numbers = self.pairs.left_numbers
                 number = index * stride if numbers is None else int(numbers[index * stride])
-                pose = pair.T_world_cam if self._poses is None else self._poses.at(number)
+                pose = pair.T_world_cam if self._poses is None else self._poses[number]
                 reference = pair.reference
                 if reference is None and self._references is not None:
                     reference = self._references.at(number, pair.left.shape[1::-1])
@@ -240,8 +237,6 @@ class Replay:
                     recorded_s=self.seconds_of(index),
                     recorded_number=number,
                 )
-            for _ in range(stride - 1):
-                self.pairs.skip()
             index += 1
             frame_id += 1
 

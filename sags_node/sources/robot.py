@@ -15,14 +15,13 @@ import numpy as np
 from sags_node.bags.bag import read_messages
 from sags_node.config.schema import BagRobot, BagSource, LaunchConfig, LiveSource, PushRobot, Ros2Robot
 from sags_node.errors import SagsError, UsageError
-from sags_node.geometry import invert
+from sags_node.geometry import invert, rigid
 from sags_node.messaging.inbox import Inbox
 from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import TF
 from sags_node.messaging.wire import Message
 from sags_node.rig.hand_eye import FILE, read_hand_eye
-from sags_node.ros.endpoints import Delivery, Reader
-from sags_node.ros.graph import Graph
+from sags_node.ros.graph import Delivery, Graph, Reader
 from sags_node.sources.pose_track import KEPT, POSE_TYPES, NoPoseError, PoseTrack
 from sags_node.sources.ros2 import absolute
 from sags_node.sources.source import Source, findings_of
@@ -312,10 +311,7 @@ class Posed:
 
 def rectified(T_hand_cam: F64, rig: StereoRig) -> F64:
     """The left rectified camera on the hand [4, 4], of the raw one."""
-    turn = np.eye(4)
-    turn[:3, :3] = rig.left.R.T
-    moved: F64 = T_hand_cam @ turn
-    return moved
+    return T_hand_cam @ rigid(rig.left.R.T, np.zeros(3))
 
 
 def hand_eye_file(config: LaunchConfig) -> Path:

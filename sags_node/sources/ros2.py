@@ -8,15 +8,14 @@ import time
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from sags_node.bags.camera_info import read_eye, same
+from sags_node.bags.camera_info import read_eye, same, topic_of
 from sags_node.bags.pictures import IMAGE_TYPES, decode_picture, header_stamp
 from sags_node.config.schema import Ros2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.rig import accept_rig, already_rectified
-from sags_node.ros.endpoints import Reader
-from sags_node.ros.graph import Graph, receive_buffer
+from sags_node.ros.graph import Graph, Reader, receive_buffer
 from sags_node.sources.sent import SentPictures
 from sags_node.types import Eye as Calibrated
 from sags_node.types import Finding, Side, StereoRig
@@ -222,8 +221,8 @@ class _CameraInfos:
 
     def __init__(self, graph: Graph, config: Ros2Source) -> None:
         self.names: Mapping[Side, str] = {
-            "left": absolute(config.left_info or _beside(config.left)),
-            "right": absolute(config.right_info or _beside(config.right)),
+            "left": absolute(config.left_info or topic_of(config.left)),
+            "right": absolute(config.right_info or topic_of(config.right)),
         }
         self._readers = {eye: graph.reader(name, CAMERA_INFO) for eye, name in self.names.items()}
 
@@ -236,7 +235,3 @@ class _CameraInfos:
         for eye, reader in self._readers.items():
             for data in reader.take():
                 yield eye, read_eye(data, self.names[eye])
-
-
-def _beside(topic: str) -> str:
-    return topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"

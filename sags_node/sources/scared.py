@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -38,22 +37,6 @@ LARGEST_JSON = 2**20  # bytes
 LARGEST_POINTS = 2**28
 
 
-@dataclass(frozen=True, slots=True)
-class Rectification:
-    """The calibration of a keyframe and the rectification that follows from it."""
-
-    size: tuple[int, int]  # width and height of one eye's picture, px
-    K: tuple[F64, F64]  # left, right: [3, 3] px
-    distortion: tuple[F64, F64]  # [5]
-    R: tuple[F64, F64]  # [3, 3] raw to rectified camera
-    P: tuple[F64, F64]  # [3, 4] px, P[1][0, 3] = -f B in metres
-
-    @property
-    def T_rectified_raw(self) -> F64:
-        """Left raw camera to left rectified camera, [4, 4]."""
-        return geometry.rigid(self.R[0], np.zeros(3))
-
-
 class ScaredPairs(Pairs):
     """The frames of a keyframe's video with their poses and, if `references`, the structured light depth.
 
@@ -65,34 +48,24 @@ class ScaredPairs(Pairs):
         self._pictures, _ = _open_pictures(folder)
         self._points: NumberedFiles | None = None
         try:
-            self._rectification = read_rectification(folder, self._pictures.size)
-            self._poses = _read_poses(folder, self._pictures.count, self._rectification.T_rectified_raw)
+            self._left = read_calibration(folder, self._pictures.size).left
+            self._poses = _read_poses(folder, self._pictures.count, self._left)
             if references:
                 self._points = open_numbered(folder / "data/scene_points", ".tiff", LARGEST_POINTS)
         except SagsError:
             self.close()
             raise
-        self._look_up = cv2.initUndistortRectifyMap(
-            *(self._rectification.K[0], self._rectification.distortion[0], self._rectification.R[0]),
-            *(self._rectification.P[0], self._rectification.size, cv2.CV_32FC1),
-        )
+        eye = self._left
+        size = eye.width, eye.height
+        self._look_up = cv2.initUndistortRectifyMap(eye.K, eye.distortion, eye.R, eye.P, size, cv2.CV_32FC1)
         self.count = self._pictures.count if self._poses is None else len(self._poses)
         self.rate, self.pixel_aspect = self._pictures.rate, self._pictures.pixel_aspect
         self.oddities, self.cut_off, self.reach = self._pictures.oddities, self._pictures.cut_off, self.count
         stamps = self._pictures.stamps
         self.stamps = None if stamps is None else stamps[: self.count]
 
-    def seek(self, index: int) -> None:
-        self._pictures.seek(index)
-        self._next = index
-
-    def skip(self) -> bool:
-        self._next += 1
-        return self._next <= self.count and self._pictures.skip()
-
-    def read(self) -> RawPair | None:
-        index, self._next = self._next, self._next + 1
-        pair = self._pictures.read() if index < self.count else None
+    def at(self, index: int) -> RawPair | None:
+        pair = self._pictures.at(index) if index < self.count else None
         if pair is None:
             return None
         return pair._replace(
@@ -108,7 +81,7 @@ class ScaredPairs(Pairs):
         data = None if self._points is None else self._points.read(index)
         if data is None:
             return None
-        width, height = self._rectification.size
+        width, height = self._left.width, self._left.height
         # OpenCV takes the three channels for R, G, B and gives B, G, R.
         name = f"data/scene_points of frame {index}"
         points = decode(data, cv2.IMREAD_UNCHANGED, name, "unpack or download scene_points.tar.gz again")
@@ -123,12 +96,10 @@ class ScaredPairs(Pairs):
         """Depth [H, W] m in the left rectified picture, of points [H, W, 3] mm at the raw picture's pixels.
         Each rectified pixel takes the point of the nearest raw one: points are never averaged.
         """
-        depth = points @ (self._rectification.R[0][2] * METRES).astype(np.float32)
+        depth = points @ (self._left.R[2] * METRES).astype(np.float32)
         rectified = cv2.remap(depth, *self._look_up, cv2.INTER_NEAREST, borderValue=0)
-        known: F32 = np.where(
-            rectified > 0, rectified, np.float32(0)
-        )  # unknown: NaN in some files, 0 in others
-        return known
+        # Unknown is NaN in some files, 0 in others.
+        return np.where(rectified > 0, rectified, np.float32(0))
 
 
 def read_rig(folder: Path) -> StereoRig:
@@ -139,18 +110,11 @@ def read_rig(folder: Path) -> StereoRig:
     """
     pictures, rectified = _open_pictures(folder)
     pictures.close()
-    found = read_rectification(folder, pictures.size)
-    name, (width, height) = f"{folder.parent.name}_{folder.name}", found.size
-    if rectified:
-        baseline = -found.P[1][0, 3] / found.P[1][0, 0]
-        return rectified_rig(name, width, height, found.P[0][:, :3], baseline)
-    eyes = [
-        Eye(width, height, *parts) for parts in zip(found.K, found.distortion, found.R, found.P, strict=True)
-    ]
-    return StereoRig(name, *eyes, path=folder)
+    rig = read_calibration(folder, pictures.size)
+    return rectified_rig(rig.name, *pictures.size, rig.left.P[:, :3], rig.baseline) if rectified else rig
 
 
-def read_rectification(folder: Path, size: tuple[int, int]) -> Rectification:
+def read_calibration(folder: Path, size: tuple[int, int]) -> StereoRig:
     """Read `endoscope_calibration.yaml` and rectify as OpenCV does by default, like the public tools for it.
 
     Args:
@@ -176,8 +140,10 @@ def read_rectification(folder: Path, size: tuple[int, int]) -> Rectification:
     if T[0] > 0:
         raise UsageError(f"{file}: T points to the left: the eyes are exchanged; SCARED maps left to right")
     R1, R2, P1, P2, *_ = cv2.stereoRectify(M1, D1, M2, D2, size, R, T[:, None])
-    distortion = np.pad(D1, (0, 5 - len(D1))), np.pad(D2, (0, 5 - len(D2)))
-    return Rectification(size, (M1, M2), distortion, (R1, R2), (P1, P2))
+    eyes = [
+        Eye(*size, K, np.pad(D, (0, 5 - len(D))), R, P) for K, D, R, P in ((M1, D1, R1, P1), (M2, D2, R2, P2))
+    ]
+    return StereoRig(f"{folder.parent.name}_{folder.name}", *eyes, path=folder)
 
 
 def _matrix(storage: cv2.FileStorage, file: Path, key: str, lengths: tuple[int, ...]) -> F64:
@@ -211,7 +177,7 @@ def _open_pictures(folder: Path) -> tuple[OneVideoPairs | FolderPairs, bool]:
     )
 
 
-def _read_poses(folder: Path, count: int, T_rectified_raw: F64) -> F64 | None:
+def _read_poses(folder: Path, count: int, left: Eye) -> F64 | None:
     """`T_world_cam` [N, 4, 4] m of the left rectified camera; the world is that of frame 0. None without
     files.
 
@@ -222,7 +188,7 @@ def _read_poses(folder: Path, count: int, T_rectified_raw: F64) -> F64 | None:
         log.warning("%s has no data/frame_data: the camera is taken to stand still", folder)
         return None
     poses: list[F64] = []
-    T_world_key = np.eye(4)
+    T_world_key, T_rectified_raw = np.eye(4), geometry.rigid(left.R, np.zeros(3))
     while len(poses) < count and (text := files.read(len(poses))) is not None:
         T_raw_key = _read_pose(text, f"{folder / 'data/frame_data'} {len(poses)}")
         if not poses:

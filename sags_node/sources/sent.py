@@ -28,12 +28,16 @@ WINDOW = 90  # stamps that the loss is counted over: three seconds
 
 
 class Arrivals:
-    """What came of one eye's pictures, and what was lost on the way, by the gaps between stamps."""
+    """What came of one eye's pictures, and what was lost on the way, by the gaps between stamps.
+
+    Attributes:
+        lost: since the start, up to the last full stretch of `WINDOW` pictures.
+    """
 
     def __init__(self) -> None:
         self._stamps: deque[int] = deque(maxlen=WINDOW + 1)  # with the one before
         self._count = 0
-        self._lost_before = 0  # the last stretch of `WINDOW` pictures began
+        self.lost = 0
 
     def add(self, stamp_ns: int) -> None:
         if self._stamps and (stamp_ns <= self._stamps[-1] or self._was_away(stamp_ns - self._stamps[-1])):
@@ -42,12 +46,7 @@ class Arrivals:
         self._stamps.append(stamp_ns)
         self._count += 1
         if self._count % WINDOW == 0:
-            self._lost_before += round(self._lost_now())
-
-    @property
-    def lost(self) -> int:
-        """Since the start, up to the last full stretch."""
-        return self._lost_before
+            self.lost += round(self._lost_now())
 
     @property
     def share_lost(self) -> float:

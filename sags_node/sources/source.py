@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self
 
 from sags_node.config import schema as cfg
 from sags_node.config.launch_file import load_launch
@@ -40,18 +40,11 @@ class Source(Protocol):
         """End the iteration promptly, also while it waits. May be called from any thread."""
 
 
-@runtime_checkable
-class Warns(Protocol):
-    """A source that knows of more than frames."""
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Return what is wrong, and how to fix it. May be read from any thread."""
-
-
 def findings_of(source: object) -> tuple[Finding, ...]:
-    """Return what a source of frames or poses says is wrong."""
-    return source.findings if isinstance(source, Warns) else ()
+    """Return what a source of frames or poses that knows of more says is wrong, and how to fix it. May be
+    called from any thread."""
+    found: tuple[Finding, ...] = getattr(source, "findings", ())
+    return found
 
 
 def open_source(

@@ -17,47 +17,35 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import open_file
 from sags_node.geometry import is_rotation
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
-from sags_node.types import F32, F64, Reference
+from sags_node.types import F32, F64, Bool, Reference
 
 UNKNOWN = 65535  # counts of depth, as many programs write it, beside 0
 _LARGEST = 2**31  # bytes
 FARTHEST = 1.0  # m that a scope moves: a millimetre that is taken for a metre
 
 
-class Poses:
-    """Camera poses of a recording, one per frame.
+def read_poses(file: Path) -> F64:
+    """`T_world_cam` [T, 4, 4] m of each frame of a recording.
 
     Raises:
-        UsageError: the file is missing, damaged, or does not hold `T_world_cam` [T, 4, 4].
+        UsageError: the file is missing, damaged, or does not hold that.
     """
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._poses = load_array(file, "T_world_cam", (None, 4, 4)).astype(np.float64)
-        if not np.isfinite(self._poses).all():
-            raise UsageError(f"{file}: T_world_cam holds values that are not finite")
-        rigid = is_rotation(self._poses[:, :3, :3]) & (self._poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
-        if not rigid.all():
-            raise UsageError(
-                f"{file}: T_world_cam of frame {int(np.argmin(rigid))} is no rotation and translation; "
-                "is it transposed, or scaled?"
-            )
-        moved = np.ptp(self._poses[:, :3, 3], axis=0).max(initial=0)
-        if moved > FARTHEST:
-            raise UsageError(
-                f"{file}: T_world_cam moves the camera by {moved:.3g} m, more than within a patient; "
-                "translations are in metres: of millimetres divide them by 1000"
-            )
-
-    def __len__(self) -> int:
-        return len(self._poses)
-
-    def at(self, index: int) -> F64:
-        """`T_world_cam` [4, 4] of one frame of the recording, metres."""
-        if index >= len(self._poses):
-            raise SagsError(f"{self._file} holds {len(self._poses)} poses, none for frame {index}")
-        pose: F64 = self._poses[index]
-        return pose
+    poses = load_array(file, "T_world_cam", (None, 4, 4)).astype(np.float64)
+    if not np.isfinite(poses).all():
+        raise UsageError(f"{file}: T_world_cam holds values that are not finite")
+    rigid = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == [0, 0, 0, 1]).all(axis=1)
+    if not rigid.all():
+        raise UsageError(
+            f"{file}: T_world_cam of frame {int(np.argmin(rigid))} is no rotation and translation; "
+            "is it transposed, or scaled?"
+        )
+    moved = np.ptp(poses[:, :3, 3], axis=0).max(initial=0)
+    if moved > FARTHEST:
+        raise UsageError(
+            f"{file}: T_world_cam moves the camera by {moved:.3g} m, more than within a patient; "
+            "translations are in metres: of millimetres divide them by 1000"
+        )
+    return poses
 
 
 class References:
@@ -70,18 +58,20 @@ class References:
     def __init__(self, config: ReferenceConfig) -> None:
         self._config = config
         self._depth_files = {} if config.depth is None else _by_frame_number(config.depth)
-        self._points = self._visible = None
-        self._rows: dict[int, int] | None = None  # of tracks by frame number; None: each frame has its row
+        self._tracks: dict[int, tuple[F64, Bool]] = {}  # points and which are visible, by frame number
+        self._numbers: Sequence[int] = ()  # of frames, as tracks say them; else each frame has its row
         if config.tracks is not None:
-            self._points = load_array(config.tracks, "points", (None, None, 3)).astype(np.float64)
-            self._visible = load_array(config.tracks, "visible", self._points.shape[:2]).astype(np.bool_)
-            self._rows = _rows_by_frame_number(config.tracks, len(self._points))
+            points = load_array(config.tracks, "points", (None, None, 3)).astype(np.float64)
+            visible = load_array(config.tracks, "visible", points.shape[:2]).astype(np.bool_)
+            self._numbers = _frame_numbers(config.tracks, len(points))
+            rows = zip(points, visible, strict=True)
+            self._tracks = dict(zip(self._numbers or range(len(points)), rows, strict=True))
 
     def beyond(self, count: int) -> str:
         """What is wrong where a number is that of no frame of the recording's `count`, as when they begin
         at 1; "": nothing."""
         config = self._config
-        for where, numbers in ((config.depth, self._depth_files), (config.tracks, self._rows or ())):
+        for where, numbers in ((config.depth, self._depth_files), (config.tracks, self._numbers)):
             if (last := max(numbers, default=-1)) >= count:
                 return (
                     f"{where} knows frame {last}, but the recording's {count} frames are numbered from 0 to "
@@ -114,10 +104,7 @@ class References:
             SagsError: the depth picture is damaged, not 16 bit, or of another shape than the frame's.
         """
         depth_file = self._depth_files.get(index)
-        points = visible = None
-        row = index if self._rows is None else self._rows.get(index)
-        if self._points is not None and self._visible is not None and row in range(len(self._points)):
-            points, visible = self._points[row], self._visible[row]
+        points, visible = self._tracks.get(index, (None, None))
         if depth_file is None and points is None:
             return None
         depth = None if depth_file is None else self._read_depth(depth_file, size)
@@ -144,18 +131,18 @@ def _by_frame_number(folder: Path) -> dict[int, Path]:
     return {int(file.stem): file for file in files}
 
 
-def _rows_by_frame_number(file: Path, count: int) -> dict[int, int] | None:
-    """Of tracks: as their `frames` [T] says; None where there is none."""
+def _frame_numbers(file: Path, count: int) -> Sequence[int]:
+    """Of tracks: as their `frames` [T] says; empty where there is none."""
     with zipfile.ZipFile(file) as archive:
         if "frames.npy" not in archive.namelist():
-            return None
+            return ()
     frames = load_array(file, "frames", (count,))
-    rows = {int(frame): row for row, frame in enumerate(frames.tolist())} if frames.dtype.kind in "iu" else {}
-    if len(rows) < count or min(rows, default=0) < 0:
+    numbers: list[int] = frames.tolist() if frames.dtype.kind in "iu" else []
+    if len(set(numbers)) < count or min(numbers, default=0) < 0:
         raise UsageError(
             f"{file}: 'frames' must hold the frame number of each row, from 0, none of them twice"
         )
-    return rows
+    return numbers
 
 
 def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[np.generic]:

@@ -114,20 +114,24 @@ class Device:
             return None
         self._last_stamp_ms = stamp_ms
         device_ns, arrival_ns = round(stamp_ms * 1e6), time.time_ns()
-        monotonic_ns = time.monotonic_ns()
-        self._learn(device_ns, monotonic_ns)
-        is_believed = self._is_near or self._far < STRANGE
-        t_ns = wall_stamp(device_ns, monotonic_ns, arrival_ns) if is_believed else arrival_ns
+        age_ns = self._age(device_ns, time.monotonic_ns() - device_ns)
         if self._shift is None:
             image: Samples = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
         else:
             image = _deep(picture, self._shift, self.size)
-        return Shot(t_ns, image, device_ns=device_ns, arrival_ns=arrival_ns)
+        return Shot(arrival_ns - age_ns, image, device_ns=device_ns, arrival_ns=arrival_ns)
 
-    def _learn(self, driver_ns: int, monotonic_ns: int) -> None:
+    def _age(self, driver_ns: int, before_ns: int) -> int:
+        """How long ago a picture was taken, ns, that the driver stamped so long before it arrived; 0 where it
+        gives no stamp (0), or one of another clock.
+
+        No picture is taken after it arrived: where a driver stamps ahead (vivid does), arrival counts.
+        """
         if not self._is_near:
-            self._is_near = abs(monotonic_ns - driver_ns) <= NEAR_NS
+            self._is_near = abs(before_ns) <= NEAR_NS
             self._far += 1
+        is_believed = driver_ns and (self._is_near or self._far < STRANGE)
+        return max(before_ns, 0) if is_believed else 0
 
     def close(self) -> None:
         self._capture.release()
@@ -138,18 +142,6 @@ def _deep(picture: Samples, shift: int, size: tuple[int, int]) -> Samples:
     gray = picture.reshape(-1).view(np.uint16).reshape(size[1], size[0])
     rgb: Samples = cv2.merge([cv2.multiply(gray, 1 << shift)] * 3)
     return rgb
-
-
-def wall_stamp(driver_ns: int, monotonic_ns: int, wall_ns: int) -> int:
-    """A driver's monotonic capture stamp on the wall clock, ns; the arrival time where it gives none.
-
-    No picture is taken after it arrived: where a driver stamps ahead (vivid does), arrival counts.
-
-    Args:
-        driver_ns: the driver's stamp, 0 when it gives none.
-        monotonic_ns, wall_ns: both clocks at arrival.
-    """
-    return wall_ns - max(monotonic_ns - driver_ns, 0) if driver_ns else wall_ns
 
 
 def _present() -> str:
@@ -175,16 +167,12 @@ def open_cameras(
     """
     sides: dict[str, Side | None] = {config.left: None}
     if config.geometry.layout == "separate":
-        sides = {config.left: "left", _right_path(config): "right"}
+        if config.right is None:
+            raise UsageError("source.right names no camera; name one, or set source.geometry.layout")
+        if os.path.realpath(config.left) == os.path.realpath(config.right):
+            raise UsageError(f"source.left and source.right are the same camera, {config.right}")
+        sides = {config.left: "left", config.right: "right"}
     inputs = [
         Input(path, side, partial(open_device, path, config), config.deadline) for path, side in sides.items()
     ]
     return LiveStereo(inputs, config, size)
-
-
-def _right_path(config: V4l2Source) -> str:
-    if config.right is None:
-        raise UsageError("source.right names no camera; name one, or set source.geometry.layout")
-    if os.path.realpath(config.left) == os.path.realpath(config.right):
-        raise UsageError(f"source.left and source.right are the same camera, {config.right}")
-    return config.right

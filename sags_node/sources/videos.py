@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 from pathlib import Path
 
@@ -13,9 +12,7 @@ from sags_node.media.video import Video
 from sags_node.sources.layout import Layout
 from sags_node.sources.pairing import NEAR, pair
 from sags_node.sources.pictures import Pairs, RawPair, size_text
-from sags_node.types import I64, U8, Bool
-
-log = logging.getLogger(__name__)
+from sags_node.types import I64
 
 PARTNERED = 0.5  # share of the pictures that have a partner, where stamps of two files tell it
 TORN = (
@@ -62,26 +59,27 @@ class VideoPairs(Pairs):
         self.left_count, self.left_numbers = self.left.count, self._numbers[:, 0]
         self.stamps = self._find_stamps()
         self.pixel_aspect = layout.pixel_aspect(*self.left.size, self.left.pixel_aspect)
-        self.cut_off = next((_cut_off(each) for each in self._videos if each.cut_off), "")
+        self.cut_off = next((each.cut_off for each in self._videos if each.cut_off), "")
         self.reach = min(self.count, *(each.count for each in self._videos))
         self._compare_lengths()
 
-    def read(self) -> RawPair | None:
-        if self._next >= self.count:
+    def at(self, index: int) -> RawPair | None:
+        if index >= self.count:
             return None
-        index, self._next = self._next, self._next + 1
         of_left, of_right = (int(number) for number in self._numbers[index])
         left = self.left.read(of_left)
         if left is None:
             return None
-        right = None if self.right is None else self.right.read(of_right)
-        if self.right is not None and right is None:
+        seen = self._layout.eye(left, "left")
+        if self.right is None:
+            return RawPair(seen, None, None)
+        right = self.right.read(of_right)
+        if right is None:
             raise SagsError(
                 f"{self.right.path} ends at frame {index} but {self.left.path} goes on; set source.frames "
                 "to stop there"
             )
-        seen = None if right is None else self._layout.eye(right, "right")
-        return RawPair(self._layout.eye(left, "left"), seen, None)
+        return RawPair(seen, self._layout.eye(right, "right"), None)
 
     def close(self) -> None:
         for video in self._videos:
@@ -117,12 +115,14 @@ class VideoPairs(Pairs):
         period = 1e9 / left.rate
         late, ends_late = (int(right.stamps[at] - left.stamps[at]) for at in (0, -1))
         of_one_clock = min(abs(late), abs(ends_late)) <= NEAR * period
-        if is_even and (not of_one_clock or abs(late) <= NEAR * period):
-            if not of_one_clock:
-                self._tell_late(late)
-            return self._drifted(left, right, period) if of_one_clock else None
         if not of_one_clock:  # two recorders, each with its own zero
-            self._tell_late(late)
+            self.oddities.append(
+                f"the stamps of the right video begin {abs(late) * 1e-9:.3f} s "
+                f"{'after' if late > 0 else 'before'} those of the left one; their first pictures are taken "
+                "for one moment: is an eye late, cut its beginning off"
+            )
+        if is_even and (not of_one_clock or abs(late) <= NEAR * period):
+            return self._drifted(left, right, period) if of_one_clock else None
         self._late = 0 if of_one_clock else late
         found = pair(left.stamps, right.stamps - self._late, NEAR * period * 1e-9)
         alone = left.count - len(found), right.count - len(found)
@@ -172,13 +172,6 @@ class VideoPairs(Pairs):
         )
         return pair(left.stamps, right.stamps, NEAR * period * 1e-9) if by_time else None
 
-    def _tell_late(self, late_ns: int) -> None:
-        self.oddities.append(
-            f"the stamps of the right video begin {abs(late_ns) * 1e-9:.3f} s "
-            f"{'after' if late_ns > 0 else 'before'} those of the left one; their first pictures are taken "
-            "for one moment: is an eye late, cut its beginning off"
-        )
-
     def _find_stamps(self) -> I64 | None:
         left, right = self.left, self.right
         if left.stamps is None or (left.is_even and self.by_number):
@@ -223,25 +216,21 @@ class OneVideoPairs(Pairs):
             of_eyes = video.stamps[self._numbers]
             self.stamps = np.stack([of_eyes[:, left], of_eyes[:, -1 - left]], axis=1)
         self.pixel_aspect = layout.pixel_aspect(*video.size, video.pixel_aspect)
-        self.cut_off = _cut_off(video) if video.cut_off else ""
-        self.reach = self.count
+        self.cut_off, self.reach = video.cut_off, self.count
         self.oddities = _oddities(video, layout)
 
-    def read(self) -> RawPair | None:
-        if self._next >= self.count:
+    def at(self, index: int) -> RawPair | None:
+        if index >= self.count:
             return None
-        index, self._next = self._next, self._next + 1
         pictures = [self._video.read(int(number)) for number in self._numbers[index]]
         first, last = pictures[0], pictures[-1]
         if first is None or last is None:
             return None
         if self._layout.is_sequential:
-            of = dict(zip(self._layout.order, (first, last), strict=True))
-            left, right = self._layout.eye(of["left"], "left"), self._layout.eye(of["right"], "right")
+            left, right = self._layout.in_turn(first, last)
         else:
             left, right = self._layout.eyes(first)
-        painted = self._layout.tools(first)
-        return RawPair(left, right, None if painted is None else _unpainted(painted, left))
+        return RawPair(left, right, self._layout.tissue(first, left))
 
     def close(self) -> None:
         self._video.close()
@@ -254,10 +243,6 @@ def _oddities(video: Video, layout: Layout) -> list[str]:
     return [*video.oddities, f"{video.path}: {TORN}; set source.geometry.deinterlace:=top, or bottom"]
 
 
-def _cut_off(video: Video) -> str:
-    return f"{video.path} {video.cut_off}; copy it again"
-
-
 def _turns(video: Video) -> I64:
     """The turn of each picture [N], where the eyes come in turn; even: the first eye's. The time between two
     pictures says how many were lost, so the eyes are not exchanged by one."""
@@ -266,9 +251,3 @@ def _turns(video: Video) -> I64:
         steps = np.maximum(1, np.rint(np.diff(video.stamps) * (video.rate * 1e-9))).astype(np.int64)
         turns = np.concatenate([[0], np.cumsum(steps)])
     return turns
-
-
-def _unpainted(painted: U8, left: U8) -> Bool:
-    from sags_node.sources.painted import unpainted  # a kernel: other videos need no place for one
-
-    return unpainted(painted, left)

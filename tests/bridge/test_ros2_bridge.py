@@ -27,8 +27,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.received import ReceivedImage, interpret
 from sags_node.messaging.subscriber import Subscriber
-from sags_node.ros.endpoints import Delivery
-from sags_node.ros.graph import kernel_buffer
+from sags_node.ros.graph import Delivery, kernel_buffer
 
 pytestmark = pytest.mark.live
 

@@ -19,8 +19,7 @@ from waiting import until
 
 from sags_node.config.schema import RosGraph
 from sags_node.messaging.sockets import Closes
-from sags_node.ros.endpoints import Delivery
-from sags_node.ros.graph import Graph
+from sags_node.ros.graph import Delivery, Graph
 
 pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
 

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from command_line import killed
 from places import HELPERS
@@ -22,6 +21,6 @@ def sending(command: Sequence[object], **variables: str) -> Iterator[subprocess.
         yield process
 
 
-def stereo_sender(way: str, where: object, session: Path, seconds: float, *settings: str) -> list[object]:
+def stereo_sender(way: str, where: object, *settings: str) -> list[object]:
     """The command of `stereo_sender.py`."""
-    return [sys.executable, HELPERS / "stereo_sender.py", way, where, session, seconds, *settings]
+    return [sys.executable, HELPERS / "stereo_sender.py", way, where, *settings]

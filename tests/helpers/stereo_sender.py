@@ -1,7 +1,7 @@
-"""A process that sends pairs of phantom pictures, for the tests of sources that other programs feed.
+"""A process that sends pairs of phantom pictures for a minute, for tests of sources that other programs feed.
 
-    python stereo_sender.py push ENDPOINT SESSION SECONDS [key=value ...]
-    python stereo_sender.py dds DOMAIN SESSION SECONDS [key=value ...]
+    python stereo_sender.py push ENDPOINT [key=value ...]
+    python stereo_sender.py dds DOMAIN [key=value ...]
 
 The number of each pair is painted into both pictures (`read_number`), so that a mismatch shows; with
 `clock=1` the milliseconds of its stamp (of a minute), so that a wrong stamp shows. In the end it says how
@@ -13,14 +13,15 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
+from places import SESSION
 
 from sags_node.rig import load_rig, resized_rig
 from sags_node.types import U8
 
+SECONDS = 60
 BITS, BLOCK = 16, 8  # of the painted number, and px of one
 
 
@@ -51,7 +52,7 @@ def push(endpoint: str, jpeg: bool) -> tuple[Callable[[U8, U8, int], None], Call
     return send, lambda: sender.left_out
 
 
-def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[[U8, U8, int], None]:
+def dds(domain: int, compressed: bool, scale: float) -> Callable[[U8, U8, int], None]:
     from sags_node.config.schema import RosGraph
     from sags_node.messaging import cdr
     from sags_node.messaging.topics import CAMERA_INFO, IMAGE, TF
@@ -64,7 +65,7 @@ def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[
     tf = graph.writer("/tf", TF)
     pose = np.eye(4)
     pose[:3, 3] = 0.1, 0.2, 0.3
-    rig = resized_rig(load_rig(session / "calib"), scale)
+    rig = resized_rig(load_rig(SESSION / "calib"), scale)
 
     def send(left: U8, right: U8, stamp_ns: int) -> None:
         tf.write(cdr.transform(pose, stamp_ns).cdr(), stamp_ns)
@@ -81,13 +82,13 @@ def dds(domain: int, compressed: bool, scale: float, session: Path) -> Callable[
 
 
 def main() -> None:
-    way, where, folder, seconds, *settings = sys.argv[1:]
+    way, where, *settings = sys.argv[1:]
     said = dict(setting.split("=") for setting in settings)
-    session, rate = Path(folder), float(said.get("rate", 30))
+    rate = float(said.get("rate", 30))
     width, height = (int(side) for side in said.get("size", "1280x1024").split("x"))
     pairs = [
         [
-            cv2.resize(cv2.imread(str(session / eye / f"{index:04d}.jpg"))[..., ::-1], (width, height))
+            cv2.resize(cv2.imread(str(SESSION / eye / f"{index:04d}.jpg"))[..., ::-1], (width, height))
             for eye in ("left", "right")
         ]
         for index in range(4)
@@ -96,10 +97,10 @@ def main() -> None:
     if way == "push":
         send, left_out = push(where, compressed)
     else:
-        send, left_out = dds(int(where), compressed, width / 320, session), lambda: 0
+        send, left_out = dds(int(where), compressed, width / 320), lambda: 0
     print("sending", flush=True)
     begun = time.monotonic()
-    for number in range(round(float(seconds) * rate)):
+    for number in range(round(SECONDS * rate)):
         time.sleep(max(0.0, begun + number / rate - time.monotonic()))
         left, right = pairs[number % len(pairs)]
         stamp_ns = time.time_ns()

@@ -193,14 +193,14 @@ def test_the_recordings_own_clock_and_a_gap_in_it(tmp_path: Path) -> None:
 
 
 def test_opening_a_large_bag_takes_little_memory(tmp_path: Path) -> None:
-    """Of 130 MB in two files no more is ever held than a few chunks."""
+    """Of 65 MB in two files no more is ever held than a few chunks."""
     big = np.zeros((600, 720, 3), np.uint8)
     schema = Schema(id=0, name=files.IMAGE, encoding="ros2msg", data=cdr.definition(files.IMAGE).encode())
-    with BagWriter(tmp_path / "bag", Limits(bytes=80_000_000)) as writer:
+    with BagWriter(tmp_path / "bag", Limits(bytes=40_000_000)) as writer:
         channels = [
             writer.add_topic(f"/rig/{eye}/image_raw", files.IMAGE, schema) for eye in ("left", "right")
         ]
-        for number in range(50):
+        for number in range(25):
             stamp = START + number * 40 * MS
             data = b"".join(bytes(part) for part in cdr.image(big, "rgb8", stamp).parts)
             for channel in channels:
@@ -217,7 +217,7 @@ def test_opening_a_large_bag_takes_little_memory(tmp_path: Path) -> None:
         [sys.executable, "-c", program, str(tmp_path / "bag")], capture_output=True, text=True, check=True
     )
     count, grown_kb = map(int, done.stdout.split())
-    assert count == 50 and grown_kb < 40_000
+    assert count == 25 and grown_kb < 40_000
 
 
 def test_a_ros1_bag_is_checked_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -327,18 +327,13 @@ def test_nothing_pairs(tmp_path: Path) -> None:
     assert len(frames) == COUNT and frames[0].t_capture_right_ns - frames[0].t_capture_ns == 17 * MS
 
 
-def test_headers_without_stamps_use_the_time_of_recording(tmp_path: Path) -> None:
-    rows = [(t, files.image(ROS2, m.data.reshape(files.HEIGHT, files.WIDTH, 3), 0), s) for t, m, s in
-            files.stereo_rows(ROS2, 3, infos=False)]  # fmt: skip
-    frames = play(files.write_rosbag2(tmp_path / "bag", rows))
-    assert [frame.t_capture_ns - START - 5 * MS for frame in frames] == [0, 40 * MS, 80 * MS]
-
-
 # ---- calibration -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unit", [10**9, 10**18], ids=["whole seconds", "one for all"])
-def test_stamps_that_repeat_give_way_to_the_time_of_recording(unit: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("unit", "told"), [(10**9, 2), (10**18, 2), (10**19, 0)], ids=["whole seconds", "one for all", "none"]
+)
+def test_stamps_that_repeat_give_way_to_the_time_of_recording(unit: int, told: int, tmp_path: Path) -> None:
     rows = files.stereo_rows(ROS2, 30)
     for _, message, stamp in rows:
         message.header.stamp.sec, message.header.stamp.nanosec = stamp // unit * unit // 10**9, 0
@@ -346,7 +341,7 @@ def test_stamps_that_repeat_give_way_to_the_time_of_recording(unit: int, tmp_pat
     frames = play(bag)
     assert [frame.t_capture_ns for frame in frames] == [START + (40 * n + 5) * MS for n in range(30)]
     said = [each.what for each in Replay(BagSource(path=bag)).pairs.judged]
-    assert len(said) == 2 and all("when they were recorded counts instead" in each for each in said)
+    assert len(said) == told and all("when they were recorded counts instead" in each for each in said)
 
 
 def test_messages_that_were_recorded_twice_count_once(tmp_path: Path) -> None:

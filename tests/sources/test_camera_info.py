@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from bag_files import BASELINE, HEIGHT, MS, ROS2, START, WIDTH, Row, eye_of, picture, play
+from places import SESSION
 
 from sags_node.errors import UsageError
 from sags_node.pipeline.session import open_session
@@ -43,12 +44,12 @@ def test_names_that_say_it(name: Path | str, rectified: bool) -> None:
 
 
 @pytest.fixture(scope="module")
-def scope(phantom_session: Path) -> tuple[StereoRig, list[StereoFrame], list[RectifiedPair]]:
+def scope() -> tuple[StereoRig, list[StereoFrame], list[RectifiedPair]]:
     """Turned eyes with distortion: frames as their cameras give them, and rectified."""
-    rig = load_rig(phantom_session / "calib")
+    rig = load_rig(SESSION / "calib")
     frames = []
     for index in (0, 20):
-        left, right = (read_picture(phantom_session / f"{side}/{index:04}.jpg") for side in ("left", "right"))
+        left, right = (read_picture(SESSION / f"{side}/{index:04}.jpg") for side in ("left", "right"))
         frames.append(StereoFrame(index, 0, 0, left, right))
     rectifier = Rectifier(rig, rig.left.width, rig.left.height)
     return rig, frames, [rectifier(frame) for frame in frames]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 import shutil
 from collections.abc import Callable
@@ -320,11 +319,6 @@ def test_a_unit_that_nobody_said_is_told_and_one_that_does_not_fit(
     assert all(re.search(one, other) for one, other in zip(said, found, strict=True))
 
 
-def torn_poses(clip: Path) -> None:
-    file = clip / "poses_bounds.npy"
-    file.write_bytes(file.read_bytes()[:-64])
-
-
 EVERY = np.s_[:]
 MISTAKES: list[tuple[Callable[[Path], object], str]] = [
     (lambda clip: shutil.rmtree(clip / "masks"), "masks does not exist; check the path"),
@@ -341,10 +335,7 @@ MISTAKES: list[tuple[Callable[[Path], object], str]] = [
     (lambda clip: (clip / "poses_bounds.npy").unlink(), "poses_bounds.npy does not exist; check the path"),
     (lambda clip: posed(clip, poses_bounds()[:, :12]),
      r"poses_bounds.npy is float64 \[12, 12\], wanted numbers \[any, 17\]"),
-    (lambda clip: posed(clip, poses_bounds().astype(object)), "poses_bounds.npy is object"),
-    (lambda clip: (clip / "poses_bounds.npy").write_bytes(pickle.dumps(poses_bounds())),
-     "poses_bounds.npy is not a readable npy file"),
-    (torn_poses, "poses_bounds.npy claims an impossible size"),
+    (lambda clip: (clip / "poses_bounds.npy").write_bytes(b"hello"), "npy is not a readable npy file"),
     (lambda clip: posed(clip, poses_bounds(FRAMES - 2)),
      "poses_bounds.npy holds 10 poses but .*images 12 pictures; there must be one pose"),
     (lambda clip: posed(clip, poses_bounds() * np.nan),

@@ -77,15 +77,6 @@ def test_one_field_is_kept_and_the_rows_between_are_means(field: str, height: in
             assert np.abs(whole[y] - np.mean(around, axis=0)).max() <= 0.5
 
 
-def test_what_moves_between_the_fields_is_torn_no_more() -> None:
-    """Over-under, interlaced: an edge that moves 6 px from field to field is one straight edge again."""
-    eye = np.zeros((24, 32, 3), np.uint8)
-    eye[0::2, :10] = eye[1::2, :16] = 200
-    left, right = layout(layout="over_under", deinterlace="top").eyes(TOGETHER["over_under"](eye, eye))
-    for picture in (left, right):
-        assert (picture[:, :10] == 200).all() and (picture[:, 10:] == 0).all()
-
-
 def test_the_lower_eye_may_begin_with_the_other_field() -> None:
     eye = np.zeros((9, 32, 3), np.uint8)
     both = np.concatenate([eye, eye])
@@ -127,6 +118,12 @@ def test_nothing_to_do_costs_no_copy() -> None:
 def test_what_does_not_fit_is_refused(said: Any, size: tuple[int, int], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         layout(**said).size(*size, "it")
+
+
+def test_panes_of_other_sizes_are_refused() -> None:
+    panes = GeometryConfig(layout="panes", crop=(0, 0, 32, 24), crop_right=(32, 0, 32, 24))
+    with pytest.raises(UsageError, match=r"tools is 16x24 px but source\.geometry\.crop 32x24; all panes"):
+        Layout(panes, tools=(0, 0, 16, 24)).size(64, 24, "it")
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ import pytest
 from command_line import RUN_HERE
 from gstreamer import BALL, apart, ball_moment, kill_pipelines, need_gstreamer
 from live_taking import Taker
-from places import ROOT
+from places import ROOT, SESSION
 from sending import sending, stereo_sender
 from stereo_sender import read_number
 from waiting import START_SECONDS, until
@@ -69,10 +69,10 @@ def lie_s(one: Shown) -> float:
 
 @contextmanager
 def running(
-    way: str, folder: Path, session: Path, monkeypatch: pytest.MonkeyPatch
+    way: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[tuple[Node, list[Shown], Callable[[], AbstractContextManager[object]]]]:
     """A node whose mapper pauses, what it shows, and what sends to it."""
-    rig = resized_rig(load_rig(session / "calib"), 4)
+    rig = resized_rig(load_rig(SESSION / "calib"), 4)
     plain = {"distortion": np.zeros(5), "R": np.eye(3)}  # so that pictures stay to the pixel
     eyes = {
         side: replace(eye, K=eye.P[:, :3], **plain)
@@ -107,7 +107,7 @@ def running(
         if way == "gst":
             return nullcontext()  # the node's own pipeline
         where = opened.source.endpoint if isinstance(opened.source, PushedPictures) else DOMAIN
-        return sending(stereo_sender("push" if way == "push" else "dds", where, session, 60, "clock=1"))
+        return sending(stereo_sender("push" if way == "push" else "dds", where, "clock=1"))
 
     node = Node(opened.config, opened.rig, opened.source, note)
     node.start()
@@ -122,9 +122,7 @@ JPEG = ("jpeg=1", "rate=15")
 
 @pytest.mark.parametrize("settings", [(), JPEG], ids=["raw", "jpeg"])
 @pytest.mark.parametrize("way", ["push", "dds"])
-def test_no_pair_is_mismatched_or_comes_twice(
-    way: str, settings: tuple[str, ...], phantom_session: Path
-) -> None:
+def test_no_pair_is_mismatched_or_comes_twice(way: str, settings: tuple[str, ...]) -> None:
     size, where = (1280, 1024), DOMAIN
     if way == "push":
         source: Any = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), size)
@@ -136,7 +134,7 @@ def test_no_pair_is_mismatched_or_comes_twice(
         kind = "compressed" if settings else ""
         left, right = (f"stereo/{eye}/image_raw/{kind}".rstrip("/") for eye in ("left", "right"))
         source = RosCameras(Ros2Source(domain=DOMAIN, left=left, right=right), size)
-    with Taker(source) as taker, sending(stereo_sender(way, where, phantom_session, 60, *settings)):
+    with Taker(source) as taker, sending(stereo_sender(way, where, *settings)):
         until(lambda: len(taker.numbers) >= 60)
     numbers = [left for left, _ in taker.numbers]
     assert taker.mismatched == 0 and numbers == sorted(set(numbers))
@@ -148,13 +146,13 @@ def test_no_pair_is_mismatched_or_comes_twice(
 @pytest.mark.fault("process: the camera's pipeline is killed")
 @pytest.mark.parametrize("way", ["gst", "push", "ros2"])
 def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
-    way: str, phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if way == "gst":
         need_gstreamer()
     if way == "ros2":
         pytest.importorskip("cyclonedds", reason="ROS 2 needs: pip install '.[ros2]'")
-    with running(way, tmp_path, phantom_session, monkeypatch) as (node, shown, sender):
+    with running(way, tmp_path, monkeypatch) as (node, shown, sender):
         with sender():
             until(lambda: shown, START_SECONDS)
             until(lambda: len(shown) > len(PAUSES) + 10)

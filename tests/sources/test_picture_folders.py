@@ -57,6 +57,10 @@ def coloured(*values: tuple[np.ndarray, str]) -> np.ndarray:
     return mask
 
 
+def with_alpha(mask: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    return np.dstack([mask, mask, mask, alpha])
+
+
 def with_masks(folder: Path, mask: np.ndarray, suffix: str = "png") -> cfg.FoldersSource:
     for number in range(COUNT):
         for side in ("left", "right"):
@@ -68,18 +72,16 @@ def with_masks(folder: Path, mask: np.ndarray, suffix: str = "png") -> cfg.Folde
     )
 
 
-SOFT = cv2.GaussianBlur(grey((TOOL, 255)), (0, 0), 3)
+INK = grey((TOOL, 255))
+SOFT = cv2.GaussianBlur(INK, (0, 0), 3)
 TOLD = {
-    "two values": (grey((TOOL, 255)), "png"),
+    "two values": (INK, "png"),
     "soft edges": (SOFT, "png"),
     "made larger": (cv2.resize(cv2.resize(SOFT, None, fx=0.5, fy=0.5), TOOL.shape[::-1]), "png"),
     "a rough JPEG, in colour": (cv2.cvtColor(grey((TOOL, 250)), cv2.COLOR_GRAY2BGR), "jpg"),
     "16 bit": (grey((TOOL, 65535), dtype=np.uint16), "png"),
-    "black below what is clear": (
-        np.dstack([cv2.cvtColor(grey((TOOL, 255)), cv2.COLOR_GRAY2BGR), grey((TOOL, 255))]),
-        "png",
-    ),
-    "clear where there is none": (np.dstack([grey()] * 3 + [grey((TOOL, 255))]), "png"),
+    "black below what is clear": (with_alpha(INK, INK), "png"),
+    "clear where there is none": (with_alpha(grey(), INK), "png"),
     "EndoVis 2018": (coloured((SHAFT, "#00ff00"), (TIP, "#7b0faf"), (RIM, "#7c9b05")), "png"),
 }
 
@@ -96,24 +98,12 @@ def test_masks_that_tell_instruments_from_tissue(name: str, tmp_path: Path) -> N
 
 
 CLEAR = grey((np.ones_like(TOOL), 255))
-EMPTY = {
-    "opaque": (np.dstack([grey((TOOL, 255))] * 3 + [CLEAR]), np.dstack([grey()] * 3 + [CLEAR]), "white"),
-    "opaque, of 16 bit": (
-        np.dstack([grey((TOOL, 255))] * 3 + [CLEAR]).astype(np.uint16) * 257,
-        np.dstack([grey()] * 3 + [CLEAR]).astype(np.uint16) * 257,
-        "white",
-    ),
-    "instruments can be seen": (
-        np.dstack([grey()] * 3 + [grey((TOOL, 255))]),
-        np.dstack([grey()] * 4),
-        "white",
-    ),
-    "tissue can be seen": (
-        np.dstack([grey()] * 3 + [CLEAR - grey((TOOL, 255))]),
-        np.dstack([grey()] * 3 + [CLEAR]),
-        "black",
-    ),
+EMPTY = {  # a mask with an instrument, one without, and what instruments are
+    "opaque": (with_alpha(INK, CLEAR), with_alpha(grey(), CLEAR), "white"),
+    "instruments can be seen": (with_alpha(grey(), INK), with_alpha(grey(), grey()), "white"),
+    "tissue can be seen": (with_alpha(grey(), CLEAR - INK), with_alpha(grey(), CLEAR), "black"),
 }
+EMPTY["opaque, of 16 bit"] = *(257 * mask.astype(np.uint16) for mask in EMPTY["opaque"][:2]), "white"
 
 
 @pytest.mark.fault("file: masks with an alpha channel, and frames without an instrument")

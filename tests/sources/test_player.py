@@ -43,13 +43,16 @@ EYES = ["left/image_rect_color", "right/image_rect_color"]
 PHASE = 24  # times that a clock is told before the player is paused, and goes on
 
 
+def served(run_dir: Path) -> PublishConfig:
+    return PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir)
+
+
 @contextmanager
 def playing(
     path: Path, run_dir: Path, paused: bool = True, wall_ns: Callable[[], int] = time.time_ns, **options: Any
 ) -> Iterator[Player]:
     """A player on a thread, paused so that subscribers can come."""
-    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir)
-    player = Player(path, PlayOptions(**options), config, "sags", paused, wall_ns)
+    player = Player(path, PlayOptions(**options), served(run_dir), "sags", paused, wall_ns)
     outcome: list[Any] = []
     with beside(lambda: outcome.append(player.play()), player.stop):
         until((run_dir / "sags.json").exists)
@@ -62,7 +65,7 @@ def test_a_consumer_sees_a_played_bag_as_a_node(plane_bag: Path, tmp_path: Path)
     truth = plane_result()
     with (
         playing(plane_bag, tmp_path / "run", loop=True) as player,
-        Subscriber(names, run_dir=tmp_path / "run") as sub,
+        Subscriber([*names, "clock"], run_dir=tmp_path / "run") as sub,
     ):
         time.sleep(0.3)
         player.toggle_pause()
@@ -80,6 +83,7 @@ def test_a_consumer_sees_a_played_bag_as_a_node(plane_bag: Path, tmp_path: Path)
         assert stamp.sec * 10**9 + stamp.nanosec == picture.stamp_ns
         player.toggle_pause()
         until(lambda: not sub.ok(names[0]))
+        assert sub.latest("clock") is None  # nobody asked for it
 
 
 def test_who_asks_a_played_bag_for_something_is_told_what_it_is(plane_bag: Path, tmp_path: Path) -> None:
@@ -101,8 +105,7 @@ def test_a_bag_whose_name_is_no_text_is_refused(plane_bag: Path, tmp_path: Path)
 
 
 def test_a_taken_port_is_named_with_the_option_that_takes_another(plane_bag: Path, tmp_path: Path) -> None:
-    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=tmp_path / "run")
-    with Publisher(config, "sags", "session") as running:
+    with Publisher(served(tmp_path / "run"), "sags", "session") as running:
         taken = running.connection.data[-1]
         refused = sags("bag", "play", plane_bag, "--endpoint", taken, "--ns", "played")
     assert refused.exit_code == 1
@@ -215,10 +218,9 @@ def test_stamps_keep_their_order_and_their_latency() -> None:
 def test_flags_of_play(plane_bag: Path, tmp_path: Path) -> None:
     depth = by_topic(plane_bag)["left/depth"]
     recorded = bag_info(plane_bag)["duration_s"]
-    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=tmp_path / "run")
 
     def outcome(**options: Any) -> dict[str, Any]:
-        return Player(plane_bag, PlayOptions(**options), config).play()
+        return Player(plane_bag, PlayOptions(**options), served(tmp_path / "run")).play()
 
     all_of_it = outcome(rate=20.0, topics=("left/depth",))
     assert all_of_it["messages"] == len(depth)
@@ -250,10 +252,9 @@ def test_another_namespace_takes_the_place_of_the_recorded_one(plane_bag: Path, 
     """As ROS would remap it, also of what `recover` saved; topics may be named as the bag has them."""
     saved, run_dir = tmp_path / "saved", tmp_path / "run"
     recover(plane_bag, saved)
-    config = PublishConfig(data=("tcp://127.0.0.1:*",), control=None, run_dir=run_dir)
     for bag in (plane_bag, saved):
         options = PlayOptions(topics=("sags/left/depth", "left/camera_info"), loop=True)
-        player = Player(bag, options, config, "other")
+        player = Player(bag, options, served(run_dir), "other")
         with beside(player.play, player.stop):
             until((run_dir / "other.json").exists)
             came = set()
@@ -321,17 +322,6 @@ def test_a_played_bag_is_stamped_by_the_wall_clock_of_now(plane_bag: Path, tmp_p
     steps = np.round(stamps / 60e9)
     assert steps[steps != 0].tolist() == [1, -1]
     assert np.array_equal(epochs, steps < 0)
-
-
-def test_without_being_asked_there_is_no_clock(plane_bag: Path, tmp_path: Path) -> None:
-    with (
-        playing(plane_bag, tmp_path / "run", loop=True) as player,
-        Subscriber(["clock", "tf"], run_dir=tmp_path / "run") as sub,
-    ):
-        player.toggle_pause()
-        assert sub.wait("tf", 30) is not None
-        time.sleep(0.2)
-        assert sub.latest("clock") is None
 
 
 def test_the_clock_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:

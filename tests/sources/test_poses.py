@@ -157,15 +157,12 @@ def test_frames_of_tf_are_chained_also_across_branches() -> None:
     track = PoseTrack("camera_base", "/tip")
 
     def tell(parent: str, child: str, x: float, fixed: bool, stamp: int = 0) -> None:
-        from rosbags import typesys
-
-        types = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
-        make = types.types
+        make = ROS2.types
         header = make["std_msgs/msg/Header"](make["builtin_interfaces/msg/Time"](0, stamp), parent)
         turn = make["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         moved = make["geometry_msgs/msg/Transform"](make["geometry_msgs/msg/Vector3"](x, 0.0, 0.0), turn)
         one = make["geometry_msgs/msg/TransformStamped"](header, child, moved)
-        track.add(bytes(types.serialize_cdr(make[topics.TF]([one]), topics.TF)), topics.TF, fixed)
+        track.add(encoded(make[topics.TF]([one]), topics.TF), topics.TF, fixed)
 
     tell("world", "/camera_base", 1.0, fixed=True)
     assert problem(track, 0) == "pose_missing"

@@ -28,7 +28,6 @@ from sags_node.config.schema import PushSource
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
 from sags_node.messaging.security import read_key_pair, write_key_pair
-from sags_node.messaging.sender import SILENT
 from sags_node.messaging.wire import Message, encode
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8
@@ -43,6 +42,13 @@ def source() -> Iterator[PushedPictures]:
     made = PushedPictures(PushSource(endpoint=ANYWHERE), (160, 120))
     with made:
         yield made
+
+
+@pytest.fixture
+def short_silence(monkeypatch: pytest.MonkeyPatch) -> float:
+    """s: a little more than between two receipts."""
+    monkeypatch.setattr("sags_node.messaging.sender.SILENT", 1.2)
+    return 1.2
 
 
 def numbered(number: int, width: int = 160) -> U8:
@@ -99,13 +105,6 @@ def test_pictures_of_two_senders_are_not_mixed(source: PushedPictures) -> None:
     assert set(taker.numbers) == {(1, 1), (2, 2)}
 
 
-def test_a_wrong_size_is_told(source: PushedPictures) -> None:
-    with FrameSender(source.endpoint) as sender:
-        said = sent_until_told(sender, numbered(1, 320), numbered(1, 320))
-        assert "320x120 px" in said and "160x120" in said
-        assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
-
-
 def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures) -> None:
     wrong = {
         "pictures come on NAME/left/image_raw": ("middle/image_raw", numbered(1), "rgb8"),
@@ -132,12 +131,15 @@ def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures
             assert words in problem and "\n" not in problem
 
 
-def test_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
+def test_wrong_sizes_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
     with zmq_socket(zmq.DEALER, source.endpoint) as stranger:
         for parts in ([b""], [b"x"] * 9, [b"a/left/image_raw", b"\xc1", b"data"], [b"t"] * 100):
             stranger.send_multipart(parts)
         with FrameSender(source.endpoint) as sender:
             assert "damaged" in sent_until_told(sender, b"\xff\xd8 no JPEG", b"\xff\xd8 no JPEG")
+        with FrameSender(source.endpoint) as sender:
+            assert "320x120 px, it must be 160x120" in sent_until_told(sender, *[numbered(1, 320)] * 2)
+            assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
         assert stranger.poll(60_000)
 
 
@@ -179,7 +181,7 @@ def test_a_sender_never_waits_for_a_node_that_is_away() -> None:
 
 
 @pytest.mark.fault("network: the node that pictures are sent to is not there, or has gone")
-def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old() -> None:
+def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old(short_silence: float) -> None:
     with PushedPictures(PushSource(endpoint=ANYWHERE), (160, 120)) as source:
         endpoint = source.endpoint
     with FrameSender(endpoint) as sender, PoseSender(endpoint) as poses:
@@ -199,11 +201,11 @@ def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old() -> None:
         assert "no answer" in sent_until_told(sender, numbered(3), numbered(3))
 
 
-def test_a_sender_that_sends_nothing_misses_no_answer(source: PushedPictures) -> None:
+def test_a_sender_that_sends_nothing_misses_no_answer(source: PushedPictures, short_silence: float) -> None:
     with FrameSender(source.endpoint) as sender:
         assert sender.send(numbered(1), numbered(1))  # the first pair, too
         until(lambda: sender.problem is None and sender.receipt)
-        time.sleep(SILENT + 0.5)
+        time.sleep(short_silence + 0.5)
         assert sender.problem is None
 
 

@@ -7,12 +7,11 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from live_taking import Taker
-from places import ROOT
+from places import ROOT, SESSION
 from ros_peers import DOMAIN, rclpy_python
 from sending import sending, stereo_sender
 from stereo_sender import paint_number
@@ -34,18 +33,20 @@ pytestmark = pytest.mark.live
 SIZE = 1280, 1024
 
 
-def dds(session: Path, seconds: float, *settings: str) -> list[object]:
-    return stereo_sender("dds", DOMAIN, session, seconds, *settings)
-
-
 def config() -> Ros2Source:
     return Ros2Source(domain=DOMAIN, left="stereo/left/image_raw", right="/stereo/right/image_raw")
 
 
-def test_the_cameras_calibration_is_taken(phantom_session: Path) -> None:
-    with sending(dds(phantom_session, 30, "size=640x512")):
-        rig = read_rig(config(), seconds=60)
-    want = resized_rig(load_rig(phantom_session / "calib"), 2)
+def test_the_calibration_and_the_tf_of_a_graph_are_taken() -> None:
+    robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, base="world", hand="left_optical_frame")))
+    try:
+        with sending(stereo_sender("dds", DOMAIN, "size=640x512")):
+            rig = read_rig(config(), seconds=60)
+            stamp = until(lambda: robot.track.newest_ns)
+            assert robot.track.at(stamp)[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
+    finally:
+        robot.close()
+    want = resized_rig(load_rig(SESSION / "calib"), 2)
     assert rig is not None and (rig.left.width, rig.left.height) == (640, 512)
     assert rig.baseline == pytest.approx(want.baseline)
     assert rig.left.distortion == pytest.approx(want.left.distortion)
@@ -57,12 +58,12 @@ def test_a_missing_calibration_is_said() -> None:
 
 
 def test_a_wrong_size_and_a_wrong_name_are_said(
-    phantom_session: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ros2, "QUIET_S", 0.5)
     said = config().model_copy(update={"right": "/stereo/rihgt/image_raw"})
     with caplog.at_level(logging.WARNING), Taker(RosCameras(said, SIZE)) as taker:
-        with sending(dds(phantom_session, 60, "size=640x512")):
+        with sending(stereo_sender("dds", DOMAIN, "size=640x512")):
             until(lambda: "640x512 px, it must be 1280x1024" in caplog.text)
             until(lambda: "nobody publishes /stereo/rihgt/image_raw" in caplog.text)
     assert f"domain {DOMAIN}, interface lo" in caplog.text
@@ -171,43 +172,20 @@ def test_the_domain_is_that_of_the_launch_file_or_of_ros(monkeypatch: pytest.Mon
         domain_of(RosGraph())
 
 
-@pytest.fixture
-def rclpy_camera() -> list[object]:
-    return [rclpy_python(), ROOT / "tests/ros2/camera.py"]
-
-
-def test_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> None:
-    """Two 1280x1024 pictures at 30 Hz from rclpy and Fast DDS."""
-    with sending([*rclpy_camera, 30, 30, *SIZE], ROS_DOMAIN_ID=str(DOMAIN)):
-        rig = read_rig(config(), seconds=60)
-        source = RosCameras(config(), SIZE)
-        with Taker(source) as taker:
-            until(lambda: len(taker.numbers) >= 60)
+def test_a_real_ros_node_is_heard() -> None:
+    """Two 1280x1024 pictures at 30 Hz from rclpy and Fast DDS; a pose, one millimetre further with each."""
+    camera = [rclpy_python(), ROOT / "tests/ros2/camera.py", 30, 30, *SIZE]
+    robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, topic="scope/measured_cp")))
+    try:
+        with sending(camera, ROS_DOMAIN_ID=str(DOMAIN)):
+            rig = read_rig(config(), seconds=60)
+            with Taker(RosCameras(config(), SIZE)) as taker:
+                until(lambda: len(taker.numbers) >= 60)
+                assert taker.newest is not None
+                number, stamp = taker.numbers[-1][0], taker.newest.t_device_ns
+                place = robot.track.at(stamp, timeout=60.0)[0, 3]
+    finally:
+        robot.close()
     assert rig is not None and rig.baseline == pytest.approx(0.004)
     assert taker.mismatched == 0
-
-
-def test_the_pose_of_a_real_ros_node_is_heard(rclpy_camera: list[object]) -> None:
-    """PoseStamped of rclpy, one millimetre further with each of its pictures."""
-    robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, topic="scope/measured_cp")))
-    source = RosCameras(config(), SIZE)
-    try:
-        with sending([*rclpy_camera, 30, 30, *SIZE], ROS_DOMAIN_ID=str(DOMAIN)), Taker(source) as taker:
-            until(lambda: len(taker.numbers) >= 30)
-            assert taker.newest is not None
-            number, stamp = taker.numbers[-1][0], taker.newest.t_device_ns
-            place = robot.track.at(stamp, timeout=60.0)[0, 3]
-    finally:
-        robot.close()
     assert place == pytest.approx(0.001 * number, abs=0.0011)  # a frame may come between the two lines
-
-
-def test_tf_of_a_graph_is_followed(phantom_session: Path) -> None:
-    robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, base="world", hand="left_optical_frame")))
-    try:
-        with sending(dds(phantom_session, 60, "size=64x48")):
-            until(lambda: robot.track.newest_ns > 0)
-            stamp = robot.track.newest_ns
-            assert robot.track.at(stamp)[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
-    finally:
-        robot.close()

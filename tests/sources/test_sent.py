@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from synthetic import plane_result
-from waiting import until
+from waiting import beside, until
 
 from sags_node.cli.foreground import inputs_text
 from sags_node.config.schema import (
@@ -125,15 +124,12 @@ def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:
 def test_a_late_first_picture_makes_no_new_epoch() -> None:
     """The offset of the clocks is known better with each picture that comes sooner."""
     sent, frames = SentPictures(PushSource(stamps="own"), None), list[StereoFrame]()
-    with ThreadPoolExecutor(1) as taker:
-        taken = taker.submit(lambda: frames.extend(sent))
+    with beside(lambda: frames.extend(sent), sent.end):
         for number in range(30):
             stamp = number * PERIOD
             for eye in ("left", "right"):
                 sent.put(eye, stamp, 100 * S + stamp + (150 if number == 0 else 5) * MS, picture)
             until(lambda number=number: len(frames) + sent.dropped > number)
-        sent.end()
-        taken.result(timeout=10)
     assert {frame.epoch for frame in frames} == {0}
     stamps = [frame.t_capture_ns for frame in frames]
     # Its stamp was 145 ms too late: four of the next are older than it seemed to be.
@@ -150,16 +146,13 @@ def test_what_is_late_is_never_told_as_new(skew: int, order: tuple[Side, Side], 
     sent = SentPictures(PushSource(stamps="own", pair_tolerance_ms=25), None)
     frames, numbers = list[StereoFrame](), [*range(60)]
     numbers[50:52] = 51, 50
-    with ThreadPoolExecutor(1) as taker:
-        taken = taker.submit(lambda: frames.extend(sent))
+    with beside(lambda: frames.extend(sent), sent.end):
         for count, number in enumerate(numbers):
             shown, way = 10 * S + number * PERIOD, (10 if number < 40 else 800) * MS
             for eye in order:
                 stamp = shown + (apart + skew * MS if eye == "right" else 0)
                 sent.put(eye, stamp, 100 * S + shown + max(skew, 0) * MS + way, picture)
             until(lambda count=count: len(frames) + sent.dropped > count)
-        sent.end()
-        taken.result(timeout=10)
     assert len(frames) >= 55
     for frame in frames:  # 10 ms is the shortest way, and what is exposed first waits for the other
         for told, late in ((frame.t_capture_ns, 0), (frame.t_capture_right_ns, skew * MS)):

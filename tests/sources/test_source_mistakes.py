@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -24,24 +25,11 @@ from sags_node.sources.replay import Recording
 from sags_node.sources.source import open_source
 from sags_node.types import StereoFrame
 
-HALVES = cfg.GeometryConfig(layout="side_by_side")
-
 # ---- at opening ------------------------------------------------------------------------------------------
 
 
 def folders_of(folder: Path, left: str = "l", right: str = "r", **said: Any) -> Recording:
     return cfg.FoldersSource(left=folder / left, right=folder / right, **said)
-
-
-def video(folder: Path, left: str, right: str | None = None) -> Recording:
-    if right is None:
-        return cfg.VideosSource(left=folder / left, geometry=HALVES)
-    return cfg.VideosSource(left=folder / left, right=folder / right)
-
-
-def panes(folder: Path, left: cfg.Box, right: cfg.Box, tools: cfg.Box | None = None) -> Recording:
-    boxes = cfg.GeometryConfig(layout="panes", crop=left, crop_right=right)
-    return cfg.VideosSource(left=folder / "lr.avi", geometry=boxes, tools=tools)
 
 
 def posed(folder: Path, **arrays: np.ndarray) -> Recording:
@@ -70,14 +58,9 @@ def torn_poses(folder: Path) -> Recording:
     return config
 
 
-def odd_width(folder: Path) -> Recording:
-    # OpenCV's own writer keeps an odd width, its FFmpeg writer cuts it.
-    mjpg = cv2.VideoWriter.fourcc(*"MJPG")
-    writer = cv2.VideoWriter(str(folder / "odd.avi"), cv2.CAP_OPENCV_MJPEG, mjpg, 25, (33, 24))
-    assert writer.isOpened()
-    writer.write(np.zeros((24, 33, 3), np.uint8))
-    writer.release()
-    return video(folder, "odd.avi")
+def beyond(folder: Path) -> Recording:
+    boxes = cfg.GeometryConfig(layout="panes", crop=(0, 0, 32, 24), crop_right=(40, 0, 32, 24))
+    return cfg.VideosSource(left=folder / "lr.avi", geometry=boxes)
 
 
 # What is wrong, made in a folder of `recordings`; what is said.
@@ -90,20 +73,7 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: write_png(at / "tools/000.png", picture(0)) or folders_of(at, tools=at / "tools"),
      "l holds 8 pictures but .*tools holds 1; pairing"),
     (lambda at: folders_of(at, start=60), "source.start 60.0 s lies behind the recording's end at 0.27 s"),
-    (lambda at: video(at, "none.mp4"), "none.mp4 does not exist; check the path"),
-    (lambda at: (at / "text.mp4").write_text("hello") and video(at, "text.mp4"),
-     "text.mp4 cannot be read as a video"),
-    (odd_width, "odd.avi is 33 px wide, which is odd"),
-    (lambda at: panes(at, (0, 0, 32, 24), (40, 0, 32, 24)),
-     r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
-    (lambda at: panes(at, (0, 0, 32, 24), (32, 0, 16, 24)),
-     "source.geometry.crop is 32x24 px but crop_right 16x24; both eyes need one"),
-    (lambda at: panes(at, (0, 0, 32, 24), (32, 0, 32, 24), (0, 0, 16, 24)),
-     "source.tools is 16x24 px but source.geometry.crop 32x24; all panes need"),
-    (lambda at: video(at, "l.avi", "lr.avi"),
-     "l.avi has 32x24 px but .*lr.avi has 64x24; they are not one stereo pair"),
-    (lambda at: write_video(at / "slow.avi", [picture(0)], rate=10) and video(at, "l.avi", "slow.avi"),
-     r"l.avi has 25.0 frames/s but .*slow.avi has 10.0;"),
+    (beyond, r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
     (lambda at: folders_of(at, poses=at / "poses.npz"), "poses.npz does not exist; check the path"),
     (lambda at: posed(at, T_world_cam=np.eye(4)),
      r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
@@ -192,36 +162,20 @@ def test_reference_depth_of_65535_counts_is_not_known(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("file: a picture is cut off")
-@pytest.mark.parametrize("suffix", ["jpg", "png"])
-def test_damaged_picture_in_the_middle_is_named(tmp_path: Path, suffix: str) -> None:
-    left, right = np.random.default_rng(1).integers(0, 255, (2, HEIGHT, WIDTH, 3), np.uint8)
-    for n in range(5):
-        write_png(tmp_path / f"l/{n}.{suffix}", left)
-        write_png(tmp_path / f"r/{n}.{suffix}", right)
-    broken = tmp_path / f"r/3.{suffix}"
-    broken.write_bytes(broken.read_bytes()[:-200])
-    frames, message = frames_until_error(
-        cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r", pace="step")
-    )
-    assert len(frames) == 3
-    assert f"picture {broken} is damaged or cut off" in message
-
-
 @pytest.mark.fault("file: a picture has another size")
-def test_picture_of_another_size_in_the_middle_is_named(folders: cfg.FoldersSource) -> None:
-    write_png(folders.left / "L7.png", np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8))
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda file: file.write_bytes(file.read_bytes()[:-20]), "L7.png is damaged or cut off"),
+        (lambda file: write_png(file, np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8)), "L7.png is 32x26 px but"),
+    ],
+)
+def test_a_wrong_picture_in_the_middle_is_named(
+    folders: cfg.FoldersSource, damage: Callable[[Path], object], said: str
+) -> None:
+    damage(folders.left / "L7.png")
     frames, message = frames_until_error(folders)
-    assert len(frames) == 7
-    assert "L7.png is 32x26 px but" in message
-
-
-def test_shorter_right_video_says_where_it_ends(tmp_path: Path) -> None:
-    left = write_video(tmp_path / "l.avi", [picture(n) for n in range(8)])
-    right = write_video(tmp_path / "r.avi", [picture(n, eye=1) for n in range(6)])
-    config = cfg.VideosSource(left=left, right=right, pace="step")
-    refused_at_opening(lambda: config, r"r.avi has 6 pictures, .*l.avi 8; .* with source.frames:=6")
-    with open_source(config.model_copy(update={"frames": 6})) as source:  # the way out that the message names
-        assert len(list(source)) == 6
+    assert len(frames) == 7 and said in message
 
 
 @pytest.mark.parametrize(("count", "stride"), [(4, 1), (48, 1), (11, 1), (13, 1), (6, 2)])
@@ -287,62 +241,64 @@ def played(config: Recording, change: Callable[[], object]) -> tuple[list[Stereo
     return frames, ""
 
 
+def add_a_pair(folder: Path) -> None:
+    for eye, name in enumerate("lr"):
+        write_png(folder / f"{name}/008.png", picture(8, eye))
+
+
 @pytest.mark.fault("file: a picture is deleted while it is played")
-def test_a_picture_that_is_deleted_is_named(tmp_path: Path) -> None:
-    config = recordings(tmp_path)["folders"]
-    frames, error = played(config, (tmp_path / "r/006.png").unlink)
-    assert numbers(frames) == list(range(len(frames))) and AT <= len(frames) <= 6
-    assert "r/006.png" in error
-
-
 @pytest.mark.fault("file: a folder of pictures grows while it is played")
-def test_pictures_that_come_later_are_not_played(tmp_path: Path) -> None:
-    config = recordings(tmp_path)["folders"]
-
-    def grow() -> None:
-        for eye, name in enumerate(("l", "r")):
-            write_png(tmp_path / f"{name}/008.png", picture(8, eye))
-
-    frames, error = played(config, grow)
-    assert numbers(frames) == list(range(8)) and error == ""
-
-
 @pytest.mark.fault("file: a video is deleted while it is played")
-def test_a_video_that_is_deleted_is_played_to_its_end(tmp_path: Path) -> None:
-    config = recordings(tmp_path)["videos"]
-    frames, error = played(config, (tmp_path / "r.avi").unlink)
-    assert numbers(frames) == list(range(8)) and error == ""
+@pytest.mark.parametrize(
+    ("kind", "change", "count", "said"),
+    [
+        ("folders", lambda folder: (folder / "r/006.png").unlink(), 6, "r/006.png"),
+        ("folders", add_a_pair, 8, ""),
+        ("videos", lambda folder: (folder / "r.avi").unlink(), 8, ""),
+    ],
+    ids=["a picture is deleted", "pictures come", "a video is deleted"],
+)
+def test_what_is_there_is_played_and_what_is_gone_is_named(
+    kind: str, change: Callable[[Path], object], count: int, said: str, tmp_path: Path
+) -> None:
+    frames, error = played(recordings(tmp_path)[kind], lambda: change(tmp_path))
+    assert numbers(frames) == list(range(count)) and said in error and bool(said) == bool(error)
+
+
+def noise_videos(folder: Path) -> tuple[Recording, Path]:
+    """Two megabytes: more than a reader reads ahead."""
+    rng = np.random.default_rng(0)
+    left, right = (
+        write_video(folder / f"{name}.avi", [*rng.integers(0, 255, (COUNT, 128, 160, 3), np.uint8)])
+        for name in "lr"
+    )
+    return cfg.VideosSource(left=left, right=right, pace="step"), right
+
+
+def long_bag(path: Path) -> tuple[Recording, Path]:
+    """Four megabytes: more than a chunk, which is read at once."""
+    return cfg.BagSource(path=path, pace="step"), path
 
 
 @pytest.mark.fault("file: a video is cut off while it is played")
-def test_a_video_that_is_cut_off_is_named(tmp_path: Path) -> None:
-    """Two megabytes of noise: more than a reader reads ahead."""
-    rng = np.random.default_rng(0)
-    eyes = [[rng.integers(0, 255, (128, 160, 3), np.uint8) for _ in range(COUNT)] for _ in range(2)]
-    left, right = (
-        write_video(tmp_path / f"{name}.avi", shown) for name, shown in zip("lr", eyes, strict=True)
-    )
-    config = cfg.VideosSource(left=left, right=right, pace="step")
-    whole, _ = played(config, lambda: None)
-    frames, error = played(config, lambda: cut(right))
-    assert AT <= len(frames) < len(whole) == COUNT and f"r.avi ends at frame {len(frames)}" in error
-    for frame, true in zip(frames[:-1], whole, strict=False):
-        assert np.array_equal(frame.right, true.right)
-
-
 @pytest.mark.fault("file: a ROS bag is cut off while it is played")
-@pytest.mark.parametrize("kind", ["mcap", "ros1"])
-def test_a_bag_that_is_cut_off_is_named(kind: str, tmp_path: Path) -> None:
-    """Four megabytes: more than a chunk, which is read at once."""
-    if kind == "mcap":
-        path = write_rosbag2(tmp_path / "bag", stereo_rows(ROS2, COUNT)) / "bag.mcap"
-    else:
-        path = write_rosbag1(tmp_path / "a.bag", stereo_rows(ROS1, COUNT))
-    config = cfg.BagSource(path=path, pace="step")
+@pytest.mark.parametrize(
+    ("write", "said", "parts"),  # how many frames at the end may be there in part
+    [
+        (noise_videos, r"r\.avi ends at frame {}", 1),
+        (lambda at: long_bag(write_rosbag2(at / "a", stereo_rows(ROS2, COUNT)) / "a.mcap"), "mcap is dam", 0),
+        (lambda at: long_bag(write_rosbag1(at / "a.bag", stereo_rows(ROS1, COUNT))), r"a\.bag is damaged", 0),
+    ],
+    ids=["video", "mcap", "ros1"],
+)
+def test_a_file_that_is_cut_off_is_named(
+    write: Callable[[Path], tuple[Recording, Path]], said: str, parts: int, tmp_path: Path
+) -> None:
+    config, file = write(tmp_path)
     whole, _ = played(config, lambda: None)
-    frames, error = played(config, lambda: cut(path))
-    assert AT <= len(frames) < len(whole) == COUNT and f"{path.name} is damaged" in error
-    for frame, true in zip(frames, whole, strict=False):
+    frames, error = played(config, lambda: cut(file))
+    assert AT <= len(frames) < len(whole) == COUNT and re.search(said.format(len(frames)), error)
+    for frame, true in zip(frames[: len(frames) - parts], whole, strict=False):
         assert np.array_equal(frame.left, true.left) and np.array_equal(frame.right, true.right)
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from waiting import repeating, until
+from waiting import beside, repeating, until
 
 from sags_node import workers
 from sags_node.config.schema import GeometryConfig, V4l2Source
@@ -22,7 +23,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.sources import live
 from sags_node.sources.live import LiveStereo
 from sags_node.sources.pairing import Shot
-from sags_node.sources.v4l2 import STRANGE, Device, open_cameras, wall_stamp
+from sags_node.sources.v4l2 import STRANGE, Device, open_cameras
+from sags_node.types import StereoFrame
 
 pytestmark = pytest.mark.live
 
@@ -84,35 +86,31 @@ def plugs(monkeypatch: pytest.MonkeyPatch) -> Plugs:
     return Plugs()
 
 
-class Collector:
-    """Takes what the left pictures show in a thread, as a node does."""
+@contextmanager
+def taking(plugs: Plugs, config: V4l2Source = CONFIG) -> Iterator[tuple[LiveStereo, list[StereoFrame]]]:
+    """A source and its frames, which a thread takes, as a node does."""
+    frames: list[StereoFrame] = []
+    with open_cameras(config, open_device=plugs) as source:
+        with beside(lambda: frames.extend(source), source.stop):
+            yield source, frames
 
-    def __init__(self, source: LiveStereo) -> None:
-        self.values: list[int] = []
-        self.skews_ms: set[float] = set()
-        self.thread = threading.Thread(target=self._take, args=(source,))
-        self.thread.start()
 
-    def _take(self, source: LiveStereo) -> None:
-        for frame in source:
-            self.skews_ms.add((frame.t_capture_right_ns - frame.t_capture_ns) / MS)
-            self.values.append(int(frame.left[0, 0, 0]))
+def values(frames: list[StereoFrame]) -> list[int]:
+    """What the left pictures show."""
+    return [int(frame.left[0, 0, 0]) for frame in frames]
 
 
 @pytest.mark.fault("camera: absent while the node stops")
 def test_pairs_come_until_the_end_and_all_is_closed(plugs: Plugs) -> None:
-    with open_cameras(CONFIG, open_device=plugs) as source:
-        collector = Collector(source)
+    with taking(plugs) as (source, frames):
         for n in range(3):
             plugs.put(20 * n, value=n, skew_ms=3)
-            until(lambda n=n: len(collector.values) == n + 1)
+            until(lambda n=n: len(frames) == n + 1)
         plugs.absent.update(plugs.opened)
         plugs.opened["/dev/left"][0].pictures.put(None)
         until(lambda: plugs.opened["/dev/left"][0].closed)
-        source.stop()
-        collector.thread.join(30)
-        assert not collector.thread.is_alive()
-    assert collector.values == [0, 1, 2] and collector.skews_ms == {3}
+    assert values(frames) == [0, 1, 2]
+    assert {frame.t_capture_right_ns - frame.t_capture_ns for frame in frames} == {3 * MS}
     assert source.dropped == 0 and source.frame_count is None and source.rate == 50
     assert all(camera.closed for cameras in plugs.opened.values() for camera in cameras)
 
@@ -142,10 +140,9 @@ def test_unplugged_camera_comes_back(
     error: type[Exception], plugs: Plugs, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(FakeCamera, "gone", error)
-    with open_cameras(CONFIG, open_device=plugs) as source:
-        collector = Collector(source)
+    with taking(plugs) as (_, frames):
         plugs.put(0, value=1)
-        until(lambda: collector.values == [1])
+        until(lambda: values(frames) == [1])
 
         plugs.absent.add("/dev/right")
         attempts = plugs.attempts
@@ -156,7 +153,7 @@ def test_unplugged_camera_comes_back(
         plugs.absent.clear()
         until(lambda: len(plugs.opened["/dev/right"]) == 2)
         plugs.put(5000, value=2)
-        until(lambda: collector.values == [1, 2])
+        until(lambda: values(frames) == [1, 2])
     said = "it will be opened again" if error is SagsError else f"internal error: {error.__name__}: camera is"
     assert said in caplog.text and "/dev/right is open again" in caplog.text
 
@@ -164,8 +161,7 @@ def test_unplugged_camera_comes_back(
 @pytest.mark.fault("camera: neither delivers nor fails")
 def test_silent_camera_is_opened_again(plugs: Plugs, caplog: pytest.LogCaptureFixture) -> None:
     """A camera that neither delivers nor fails, as unplugged USB cameras may do."""
-    with open_cameras(CONFIG.model_copy(update={"deadline": 0.15}), open_device=plugs) as source:
-        collector = Collector(source)
+    with taking(plugs, CONFIG.model_copy(update={"deadline": 0.15})) as (_, frames):
         plugs.put(0, value=1)
         until(lambda: all(len(cameras) >= 2 for cameras in plugs.opened.values()))
         assert plugs.opened["/dev/left"][0].closed
@@ -175,7 +171,7 @@ def test_silent_camera_is_opened_again(plugs: Plugs, caplog: pytest.LogCaptureFi
             plugs.put(1000.0 + 20 * number, value=2)
 
         with repeating(film):
-            until(lambda: 2 in collector.values)
+            until(lambda: 2 in values(frames))
     assert "no new picture for" in caplog.text
 
 
@@ -262,28 +258,16 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Dev
     return build
 
 
-@pytest.mark.parametrize(
-    ("driver_ns", "expected"),
-    [
-        (95_000_000_000, 995_000_000_000),  # 5 s old: it waited in the driver
-        (99_980_000_000, 999_980_000_000),  # 20 ms old
-        (100_060_000_000, 1_000_000_000_000),  # ahead of its arrival
-        (0, 1_000_000_000_000),  # the driver gives none
-        (1_000_000_000_000, 1_000_000_000_000),  # a wall clock stamp
-    ],
-)
-def test_wall_stamp(driver_ns: int, expected: int) -> None:
-    assert wall_stamp(driver_ns, 100_000_000_000, 1_000_000_000_000) == expected
-
-
 @pytest.fixture
 def told(device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[float]]:
-    """How old pictures are said to be of which a driver says these ages, s."""
+    """How old pictures are said to be of which a driver says these ages, s; None: it gives no stamp."""
 
-    def read(ages: list[float]) -> list[float]:
+    def read(ages: list[float | None]) -> list[float]:
         wall_ns, monotonic_ns = 10**18, 10**14
-        # Each stamp is another one.
-        camera = device([1e-6 * (monotonic_ns + n - round(age * 1e9)) for n, age in enumerate(ages)])
+        stamps = (  # each is another one
+            0.0 if age is None else 1e-6 * (monotonic_ns + n - round(age * 1e9)) for n, age in enumerate(ages)
+        )
+        camera = device([*stamps])
         monkeypatch.setattr(time, "time_ns", lambda: wall_ns)
         monkeypatch.setattr(time, "monotonic_ns", lambda: monotonic_ns)
         return [(wall_ns - camera.read(1.0).t_ns) * 1e-9 for _ in ages]  # type: ignore[union-attr]
@@ -300,6 +284,11 @@ def test_what_waited_in_the_driver_keeps_its_age(
     """Four buffers of before a stop, also where they are the very first."""
     ages = before + [stopped_s] * 4
     assert told(ages) == pytest.approx(ages, abs=0.01)
+
+
+def test_no_picture_is_taken_after_it_arrived(told: Callable[..., list[float]]) -> None:
+    """vivid stamps ahead; a stamp of the wall clock is ahead by years. Some drivers give none."""
+    assert told([-0.06, 0.02, -1e9, None, None]) == pytest.approx([0.0, 0.02, 0.0, 0.0, 0.0], abs=1e-3)
 
 
 def test_stamps_of_a_clock_of_its_own_are_found_out(told: Callable[..., list[float]]) -> None:
@@ -331,14 +320,6 @@ def test_more_than_eight_bits_are_kept(
     assert picture is not None and picture.image.shape == (4, 8, 3)
     bright = picture.image[..., 1].ravel() / 65535
     assert np.abs(bright - counts / (2**bits - 1)).max() < 2.0**-bits
-
-
-def test_driver_without_stamps_gets_the_arrival_time(device: Callable[..., Device]) -> None:
-    camera = device([0.0, 0.0])
-    before = time.time_ns()
-    first, second = camera.read(0.1), camera.read(0.1)
-    assert first is not None and second is not None
-    assert before <= first.t_ns <= second.t_ns <= time.time_ns()
 
 
 def test_device_that_fails_says_so(device: Callable[..., Device]) -> None:

@@ -60,6 +60,19 @@ def test_pictures_are_counted_and_found_in_every_container(tmp_path: Path, name:
         np.testing.assert_array_equal(video.read(number), shown[number])  # to the bit
 
 
+def tracks(file: Path, pixels: str, shown: list[np.ndarray], raw: str = "rgb24") -> Path:
+    """Lossless, with one picture in each track."""
+    with av.open(str(file), "w") as container:
+        streams = [container.add_stream("ffv1", RATE) for _ in shown]
+        for stream, picture in zip(streams, shown, strict=True):
+            stream.height, stream.width, stream.pix_fmt = *picture.shape[:2], pixels
+        for stream, picture in zip(streams, shown, strict=True):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, raw)))
+        for stream in streams:
+            container.mux(stream.encode())
+    return file
+
+
 def pair_of(folder: Path, left: Path, right: Path | None, **geometry: object) -> cfg.VideosSource:
     return cfg.VideosSource(
         left=left, right=right, pace="step", geometry=cfg.GeometryConfig.model_validate(geometry)
@@ -363,34 +376,24 @@ def test_even_files_whose_rates_differ_a_little_are_paired_by_time_and_it_is_tol
         assert f"paired by {how}" in said and "25 frames/s but" in said
 
 
-def test_a_file_that_says_it_is_interlaced_is_told_unless_fields_are_taken(tmp_path: Path) -> None:
-    for side in "lr":
-        write(tmp_path / f"{side}.mp4", pictures(range(9)), options={"x264-params": "interlaced=1:tff=1"})
-    config = pair_of(tmp_path, tmp_path / "l.mp4", tmp_path / "r.mp4")
-    said = Replay(config).pairs.oddities
-    assert len(said) == 2 and all("interlaced" in each and "deinterlace:=top" in each for each in said)
-    fields = config.geometry.model_copy(update={"deinterlace": "top"})
-    assert not Replay(config.model_copy(update={"geometry": fields})).pairs.oddities
-
-
-def test_eyes_whose_pixels_differ_are_told(tmp_path: Path) -> None:
+def test_eyes_that_are_interlaced_or_have_other_pixels_are_told(tmp_path: Path) -> None:
+    """Of interlaced ones unless their fields are taken."""
     left, right = (
-        write(tmp_path / f"{side}.mp4", pictures(range(9)), aspect=aspect)
+        write(tmp_path / f"{side}.mp4", pictures(range(9)), aspect=aspect, options=options)
         for side, aspect in (("l", Fraction(4, 3)), ("r", None))
+        for options in [{"x264-params": "interlaced=1:tff=1"}]
     )
-    (said,) = Replay(pair_of(tmp_path, left, right)).pairs.oddities
-    assert "1.33 times as wide as high" in said
+    *torn, pixels = Replay(pair_of(tmp_path, left, right)).pairs.oddities
+    assert len(torn) == 2 and all("interlaced" in each and "deinterlace:=top" in each for each in torn)
+    assert "1.33 times as wide as high" in pixels
+    (pixels,) = Replay(pair_of(tmp_path, left, right, deinterlace="top")).pairs.oddities
+    assert "1.33 times as wide as high" in pixels
 
 
 @pytest.mark.parametrize(("bits", "is_told"), [(12, True), (16, False)])
 def test_bits_that_a_deep_video_does_not_use_are_told(tmp_path: Path, bits: int, is_told: bool) -> None:
     samples = np.linspace(0, 2**bits - 1, 128 * 96).astype(np.uint16).reshape(96, 128)
-    with av.open(str(tmp_path / "a.mkv"), "w") as container:
-        stream = container.add_stream("ffv1", RATE)
-        stream.height, stream.width, stream.pix_fmt = 96, 128, "gray16le"
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(samples, "gray16le")))
-        container.mux(stream.encode())
-    video = Video(tmp_path / "a.mkv")
+    video = Video(tracks(tmp_path / "a.mkv", "gray16le", [samples], "gray16le"))
     picture = video.read(0)
     assert picture is not None and is_told == ("uses 12: it may be played too dark" in str(video.oddities))
     assert np.abs(picture[..., 1] - samples / 257).max() < 2
@@ -410,14 +413,7 @@ def test_tones_of_hdr_are_told(tmp_path: Path, transfer: int, name: str) -> None
 
 
 def test_a_second_track_is_told_with_how_to_take_eyes_apart(tmp_path: Path) -> None:
-    with av.open(str(tmp_path / "scope.mkv"), "w") as container:
-        streams = [container.add_stream("ffv1", RATE) for _ in range(2)]
-        for stream in streams:
-            stream.height, stream.width, stream.pix_fmt = 96, 128, "bgr0"
-        for eye, stream in enumerate(streams):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(numbered(1, eye=eye), "rgb24")))
-        for stream in streams:
-            container.mux(stream.encode())
+    tracks(tmp_path / "scope.mkv", "bgr0", [numbered(1, eye=eye) for eye in (0, 1)])
     (error,) = [each for each in check_folder(tmp_path) if each.level == "error"][:1]
     assert "2 video tracks" in error.fix
     assert (

@@ -27,8 +27,7 @@ from sags_node.errors import UsageError
 from sags_node.messaging import cdr, content, topics
 from sags_node.messaging.received import Frame, Received, ReceivedCloud, ReceivedRos
 from sags_node.messaging.topics import VIEW_NAME
-from sags_node.ros.endpoints import Delivery
-from sags_node.ros.graph import Graph, kernel_buffer
+from sags_node.ros.graph import Delivery, Graph, kernel_buffer
 
 ALL_POINTS = "/all"
 GLOBAL = {"tf": "/tf", "diagnostics": "/diagnostics"}  # the names by which all of ROS knows them

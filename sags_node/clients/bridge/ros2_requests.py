@@ -20,8 +20,7 @@ from sags_node.clients.bridge.requests import ANSWER_TIME, Requests
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.topics import VIEW_NAME
-from sags_node.ros.endpoints import Delivery, Reader, Writer
-from sags_node.ros.graph import Graph
+from sags_node.ros.graph import Delivery, Graph, Reader, Writer
 
 ASK = "request"  # /sags/request/OPERATION
 ANSWER = "answer"  # /sags/answer

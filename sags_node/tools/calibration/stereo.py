@@ -60,7 +60,7 @@ def calibrate_folders(
     views: list[StereoView] = []
     unseen: list[str] = []
     for index, file in enumerate(pictures.files):
-        pair = pictures.read()
+        pair = pictures.at(index)
         assert pair is not None and pair.right is not None  # there are as many as files, with both eyes
         view = find_in_both(board, file.name, pair.left, pair.right)
         if view is None:
@@ -137,10 +137,9 @@ def _eyes(solution: Solution) -> Any:
 
 def _instead(board: Board, pictures: FolderPairs) -> str:
     """Return what most of some pictures show instead of the board."""
-    pictures.seek(0)
     said: Counter[str] = Counter()
-    for _ in range(min(LOOKED_AT, pictures.count)):
-        pair = pictures.read()
+    for index in range(min(LOOKED_AT, pictures.count)):
+        pair = pictures.at(index)
         assert pair is not None  # it was read before
         said[board.explain(cv2.cvtColor(pair.left, cv2.COLOR_RGB2GRAY))] += 1
     likely = said.most_common(1)[0][0]

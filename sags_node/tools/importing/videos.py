@@ -166,9 +166,8 @@ def _some_pairs(pairs: VideoPairs) -> list[Pair]:
     found = []
     both = min(pairs.count, pairs.right.count) if pairs.right is not None and pairs.by_number else pairs.count
     for index in _spread(both):
-        pairs.seek(index)
         with suppress(LostPictureError):
-            pair = pairs.read()
+            pair = pairs.at(index)
             if pair is not None and pair.right is not None:
                 found.append((pair.left, pair.right))
     return found
@@ -180,10 +179,9 @@ def _late(pairs: VideoPairs) -> list[Finding]:
         return []
     longer = abs(pairs.left.count - pairs.right.count)
     looked = timing.Timing(longer)
-    pairs.seek(0)
-    for _ in range(min(pairs.reach, timing.LOOKED_AT + min(longer, MOST_LATE))):
+    for index in range(min(pairs.reach, timing.LOOKED_AT + min(longer, MOST_LATE))):
         with suppress(LostPictureError):
-            pair = pairs.read()
+            pair = pairs.at(index)
             if pair is not None and pair.right is not None:
                 looked.add(pair.left, pair.right)
     return looked.findings()
