@@ -19,7 +19,6 @@ from sags_node.messaging.cdr import Content, Status
 from sags_node.types import (
     F32,
     SH_DEGREE_0,
-    U8,
     Bool,
     ClockStatus,
     DrawnView,
@@ -27,6 +26,7 @@ from sags_node.types import (
     Gaussians,
     NodeHealth,
     RectifiedPair,
+    RenderedView,
     Side,
 )
 
@@ -155,10 +155,7 @@ def view(name: str, drawn: DrawnView) -> dict[str, Content]:
         stamp_ns, baseline = picture.t_capture_ns, drawn.baseline if eye == "right" else 0.0
         said[f"{topic}camera_info"] = cdr.camera_info(picture.camera, stamp_ns, frame, baseline)
         size = picture.camera.width, picture.camera.height
-        rgba = _rgba(published.colours_at(picture, size), published.alpha_at(picture, size))
-        said[f"{topic}image"] = replace(
-            cdr.image(rgba, "rgba8", stamp_ns, frame), detail_age_ns=published.detail_age_ns(picture)
-        )
+        said[f"{topic}image"] = _drawn(picture, size, stamp_ns, frame)
         if drawn.depth:
             said[f"{topic}depth"] = cdr.image(_depth(picture.depth), "32FC1", stamp_ns, frame)
             if picture.confidence is not None:
@@ -181,19 +178,17 @@ def _visible(result: FrameResult) -> Bool:
     return visible
 
 
-def _rgba(rgb: U8, coverage: F32) -> U8:
-    """Straight-alpha picture [H, W, 4] of a rendered view."""
-    rgba = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
-    alpha = cv2.convertScaleAbs(coverage, alpha=255.0)  # scales, rounds and saturates in one pass
-    return np.asarray(cv2.insertChannel(alpha, rgba, 3), np.uint8)
-
-
-def _drawn(result: FrameResult, side: Side) -> Content:
-    pair, view = result.pair, result.views[side]
-    rgba = _rgba(published.colours(pair, view), published.alpha(pair, view))
-    frame = cdr.LEFT_FRAME if side == "left" else cdr.RIGHT_FRAME
-    image = cdr.image(rgba, "rgba8", pair.t_capture_ns, frame)
+def _drawn(view: RenderedView, size: tuple[int, int], stamp_ns: int, frame: str) -> Content:
+    """A rendered view with straight alpha, [H, W, 4]."""
+    rgba = cv2.cvtColor(published.colours(view, size), cv2.COLOR_RGB2RGBA)
+    alpha = cv2.convertScaleAbs(published.alpha(view, size), alpha=255.0)  # scales, rounds, saturates at once
+    image = cdr.image(cv2.insertChannel(alpha, rgba, 3), "rgba8", stamp_ns, frame)
     return replace(image, detail_age_ns=published.detail_age_ns(view))
+
+
+def _eye(result: FrameResult, side: Side) -> Content:
+    frame = cdr.LEFT_FRAME if side == "left" else cdr.RIGHT_FRAME
+    return _drawn(result.views[side], published.size_of(result.pair), result.pair.t_capture_ns, frame)
 
 
 def _confidence(gaussians: Gaussians) -> F32:
@@ -243,8 +238,8 @@ FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
     "right/image_rect_color": _right_image,
     "left/camera_info": lambda r: cdr.camera_info(published.camera_of(r.pair), r.pair.t_capture_ns),
     "right/camera_info": _right_camera_info,
-    "left/render/image": lambda r: _drawn(r, "left"),
-    "right/render/image": lambda r: _drawn(r, "right"),
+    "left/render/image": lambda r: _eye(r, "left"),
+    "right/render/image": lambda r: _eye(r, "right"),
     "left/render/depth": lambda r: _depth_image(r.pair, r.views["left"].depth),
     "left/render/depth_confidence": _depth_confidence,
     "left/depth": lambda r: _depth_image(r.pair, r.observation.depth),

@@ -1,7 +1,7 @@
 """A socket that takes in what other programs hand over, in the form of `wire`, and tells them what is wrong.
 
 A sender connects with DEALER, and sends messages as the node itself publishes them. Once a second it gets a
-`receipt.Receipt`. Nobody is waited for: of what came too fast the newest is taken.
+`wire.Receipt`. Nobody is waited for: of what came too fast the newest is taken.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import zmq
 from sags_node.errors import SagsError
 from sags_node.messaging import wire
 from sags_node.messaging.peers import Peers
-from sags_node.messaging.receipt import Receipt
 from sags_node.messaging.security import RateLimitedLog, authenticated, check_endpoint
 from sags_node.messaging.sockets import bind, limit, waiting
 from sags_node.messaging.wire import Message
@@ -208,7 +207,7 @@ class Inbox:
             elif now >= sender.due:
                 sender.due = now + RECEIPT_S
                 problem, sender.problem = sender.problem or self._advice(), None
-                receipt = Receipt(
+                receipt = wire.Receipt(
                     taken=sender.taken, refused=sender.refused, overtaken=sender.overtaken, problem=problem
                 )
                 try:

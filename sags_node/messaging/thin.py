@@ -87,7 +87,8 @@ def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
     side, pair = _side(topic), result.pair
     if topic.endswith("image_rect_color"):
         return published.picture(pair, side)[part]
-    colours, coverage = published.colours(pair, result.views[side])[part], _alpha(result, topic, part)
+    colours = published.colours(result.views[side], published.size_of(pair))[part]
+    coverage = _alpha(result, topic, part)
     over_black: U8 = cv2.multiply(colours, cv2.merge([coverage] * 3), scale=1 / 255)
     return over_black
 
@@ -97,7 +98,7 @@ def _side(topic: str) -> Side:
 
 
 def _alpha(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
-    whole = published.alpha(result.pair, result.views[_side(topic)])
+    whole = published.alpha(result.views[_side(topic)], published.size_of(result.pair))
     alpha: U8 = cv2.convertScaleAbs(whole[part], alpha=255.0)
     return alpha
 
