@@ -28,7 +28,7 @@ from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, Topi
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
 from sags_node.messaging.wire import WireError
-from sags_node.node.recorder_state import findings
+from sags_node.node.recorder import findings
 
 pytestmark = pytest.mark.live
 
