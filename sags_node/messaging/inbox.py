@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -177,10 +178,10 @@ class Inbox:
                 self._refuse(sender, str(error))
         if not self._newest:
             return came
-        kept, counts = [], dict[tuple[int, str], int]()
+        kept, counts = [], Counter[tuple[int, str]]()
         for one in reversed(came):
             topic = id(one[0]), one[1].topic
-            counts[topic] = counts.get(topic, 0) + 1
+            counts[topic] += 1
             if counts[topic] <= self._newest:
                 kept.append(one)
             else:

@@ -75,7 +75,7 @@ def _thin(
     if is_jpeg:
         picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     _, file = cv2.imencode(".jpg" if is_jpeg else ".png", picture, _JPEG if is_jpeg else PNG)
-    frame = cdr.RIGHT_FRAME if thin.topic.startswith("right") else cdr.LEFT_FRAME
+    frame = cdr.FRAMES[_side(thin.topic)]
     kind = "jpeg" if is_jpeg else "png"
     drawn = result.views[_side(thin.topic)] if thin.topic.endswith("render/image") else None
     body = cdr.thin_picture(file, kind, encoding, result.pair.t_capture_ns, frame, scale, window)
