@@ -53,8 +53,7 @@ class Watched:
         return client.subscribed(self.data, *prefixes)
 
     def heard(self, *names: str, count: int = 3) -> dict[str, list[client.Received]]:
-        got = client.collect(self.data, [f"sags/{name}" for name in names], count, timeout=60)
-        return {name: got[f"sags/{name}"] for name in names}
+        return client.collect(self.data, names, count, timeout=60)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from sags_node.errors import SagsError
 from sags_node.messaging import wire
 from sags_node.messaging.peers import Peers
 from sags_node.messaging.security import RateLimitedLog, authenticated, check_endpoint
-from sags_node.messaging.sockets import bind, limit, waiting
+from sags_node.messaging.sockets import bind, limit
 from sags_node.messaging.wire import Message
 from sags_node.types import Finding
 from sags_node.workers import go_on
@@ -169,7 +169,7 @@ class Inbox:
     def _waiting(self) -> list[tuple[_Sender, Message, int]]:
         """Return what has come, in its order; of each sender's topics the newest."""
         came: list[tuple[_Sender, Message, int]] = []
-        for identity, *frames in waiting(self._socket, MOST_AT_ONCE, wire.MAX_PARTS + 1, self._peers.took):
+        for identity, *frames in self._peers.waiting(MOST_AT_ONCE, wire.MAX_PARTS + 1):
             arrival_ns = time.time_ns()
             sender = self._sender(identity.bytes)
             try:

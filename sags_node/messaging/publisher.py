@@ -140,7 +140,7 @@ class Publisher(Closes):
             limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
             self._watch("control", router, control.MAX_UNANSWERED_BYTES, gate)
             control_endpoint = bind(router, config.control, "publish.control", keys)
-            self._control = control.ControlServer(router, handlers, self._peers["control"].took, gate)
+            self._control = control.ControlServer(router, handlers, self._peers["control"].waiting, gate)
         self.connection = Connection(
             protocol=PROTOCOL,
             ns=self.ns,

@@ -128,13 +128,7 @@ def test_allow_lists(keys: Path, tmp_path: Path) -> None:
         read_key_pair(keys / "node.pub")
 
 
-def test_keys_in_a_launch_file_are_relative_to_it(tmp_path: Path) -> None:
-    file = tmp_path / "launch.yaml"
-    file.write_text("publish: {key: node.key, allow: [clients, one.pub]}")
-    publish = load_launch(file).publish
-    assert publish.key == tmp_path / "node.key"
-    assert publish.allow == (tmp_path / "clients", tmp_path / "one.pub")
-    assert load_launch(None, ["publish.key:=a.key", "publish.allow:=b"]).publish.allow == (Path("b"),)
+def test_a_key_and_an_allow_list_belong_together() -> None:
     with pytest.raises(UsageError, match="belong together"):
         load_launch(None, ["publish.key:=a.key"])
     with pytest.raises(UsageError, match="belong together"):
