@@ -18,10 +18,8 @@ from ports import free_port
 from synthetic import publisher
 from waiting import beside, repeating, until
 
-from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
-from sags_node.messaging.publisher import Publisher
 from sags_node.node.operations import Requests
 
 pytestmark = pytest.mark.live
@@ -113,11 +111,11 @@ def test_what_has_failed_is_not_done_later(tmp_path: Path) -> None:
         "pause": lambda args: done.append("pause"),
         "reset_model": lambda args: posted.append(waiting.post(lambda: done.append("reset"))) or posted[0],
     }
-    config = PublishConfig(data=(), control=f"tcp://127.0.0.1:{free_port()}", run_dir=tmp_path / "run")
-    with ControlClient(config.control) as asker:
+    endpoint = f"tcp://127.0.0.1:{free_port()}"
+    with ControlClient(endpoint) as asker:
         with pytest.raises(SagsError, match="no answer"):
             asker.request("pause", timeout=0.2)
-        with Publisher(config, "sags", "session-1", handlers) as running:
+        with publisher(tmp_path / "run", handlers, control=endpoint) as running:
             with repeating(lambda _: running.poll(20)):
                 assert asker.request("ping", timeout=60) == "pong"
             with pytest.raises(SagsError, match="no answer"):

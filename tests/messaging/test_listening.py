@@ -144,8 +144,7 @@ def test_a_long_run_directory_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_control_socket(tmp_path: Path) -> None:
-    config = PublishConfig(data=(), control=None, run_dir=tmp_path / "run")
-    with Publisher(config, "sags", "session-1") as running:
+    with publisher(tmp_path / "run", data=(), control=None) as running:
         assert running.connection.control is None and len(running.connection.data) == 1
         running.publish_health(health())
         assert running.poll(0) is False
