@@ -20,6 +20,7 @@ from waiting import START_SECONDS, until
 from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.roles import needed
+from sags_node.messaging.subscriber import Subscriber
 
 pytestmark = pytest.mark.live
 
@@ -132,6 +133,21 @@ def test_no_thread_gives_way_to_others(node: RunningNode) -> None:
     assert {os.sched_getscheduler(thread) for thread in threads} == {os.SCHED_OTHER}
     own = os.getpriority(os.PRIO_PROCESS, node.process.pid)
     assert {os.getpriority(os.PRIO_PROCESS, thread) for thread in threads} == {own}
+
+
+@pytest.mark.fault("process: the node is killed")
+def test_a_killed_node_goes_stale_and_reads_fail(node: RunningNode) -> None:
+    """What was received from a dead node must not be taken for the present. The last of these tests: it ends
+    the node of the others."""
+    name = "left/render/image"
+    with Subscriber([name], endpoint=node.data) as subscriber:
+        assert subscriber.wait(name, timeout=30) is not None
+        until(lambda: subscriber.ok(name))
+        node.process.kill()
+        node.process.wait(30)
+        until(lambda: not subscriber.ok(name))
+        with pytest.raises(SagsError):
+            subscriber.read(name)
 
 
 def test_what_a_mapper_of_the_papers_model_shows_is_published_as_any_others(
