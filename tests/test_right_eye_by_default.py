@@ -101,6 +101,7 @@ def test_who_comes_gets_every_frame_from_then_on(running: Watched) -> None:
 
 def test_a_pair_of_eyes_from_elsewhere_is_a_look_at_the_right_one(running: Watched) -> None:
     """Of a view nobody subscribes to, and of its left eye alone, it is not."""
+    until(lambda: running.draws(False))  # those of the tests before have gone
     aside = np.eye(4)
     aside[0, 3] = 0.002
     with ControlClient(run_dir=running.run_dir) as asker:
