@@ -25,11 +25,7 @@ def test_invert_undoes_transform() -> None:
     homogeneous = np.concatenate([points, np.ones((4, 5, 1))], -1) @ T.T
     np.testing.assert_allclose(moved, homogeneous[..., :3], atol=1e-12)
     np.testing.assert_allclose(geometry.transform(geometry.invert(T), moved), points, atol=1e-12)
-
-
-def test_transform_keeps_float32() -> None:
-    points = np.ones((2, 3), np.float32)
-    assert geometry.transform(random_pose(np.random.default_rng(0)), points).dtype == np.float32
+    assert geometry.transform(T, points.astype(np.float32)).dtype == np.float32
 
 
 def test_quaternion_of_a_known_rotation() -> None:
@@ -101,12 +97,7 @@ def test_scaled_intrinsics_follow_a_resized_picture(new_size: tuple[int, int]) -
     centroid = [(x * resized).sum() / resized.sum(), (y * resized).sum() / resized.sum()]
     scaled = Camera(*new_size, geometry.scale_intrinsics(K, (320, 240), new_size), np.eye(4))
     np.testing.assert_allclose(geometry.project(scaled, point)[0], centroid, atol=0.02)
-
-
-def test_scaling_intrinsics_leaves_the_original_alone() -> None:
-    before = K.copy()
-    geometry.scale_intrinsics(K, (320, 240), (100, 100))
-    np.testing.assert_array_equal(K, before)
+    assert np.array_equal(K, [[410, 0, 160.5], [0, 405, 118.25], [0, 0, 1]]), "the original is left alone"
 
 
 def test_no_disparity_is_unknown_depth() -> None:

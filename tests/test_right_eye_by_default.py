@@ -53,8 +53,7 @@ class Watched:
         return client.subscribed(self.data, *prefixes)
 
     def heard(self, *names: str, count: int = 3) -> dict[str, list[client.Received]]:
-        got = client.collect(self.data, [f"sags/{name}" for name in names], count, timeout=60)
-        return {name: got[f"sags/{name}"] for name in names}
+        return client.collect(self.data, names, count, timeout=60)
 
 
 @contextmanager
@@ -102,6 +101,7 @@ def test_who_comes_gets_every_frame_from_then_on(running: Watched) -> None:
 
 def test_a_pair_of_eyes_from_elsewhere_is_a_look_at_the_right_one(running: Watched) -> None:
     """Of a view nobody subscribes to, and of its left eye alone, it is not."""
+    until(lambda: running.draws(False))  # those of the tests before have gone
     aside = np.eye(4)
     aside[0, 3] = 0.002
     with ControlClient(run_dir=running.run_dir) as asker:

@@ -146,7 +146,7 @@ def record(
     from sags_node.clients.recording.recorder import Recorder, RecordOptions
     from sags_node.findings import by_code, by_stage
     from sags_node.messaging.stream import check_topic
-    from sags_node.node.recorder_state import findings
+    from sags_node.node.recorder import findings
     from sags_node.terminal.console import tell as warn
     from sags_node.terminal.notices import Notices
 
@@ -343,7 +343,7 @@ def remappings(said: Sequence[str], ns: str) -> dict[str, str]:
 
 def recorded_table(summary: Mapping[str, Any]) -> Table:
     """Return what a recorder wrote and what it could not."""
-    from sags_node.node.recorder_state import SILENT_SECONDS  # brings NumPy along, which --help does not need
+    from sags_node.node.recorder import SILENT_SECONDS  # brings NumPy along, which --help does not need
 
     table = text.table("topic", "messages", "dropped", "lost")
     for name, row in summary["topics"].items():

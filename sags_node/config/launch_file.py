@@ -137,19 +137,15 @@ def _with_texts(
     """
 
     def changed(key: str, value: Any) -> Any:
-        field = None if section is None else section.model_fields.get(key)
-        kinds = [None if field is None else field.annotation]
-        for kind in kinds:  # grows
-            kinds += get_args(kind)
         if isinstance(value, dict):
-            sections = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)]
+            sections = _sections_in(section, key)
             if len(sections) > 1:  # of which `kind` chooses one
                 named = value.get("kind")
                 sections = [each for each in sections if each.model_fields["kind"].default == named]
             return _with_texts(value, change, next(iter(sections), None))
         if isinstance(value, list):
             return [changed(key, item) for item in value]
-        return change(key, value, Path in kinds) if isinstance(value, str) else value
+        return change(key, value, Path in _kinds(section, key)) if isinstance(value, str) else value
 
     return {key: changed(key, value) for key, value in tree.items()}
 
@@ -326,16 +322,18 @@ def _known_keys(path: Sequence[str], root: type[Section]) -> list[str]:
     return list(dict.fromkeys(name for one in there for name in one.model_fields))
 
 
-def _sections_in(section: type[Section], key: str) -> list[type[Section]]:
+def _sections_in(section: type[Section] | None, key: str) -> list[type[Section]]:
     """What may stand under a key: one, one of several, or a list of them."""
-    field = section.model_fields.get(key)
-    left, found = [] if field is None else [field.annotation], list[type[Section]]()
-    while left:
-        annotation = left.pop(0)
-        if isinstance(annotation, type) and issubclass(annotation, Section):
-            found.append(annotation)
-        left += get_args(annotation)
-    return found
+    return [kind for kind in _kinds(section, key) if isinstance(kind, type) and issubclass(kind, Section)]
+
+
+def _kinds(section: type[Section] | None, key: str) -> list[Any]:
+    """The type of a key, and all that it is made of."""
+    field = None if section is None else section.model_fields.get(key)
+    kinds: list[Any] = [] if field is None else [field.annotation]
+    for kind in kinds:  # grows
+        kinds += get_args(kind)
+    return kinds
 
 
 _SECTIONS = ("vision", "engine", "mapping", "publish")

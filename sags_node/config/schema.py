@@ -6,8 +6,11 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from annotated_types import Ge, Gt, Le
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from sags_node.geometry import is_rotation
 
 # Every number has a lower and an upper limit: a slip is told when it is read, not by what it leads to.
 Pixels = Annotated[int, Ge(0), Le(65536)]
@@ -59,24 +62,16 @@ _INSTRUMENTS = (
 
 
 def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
-    turn = [row[:3] for row in rows[:3]]
-    (a, b, c), (d, e, f), (g, h, i) = turn
-    unit = all(
-        abs(sum(x * y for x, y in zip(one, other, strict=True)) - (one is other)) < ROUNDED
-        for one in turn
-        for other in turn
-    )
-    if not unit or a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0 or rows[3] != LAST_ROW:
+    T = np.array(rows, np.float64)
+    if not is_rotation(T[:3, :3]) or rows[3] != (0, 0, 0, 1):
         raise ValueError("should be a rotation and a translation above a last row 0, 0, 0, 1")
-    if max(abs(row[3]) for row in rows[:3]) > FARTHEST_BASE:
+    if np.abs(T[:3, 3]).max() > FARTHEST_BASE:
         raise ValueError(f"is more than {FARTHEST_BASE:g} m away; translations are in metres")
     return rows
 
 
 Row = tuple[Finite, Finite, Finite, Finite]
 Pose = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]  # m
-LAST_ROW = (0, 0, 0, 1)
-ROUNDED = 1e-3  # of a rotation written with few digits
 FARTHEST_BASE = 10.0  # m
 NAMESPACE = r"^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$"
 

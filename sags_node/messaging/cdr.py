@@ -19,11 +19,12 @@ from rosbags.typesys import Stores, get_typestore
 from sags_node.geometry import matrix_to_quat
 from sags_node.messaging import topics
 from sags_node.messaging.wire import Buffer, DType, Message, WireError
-from sags_node.types import F64, Camera, Eye
+from sags_node.types import F64, Camera, Eye, Side
 
 WORLD_FRAME = "world"
 LEFT_FRAME = "left_optical_frame"
 RIGHT_FRAME = "right_optical_frame"
+FRAMES: dict[Side, str] = {"left": LEFT_FRAME, "right": RIGHT_FRAME}
 IMAGE_ENCODINGS: dict[str, tuple[DType, int]] = {  # ROS name: dtype, channels
     "rgb8": ("uint8", 3),
     "rgba8": ("uint8", 4),

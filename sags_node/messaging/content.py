@@ -19,7 +19,6 @@ from sags_node.messaging.cdr import Content, Status
 from sags_node.types import (
     F32,
     SH_DEGREE_0,
-    U8,
     Bool,
     ClockStatus,
     DrawnView,
@@ -27,6 +26,7 @@ from sags_node.types import (
     Gaussians,
     NodeHealth,
     RectifiedPair,
+    RenderedView,
     Side,
 )
 
@@ -149,20 +149,17 @@ def view_topics(name: str, stereo: bool, depth: bool) -> list[str]:
 def view(name: str, drawn: DrawnView) -> dict[str, Content]:
     """Return what the topics of a view that a consumer asked for say, by name without the namespace."""
     said = {}
-    for eye, picture in drawn.eyes.items():
+    for eye, shown in drawn.eyes.items():
         topic = f"view/{name}/{eye}/" if eye else f"view/{name}/"
         frame = f"{topic[:-1].replace('/', '_')}_optical_frame"
-        stamp_ns, baseline = picture.t_capture_ns, drawn.baseline if eye == "right" else 0.0
-        said[f"{topic}camera_info"] = cdr.camera_info(picture.camera, stamp_ns, frame, baseline)
-        size = picture.camera.width, picture.camera.height
-        rgba = _rgba(published.colours_at(picture, size), published.alpha_at(picture, size))
-        said[f"{topic}image"] = replace(
-            cdr.image(rgba, "rgba8", stamp_ns, frame), detail_age_ns=published.detail_age_ns(picture)
-        )
+        stamp_ns, baseline = shown.t_capture_ns, drawn.baseline if eye == "right" else 0.0
+        said[f"{topic}camera_info"] = cdr.camera_info(shown.camera, stamp_ns, frame, baseline)
+        size = shown.camera.width, shown.camera.height
+        said[f"{topic}image"] = _drawn(shown, size, stamp_ns, frame)
         if drawn.depth:
-            said[f"{topic}depth"] = cdr.image(_depth(picture.depth), "32FC1", stamp_ns, frame)
-            if picture.confidence is not None:
-                confidence = cdr.image(picture.confidence, "32FC1", stamp_ns, frame)
+            said[f"{topic}depth"] = cdr.image(_depth(shown.depth), "32FC1", stamp_ns, frame)
+            if shown.confidence is not None:
+                confidence = cdr.image(shown.confidence, "32FC1", stamp_ns, frame)
                 said[f"{topic}depth_confidence"] = confidence
     return said
 
@@ -181,19 +178,18 @@ def _visible(result: FrameResult) -> Bool:
     return visible
 
 
-def _rgba(rgb: U8, coverage: F32) -> U8:
-    """Straight-alpha picture [H, W, 4] of a rendered view."""
-    rgba = cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA)
-    alpha = cv2.convertScaleAbs(coverage, alpha=255.0)  # scales, rounds and saturates in one pass
-    return np.asarray(cv2.insertChannel(alpha, rgba, 3), np.uint8)
-
-
-def _drawn(result: FrameResult, side: Side) -> Content:
-    pair, view = result.pair, result.views[side]
-    rgba = _rgba(published.colours(pair, view), published.alpha(pair, view))
-    frame = cdr.LEFT_FRAME if side == "left" else cdr.RIGHT_FRAME
-    image = cdr.image(rgba, "rgba8", pair.t_capture_ns, frame)
+def _drawn(view: RenderedView, size: tuple[int, int], stamp_ns: int, frame: str) -> Content:
+    """A rendered view with straight alpha, [H, W, 4]."""
+    rgba = cv2.cvtColor(published.colours(view, size), cv2.COLOR_RGB2RGBA)
+    alpha = cv2.convertScaleAbs(published.alpha(view, size), alpha=255.0)  # scales, rounds, saturates at once
+    image = cdr.image(cv2.insertChannel(alpha, rgba, 3), "rgba8", stamp_ns, frame)
     return replace(image, detail_age_ns=published.detail_age_ns(view))
+
+
+def _eye(result: FrameResult, side: Side) -> Content:
+    """The model as an eye sees it."""
+    size, stamp_ns = published.size_of(result.pair), result.pair.t_capture_ns
+    return _drawn(result.views[side], size, stamp_ns, cdr.FRAMES[side])
 
 
 def _confidence(gaussians: Gaussians) -> F32:
@@ -223,28 +219,23 @@ def _mask(result: FrameResult) -> Content:
     return cdr.image(tissue.view(np.uint8) * np.uint8(255), "mono8", result.pair.t_capture_ns)
 
 
-def left_image(pair: RectifiedPair) -> Content:
-    """The rectified left picture."""
-    return cdr.image(published.picture(pair, "left"), "rgb8", pair.t_capture_ns)
+def picture(pair: RectifiedPair, side: Side) -> Content:
+    """The rectified picture of an eye."""
+    return cdr.image(published.picture(pair, side), "rgb8", pair.t_capture_ns, cdr.FRAMES[side])
 
 
-def _right_image(result: FrameResult) -> Content:
-    pair = result.pair
-    return cdr.image(published.picture(pair, "right"), "rgb8", pair.t_capture_ns, cdr.RIGHT_FRAME)
-
-
-def _right_camera_info(result: FrameResult) -> Content:
-    pair = result.pair
-    return cdr.camera_info(published.camera_of(pair), pair.t_capture_ns, cdr.RIGHT_FRAME, pair.baseline)
+def _camera_info(pair: RectifiedPair, side: Side) -> Content:
+    baseline = pair.baseline if side == "right" else 0.0
+    return cdr.camera_info(published.camera_of(pair), pair.t_capture_ns, cdr.FRAMES[side], baseline)
 
 
 FRAME_CONTENT: Mapping[str, Callable[[FrameResult], Content]] = {
-    "left/image_rect_color": lambda r: left_image(r.pair),
-    "right/image_rect_color": _right_image,
-    "left/camera_info": lambda r: cdr.camera_info(published.camera_of(r.pair), r.pair.t_capture_ns),
-    "right/camera_info": _right_camera_info,
-    "left/render/image": lambda r: _drawn(r, "left"),
-    "right/render/image": lambda r: _drawn(r, "right"),
+    "left/image_rect_color": lambda r: picture(r.pair, "left"),
+    "right/image_rect_color": lambda r: picture(r.pair, "right"),
+    "left/camera_info": lambda r: _camera_info(r.pair, "left"),
+    "right/camera_info": lambda r: _camera_info(r.pair, "right"),
+    "left/render/image": lambda r: _eye(r, "left"),
+    "right/render/image": lambda r: _eye(r, "right"),
     "left/render/depth": lambda r: _depth_image(r.pair, r.views["left"].depth),
     "left/render/depth_confidence": _depth_confidence,
     "left/depth": lambda r: _depth_image(r.pair, r.observation.depth),

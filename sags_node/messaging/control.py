@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -19,7 +20,7 @@ from sags_node.errors import SagsError, brief
 from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect, found
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, RateLimitedLog
-from sags_node.messaging.sockets import Closes, Took, waiting
+from sags_node.messaging.sockets import Closes, waiting
 from sags_node.messaging.wire import PROTOCOL
 
 # As many views as there may be, each moved as often as it is drawn, are 480 a second.
@@ -108,7 +109,7 @@ class ControlServer:
     A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
 
     Args:
-        took: is told what was read of whom.
+        read: what has arrived, so many messages and parts of each at most; default: `sockets.waiting`.
         gate: who came through it with which key.
 
     Attributes:
@@ -119,12 +120,12 @@ class ControlServer:
         self,
         socket: zmq.Socket[bytes],
         handlers: Mapping[str, Handler],
-        took: Took | None = None,
+        read: Callable[[int, int], Iterable[list[zmq.Frame]]] | None = None,
         gate: Gate = Gate(),  # noqa: B008  it is frozen
     ) -> None:
         self._socket = socket
         self._handlers = handlers
-        self._took = took
+        self._read = read or partial(waiting, socket)
         self._gate = gate
         self._rate = RequestRate()
         self.refused = Counter[str](requests_not_allowed=0, requests_too_often=0)
@@ -139,7 +140,7 @@ class ControlServer:
 
     def serve(self) -> None:
         """Answer what has arrived and what has been finished, without waiting."""
-        for frames in waiting(self._socket, MAX_REQUESTS_AT_ONCE, MAX_REQUEST_PARTS, self._took):
+        for frames in self._read(MAX_REQUESTS_AT_ONCE, MAX_REQUEST_PARTS):
             *envelope, body = (frame.bytes for frame in frames)
             if len(envelope) in (1, 2):
                 self._handle(self._sender(frames[-1], envelope), body)

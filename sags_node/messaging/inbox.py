@@ -1,7 +1,7 @@
 """A socket that takes in what other programs hand over, in the form of `wire`, and tells them what is wrong.
 
 A sender connects with DEALER, and sends messages as the node itself publishes them. Once a second it gets a
-`receipt.Receipt`. Nobody is waited for: of what came too fast the newest is taken.
+`wire.Receipt`. Nobody is waited for: of what came too fast the newest is taken.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -21,9 +22,8 @@ import zmq
 from sags_node.errors import SagsError
 from sags_node.messaging import wire
 from sags_node.messaging.peers import Peers
-from sags_node.messaging.receipt import Receipt
 from sags_node.messaging.security import RateLimitedLog, authenticated, check_endpoint
-from sags_node.messaging.sockets import bind, limit, waiting
+from sags_node.messaging.sockets import bind, limit
 from sags_node.messaging.wire import Message
 from sags_node.types import Finding
 from sags_node.workers import go_on
@@ -169,7 +169,7 @@ class Inbox:
     def _waiting(self) -> list[tuple[_Sender, Message, int]]:
         """Return what has come, in its order; of each sender's topics the newest."""
         came: list[tuple[_Sender, Message, int]] = []
-        for identity, *frames in waiting(self._socket, MOST_AT_ONCE, wire.MAX_PARTS + 1, self._peers.took):
+        for identity, *frames in self._peers.waiting(MOST_AT_ONCE, wire.MAX_PARTS + 1):
             arrival_ns = time.time_ns()
             sender = self._sender(identity.bytes)
             try:
@@ -178,10 +178,10 @@ class Inbox:
                 self._refuse(sender, str(error))
         if not self._newest:
             return came
-        kept, counts = [], dict[tuple[int, str], int]()
+        kept, counts = [], Counter[tuple[int, str]]()
         for one in reversed(came):
             topic = id(one[0]), one[1].topic
-            counts[topic] = counts.get(topic, 0) + 1
+            counts[topic] += 1
             if counts[topic] <= self._newest:
                 kept.append(one)
             else:
@@ -208,7 +208,7 @@ class Inbox:
             elif now >= sender.due:
                 sender.due = now + RECEIPT_S
                 problem, sender.problem = sender.problem or self._advice(), None
-                receipt = Receipt(
+                receipt = wire.Receipt(
                     taken=sender.taken, refused=sender.refused, overtaken=sender.overtaken, problem=problem
                 )
                 try:

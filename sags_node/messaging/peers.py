@@ -10,14 +10,14 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from sags_node.messaging.security import RateLimitedLog
-from sags_node.messaging.sockets import HANDSHAKES
+from sags_node.messaging.sockets import HANDSHAKES, waiting
 from sags_node.workers import go_on
 
 MAX_PEERS = 64  # of one socket; ZeroMQ has no such limit of its own
@@ -63,7 +63,7 @@ class Peers:
     Args:
         socket: not yet bound.
         name: of the socket, for the log.
-        max_untaken: bytes a tcp peer may have sent beyond what `took` says was read. This bounds what ZeroMQ
+        max_untaken: bytes a tcp peer may have sent beyond what `waiting` has read. This bounds what ZeroMQ
             itself does not: the number of parts of a message, and of subscriptions.
         revocations: when it grows all tcp peers are cut off. Those who may come in are back at once.
     """
@@ -104,11 +104,12 @@ class Peers:
             "flooding": self._count["flooding"],
         }
 
-    def took(self, descriptor: int, size: int) -> None:
-        """Note that a message of a peer was read."""
-        peer = self._open.get(descriptor)
-        if peer is not None:
-            peer.taken += size
+    def waiting(self, most: int, most_parts: int) -> Iterator[list[zmq.Frame]]:
+        """Read the messages that have arrived, as `sockets.waiting`, and note of whom."""
+        for frames in waiting(self._socket, most, most_parts):
+            if (peer := self._open.get(int(frames[-1].get(zmq.SRCFD)))) is not None:
+                peer.taken += sum(len(frame) for frame in frames)
+            yield frames
 
     def close(self) -> None:
         """End the thread; before the socket is closed, on its thread."""

@@ -49,32 +49,22 @@ def nearest(pair: RectifiedPair, plane: Plane) -> Plane:
     return np.asarray(enlarged).view(plane.dtype)
 
 
-def colours(pair: RectifiedPair, view: RenderedView) -> U8:
-    """Return what a view of the frame shows, [H, W, 3] RGB."""
-    return colours_at(view, size_of(pair))
-
-
-def alpha(pair: RectifiedPair, view: RenderedView) -> F32:
-    """Its coverage, [H, W] 0..1."""
-    return alpha_at(view, size_of(pair))
-
-
-def colours_at(view: RenderedView, size: tuple[int, int]) -> U8:
-    """Return what a view shows in a size of width and height, px: with the detail of pictures, where it has
-    it."""
+def colours(view: RenderedView, size: tuple[int, int]) -> U8:
+    """Return what a view shows in a size of width and height, px, [H, W, 3] RGB: with the detail of pictures,
+    where it has it."""
     if view.shown is not None and view.shown.rgb.shape[1::-1] == size:
         return view.shown.rgb
     return view.colours.at(*size)
 
 
-def alpha_at(view: RenderedView, size: tuple[int, int]) -> F32:
-    """Its coverage in that size, by the model or a picture, 0..1."""
-    alpha = view.alpha
-    if alpha.shape[::-1] != size:
-        alpha = np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_LINEAR))
+def alpha(view: RenderedView, size: tuple[int, int]) -> F32:
+    """Its coverage in that size, by the model or a picture, [H, W] 0..1."""
+    drawn = view.alpha
+    if drawn.shape[::-1] != size:
+        drawn = np.asarray(cv2.resize(drawn, size, interpolation=cv2.INTER_LINEAR))
     if view.shown is None or view.shown.taken.shape[::-1] != size:
-        return alpha
-    return np.asarray(np.maximum(alpha, view.shown.taken * np.float32(1 / 255)))
+        return drawn
+    return np.asarray(np.maximum(drawn, view.shown.taken * np.float32(1 / 255)))
 
 
 def detail_age_ns(view: RenderedView) -> int | None:
@@ -90,7 +80,7 @@ def view(pair: RectifiedPair, drawn: RenderedView) -> RenderedView:
         camera=replace(camera, T_world_cam=drawn.camera.T_world_cam),
         colours=Colours(drawn.colours.small, *size),
         depth=nearest(pair, drawn.depth).copy(),
-        alpha=alpha(pair, drawn),
+        alpha=alpha(drawn, size),
         confidence=None if sure is None else nearest(pair, sure),
     )
 

@@ -140,7 +140,7 @@ class Publisher(Closes):
             limit(router, control.SEND_HIGH_WATER, control.RECEIVE_HIGH_WATER, control.MAX_REQUEST_BYTES)
             self._watch("control", router, control.MAX_UNANSWERED_BYTES, gate)
             control_endpoint = bind(router, config.control, "publish.control", keys)
-            self._control = control.ControlServer(router, handlers, self._peers["control"].took, gate)
+            self._control = control.ControlServer(router, handlers, self._peers["control"].waiting, gate)
         self.connection = Connection(
             protocol=PROTOCOL,
             ns=self.ns,
@@ -178,7 +178,7 @@ class Publisher(Closes):
         self._pictured = pair.frame_id
         self._seq[EARLY_PICTURE] += 1
         if self.wanted(EARLY_PICTURE):
-            picture = content.left_image(pair)
+            picture = content.picture(pair, "left")
             self._send(EARLY_PICTURE, _Value(picture, pair.t_capture_ns, pair.frame_id, epoch))
 
     def publish_result(self, result: FrameResult, dropped: int) -> None:
@@ -356,7 +356,8 @@ class Publisher(Closes):
                 self._any_view = True
             resend.update(topic.name for topic in matching if topic.cached)
             if of_views:
-                resend.update(name for name in self._kept if self._is_kept_view(name, prefix))
+                kept = [name for name in self._kept if name.startswith("view/")]
+                resend.update(name for name in kept if topics.full_name(self.ns, name).startswith(prefix))
         elif message[:1] == b"\x00":
             self._subscribed.discard(prefix)
 
@@ -381,9 +382,6 @@ class Publisher(Closes):
         else:
             self.thin = {**self.thin, name: asked}
             self._seq.setdefault(name, self._thin_seq)
-
-    def _is_kept_view(self, name: str, prefix: str) -> bool:
-        return name.startswith("view/") and topics.full_name(self.ns, name).startswith(prefix)
 
     def _stay_findable(self) -> None:
         """Put back what somebody has removed from the run directory; who is connected stays so."""

@@ -24,9 +24,8 @@ from sags_node.geometry import is_rigid
 from sags_node.messaging import cdr
 from sags_node.messaging.address import Address, ClientKeys, connect
 from sags_node.messaging.cdr import Content
-from sags_node.messaging.receipt import Receipt
 from sags_node.messaging.sockets import Closes
-from sags_node.messaging.wire import Message, Meta, encode
+from sags_node.messaging.wire import Message, Meta, Receipt, encode
 from sags_node.types import F64
 
 log = logging.getLogger(__name__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Self
 
 import zmq
@@ -22,8 +22,6 @@ HANDSHAKES = (  # events of a socket's monitor
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
 HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
-
-Took = Callable[[int, int], None]  # the file descriptor of a peer, and the bytes of a message read from it
 
 
 class Closes:
@@ -84,23 +82,14 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | 
     return bound
 
 
-def waiting(
-    socket: zmq.Socket[bytes], most: int, most_parts: int, took: Took | None = None
-) -> Iterator[list[zmq.Frame]]:
+def waiting(socket: zmq.Socket[bytes], most: int, most_parts: int) -> Iterator[list[zmq.Frame]]:
     """Read the messages that have arrived, at most `most` of them, so that no peer keeps the reader; their
-    parts as in `receive_frames`.
-
-    Args:
-        took: is told what was read of whom.
-    """
+    parts as in `receive_frames`."""
     for _ in range(most):
         try:
-            frames = receive_frames(socket, most_parts)
+            yield receive_frames(socket, most_parts)
         except zmq.Again:
             return
-        if took is not None:
-            took(int(frames[-1].get(zmq.SRCFD)), sum(len(frame) for frame in frames))
-        yield frames
 
 
 def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:

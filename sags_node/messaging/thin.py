@@ -23,7 +23,7 @@ from sags_node.messaging.cdr import Content
 from sags_node.messaging.content import tells_of
 from sags_node.messaging.topics import ThinPicture
 from sags_node.messaging.wire import Buffer, WireError
-from sags_node.types import F32, U8, FrameResult, Side
+from sags_node.types import U8, FrameResult, Side
 
 DEPTH_STEP = 5e-5  # m: 25 um at most beside the depth, far below what any depth here is sure to; up to 3.2 m
 CONFIDENCE_STEP = 1 / 255
@@ -75,7 +75,7 @@ def _thin(
     if is_jpeg:
         picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     _, file = cv2.imencode(".jpg" if is_jpeg else ".png", picture, _JPEG if is_jpeg else PNG)
-    frame = cdr.RIGHT_FRAME if thin.topic.startswith("right") else cdr.LEFT_FRAME
+    frame = cdr.FRAMES[_side(thin.topic)]
     kind = "jpeg" if is_jpeg else "png"
     drawn = result.views[_side(thin.topic)] if thin.topic.endswith("render/image") else None
     body = cdr.thin_picture(file, kind, encoding, result.pair.t_capture_ns, frame, scale, window)
@@ -87,7 +87,8 @@ def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
     side, pair = _side(topic), result.pair
     if topic.endswith("image_rect_color"):
         return published.picture(pair, side)[part]
-    colours, coverage = published.colours(pair, result.views[side])[part], _alpha(result, topic, part)
+    colours = published.colours(result.views[side], published.size_of(pair))[part]
+    coverage = _alpha(result, topic, part)
     over_black: U8 = cv2.multiply(colours, cv2.merge([coverage] * 3), scale=1 / 255)
     return over_black
 
@@ -97,7 +98,7 @@ def _side(topic: str) -> Side:
 
 
 def _alpha(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
-    whole = published.alpha(result.pair, result.views[_side(topic)])
+    whole = published.alpha(result.views[_side(topic)], published.size_of(result.pair))
     alpha: U8 = cv2.convertScaleAbs(whole[part], alpha=255.0)
     return alpha
 
@@ -116,7 +117,9 @@ def _numbers(
         steps = cv2.convertScaleAbs(confidence[part][few], alpha=1 / CONFIDENCE_STEP)
         return CONFIDENCE_STEP, "mono8", steps
     depth = view.depth if topic == "left/render/depth" else result.observation.depth
-    return DEPTH_STEP, "16UC1", _in_steps(published.nearest(result.pair, depth)[part][few])
+    steps = published.nearest(result.pair, depth)[part][few] * np.float32(1 / DEPTH_STEP) + np.float32(0.5)
+    told = np.where(steps < 65536, steps, 0)  # 0: unknown, or further than can be said
+    return DEPTH_STEP, "16UC1", told.astype(np.uint16)
 
 
 def _averaged(picture: U8, every: int) -> U8:
@@ -126,12 +129,6 @@ def _averaged(picture: U8, every: int) -> U8:
         return picture
     smaller: U8 = cv2.resize(picture, (width // every, height // every), interpolation=cv2.INTER_AREA)
     return smaller
-
-
-def _in_steps(depth: F32) -> NDArray[np.uint16]:
-    """Depth [H, W] (m) in `DEPTH_STEP`; 0: unknown, or further than can be said."""
-    steps = depth * np.float32(1 / DEPTH_STEP) + np.float32(0.5)
-    return np.where(steps < 65536, steps, 0).astype(np.uint16)
 
 
 def decode(topic: str, scale: float, file: Buffer) -> NDArray[Any]:

@@ -65,6 +65,16 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     units: Text | msgspec.UnsetType = msgspec.UNSET  # of lengths: "relative", of a guessed rig; unset: metres
 
 
+class Receipt(msgspec.Struct, frozen=True, kw_only=True):
+    """What a program that hands pictures or poses in gets back, once a second."""
+
+    v: str = PROTOCOL
+    taken: int  # messages since it connected
+    refused: int
+    overtaken: int  # that newer ones came before they were looked at
+    problem: str | None = None  # what is wrong and how to fix it
+
+
 @dataclass(frozen=True, slots=True)
 class Message:
     topic: str

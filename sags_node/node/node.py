@@ -361,7 +361,9 @@ class Node:
             if picture is not None:
                 self._publisher.publish_picture(*picture)
             self._send_views()
-            self._send_thin()
+            made = self._thin.get(timeout=0)
+            if made is not None:
+                self._publisher.publish_thin(*made)
             before, warned = warned, tuple(by_code(self._state.pipeline.warnings))
             if time.monotonic() >= next_health or self._state.status_due.is_set() or warned != before:
                 self._state.status_due.clear()
@@ -401,11 +403,6 @@ class Node:
         if self._state.config.publish.right == "auto":
             pictures = ["right/render/image", *(f"view/{name}/right/image" for name in views.pairs)]
             self._right_is_watched = any(map(self._publisher.looked_at, pictures))
-
-    def _send_thin(self) -> None:
-        made = self._thin.get(timeout=0)
-        if made is not None:
-            self._publisher.publish_thin(*made)
 
     # ---- control -------------------------------------------------------------------------------------
 

@@ -51,8 +51,13 @@ def test_paths_are_relative_to_the_file_and_variables_are_expanded(
 
 def test_paths_of_a_section_of_several_kinds_are_those_of_its_kind(tmp_path: Path) -> None:
     file = tmp_path / "launch.yaml"
-    file.write_text("robot: {kind: push, key: a.key, allow: clients, hand_eye: he.yaml}\n")
-    robot = load_launch(file).robot
+    file.write_text(
+        "robot: {kind: push, key: a.key, allow: clients, hand_eye: he.yaml}\n"
+        "publish: {key: node.key, allow: [clients, one.pub]}"
+    )
+    robot, publish = load_launch(file).robot, load_launch(file).publish
+    assert publish.key == tmp_path / "node.key"
+    assert publish.allow == (tmp_path / "clients", tmp_path / "one.pub")
     assert isinstance(robot, PushRobot)
     assert (robot.key, robot.allow) == (tmp_path / "a.key", (tmp_path / "clients",))
     assert robot.hand_eye == tmp_path / "he.yaml"

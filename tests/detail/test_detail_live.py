@@ -27,7 +27,7 @@ def test_the_left_render_is_the_picture_where_tissue_is_seen_and_says_how_old_th
     with ControlClient(node.connection["control"]) as control:
         until(lambda: control.request("get_status")["gaussians"], START_SECONDS)
         control.request("open_view", {"name": "later", "ahead_ms": 30, "rate_hz": 30})
-        names = [f"sags/{name}" for name in (RENDER, INPUT, MASK, DEPTH, VIEW)]
+        names = [RENDER, INPUT, MASK, DEPTH, VIEW]
         got = client.collect(node.data, names, 20, START_SECONDS)
     assert node.stop() == 0, node.said()
     # A frame that was begun before anybody looked is the model alone, and says nothing of pictures.

@@ -62,19 +62,19 @@ def subscribed(endpoint: str, *prefixes: str, high_water: int = 1000) -> Abstrac
     return zmq_socket(zmq.SUB, endpoint, (zmq.RCVHWM, high_water), *wanted)
 
 
-def collect(endpoint: str, topics: Sequence[str], count: int, timeout: float) -> dict[str, list[Received]]:
-    """The first `count` messages of every topic, or what has come after `timeout` seconds."""
-    received: dict[str, list[Received]] = {topic: [] for topic in topics}
+def collect(endpoint: str, names: Sequence[str], count: int, timeout: float) -> dict[str, list[Received]]:
+    """The first `count` messages of every topic of the node `sags`, or what has come after `timeout` s."""
+    received: dict[str, list[Received]] = {name: [] for name in names}
     deadline = time.monotonic() + timeout
-    with subscribed(endpoint, *topics) as socket:
+    with subscribed(endpoint, *(f"sags/{name}" for name in names)) as socket:
         while time.monotonic() < deadline and min(len(got) for got in received.values()) < count:
             if not socket.poll(50):
                 continue
             topic, meta, *parts = socket.recv_multipart()
-            message = Received(topic.decode(), msgpack.unpackb(meta), parts)
+            name = topic.decode().removeprefix("sags/")
             # A subscription is a prefix: that to a depth brings its confidence too.
-            if message.topic in received and len(received[message.topic]) < count:
-                received[message.topic].append(message)
+            if name in received and len(received[name]) < count:
+                received[name].append(Received(topic.decode(), msgpack.unpackb(meta), parts))
     return received
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgpack
+
 from sags_node.messaging.cdr import Content, type_hash
 from sags_node.messaging.wire import Message, Meta
 
@@ -39,3 +41,28 @@ def message_of(topic: str, said: Content, seq: int = 1, stamp_ms: float = 0, **c
         "dtype": said.dtype,
     }
     return Message(f"sags/{topic}", meta(seq, stamp_ms, **{**form, **changes}), said.parts)
+
+
+def changed(header: bytes, **fields: object) -> bytes:
+    """A header that says something else."""
+    return msgpack.packb(msgpack.unpackb(header) | fields)
+
+
+def damaged(depth: list[bytes], other: bytes) -> list[list[bytes]]:
+    """What is no message, of the parts of a depth picture and the header of another one."""
+    topic, header, head, pixels = depth
+    return [
+        [topic],
+        [topic, header],
+        [topic, header, head, pixels[:-4]],
+        *([topic, bad, head, pixels] for bad in (
+            b"\xc1",
+            b"\xdd\xff\xff\xff\xff",  # an array of four thousand million
+            b"\x91" * 4000,
+            changed(header, shape=[2**31 - 1, 2**31 - 1]),
+            changed(header, shape=[2**31, 2**31]),
+            changed(header, shape=[-64, -96]),
+            changed(header, seq="one"),
+            other,
+        )),
+    ]  # fmt: skip

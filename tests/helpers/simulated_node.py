@@ -14,6 +14,7 @@ import tempfile
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,6 +33,7 @@ from sags_node.mapping.budget import TimeBudget
 from sags_node.mapping.ladder import FULL, RUNGS, USED, Ladder, price
 from sags_node.messaging import cdr, publisher, topics
 from sags_node.messaging.freshness import MAX_CLOCK_AHEAD, STALE_AFTER, STALE_PERIODS, Freshness
+from sags_node.messaging.sockets import waiting
 from sags_node.messaging.wire import decode
 from sags_node.node import health, latest, node, views
 from sags_node.node import operations as node_operations
@@ -412,11 +414,12 @@ class Run:
 class _Peers:
     """Nobody is counted."""
 
-    def __init__(self, *_: object) -> None: ...
+    def __init__(self, socket: Any, *_: object) -> None:
+        self.waiting = partial(waiting, socket)
+
     def counts(self) -> dict[str, int]:
         return {"open": 0, "refused": 0}
 
-    def took(self, descriptor: int, size: int) -> None: ...
     def close(self) -> None: ...
 
 

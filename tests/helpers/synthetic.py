@@ -141,11 +141,11 @@ def health(state: str = "running") -> NodeHealth:
 
 @contextmanager
 def publisher(
-    run_dir: Path, handlers: Mapping[str, Handler] | None = None, **config: Any
+    run_dir: Path, handlers: Mapping[str, Handler] | None = None, thins: bool = False, **config: Any
 ) -> Iterator[Publisher]:
     """A publisher named `sags` on free loopback ports."""
     settings = {"data": ("tcp://127.0.0.1:*",), "control": "tcp://127.0.0.1:*", "run_dir": run_dir, **config}
-    with Publisher(PublishConfig(**settings), "sags", "session-1", handlers) as running:
+    with Publisher(PublishConfig(**settings), "sags", "session-1", handlers, thins=thins) as running:
         yield running
 
 

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from synthetic import at_frame, health
+from synthetic import at_frame, health, publisher
 from waiting import repeating
 
-from sags_node.config.schema import PublishConfig
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.thin import thin_pictures
 from sags_node.types import FrameResult
 
 
-@contextmanager
-def node_sockets(run_dir: Path, right: bool = False) -> Iterator[Publisher]:
+def node_sockets(run_dir: Path, right: bool = False) -> AbstractContextManager[Publisher]:
     """Those of a node."""
-    endpoints = {"data": ("tcp://127.0.0.1:*",), "control": None}
-    config = PublishConfig(**endpoints, run_dir=run_dir, right=right)
-    with Publisher(config, "sags", "session", thins=True) as running:
-        yield running
+    return publisher(run_dir, thins=True, control=None, right=right)
 
 
 @contextmanager

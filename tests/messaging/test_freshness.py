@@ -22,32 +22,29 @@ def followed(
     return fresh
 
 
-def test_stale_after_ten_periods() -> None:
-    fresh = followed(list(range(1, 31)))
-    newest = 30 * 33
-    assert fresh.period == pytest.approx(0.033)
-    assert fresh.problem((newest + 329) * MS) is None
-    assert "too old" in str(fresh.problem((newest + 331) * MS))
-    assert "too old" in str(fresh.problem((newest + 101) * MS, max_age=0.1))
-    assert fresh.problem((newest + 99) * MS, max_age=0.1) is None
-    assert "too old" in str(fresh.problem((newest + 331) * MS, max_age=10.0))
-
-
 @pytest.mark.fault("CPU: the node makes one frame a second")
-def test_what_a_slow_node_shows_is_stale_after_half_a_second() -> None:
-    """Ten of its periods would be ten seconds. Who wants older content says so."""
-    fresh = followed(list(range(1, 31)), period_ms=1000)
-    assert fresh.problem((30_000 + 499) * MS) is None
-    assert "too old" in str(fresh.problem((30_000 + 501) * MS))
-    assert fresh.problem((30_000 + 1_900) * MS, max_age=2.0) is None
-    assert "too old" in str(fresh.problem((30_000 + 2_001) * MS, max_age=2.0))
-
-
-def test_what_shows_no_frame_is_stale_after_ten_periods() -> None:
-    """`status` and `diagnostics` come once a second."""
-    said = followed(list(range(1, 31)), period_ms=1000, changes={"frame_id": -1})
-    assert said.problem((30_000 + 9_900) * MS) is None
-    assert "too old" in str(said.problem((30_000 + 10_100) * MS))
+@pytest.mark.parametrize(
+    ("count", "period_ms", "changes", "max_age", "limit_ms"),
+    [
+        (30, 33, {}, None, 330),  # ten periods
+        (30, 33, {}, 0.1, 100),
+        (30, 33, {}, 10.0, 330),
+        (30, 1000, {}, None, 1000 * STALE_AFTER),  # ten would be ten seconds
+        (30, 1000, {}, 2.0, 2000),  # who wants older content says so
+        (30, 1000, {"frame_id": -1}, None, 10_000),  # shows no frame: `status` comes once a second
+        (1, 33, {}, None, 1000 * STALE_AFTER),  # before the period is known
+        (1, 33, {}, 5.0, 1000),  # ten of 0.1 s
+        (5, 1500, {}, 20, 1000),  # the first frames of a node on a busy machine do not tell the period
+        (6, 1500, {}, 20, 15_000),
+    ],
+)
+def test_content_is_stale_after_its_limit(
+    count: int, period_ms: int, changes: dict[str, Any], max_age: float | None, limit_ms: float
+) -> None:
+    fresh = followed(list(range(1, count + 1)), period_ms, changes)
+    newest = count * period_ms
+    assert fresh.problem(round((newest + limit_ms - 1) * MS), max_age) is None
+    assert "too old" in str(fresh.problem(round((newest + limit_ms + 1) * MS), max_age))
 
 
 @pytest.mark.fault("clock: the sender's is 0.9 s ahead, and it falls silent")
@@ -62,18 +59,8 @@ def test_silence_is_stale_whatever_the_stamps_say(ahead: int) -> None:
         assert (fresh.problem(round((30 * 33 + 1000 * silent - 10) * MS)) is not None) == is_stale
 
 
-def test_stale_before_the_period_is_known() -> None:
+def test_nothing_is_fresh_before_the_first() -> None:
     assert Freshness().problem(0) == "nothing received yet"
-    for max_age, limit in ((None, 1000 * STALE_AFTER), (5.0, 1000)):  # ten of 0.1 s
-        fresh = followed([4])
-        assert fresh.problem((4 * 33 + limit - 10) * MS, max_age) is None
-        assert "too old" in str(fresh.problem((4 * 33 + limit + 10) * MS, max_age))
-
-
-def test_a_slow_beginning_is_not_believed_to_be_the_period() -> None:
-    fresh = followed([1, 2, 3, 4, 5], period_ms=1500)  # the first frames of a node on a busy machine
-    assert "too old" in str(fresh.problem((5 * 1500 + 1010) * MS, max_age=20))
-    assert followed([1, 2, 3, 4, 5, 6], period_ms=1500).problem((6 * 1500 + 14_900) * MS, max_age=20) is None
 
 
 def test_losses_do_not_stretch_the_period_but_count() -> None:

@@ -1,18 +1,19 @@
-"""A program that uses a node needs nothing of what maps: `pip install .` does not bring it."""
+"""A program that uses a node needs nothing of what maps: `pip install .` does not bring it along."""
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
-import pytest
 from places import ROOT
 
 from sags_node.cli.main import OF_THE_NODE
 from sags_node.errors import install
 
+HEAVY = {"numba", "llvmlite", "torch", "cv2", "open3d", "onnxruntime", "scipy", "pydantic", "matplotlib"}
 BLOCKED = """
 import sys
 
@@ -31,13 +32,24 @@ with Subscriber([image], endpoint="tcp://127.0.0.1:1") as node:
 with ControlClient("tcp://127.0.0.1:1") as control:
     pass
 """
-COMMAND = "from sags_node.__main__ import main; sys.argv[0] = 'sags'; main()"
+COMMANDS = """
+import json
+from click.testing import CliRunner
+from sags_node.cli.main import main
+for command in sys.argv[1:]:
+    ended = CliRunner().invoke(main, command.split())
+    print(json.dumps([command, ended.exit_code, ended.stderr]))
+"""
+OF_CLIENTS = ("topic list", "anchor list", "measure 1 2", "param get", "health", "pause", "reset")
+NEED_IT = ("run", "demo", "overlay", "doctor", "bag info x", "import --check .")
 
 
-def without_the_node(code: str, *arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    blocked = BLOCKED.format(blocked=set(OF_THE_NODE))
-    command = [sys.executable, "-c", blocked + code, *arguments]
-    return subprocess.run(command, check=False, cwd=folder, capture_output=True, text=True, timeout=120)
+def ran(code: str, *arguments: str, folder: Path, blocked: set[str] = OF_THE_NODE) -> str:
+    """What a new process says that cannot load some packages."""
+    command = [sys.executable, "-c", BLOCKED.format(blocked=blocked) + code, *arguments]
+    done = subprocess.run(command, check=False, cwd=folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def requirements(extra: str = "") -> set[str]:
@@ -47,27 +59,39 @@ def requirements(extra: str = "") -> set[str]:
 
 
 def test_the_front_door_opens_without_it(tmp_path: Path) -> None:
-    done = without_the_node(CLIENT, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    ran(CLIENT, folder=tmp_path)
 
 
-@pytest.mark.parametrize("command", [
-    "topic list", "anchor list", "measure 1 2", "param get", "health", "pause", "reset", "export --help",
-    "--help",
-])  # fmt: skip
-def test_commands_that_ask_a_node_work_without_it(command: str, tmp_path: Path) -> None:
-    asked = command.split() if "help" in command else [*command.split(), "--ns", "other"]
-    done = without_the_node(COMMAND, *asked, folder=tmp_path)
-    assert done.returncode == (0 if "help" in command else 1), done.stderr
-    assert "help" in command or "no node runs as 'other'" in done.stderr
+def test_commands_work_without_it_or_say_how_to_install_it(tmp_path: Path) -> None:
+    asked = [f"{command} --ns other" for command in OF_CLIENTS]
+    said = ran(COMMANDS, *asked, "--help", "export --help", *NEED_IT, folder=tmp_path)
+    for command, code, error in map(json.loads, said.splitlines()):
+        if command in NEED_IT:
+            (line,) = error.splitlines()
+            assert code == 2 and "is not installed" in line and "pip install '.[node]'" in line, command
+        else:
+            assert code == (0 if "help" in command else 1), (command, error)
+            assert "help" in command or "no node runs as 'other'" in error, command
 
 
-@pytest.mark.parametrize("command", ["run", "demo", "overlay", "doctor", "bag info x", "import --check ."])
-def test_what_needs_it_says_how_to_install_it(command: str, tmp_path: Path) -> None:
-    done = without_the_node(COMMAND, *command.split(), folder=tmp_path)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert "is not installed" in line and "pip install '.[node]'" in line
+def loaded(code: str, folder: Path) -> set[str]:
+    """Packages that a fresh interpreter has loaded after this."""
+    printing = f"{code}\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
+    return set(ran(printing, folder=folder, blocked=set()).splitlines()[-1].split())
+
+
+def test_a_client_loads_nothing_that_maps(tmp_path: Path) -> None:
+    found = loaded("import sags_node.client", tmp_path)
+    assert {"zmq", "numpy", "msgspec"} <= found
+    assert not found & HEAVY
+
+
+def test_help_loads_no_numerics(tmp_path: Path) -> None:
+    asked = (["--help"], ["topic", "--help"], ["bag", "--help"])
+    helped = [f"main({arguments}, standalone_mode=False)" for arguments in asked]
+    found = loaded("\n".join(["from sags_node.cli.main import main", *helped]), tmp_path)
+    assert "click" in found
+    assert not found & (HEAVY | {"numpy"})
 
 
 def test_the_package_asks_for_it_in_an_extra_alone() -> None:

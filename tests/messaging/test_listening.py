@@ -106,19 +106,6 @@ def test_other_machines_are_refused(tmp_path: Path, key: str, endpoint: str) -> 
 
 
 @pytest.mark.fault("socket: the port is taken")
-def test_a_taken_port_is_named_with_a_way_out(tmp_path: Path) -> None:
-    with publisher(tmp_path / "one") as running:
-        taken = running.connection.data[-1]
-        with (
-            pytest.raises(SagsError, match=rf"{taken} is already in use.*publish\.data:=") as raised,
-            publisher(tmp_path / "two", data=(taken,)),
-        ):
-            pass
-        assert raised.value.exit_code == 1
-        with publisher(tmp_path / "two"):  # nothing was left behind by the failure
-            pass
-
-
 def test_one_name_one_node(tmp_path: Path) -> None:
     """A second one is told all the keys that it needs, by its name or by the first port that is taken."""
     first = PublishConfig(data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=tmp_path / "run")
@@ -157,8 +144,7 @@ def test_a_long_run_directory_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_control_socket(tmp_path: Path) -> None:
-    config = PublishConfig(data=(), control=None, run_dir=tmp_path / "run")
-    with Publisher(config, "sags", "session-1") as running:
+    with publisher(tmp_path / "run", data=(), control=None) as running:
         assert running.connection.control is None and len(running.connection.data) == 1
         running.publish_health(health())
         assert running.poll(0) is False

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import random
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,11 +12,11 @@ from typing import Any
 
 import pytest
 import zmq
+from cable import Cable
 from synthetic import at_frame, plane_result, publisher, stream
-from waiting import heard, repeating, until
+from waiting import heard, until
 
 from sags_node import workers
-from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError
 from sags_node.messaging import node_clock
 from sags_node.messaging.address import NodeAddress
@@ -99,56 +97,14 @@ def test_what_nobody_foresaw_does_not_end_the_watch(monkeypatch: pytest.MonkeyPa
 @contextmanager
 def answering(run_dir: Path, clock_ns: Callable[[], int]) -> Iterator[Publisher]:
     """A node on a machine with that clock."""
+    plane = plane_result()
 
     def stamps(args: object) -> dict[str, int]:
         return {"received_ns": clock_ns(), "answered_ns": clock_ns()}
 
-    config = PublishConfig(data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=run_dir)
-    with Publisher(config, "sags", "session-1", {"get_clock": stamps}) as running:
-        plane = plane_result()
-
-        def serve(frame: int) -> None:
-            running.publish_result(at_frame(plane, frame, clock_ns()), dropped=0)
-            running.poll(20)
-
-        with repeating(serve):
+    with publisher(run_dir, {"get_clock": stamps}) as running:
+        with stream(running, lambda frame: at_frame(plane, frame, clock_ns())):
             yield running
-
-
-@contextmanager
-def jittered(endpoint: str) -> Iterator[str]:
-    """The way to a socket with up to `JITTER` more delay, each way, in order."""
-    port = int(endpoint.rpartition(":")[2])
-    listener = socket.create_server(("127.0.0.1", 0))
-    rng = random.Random(1)
-
-    def pump(source: socket.socket, sink: socket.socket) -> None:
-        try:
-            while data := source.recv(65536):
-                time.sleep(rng.uniform(0, JITTER))
-                sink.sendall(data)
-        except OSError:  # an end of it was closed
-            pass
-
-    def serve() -> None:
-        try:
-            while True:
-                near, _ = listener.accept()
-                far = socket.create_connection(("127.0.0.1", port))
-                opened.extend((near, far))
-                for pair in ((near, far), (far, near)):
-                    threading.Thread(target=pump, args=pair, daemon=True).start()
-        except OSError:  # closed
-            pass
-
-    opened = [listener]
-    threading.Thread(target=serve, daemon=True).start()
-    try:
-        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}"
-    finally:
-        for end in opened:
-            end.shutdown(socket.SHUT_RDWR)
-            end.close()
 
 
 def ahead_and_drifting() -> int:
@@ -182,11 +138,15 @@ def test_a_drifting_clock_is_known_to_a_millisecond(tmp_path: Path) -> None:
 
 @pytest.mark.live
 def test_jitter_widens_the_bound_and_does_not_mislead(tmp_path: Path) -> None:
-    with answering(tmp_path, ahead_and_drifting) as running, jittered(clock_endpoint(running)) as far:
-        with NodeClock(far) as clock:
-            until(lambda: clock.offset is not None and clock.offset.bound < 5e-3)
-            found = clock.offset
-            assert found is not None and abs(found.seconds - true_offset()) <= found.bound + 1e-4
+    rng = random.Random(1)
+    with (
+        answering(tmp_path, ahead_and_drifting) as running,
+        Cable(clock_endpoint(running), lambda: rng.uniform(0, JITTER)) as far,
+        NodeClock(far.endpoint) as clock,
+    ):
+        until(lambda: clock.offset is not None and clock.offset.bound < 5e-3)
+        found = clock.offset
+        assert found is not None and abs(found.seconds - true_offset()) <= found.bound + 1e-4
 
 
 @pytest.mark.live
@@ -228,8 +188,7 @@ def test_a_node_of_before_says_what_it_lacks(tmp_path: Path) -> None:
     def lacks(args: object) -> object:
         raise SagsError("unknown op 'get_clock'")
 
-    config = PublishConfig(data=("tcp://127.0.0.1:*",), control="tcp://127.0.0.1:*", run_dir=tmp_path)
-    with Publisher(config, "sags", "session-1", {"get_clock": lacks}) as running, stream(running):
+    with publisher(tmp_path, {"get_clock": lacks}) as running, stream(running):
         with NodeClock(run_dir=tmp_path) as clock:
             until(lambda: "unknown op" in str(clock.problem))
             assert clock.status()["offset_ms"] is None

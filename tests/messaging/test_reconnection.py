@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
-import threading
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Self
 
 import msgspec
 import pytest
+from cable import Cable
 from command_line import killed
 from keyed_node import make_keys, node
 from places import HELPERS
@@ -85,58 +83,6 @@ def test_a_connection_that_died_without_a_word_is_made_anew(
                 until(lambda: not subscriber.ok("tf"))
                 until(lambda: subscriber.ok("tf"))
                 assert cable.connections > before
-
-
-class Cable:
-    """Passes connections on. Those that are open when it is cut stay open, and silent."""
-
-    def __init__(self, endpoint: str) -> None:
-        host, port = endpoint.removeprefix("tcp://").split(":")
-        self._far = (host, int(port))
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
-        self.connections = 0
-        self._open: list[socket.socket] = []
-        self._cut = threading.Event()
-        self._threads = [threading.Thread(target=self._accept)]
-        self._threads[0].start()
-
-    def cut(self) -> None:
-        self._cut.set()
-        self._cut = threading.Event()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                near, _ = self._listener.accept()
-            except OSError:
-                return
-            far = socket.create_connection(self._far)
-            self.connections += 1
-            self._open += [near, far]
-            for source, target in ((near, far), (far, near)):
-                passing = threading.Thread(target=self._pass, args=(source, target, self._cut))
-                self._threads.append(passing)
-                passing.start()
-
-    @staticmethod
-    def _pass(source: socket.socket, target: socket.socket, cut: threading.Event) -> None:
-        try:
-            while (data := source.recv(65536)) and not cut.is_set():
-                target.sendall(data)
-        except OSError:
-            return
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for one in (self._listener, *self._open):
-            with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-            one.close()
-        for thread in self._threads:
-            thread.join()
 
 
 def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:

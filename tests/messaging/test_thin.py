@@ -20,15 +20,14 @@ from waiting import heard, until
 
 from sags_node.clients.recording.recorder import Recorder, RecordOptions
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging import content, thin, topics
+from sags_node.messaging import content, topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.introspection import topic_echo, topic_figures, topic_info
 from sags_node.messaging.publisher import MAX_THIN, Publisher
 from sags_node.messaging.received import ReceivedCompressed, ReceivedImage, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.thin import DEPTH_STEP, thin_pictures
-from sags_node.messaging.wire import WireError
-from sags_node.node.recorder_state import findings
+from sags_node.node.recorder import findings
 
 pytestmark = pytest.mark.live
 
@@ -120,7 +119,7 @@ def test_another_language_finds_file_scale_and_place(tmp_path: Path) -> None:
     """docs/wire.md alone: the file is part 1; `scale` and `window` are in the header."""
     name = "thin/half/10,20,30,24/left/render/depth/png"
     with node_sockets(tmp_path) as running, making(running, plane_result()):
-        (message,) = collect(running.connection.data[-1], [f"sags/{name}"], 1, 60)[f"sags/{name}"]
+        (message,) = collect(running.connection.data[-1], [name], 1, 60)[name]
     assert message.meta["type"] == "sensor_msgs/msg/CompressedImage"
     assert message.meta["window"] == [10, 20, 2] and message.meta["scale"] == DEPTH_STEP
     stored = cv2.imdecode(np.frombuffer(message.parts[1], np.uint8), cv2.IMREAD_UNCHANGED)
@@ -199,7 +198,7 @@ def test_a_pause_loses_no_message_that_comes_after_it(tmp_path: Path) -> None:
 def test_a_wrong_request_hears_why(name: str, said: str, tmp_path: Path) -> None:
     """From the node, on the topic that was asked for; our own subscriber knows most of it before."""
     with node_sockets(tmp_path) as running, making(running, plane_result()) as made:
-        (answer,) = collect(running.connection.data[-1], [f"sags/{name}"], 1, 60)[f"sags/{name}"]
+        (answer,) = collect(running.connection.data[-1], [name], 1, 60)[name]
         assert said in content.cdr.decode(answer.cdr(), "std_msgs/msg/String").data
         try:
             with Subscriber([name], running.connection.data[-1]) as subscriber:
@@ -293,24 +292,15 @@ def test_what_cannot_be_made_costs_its_topic_alone(
     assert thin_pictures(plane_result(), asked, logged)[names[0]].type == topics.COMPRESSED_IMAGE
 
 
-def test_a_damaged_file_is_said_and_nothing_is_shown() -> None:
-    made = thin_pictures(plane_result(), {"t": topics.thin_picture("thin/half/left/depth/png")})["t"]
-    file = bytes(made.parts[1])
-    assert thin.decode("t", DEPTH_STEP, file).shape == (HEIGHT // 2, WIDTH // 2)
-    with pytest.raises(WireError, match="damaged"):
-        thin.decode("t", DEPTH_STEP, file[: len(file) // 2])
-
-
 def test_a_running_node_sends_colour_and_depth_over_20_mbit(tmp_path: Path) -> None:
     """At half of 640x512 px and 30 Hz, as docs/wire.md says; and the whole picture comes beside."""
     size = ("vision.width:=640", "vision.height:=512")
     with RunningNode(SESSION, tmp_path, "source.pace:=realtime", *size) as node:
-        jpeg, png = (f"sags/thin/half/left/render/{name}" for name in ("image/jpeg", "depth/png"))
-        whole = "sags/left/render/image"
-        came = collect(node.data, [jpeg, png, whole], 20, 60)
+        jpeg, png = (f"thin/half/left/render/{name}" for name in ("image/jpeg", "depth/png"))
+        came = collect(node.data, [jpeg, png, IMAGE], 20, 60)
     assert node.process.returncode == 0
     assert [len(messages) for messages in came.values()] == [20, 20, 20]
-    assert came[whole][0].meta["shape"] == [512, 640, 4]
+    assert came[IMAGE][0].meta["shape"] == [512, 640, 4]
     sizes = [sum(len(part) for message in came[name] for part in message.parts) / 20 for name in (jpeg, png)]
     assert 8 * 30 * sum(sizes) < 20e6, sizes
     colour, depth = (came[name][-1].parts[1] for name in (jpeg, png))

@@ -54,6 +54,8 @@ def test_joined_parts_are_stock_cdr(name: str) -> None:
     assert bytes(STORE.serialize_cdr(ros, said.type)) == joined
     if hasattr(ros, "header"):
         assert ros.header.stamp.sec * 10**9 + ros.header.stamp.nanosec == STAMP
+    if name == "diagnostics":
+        assert [(part.name, part.level) for part in ros.status] == [("node", 0), ("rectify", 0), ("map", 0)]
 
 
 def test_type_hash_is_the_published_one() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from places import ROOT
 from running_node import RunningNode
-from waiting import until
+from waiting import START_SECONDS, until
 
 from sags_node.errors import SagsError
 from sags_node.messaging.control import ControlClient
@@ -53,20 +53,16 @@ def truth_depth(session: Path, frame_id: int) -> np.ndarray:
 
 def test_a_stranger_reads_pictures_depth_points_and_splats(node: RunningNode, phantom_session: Path) -> None:
     """Everything a consumer needs, from the contract alone, in metres against the phantom's truth."""
-    names = {
-        name: f"sags/{name}"
-        for name in (
-            "left/image_rect_color", "right/image_rect_color", "left/render/image", "right/render/image",
-            "left/render/depth", "left/depth", "left/tissue_mask", "left/camera_info", "right/camera_info",
-            "points", "splats", "tf", "status",
-        )
-    }  # fmt: skip
+    names = [
+        "left/image_rect_color", "right/image_rect_color", "left/render/image", "right/render/image",
+        "left/render/depth", "left/depth", "left/tissue_mask", "left/camera_info", "right/camera_info",
+        "points", "splats", "tf", "status",
+    ]  # fmt: skip
     width, height = 320, 256
 
     def covered() -> tuple[dict[str, list[independent_client.Received]], float, float] | None:
         """A model that is young, or had little time, does not cover everything yet."""
-        got = independent_client.collect(node.data, list(names.values()), count=12, timeout=40)
-        by_name = {name: got[topic] for name, topic in names.items()}
+        by_name = independent_client.collect(node.data, names, count=12, timeout=40)
         assert not [name for name, messages in by_name.items() if not messages]
         rendered = by_name["left/render/depth"][-1]
         depth = independent_client.check_image(rendered, "32FC1", width, height)
@@ -152,6 +148,29 @@ def test_a_killed_node_goes_stale_and_reads_fail(node: RunningNode) -> None:
         until(lambda: not subscriber.ok(name))
         with pytest.raises(SagsError):
             subscriber.read(name)
+
+
+def test_what_a_mapper_of_the_papers_model_shows_is_published_as_any_others(
+    phantom_session: Path, tmp_path: Path
+) -> None:
+    """Renders, depth, points, splats, views and anchors."""
+    options = ["mapping.method:=sags", "source.pace:=fast", "mapping.rung:=3"]  # no frame is left out
+    with RunningNode(phantom_session, tmp_path, *options) as node:
+        with ControlClient(node.connection["control"]) as control:
+            until(lambda: control.request("get_status")["gaussians"], START_SECONDS)
+            control.request("open_view", {"name": "near", "width": 160, "height": 128})
+            anchor = control.request("add_anchor", {"u": 150, "v": 120})["id"]
+            names = ["left/render/image", "right/render/image", "left/depth", "points", "splats", "anchors"]
+            names += ["view/near/image"]
+            got = independent_client.collect(node.data, names, 3, START_SECONDS)
+        assert node.stop() == 0, node.said()
+    last = {name: messages[-1] for name, messages in got.items()}
+    assert len(independent_client.check_splats(last["splats"])["x"]) > 1000
+    assert np.isfinite(last["left/depth"].array()).mean() > 0.5
+    assert len(last["points"].array()) > 1000
+    for name in ("left/render/image", "right/render/image", "view/near/image"):
+        assert last[name].array().std() > 10, name
+    assert anchor in last["anchors"].array().view(np.uint32)[:, 3]
 
 
 def test_the_consumer_of_the_readme_runs_as_it_stands(

@@ -60,8 +60,7 @@ def control(node: RunningNode) -> Iterator[ControlClient]:
 
 
 def collect(node: RunningNode, names: list[str], count: int = 1, timeout: float = 60) -> dict[str, list[Any]]:
-    got = client.collect(node.data, [f"sags/{name}" for name in names], count, timeout)
-    return {name: got[f"sags/{name}"] for name in names}
+    return client.collect(node.data, names, count, timeout)
 
 
 def anchor_rows(message: client.Received) -> dict[int, np.ndarray]:

@@ -35,7 +35,7 @@ from sags_node.messaging.cdr import Content
 from sags_node.messaging.stream import listen_to
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, encode
-from sags_node.node.recorder_state import LOW_SECONDS, SILENT_SECONDS, findings
+from sags_node.node.recorder import LOW_SECONDS, SILENT_SECONDS, findings
 
 pytestmark = pytest.mark.live
 

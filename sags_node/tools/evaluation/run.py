@@ -128,7 +128,7 @@ class Run:
             baseline=result.pair.baseline,
             measured_depth=seen.depth,
             confidence=view.confidence,
-            right_rgb=published.colours(result.pair, right) if right is not None else None,
+            right_rgb=published.colours(right, published.size_of(result.pair)) if right is not None else None,
         )
         self._keep(snapshot.frame_id, _MAPPED, mapped)
         self.frame_ids.append(snapshot.frame_id)

@@ -189,8 +189,8 @@ class Renders:
 
     def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
         pair, view = result.pair, result.views["left"]
-        shown = published.alpha(pair, view)[..., None] > 0
-        picture = published.colours(pair, view) * shown * np.uint8(not result.held)
+        shown = published.alpha(view, published.size_of(pair))[..., None] > 0
+        picture = published.colours(view, published.size_of(pair)) * shown * np.uint8(not result.held)
         self._video.add(picture, pair.t_capture_ns)
         self._holds += 1
 
