@@ -6,12 +6,10 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Self
 
-from command_line import RUN_HERE
-from waiting import START_SECONDS
+from command_line import RUN_HERE, wait_for
 
 
 class RunningNode:
@@ -27,13 +25,12 @@ class RunningNode:
             stderr=subprocess.PIPE,
             text=True,
         )  # fmt: skip
-        file = self.run_dir / "sags.json"
-        deadline = time.monotonic() + START_SECONDS
-        while not file.exists():
-            assert self.process.poll() is None, self.said()
-            assert time.monotonic() < deadline, "the node did not start"
-            time.sleep(0.05)
-        self.connection = json.loads(file.read_text())
+        try:
+            wait_for(self.process, (self.run_dir / "sags.json").exists)
+        except BaseException:
+            self.process.kill()
+            raise
+        self.connection = json.loads((self.run_dir / "sags.json").read_text())
         self.data = next(e for e in self.connection["data"] if e.startswith("tcp"))
 
     def said(self) -> str:

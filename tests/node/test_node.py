@@ -29,6 +29,8 @@ pytestmark = pytest.mark.live
 def node(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningNode]:
     # No frame is left out, so what is shown does not depend on how busy the machine is.
     with RunningNode(phantom_session, tmp_path_factory.mktemp("node"), "source.pace:=fast") as running:
+        with Subscriber(["splats"], endpoint=running.data) as subscriber:
+            assert subscriber.wait("splats", timeout=START_SECONDS) is not None  # there is a model
         yield running
 
 
