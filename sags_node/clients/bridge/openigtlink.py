@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from sags_node.clients.bridge import igtl
 from sags_node.clients.bridge.compressed import over_black
 from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
-from sags_node.clients.bridge.options import ServerOptions
 from sags_node.clients.bridge.pins import MOST, Pin, Pins, Release
-from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source
+from sags_node.clients.bridge.relay import Outlet, Output, Relay, ServerOptions, Source
 from sags_node.clients.bridge.requests import Requests
 from sags_node.clients.overlay.draw import over
 from sags_node.confidence import SURE, is_sure_in_space

@@ -24,9 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
-from sags_node.clients.bridge.feed import Feed
-from sags_node.clients.bridge.options import ServerOptions
-from sags_node.clients.bridge.relay import LOOK, Outlet, Output, Relay, Source
+from sags_node.clients.bridge.relay import LOOK, Feed, Outlet, Output, Relay, ServerOptions, Source
 from sags_node.clients.bridge.requests import Requests
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.received import Frame
