@@ -23,10 +23,9 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bri
 from pyigtl.messages import PointMessage
 
 from sags_node.clients.bridge import igtl
-from sags_node.clients.bridge.igtl import MAX_BODY_BYTES
-from sags_node.clients.bridge.igtl_peers import Peers
+from sags_node.clients.bridge.igtl import MAX_BODY_BYTES, Peers
 from sags_node.clients.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
-from sags_node.clients.bridge.pins import Pins, Release
+from sags_node.clients.bridge.pins import Pins
 from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.geometry import invert, transform, unproject
 
@@ -382,7 +381,7 @@ def test_points_that_are_named_alike_are_all_pinned_and_given_back() -> None:
     due = pins.due(1.0)
     assert [(pin.name, pin.place.tolist()) for pin in due] == [("vessel", each.tolist()) for each in places]
     assert not any(pins.pinned(pin, anchor) for anchor, pin in enumerate(due, 7))
-    assert pins.hear([("vessel", places[0])], 2.0) == [Release(8)] and pins.due(3.0) == []
+    assert pins.hear([("vessel", places[0])], 2.0) == [8] and pins.due(3.0) == []
 
 
 def test_an_answer_that_comes_after_the_end_goes_nowhere() -> None:
