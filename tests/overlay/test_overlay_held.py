@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -93,6 +94,8 @@ def test_one_anchor_gives_the_place_and_the_normal_of_the_surface() -> None:
 
 
 PIXELS = [[20, 20], [70, 30], [30, 55], [85, 50]]
+WORKER = ThreadPoolExecutor(1)
+EVERYWHERE = Body(rod(np.full(3, -1.0), np.ones(3), (0, 0, 0)), 1.0, None)  # so it lies at any anchors
 
 
 def held(
@@ -102,7 +105,7 @@ def held(
     **more: Any,
 ) -> HeldObject:
     spec = ObjectSpec.model_validate({"shape": "sphere", "anchors": anchors, **more})
-    return HeldObject(spec, "pin", pinner or FakePinner(), repin)
+    return HeldObject(spec, "pin", pinner or FakePinner(), repin, 0, EVERYWHERE, WORKER)
 
 
 def with_anchors(frame: TissueFrame, places: Any, confidence: Any = 1.0) -> TissueFrame:
@@ -243,7 +246,7 @@ def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any
     spec = ObjectSpec.model_validate({"file": "tube.stl", "scale": scale, "anchors": anchors, **more})
     ends = np.array([[-0.015, 0.0, 0.0], [0.015, 0.0, 0.0]]) + (0 if around is None else around)
     body = Body(rod(*ends, (0, 0, 0)), 1.0, None)
-    return HeldObject(spec, "pin", FakePinner(), False, 0, body), with_anchors(frame, places)
+    return HeldObject(spec, "pin", FakePinner(), False, 0, body, WORKER), with_anchors(frame, places)
 
 
 def local_places() -> np.ndarray:
@@ -323,7 +326,7 @@ def test_points_that_lie_on_the_file_in_other_axes_only_are_unsure(
     at = 1e3 * (local * factors - [0, 0, under])
     anchors = [{"pixel": pixel, "at": each.tolist()} for pixel, each in zip(PIXELS, at, strict=True)]
     spec = ObjectSpec.model_validate({"file": "a.stl", "scale": 1e-3, "anchors": anchors})
-    thing = HeldObject(spec, "pin", FakePinner(), False, 0, Body(wall, 1.0, None))
+    thing = HeldObject(spec, "pin", FakePinner(), False, 0, Body(wall, 1.0, None), WORKER)
     placed_at(thing, with_anchors(frame, places))
     assert thing.is_sure == (said is None) and str(said or None) in str(thing.unsure)
 
