@@ -11,7 +11,7 @@ import pytest
 from command_line import refused
 
 from sags_node.clients.overlay.mesh import LEAN, mesh_of
-from sags_node.clients.overlay.polygons import triangulate
+from sags_node.clients.overlay.mesh_files import triangulate
 from sags_node.clients.overlay.scene import SHAPES, ObjectSpec, built_in
 
 

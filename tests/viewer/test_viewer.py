@@ -35,6 +35,7 @@ from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
 from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.clients.viewer.still import SILENT_AFTER
 from sags_node.config.schema import PhantomSource
+from sags_node.messaging.address import THE_NODE
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
 from sags_node.messaging.subscriber import Subscriber
@@ -237,7 +238,7 @@ def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
         return replace(moment(), status=msgspec.structs.replace(moment().status, session=session))
 
     with serving("127.0.0.1", 0, False) as (server, _):
-        panel = Panel(server, Scene(server), None, None, "sags", 20.0)
+        panel = Panel(server, Scene(server), THE_NODE, None, 20.0)
         panel.show(seen("first"))
         panel.choose(1)
         panel.show(Moment("stale", Status(session="first")))

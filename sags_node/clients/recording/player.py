@@ -299,8 +299,8 @@ def outgoing(message: BagMessage, stamp_ns: int) -> tuple[str, Content]:
     name = message.topic.lstrip("/")
     if message.type == cdr.COMPRESSED and name.endswith(COMPRESSED_SUFFIX):
         return name.removesuffix(COMPRESSED_SUFFIX), _raw_picture(message, stamp_ns)
-    if message.type == topics.IMAGE:
-        return name, _picture(message, stamp_ns)
+    if message.type == topics.IMAGE and (picture := _picture(message, stamp_ns)) is not None:
+        return name, picture
     if message.type == topics.POINT_CLOUD:
         return name, _cloud(message, stamp_ns)
     stamped = bytearray(message.data)
@@ -326,14 +326,13 @@ def _parts(message: BagMessage, bulk: int, after: int, stamp_ns: int) -> tuple[B
     return (*parts, bytes(data[len(data) - after :])) if after else parts
 
 
-def _picture(message: BagMessage, stamp_ns: int) -> Content:
+def _picture(message: BagMessage, stamp_ns: int) -> Content | None:
+    """None: it is valid, but not in the words of this protocol."""
     ros = cdr.decode(message.data, topics.IMAGE)
     dtype, channels = cdr.IMAGE_ENCODINGS.get(ros.encoding, ("uint8", 0))
     row_bytes = ros.width * channels * np.dtype(dtype).itemsize
     if not row_bytes or ros.step != row_bytes or ros.data.size != row_bytes * ros.height or ros.is_bigendian:
-        data = bytearray(message.data)  # valid, but not in the words of this protocol: sent as it is
-        _restamp(data, _HEADER_AT, stamp_ns)
-        return Content(topics.IMAGE, (bytes(data),))
+        return None
     shape = (ros.height, ros.width, channels) if channels > 1 else (ros.height, ros.width)
     return Content(topics.IMAGE, _parts(message, ros.data.size, 0, stamp_ns), ros.encoding, shape, dtype)
 
