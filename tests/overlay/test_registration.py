@@ -16,9 +16,8 @@ from test_overlay import overlay
 from waiting import until
 
 from sags_node.clients.overlay.scene import read_scene
-from sags_node.clients.registration.certainty import nine_of_ten, of_pairs, picking_error
 from sags_node.clients.registration.register import Registration, register
-from sags_node.clients.registration.rigid import kabsch, rigid_fit
+from sags_node.clients.registration.rigid import kabsch, nine_of_ten, of_pairs, picking_error, rigid_fit
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.geometry import project, transform
 from sags_node.phantom import write_session

@@ -198,7 +198,9 @@ class OpenIgtLink(Outlet):
         if name == "Anchors":
             return _anchors(frame[ANCHORS])
         if name == "LeftCamera":
-            return igtl.transform(RAS @ _in_mm(frame[POSE].pose()) @ RAS)
+            T = frame[POSE].pose()
+            T[:3, 3] *= 1e3  # mm
+            return igtl.transform(RAS @ T @ RAS)
         if name == "Surface":
             return self._surface(frame)
         (channels, draw), info = PICTURES[name], frame[INFO]
@@ -300,12 +302,6 @@ def _ras(places: F64) -> F64:
     """World coordinates [N, 3] in m as Slicer's, in mm."""
     turned: F64 = 1e3 * places @ RAS[:3, :3]
     return turned
-
-
-def _in_mm(T: F64) -> F64:
-    scaled = T.copy()
-    scaled[:3, 3] *= 1e3
-    return scaled
 
 
 def _before_camera(K: F64) -> F64:

@@ -17,7 +17,7 @@ from sags_node.clients.overlay.pinner import Pinner, Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
 from sags_node.clients.overlay.residual import Residual
 from sags_node.clients.overlay.scene import ObjectSpec
-from sags_node.clients.registration.misread import misread
+from sags_node.clients.registration.register import misread
 from sags_node.clients.registration.rigid import on_a_line, rigid_fit
 from sags_node.clients.registration.surfaces import Shape
 from sags_node.confidence import LEAST

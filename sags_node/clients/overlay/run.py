@@ -23,7 +23,6 @@ import numpy as np
 
 from sags_node.clients.overlay import draw as overlay_draw
 from sags_node.clients.overlay.draw import Body, Placed
-from sags_node.clients.overlay.durations import REMEMBERED, Durations
 from sags_node.clients.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.clients.overlay.held import HeldObject
 from sags_node.clients.overlay.mesh import mesh_of
@@ -42,7 +41,7 @@ from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, 
 from sags_node.messaging.rundir import NoNodeError
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import NO_RIGHT_EYE
-from sags_node.types import U8
+from sags_node.types import F32, U8
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +51,7 @@ WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
 WAIT_FOR_REST = 0.05  # s for what belongs to the frame
 PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
 UNSEEN = "nothing of it is in sight: beyond the picture, or behind an instrument"
+REMEMBERED = 54_000  # durations: half an hour at 30 Hz
 RECENT = 300  # durations are behind the figures in `status`
 
 
@@ -353,3 +353,27 @@ class _Overlay:
             return ""
         p50, p99 = np.percentile(recent, (50, 99))
         return f"{recent[-1]:.0f} ms (p50 {p50:.0f}, p99 {p99:.0f})"
+
+
+class Durations:
+    """The newest half hour of one duration, milliseconds, in memory that never grows."""
+
+    def __init__(self) -> None:
+        self._ms = np.full(REMEMBERED, np.nan, np.float32)  # written once, so that its pages are there
+        self._count = 0
+
+    def add(self, ms: float) -> None:
+        """Remember it in the place of the oldest."""
+        self._ms[self._count % REMEMBERED] = ms
+        self._count += 1
+
+    def last(self, count: int = REMEMBERED) -> F32:
+        """The newest `count` [N <= count], the newest last."""
+        known = min(count, self._count, REMEMBERED)
+        return self._ms[np.arange(self._count - known, self._count) % REMEMBERED]
+
+    def percentiles(self, count: int = REMEMBERED) -> dict[str, float | None]:
+        """p50, p90 and p99 of the newest `count`; None before there is one."""
+        values = self.last(count)
+        known = len(values) > 0
+        return {f"p{q}": round(float(np.percentile(values, q)), 2) if known else None for q in (50, 90, 99)}
