@@ -9,13 +9,14 @@ import struct
 import subprocess
 import time
 from collections import deque
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bridging import SEEN, anchored, anchored_at, bridged, sockets
+from bridging import SEEN, anchored, anchored_at, bridged, options_of, sockets
 from command_line import killed
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, stream
@@ -26,7 +27,6 @@ pytest.importorskip("websockets", reason="no gateway without: pip install '.[bri
 from websockets.sync.server import ServerConnection, serve
 
 from sags_node.clients.bridge.web import WebOptions, run_web
-from sags_node.messaging.address import NodeAddress
 
 pytestmark = [pytest.mark.live, pytest.mark.beside]
 
@@ -83,7 +83,7 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     result = anchored()
     guessed = replace(result.anchors, depth_confidence=np.full(4, 0.25, np.float32))
     result, view = replace(result, anchors=guessed), result.views["left"]
-    options = WebOptions(NodeAddress(run_dir=tmp_path), NodeAddress("overlay", run_dir=tmp_path), port=0)
+    options = options_of(WebOptions, tmp_path, port=0)
     with sockets(tmp_path) as node, bridged(run_web, options) as port, running(program, port) as process:
         with stream(node, lambda i: at_frame(result, i, time.time_ns())):
             found = LINE.fullmatch(until_line(process, "stamp_ns="))
@@ -124,9 +124,22 @@ def frame(stamp: int, **said: object) -> list[bytes]:
     ]
 
 
-def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
+def answer(asked: dict[str, object]) -> dict[str, object]:
+    """To a request for the clock."""
+    clock = {"received_ns": time.time_ns(), "answered_ns": time.time_ns()}
+    return {"id": asked["id"], "ok": True, "result": clock}
+
+
+@contextmanager
+def gateway(program: Path, attend: Callable[[ServerConnection], None]) -> Iterator[subprocess.Popen[str]]:
+    """The program at a false gateway."""
+    with serve(attend, "127.0.0.1", 0) as server, beside(server.serve_forever, server.shutdown):
+        with running(program, server.socket.getsockname()[1]) as process:
+            yield process
+
+
+def test_a_false_gateway_does_not_end_it(program: Path) -> None:
     """Broken messages, then a true one over a new connection."""
-    now_ns = time.time_ns
     attempts: list[int] = []
     broken = [
         b"", b"\x01", b"\xff\xff\xff\xff", b"\x00\x00\x00\x7f", struct.pack("<I", 4) + b"none",
@@ -142,17 +155,14 @@ def test_a_false_gateway_does_not_end_it(program: Path, tmp_path: Path) -> None:
         else:
             while True:
                 asked = json.loads(connection.recv())
-                clock = {"received_ns": now_ns(), "answered_ns": now_ns()}
                 if "op" in asked:
-                    connection.send(json.dumps({"id": asked["id"], "ok": True, "result": clock}))
+                    connection.send(json.dumps(answer(asked)))
                 connection.send(message("sags/left/render/image", "rgba8", [3, 2, 4], bytes(16)))  # left out
-                for each in frame(now_ns()):
+                for each in frame(time.time_ns()):
                     connection.send(each)
 
-    with serve(attend, "127.0.0.1", 0) as server:
-        with beside(server.serve_forever, server.shutdown):
-            with running(program, server.socket.getsockname()[1]) as process:
-                found = LINE.fullmatch(until_line(process, "stamp_ns="))
+    with gateway(program, attend) as process:
+        found = LINE.fullmatch(until_line(process, "stamp_ns="))
     assert found is not None and found[4] == "70" and found[5] == "9,9,9,9" and found[6] == ""
     assert len(attempts) > len(broken)
 
@@ -171,8 +181,7 @@ def test_pictures_that_come_late_are_old_also_where_the_clock_s_answers_are_as_l
             with suppress(TimeoutError):
                 asked = json.loads(connection.recv(timeout=0.05))
                 if "op" in asked:
-                    clock = {"received_ns": time.time_ns(), "answered_ns": time.time_ns()}
-                    due.append((time.time_ns(), {"id": asked["id"], "ok": True, "result": clock}))
+                    due.append((time.time_ns(), answer(asked)))
             behind = 0 if timely else int(late * 1e9)
             while due and due[0][0] + behind <= time.time_ns():
                 connection.send(json.dumps(due.popleft()[1]))
@@ -182,9 +191,8 @@ def test_pictures_that_come_late_are_old_also_where_the_clock_s_answers_are_as_l
             if answers == 3 and not timely:
                 timely.append(time.time_ns())
 
-    with serve(attend, "127.0.0.1", 0) as server, beside(server.serve_forever, server.shutdown):
-        with running(program, server.socket.getsockname()[1]) as process:
-            found = LINE.fullmatch(until_line(process, "stamp_ns="))
+    with gateway(program, attend) as process:
+        found = LINE.fullmatch(until_line(process, "stamp_ns="))
     assert found is not None and timely and int(found[1]) >= timely[0]
 
 
@@ -192,12 +200,10 @@ def test_lengths_without_a_unit_are_not_said_to_be_millimetres(program: Path) ->
     def attend(connection: ServerConnection) -> None:
         while True:
             asked = json.loads(connection.recv())
-            clock = {"received_ns": time.time_ns(), "answered_ns": time.time_ns()}
             if "op" in asked:
-                connection.send(json.dumps({"id": asked["id"], "ok": True, "result": clock}))
+                connection.send(json.dumps(answer(asked)))
             for each in frame(time.time_ns(), units="relative"):
                 connection.send(each)
 
-    with serve(attend, "127.0.0.1", 0) as server, beside(server.serve_forever, server.shutdown):
-        with running(program, server.socket.getsockname()[1]) as process:
-            assert " depth_no_unit=0.07 " in until_line(process, "stamp_ns=")
+    with gateway(program, attend) as process:
+        assert " depth_no_unit=0.07 " in until_line(process, "stamp_ns=")

@@ -6,6 +6,8 @@ import socket
 import subprocess
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,12 +25,12 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bri
 from pyigtl.messages import PointMessage
 
 from sags_node.clients.bridge import igtl
-from sags_node.clients.bridge.igtl import MAX_BODY_BYTES
-from sags_node.clients.bridge.igtl_peers import Peers
+from sags_node.clients.bridge.igtl import MAX_BODY_BYTES, Peers
 from sags_node.clients.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
-from sags_node.clients.bridge.pins import Pins, Release
+from sags_node.clients.bridge.pins import Pins
 from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.geometry import invert, transform, unproject
+from sags_node.types import FrameResult
 
 pytestmark = pytest.mark.live
 
@@ -57,19 +59,24 @@ def matrix(fields: list[str]) -> np.ndarray:
     return np.array(fields, np.float64).reshape(3, 4)
 
 
+@contextmanager
+def joined_to(program: Path, asked: IgtlOptions, result: FrameResult | None = None) -> Iterator[Peer]:
+    """A peer of a bridge to a node that sends one result, or the plane with its anchors, over and over."""
+    shown = result or anchored_at(0)
+    with plane_bridged(run_openigtlink, asked, lambda i: at_frame(shown, i, time.time_ns())) as (_, port):
+        with Peer(program, port) as joined:
+            yield joined
+
+
 # ---- what comes ------------------------------------------------------------------------------------------
 
 
 def test_every_device_says_in_millimetres_what_the_node_says(tmp_path: Path, program: Path) -> None:
     truth, camera = plane_result(), plane_camera()
-    with sockets(tmp_path) as running, stream(running, anchored_at):
-        with (
-            bridged(run_openigtlink, options(tmp_path, surface_step=8)) as port,
-            Peer(program, port) as joined,
-        ):
-            devices = ("SagsPicture", "SagsRender", "SagsSurface", "SagsAnchors", "SagsLeftCamera")
-            until(lambda: all(joined.newest(device) for device in devices))
-            picture, render, surface, anchors, pose = (joined.newest(device) or [] for device in devices)
+    devices = ("SagsPicture", "SagsRender", "SagsSurface", "SagsAnchors", "SagsLeftCamera")
+    with joined_to(program, options(tmp_path, surface_step=8)) as joined:
+        until(lambda: all(joined.newest(device) for device in devices))
+        picture, render, surface, anchors, pose = (joined.newest(device) or [] for device in devices)
 
     assert picture[:4] == [str(WIDTH), str(HEIGHT), "3", "1"], "RGB, and the numbers are said to be RAS"
     assert int(picture[4]) == weighted(truth.pair.left)
@@ -111,11 +118,8 @@ def test_every_device_says_in_millimetres_what_the_node_says(tmp_path: Path, pro
 def test_an_anchor_whose_depth_is_a_guess_is_no_sure_place(tmp_path: Path, program: Path) -> None:
     result = anchored_at(1)
     guessed = replace(result.anchors, depth_confidence=np.array([0.49, 1, 1, 1], np.float32))
-    result = replace(result, anchors=guessed)
-    with sockets(tmp_path) as running, stream(running, lambda i: at_frame(result, i, time.time_ns())):
-        with bridged(run_openigtlink, options(tmp_path, send=("anchors",))) as port:
-            with Peer(program, port) as joined:
-                seen, _, unsure = np.array(until(lambda: joined.newest("SagsAnchors"))).reshape(-1, 2)[:, 1]
+    with joined_to(program, options(tmp_path, send=("anchors",)), replace(result, anchors=guessed)) as joined:
+        seen, _, unsure = np.array(until(lambda: joined.newest("SagsAnchors"))).reshape(-1, 2)[:, 1]
     assert seen.split(";")[4] == unsure.split(";")[4], "orange, as one that is not recognised"
 
 
@@ -139,11 +143,8 @@ def test_a_surface_has_holes_where_the_depth_is_not_sure_or_jumps(tmp_path: Path
     depth[:, : WIDTH // 3] += 0.05  # a step of 50 mm between two neighbours, 8 px or 5 mm apart
     confidence[:, 2 * WIDTH // 3 :] = 0.49
     torn = replace(plane, views=plane.views | {"left": replace(view, depth=depth, confidence=confidence)})
-    with sockets(tmp_path) as running, stream(running, lambda i: at_frame(torn, i, time.time_ns())):
-        with bridged(run_openigtlink, options(tmp_path, send=("surface",), surface_step=8)) as port:
-            with Peer(program, port) as joined:
-                until(lambda: joined.newest("SagsSurface"))
-                surface = joined.newest("SagsSurface") or []
+    with joined_to(program, options(tmp_path, send=("surface",), surface_step=8), torn) as joined:
+        surface = until(lambda: joined.newest("SagsSurface"))
     corners = int(surface[0])
     camera = plane_camera()
     places = np.array([corner.split(";") for corner in surface[2 : 2 + corners]], np.float64) @ RAS * 1e-3
@@ -174,9 +175,7 @@ def test_the_overlay_comes_over_its_picture(tmp_path: Path, program: Path) -> No
 
     with (
         OverlayStream("overlay", tmp_path, (0, 0, 255)) as overlay,
-        sockets(tmp_path) as running,
-        stream(running, frame),
-        bridged(run_openigtlink, options(tmp_path, send=("overlay",))) as port,
+        plane_bridged(run_openigtlink, options(tmp_path, send=("overlay",)), frame) as (_, port),
         Peer(program, port) as joined,
     ):
         until(drawn)
@@ -193,8 +192,7 @@ def test_what_stops_is_dark_and_empty_and_comes_back(tmp_path: Path, program: Pa
         with sockets(tmp_path) as running:
             with stream(running, anchored_at):
                 until(lambda: joined.newest("SagsAnchors") and joined.newest("SagsSurface"))
-                until(lambda: joined.newest("SagsPicture"))
-                bright = int((joined.newest("SagsPicture") or [])[4])
+                bright = int(until(lambda: joined.newest("SagsPicture"))[4])
             # The node is there, and silent.
             until(lambda: joined.newest("SagsAnchors") == [NO_ANCHOR])
             until(lambda: joined.newest("SagsSurface") == ["0", "0"])
@@ -227,10 +225,8 @@ def test_nothing_is_asked_of_the_node_while_nobody_is_connected(tmp_path: Path, 
 
 
 def test_depth_is_asked_for_only_when_a_surface_is_due(tmp_path: Path, program: Path) -> None:
-    with plane_bridged(run_openigtlink, options(tmp_path, send=("surface",), surface_rate=0.5)) as (
-        running,
-        port,
-    ):
+    asked = options(tmp_path, send=("surface",), surface_rate=0.5)
+    with plane_bridged(run_openigtlink, asked) as (running, port):
         with Peer(program, port) as joined:
             until(lambda: joined.newest("SagsSurface"))
             until(lambda: not running.wanted("left/render/depth"))
@@ -261,24 +257,19 @@ class Node:
 
 def test_a_peer_pins_anchors_by_point_and_by_pixel(tmp_path: Path, program: Path) -> None:
     node = Node()
-    with (
-        sockets(tmp_path, node.handlers) as running,
-        stream(running),
-    ):
-        with bridged(run_openigtlink, options(tmp_path)) as port:
-            with Peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
-                until(lambda: node.pinned)
-                assert np.allclose([node.pinned[0][axis] for axis in "xyz"], [0.01, 0.02, 0.07])
-                until(lambda: joined.newest("SagsAnswer"))
-                assert "depth_confidence" in " ".join(joined.newest("SagsAnswer") or [])
-            with Peer(program, port, "point", "SagsPin", -10, -20, 70):  # the same list again: nothing new
-                time.sleep(1.0)
-            with Peer(program, port, "point", "SagsPin", -10, -20, 71):  # moved
-                until(lambda: len(node.pinned) == 2 and node.removed == [1])
-            with Peer(program, port, "say", "SagsRequest", "pin 320 256.5"):
-                until(lambda: len(node.pinned) == 3)
-            with Peer(program, port, "say", "SagsRequest", "dance"):
-                pass
+    with plane_bridged(run_openigtlink, options(tmp_path), handlers=node.handlers) as (_, port):
+        with Peer(program, port, "point", "SagsPin", -10, -20, 70) as joined:
+            until(lambda: node.pinned)
+            assert np.allclose([node.pinned[0][axis] for axis in "xyz"], [0.01, 0.02, 0.07])
+            assert "depth_confidence" in " ".join(until(lambda: joined.newest("SagsAnswer")))
+        with Peer(program, port, "point", "SagsPin", -10, -20, 70):  # the same list again: nothing new
+            time.sleep(1.0)
+        with Peer(program, port, "point", "SagsPin", -10, -20, 71):  # moved
+            until(lambda: len(node.pinned) == 2 and node.removed == [1])
+        with Peer(program, port, "say", "SagsRequest", "pin 320 256.5"):
+            until(lambda: len(node.pinned) == 3)
+        with Peer(program, port, "say", "SagsRequest", "dance"):
+            pass
     assert node.pinned[2] == {"u": 320.0, "v": 256.5}
 
 
@@ -382,7 +373,7 @@ def test_points_that_are_named_alike_are_all_pinned_and_given_back() -> None:
     due = pins.due(1.0)
     assert [(pin.name, pin.place.tolist()) for pin in due] == [("vessel", each.tolist()) for each in places]
     assert not any(pins.pinned(pin, anchor) for anchor, pin in enumerate(due, 7))
-    assert pins.hear([("vessel", places[0])], 2.0) == [Release(8)] and pins.due(3.0) == []
+    assert pins.hear([("vessel", places[0])], 2.0) == [8] and pins.due(3.0) == []
 
 
 def test_an_answer_that_comes_after_the_end_goes_nowhere() -> None:

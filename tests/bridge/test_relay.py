@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +13,7 @@ from made_messages import meta
 from simulation import START_NS, World
 
 from sags_node.clients.bridge import gst, relay
-from sags_node.clients.bridge.relay import LEAD, LOOK, MAX_AGE, Output, Relay, Source
+from sags_node.clients.bridge.relay import LEAD, LOOK, MAX_AGE, Outlet, Output, Relay, Source
 from sags_node.messaging import address
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freshness import Freshness
@@ -70,15 +70,12 @@ class Node:
     def close(self) -> None: ...
 
 
-class Peer:
+class Peer(Outlet):
     """What it is shown: when, and captured when; None: nothing."""
 
     def __init__(self, world: World) -> None:
         self.shown: list[tuple[float, float | None]] = []
         self._world = world
-
-    def wants(self, output: Output) -> bool:
-        return True
 
     def send(self, output: Output, frame: Frame) -> bool:
         stamp_ns = frame[output.sources[0].topic].stamp_ns
@@ -87,8 +84,6 @@ class Peer:
 
     def blank(self, output: Output, reason: str) -> None:
         self.shown.append((self._world.now, None))
-
-    def report(self, missing: Mapping[str, str], shows: bool) -> None: ...
 
 
 def bridged(

@@ -240,48 +240,45 @@ def test_requests_are_passed_on_and_answered(tmp_path: Path) -> None:
 
         return handle
 
-    operations = {ask.op for ask in asks(["ros"]).values()}
-    with (
-        sockets(tmp_path, {name: note(name) for name in operations}) as running,
-        stream(running, anchored_at),
-    ):
-        with bridged(run_ros2, options(tmp_path)), Listener(("/sags/answer", TEXT)) as joined:
+    handlers = {ask.op: note(ask.op) for ask in asks(["ros"]).values()}
+    bridge = plane_bridged(run_ros2, options(tmp_path), handlers=handlers)
+    with bridge, Listener(("/sags/answer", TEXT)) as joined:
 
-            def ask(name: str, content: bytes) -> dict[str, Any]:
-                kind = asks(["ros"])[name].kind
-                count = len(joined.came["/sags/answer"])
-                writer = joined.graph.writer(f"/sags/request/{name}", kind, Delivery(reliable=True))
-                until(lambda: writer.readers)
-                writer.write(content, time.time_ns())
-                until(lambda: len(joined.came["/sags/answer"]) > count)
-                said = json.loads(cdr.decode(joined.newest("/sags/answer"), TEXT).data)
-                assert said.pop("request") == name
-                return said
+        def ask(name: str, content: bytes) -> dict[str, Any]:
+            kind = asks(["ros"])[name].kind
+            count = len(joined.came["/sags/answer"])
+            writer = joined.graph.writer(f"/sags/request/{name}", kind, Delivery(reliable=True))
+            until(lambda: writer.readers)
+            writer.write(content, time.time_ns())
+            until(lambda: len(joined.came["/sags/answer"]) > count)
+            said = json.loads(cdr.decode(joined.newest("/sags/answer"), TEXT).data)
+            assert said.pop("request") == name
+            return said
 
-            assert ask("add_anchor", point("world", 0.01, 0.02, 0.07)) == {"result": {"id": 7}}
-            assert asked.pop() == ("add_anchor", {"x": 0.01, "y": 0.02, "z": 0.07})
-            ask("add_anchor_at_pixel", HEAD + struct.pack("<ddd", 12.5, 3.0, 0.0))
-            assert asked.pop() == ("add_anchor", {"u": 12.5, "v": 3.0})
-            ask("remove_anchor", HEAD + struct.pack("<I", 7))
-            assert asked.pop() == ("remove_anchor", {"id": 7})
-            ask("open_view", cdr.string('{"name": "ros", "width": 64, "height": 48}').cdr())
-            assert asked.pop() == ("open_view", {"name": "ros", "width": 64, "height": 48})
-            ask("start_recording", cdr.string("case_1").cdr())
-            assert asked.pop() == ("start_recording", {"path": "case_1"})
-            ask("pause", HEAD + b"\0")
-            assert asked.pop() == ("pause", {})
-            assert "not now" in ask("reset_model", HEAD + b"\0")["error"]
-            asked.clear()
-            for name, content, reason in (
-                ("add_anchor", point("tool", 0.0, 0.0, 0.0), "frame 'world'"),
-                ("add_anchor", point("world", float("nan"), 0.0, 0.0), "finite"),
-                ("add_anchor", HEAD, "damaged"),
-                ("open_view", cdr.string('{"name": "other"}').cdr(), "--view: ros"),
-                ("open_view", cdr.string("[" * 100_000).cdr(), "JSON object"),
-                ("start_recording", cdr.string("../../etc").cdr(), "letters"),
-            ):
-                assert reason in ask(name, content)["error"]
-            assert asked == []
+        assert ask("add_anchor", point("world", 0.01, 0.02, 0.07)) == {"result": {"id": 7}}
+        assert asked.pop() == ("add_anchor", {"x": 0.01, "y": 0.02, "z": 0.07})
+        ask("add_anchor_at_pixel", HEAD + struct.pack("<ddd", 12.5, 3.0, 0.0))
+        assert asked.pop() == ("add_anchor", {"u": 12.5, "v": 3.0})
+        ask("remove_anchor", HEAD + struct.pack("<I", 7))
+        assert asked.pop() == ("remove_anchor", {"id": 7})
+        ask("open_view", cdr.string('{"name": "ros", "width": 64, "height": 48}').cdr())
+        assert asked.pop() == ("open_view", {"name": "ros", "width": 64, "height": 48})
+        ask("start_recording", cdr.string("case_1").cdr())
+        assert asked.pop() == ("start_recording", {"path": "case_1"})
+        ask("pause", HEAD + b"\0")
+        assert asked.pop() == ("pause", {})
+        assert "not now" in ask("reset_model", HEAD + b"\0")["error"]
+        asked.clear()
+        for name, content, reason in (
+            ("add_anchor", point("tool", 0.0, 0.0, 0.0), "frame 'world'"),
+            ("add_anchor", point("world", float("nan"), 0.0, 0.0), "finite"),
+            ("add_anchor", HEAD, "damaged"),
+            ("open_view", cdr.string('{"name": "other"}').cdr(), "--view: ros"),
+            ("open_view", cdr.string("[" * 100_000).cdr(), "JSON object"),
+            ("start_recording", cdr.string("../../etc").cdr(), "letters"),
+        ):
+            assert reason in ask(name, content)["error"]
+        assert asked == []
 
 
 HEAD = b"\0\1\0\0"  # of CDR, little-endian

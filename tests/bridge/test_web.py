@@ -125,12 +125,8 @@ def test_only_what_was_let_in_is_asked_of_the_node(tmp_path: Path) -> None:
         before, answer, after = time.time_ns(), told(joined), time.time_ns()
         assert answer["id"] == 4 and answer["ok"]
         assert before - 1e9 < answer["result"]["received_ns"] <= after
-    with (
-        sockets(tmp_path, handlers) as running,
-        stream(running, anchored_at),
-        bridged(run_web, options(tmp_path, pin=True)) as port,
-        peer(port) as joined,
-    ):
+    pinning = options(tmp_path, pin=True)
+    with plane_bridged(run_web, pinning, handlers=handlers) as (_, port), peer(port) as joined:
         joined.send(json.dumps(request))
         assert told(joined) == {"id": 3, "ok": True, "result": {"id": 7}} and asked == [request["args"]]
         joined.send(json.dumps({"id": 5, "op": "reset_model"}))

@@ -86,8 +86,13 @@ def bridged(
 
 
 @contextmanager
-def plane_bridged(run: Callable[..., None], options: Any) -> Iterator[tuple[Publisher, int]]:
+def plane_bridged(
+    run: Callable[..., None],
+    options: Any,
+    frame: Callable[[int], FrameResult] = anchored_at,
+    handlers: Mapping[str, Callable[[dict[str, Any]], Any]] | None = None,
+) -> Iterator[tuple[Publisher, int]]:
     """A node that sends the plane with its anchors, and the port of a bridge beside it."""
-    with sockets(options.node.run_dir) as running, stream(running, anchored_at):
+    with sockets(options.node.run_dir, handlers) as running, stream(running, frame):
         with bridged(run, options) as port:
             yield running, port

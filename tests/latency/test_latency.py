@@ -20,14 +20,14 @@ from browsers import new_page
 from synthetic import plane_result, publisher
 from waiting import beside, repeating, until
 
-from sags_node.clients.latency.code import NUMBERS, Reader, paint
 from sags_node.clients.latency.ledger import Ledger, Moment
 from sags_node.clients.latency.run import WAITING, measure_latency
-from sags_node.clients.latency.shown import Codes, Page, Pushed
+from sags_node.clients.latency.shown import NUMBERS, Codes, Page, Pushed, Reader, paint
 from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.config.schema import PushSource
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
+from sags_node.messaging.publisher import Publisher
 from sags_node.sources.push import PushedPictures
 from sags_node.types import U8, Camera, FrameResult
 
@@ -134,6 +134,14 @@ def shows(left: U8, stamp_ns: int, frame_id: int) -> FrameResult:
     return replace(result, pair=replace(result.pair, camera=camera, left=left, right=None))
 
 
+def show_late(node: Publisher, left: U8, stamp_ns: int, frame_id: int) -> None:
+    """As a node that holds pictures for `HELD` s."""
+    while time.time_ns() < stamp_ns + HELD * 1e9:
+        time.sleep(0.001)
+    node.publish_result(shows(left, stamp_ns, frame_id), dropped=0)
+    node.poll(0)
+
+
 @contextmanager
 def measuring(
     codes: Codes, run_dir: Path, ended: Callable[[], object], overlay: NodeAddress | None = None
@@ -163,10 +171,7 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
         codes = Pushed(source.endpoint, phantom_session, rate=20.0)
         with measuring(codes, tmp_path / "run", source.stop) as found:
             for frame in source:
-                while time.time_ns() < frame.t_capture_ns + HELD * 1e9:
-                    time.sleep(0.001)
-                node.publish_result(shows(frame.left, frame.t_capture_ns, frame.frame_id), dropped=0)
-                node.poll(0)
+                show_late(node, frame.left, frame.t_capture_ns, frame.frame_id)
     assert found["read"] > 0 and found["read"] + found["lost"] == found["codes"]
     assert found["unknown"] == found["unreadable"] == found["clock_set"] == 0
     # Its stamp is that of the sending.
@@ -245,11 +250,7 @@ def test_a_camera_that_films_the_page_closes_the_circle(tmp_path: Path) -> None:
             if ended.is_set():
                 break
             shot = cv2.imdecode(np.frombuffer(display.screenshot(), np.uint8), cv2.IMREAD_COLOR)
-            stamp_ns = time.time_ns()
-            while time.time_ns() < stamp_ns + HELD * 1e9:
-                time.sleep(0.001)
-            node.publish_result(shows(shot[..., ::-1].copy(), stamp_ns, number), dropped=0)
-            node.poll(0)
+            show_late(node, shot[..., ::-1].copy(), time.time_ns(), number)
         until(lambda: "ended" in display.inner_text("#said"))
     assert found["from"] == "displayed" and found["read"] > 0 and found["unknown"] == 0
     assert found["parts_ms"]["published"]["p50"] >= 1e3 * HELD

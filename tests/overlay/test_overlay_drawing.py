@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from sags_node.clients.overlay.draw import NEAREST, UNDER, Body, Placed, color_key, draw, over
-from sags_node.clients.overlay.durations import REMEMBERED, Durations
 from sags_node.clients.overlay.frame import TissueFrame
 from sags_node.clients.overlay.mesh import Mesh
 from sags_node.clients.overlay.raster import fill
+from sags_node.clients.overlay.run import REMEMBERED, Durations
 from sags_node.clients.overlay.stream import OverlayStream
 from sags_node.geometry import quat_to_matrix
 from sags_node.types import Camera

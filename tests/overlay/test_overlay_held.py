@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -60,29 +61,26 @@ def test_points_on_a_line_hold_nothing() -> None:
     assert not on_a_line(line + np.eye(4, 3))
 
 
-def plane_frame() -> TissueFrame:
-    result = plane_result()
-    camera = result.pair.camera
-    depth, tissue = plane_depth(camera), result.observation.tissue
-    return TissueFrame(5, 5, "s", 2, camera, BASELINE, depth, tissue, {})
+PLANE = plane_result()
+CAMERA = PLANE.pair.camera
+FRAME = TissueFrame(5, 5, "s", 2, CAMERA, BASELINE, plane_depth(CAMERA), PLANE.observation.tissue, {})
 
 
-def on_plane(frame: TissueFrame, u: int, v: int) -> np.ndarray:
-    local = np.linalg.inv(frame.camera.K) @ (u, v, 1.0) * float(frame.depth[v, u])
-    return np.asarray(transform(frame.camera.T_world_cam, local))
+def on_plane(u: int, v: int) -> np.ndarray:
+    local = np.linalg.inv(CAMERA.K) @ (u, v, 1.0) * float(FRAME.depth[v, u])
+    return np.asarray(transform(CAMERA.T_world_cam, local))
 
 
 def test_one_anchor_gives_the_place_and_the_normal_of_the_surface() -> None:
-    frame = plane_frame()
-    place = on_plane(frame, 30, 40)
-    normal = surface_normal(frame, place)
+    place = on_plane(30, 40)
+    normal = surface_normal(FRAME, place)
     assert normal is not None
-    towards = frame.camera.T_world_cam[:3, :3] @ NORMAL
+    towards = CAMERA.T_world_cam[:3, :3] @ NORMAL
     assert np.allclose(normal, -towards / np.linalg.norm(NORMAL), atol=1e-3)
-    assert surface_normal(replace(frame, depth=frame.depth * np.float32(np.nan)), place) is None
-    assert surface_normal(replace(frame, tissue=~np.ones_like(frame.tissue)), place) is None
-    assert surface_normal(frame, frame.camera.T_world_cam[:3, 3] - frame.camera.T_world_cam[:3, 2]) is None
-    right = frame.camera.T_world_cam[:3, 0]
+    assert surface_normal(replace(FRAME, depth=FRAME.depth * np.float32(np.nan)), place) is None
+    assert surface_normal(replace(FRAME, tissue=~np.ones_like(FRAME.tissue)), place) is None
+    assert surface_normal(FRAME, CAMERA.T_world_cam[:3, 3] - CAMERA.T_world_cam[:3, 2]) is None
+    right = CAMERA.T_world_cam[:3, 0]
     T = on_surface(place, np.array([0.0, 0, 0.001]), normal, right)
     assert np.allclose(T[:3, 2], normal) and T[:3, 0] @ right > 0.9
     assert np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3)) and np.linalg.det(T[:3, :3]) > 0
@@ -93,6 +91,11 @@ def test_one_anchor_gives_the_place_and_the_normal_of_the_surface() -> None:
 
 
 PIXELS = [[20, 20], [70, 30], [30, 55], [85, 50]]
+PLACES = np.stack([on_plane(u, v) for u, v in PIXELS])
+LOCAL = np.asarray(transform(invert(CAMERA.T_world_cam), PLACES))
+LOCAL -= LOCAL.mean(0)  # m, in an object in their middle with the camera's axes
+WORKER = ThreadPoolExecutor(1)
+EVERYWHERE = Body(rod(np.full(3, -1.0), np.ones(3), (0, 0, 0)), 1.0, None)  # so it lies at any anchors
 
 
 def held(
@@ -102,10 +105,10 @@ def held(
     **more: Any,
 ) -> HeldObject:
     spec = ObjectSpec.model_validate({"shape": "sphere", "anchors": anchors, **more})
-    return HeldObject(spec, "pin", pinner or FakePinner(), repin)
+    return HeldObject(spec, "pin", pinner or FakePinner(), repin, 0, EVERYWHERE, WORKER)
 
 
-def with_anchors(frame: TissueFrame, places: Any, confidence: Any = 1.0) -> TissueFrame:
+def with_anchors(places: Any, confidence: Any = 1.0, frame: TissueFrame = FRAME) -> TissueFrame:
     """The frame with anchors 1, 2, ... at these places, hidden below a confidence of 1; None: no such row."""
     sure = np.broadcast_to(confidence, len(places))
     anchors = {
@@ -126,48 +129,43 @@ def placed_at(thing: HeldObject, frame: TissueFrame) -> np.ndarray:
 
 
 def test_one_anchor_carries_the_object_and_keeps_its_direction_while_hidden() -> None:
-    frame = plane_frame()
     thing = held([{"pixel": [30, 40]}], pinner=(pinner := FakePinner()))
-    T = placed_at(thing, with_anchors(frame, [on_plane(frame, 30, 40)]))
+    T = placed_at(thing, with_anchors([on_plane(30, 40)]))
     assert pinner.asked == [[{"u": 30, "v": 40}]]
-    assert np.allclose(T[:3, 3], on_plane(frame, 30, 40))
-    hidden = replace(frame, tissue=~np.ones_like(frame.tissue))
-    again = thing.place(with_anchors(hidden, [on_plane(frame, 33, 41)], 0.3))
+    assert np.allclose(T[:3, 3], on_plane(30, 40))
+    hidden = replace(FRAME, tissue=~np.ones_like(FRAME.tissue))
+    again = thing.place(with_anchors([on_plane(33, 41)], 0.3, hidden))
     assert again is not None and np.allclose(again[:3, :3], T[:3, :3])
-    assert np.allclose(again[:3, 3], on_plane(frame, 33, 41))
-    assert thing.place(with_anchors(hidden, [on_plane(frame, 33, 41)], 0.05)) is None
+    assert np.allclose(again[:3, 3], on_plane(33, 41))
+    assert thing.place(with_anchors([on_plane(33, 41)], 0.05, hidden)) is None
     assert thing.reason == f"its anchor was not recognised for too long; {AGAIN}"
 
 
 def test_many_anchors_carry_it_rigidly_whatever_is_hidden() -> None:
-    frame = plane_frame()
-    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
     thing = held([{"pixel": p} for p in PIXELS])
-    T = placed_at(thing, with_anchors(frame, places))
-    assert np.allclose(T, frame.camera.T_world_cam, atol=1e-6)  # coordinates of the camera
+    T = placed_at(thing, with_anchors(PLACES))
+    assert np.allclose(T, CAMERA.T_world_cam, atol=1e-6)  # coordinates of the camera
     motion = np.eye(4)
     motion[:3, :3] = quat_to_matrix(np.array([1.0, 0.1, -0.05, 0.08]))
     motion[:3, 3] = [0.003, -0.002, 0.001]
-    moved = np.asarray(transform(motion, places))
+    moved = np.asarray(transform(motion, PLACES))
     for confidence in (1.0, [1, 1, 0.02, 1]):
         astray = moved.copy()
         if confidence != 1.0:
             astray[2] += 0.01  # of the hidden one
-        T = placed_at(thing, with_anchors(frame, astray, confidence))
-        assert np.allclose(T, motion @ frame.camera.T_world_cam, atol=1e-6)
-    assert thing.place(with_anchors(frame, moved, [1, 1, 0.02, 0.02])) is None
+        T = placed_at(thing, with_anchors(astray, confidence))
+        assert np.allclose(T, motion @ CAMERA.T_world_cam, atol=1e-6)
+    assert thing.place(with_anchors(moved, [1, 1, 0.02, 0.02])) is None
     assert thing.reason == f"2 of its 4 anchors hold it, 3 are needed; {AGAIN}"
 
 
 def test_of_anchors_in_sight_those_count_that_are_recognised() -> None:
     """One that is visible and not recognised may be on other tissue: here 1 mm off, too little to be taken
     for astray."""
-    frame = plane_frame()
-    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
     thing = held([{"pixel": p} for p in PIXELS])
-    T = placed_at(thing, with_anchors(frame, places))
+    T = placed_at(thing, with_anchors(PLACES))
     assert thing.is_sure
-    slipped = places.copy()
+    slipped = PLACES.copy()
     slipped[3] += [0.001, 0, 0]
     wrong, right = (
         {i + 1: Anchor(place, 1.0, sure[i]) for i, place in enumerate(slipped)}
@@ -175,12 +173,12 @@ def test_of_anchors_in_sight_those_count_that_are_recognised() -> None:
     )
     off = []
     for anchors in (wrong, right):
-        found = thing.place(replace(frame, anchors=anchors))
+        found = thing.place(replace(FRAME, anchors=anchors))
         assert found is not None and thing.is_sure
-        off.append(np.linalg.norm(transform(found @ invert(T), places) - places, axis=1).max())
+        off.append(np.linalg.norm(transform(found @ invert(T), PLACES) - PLACES, axis=1).max())
     assert off[1] < 0.2 * off[0]
-    few = {i + 1: Anchor(place, 1.0, 0.3 if i > 1 else 1.0) for i, place in enumerate(places)}
-    assert thing.place(replace(frame, anchors=few)) is not None and not thing.is_sure  # three hold a shape
+    few = {i + 1: Anchor(place, 1.0, 0.3 if i > 1 else 1.0) for i, place in enumerate(PLACES)}
+    assert thing.place(replace(FRAME, anchors=few)) is not None and not thing.is_sure  # three hold a shape
     assert thing.status()["sure"] is False
 
 
@@ -218,14 +216,12 @@ def test_what_one_visible_anchor_holds_is_unsure_until_it_is_recognised_again() 
 
 
 def test_named_points_of_the_object_come_to_lie_at_its_anchors() -> None:
-    frame = plane_frame()
-    T = frame.camera.T_world_cam @ pose(3)
-    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
-    model = np.asarray(transform(invert(T), places))
+    T = CAMERA.T_world_cam @ pose(3)
+    model = np.asarray(transform(invert(T), PLACES))
     thing = held([{"pixel": p, "at": at.tolist()} for p, at in zip(PIXELS, model, strict=True)])
-    assert np.allclose(placed_at(thing, with_anchors(frame, places)), T, atol=1e-6)
-    in_world = held([{"place": place.tolist()} for place in places], coordinates="world")
-    assert np.allclose(placed_at(in_world, with_anchors(frame, places)), np.eye(4), atol=1e-6)
+    assert np.allclose(placed_at(thing, with_anchors(PLACES)), T, atol=1e-6)
+    in_world = held([{"place": place.tolist()} for place in PLACES], coordinates="world")
+    assert np.allclose(placed_at(in_world, with_anchors(PLACES)), np.eye(4), atol=1e-6)
 
 
 # ---- an object lies where its anchors are, or is not drawn ------------------------------------------------
@@ -235,23 +231,14 @@ SCALES = {"mm": 1e-3, "cm": 1e-2, "inch": 0.0254}  # m for one of a file's units
 
 def of_file(at: np.ndarray | None, scale: float, around: Any = None, **more: Any) -> tuple[HeldObject, Any]:
     """A tube of a file, 30 mm long and centred on `around` (m), held by the first of `PIXELS`; the frame."""
-    frame = plane_frame()
-    places = [on_plane(frame, u, v) for u, v in PIXELS[: 4 if at is None else len(at)]]
+    places = PLACES[: 4 if at is None else len(at)]
     anchors: list[dict[str, Any]] = [{"pixel": pixel} for pixel in PIXELS[: len(places)]]
     for anchor, said in zip(anchors, [] if at is None else at.tolist(), strict=False):
         anchor["at"] = said
     spec = ObjectSpec.model_validate({"file": "tube.stl", "scale": scale, "anchors": anchors, **more})
     ends = np.array([[-0.015, 0.0, 0.0], [0.015, 0.0, 0.0]]) + (0 if around is None else around)
     body = Body(rod(*ends, (0, 0, 0)), 1.0, None)
-    return HeldObject(spec, "pin", FakePinner(), False, 0, body), with_anchors(frame, places)
-
-
-def local_places() -> np.ndarray:
-    """Where the anchors lie in an object in their middle with the camera's axes, m."""
-    frame = plane_frame()
-    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
-    local = np.asarray(transform(invert(frame.camera.T_world_cam), places))
-    return np.asarray(local - local.mean(0))
+    return HeldObject(spec, "pin", FakePinner(), False, 0, body, WORKER), with_anchors(places)
 
 
 @pytest.mark.parametrize("unit", SCALES)
@@ -261,19 +248,16 @@ def test_named_points_are_read_in_the_files_units_or_in_metres_where_only_these_
 ) -> None:
     in_metres = said != "in the file's units"
     more = {"at_units": "m"} if said.endswith("said") else {}
-    thing, frame = of_file(local_places() / (1 if in_metres else SCALES[unit]), SCALES[unit], **more)
+    thing, frame = of_file(LOCAL / (1 if in_metres else SCALES[unit]), SCALES[unit], **more)
     T = placed_at(thing, frame)
-    middle = np.mean([on_plane(frame, u, v) for u, v in PIXELS], axis=0)
-    assert np.allclose(T[:3, 3], middle, atol=1e-6) and thing.is_sure and thing.unsure is None
+    assert np.allclose(T[:3, 3], PLACES.mean(0), atol=1e-6) and thing.is_sure and thing.unsure is None
     assert ("is read in metres" in caplog.text) == (said == "in metres, as before")  # never without a word
 
 
 @pytest.mark.parametrize(("at", "offset"), [((0, 0, 5), 5e-3), ((0, 0, 0.005), 5e-3), ((0, 0, 0), 0.0)])
 def test_so_is_that_of_a_single_anchor(at: tuple[float, ...], offset: float) -> None:
     thing, frame = of_file(np.array([at], np.float64), 1e-3)
-    assert np.linalg.norm(placed_at(thing, frame)[:3, 3] - on_plane(frame, *PIXELS[0])) == pytest.approx(
-        offset
-    )
+    assert np.linalg.norm(placed_at(thing, frame)[:3, 3] - on_plane(*PIXELS[0])) == pytest.approx(offset)
 
 
 @pytest.mark.parametrize(
@@ -281,7 +265,7 @@ def test_so_is_that_of_a_single_anchor(at: tuple[float, ...], offset: float) -> 
     [
         (None, None, r"5\d\.?\d* mm from its anchors: are the file's coordinates those of the camera"),
         (np.zeros((1, 3)), (0.1, 0, 0), r" 85 mm from its anchors: is `at` in the file's units"),
-        (1e3 * local_places() + (300, 0, 0), None, r"\d mm from its anchors: is `at` in the file's units"),
+        (1e3 * LOCAL + (300, 0, 0), None, r"\d mm from its anchors: is `at` in the file's units"),
     ],
 )  # fmt: skip
 def test_what_does_not_lie_at_its_anchors_is_refused(at: np.ndarray | None, around: Any, said: str) -> None:
@@ -296,8 +280,8 @@ def test_what_does_not_lie_at_its_anchors_is_refused(at: np.ndarray | None, arou
 @pytest.mark.parametrize(("factor", "sure"), [(1.0, True), (1.1, True), (2.0, False), (0.5, False)])
 def test_what_does_not_fit_its_anchors_is_unsure_and_says_why(factor: float, sure: bool) -> None:
     """The anchors are up to 22 mm from their middle: at 1.1 of that they are off by 2.2 mm at most."""
-    assert 0.02 < np.linalg.norm(local_places(), axis=1).max() < 0.025
-    thing, frame = of_file(1e3 * factor * local_places(), 1e-3, at_units="file")
+    assert 0.02 < np.linalg.norm(LOCAL, axis=1).max() < 0.025
+    thing, frame = of_file(1e3 * factor * LOCAL, 1e-3, at_units="file")
     placed_at(thing, frame)
     assert thing.is_sure == sure and thing.status()["sure"] == sure
     assert sure or "mm from where its shape has it: check `at`" in thing.status()["unsure"]
@@ -314,17 +298,15 @@ def test_points_that_lie_on_the_file_in_other_axes_only_are_unsure(
     factors: Any, under: float, said: str | None
 ) -> None:
     """A wall of 0.1 m through all anchors, and their points in Slicer's RAS."""
-    frame = plane_frame()
-    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS])
-    local = local_places() + np.array([0.03, 0.02, 0.05])
+    local = LOCAL + np.array([0.03, 0.02, 0.05])
     _, _, (along, across, _) = np.linalg.svd(local - local.mean(0))
     ends = [local.mean(0) + a * along + b * across for a, b in ((-0.05, -0.05), (-0.05, 0.05), (0.1, 0))]
     wall = Mesh(np.float32(ends), np.array([[0, 1, 2]], np.int32), np.zeros((1, 3), np.float32))
     at = 1e3 * (local * factors - [0, 0, under])
     anchors = [{"pixel": pixel, "at": each.tolist()} for pixel, each in zip(PIXELS, at, strict=True)]
     spec = ObjectSpec.model_validate({"file": "a.stl", "scale": 1e-3, "anchors": anchors})
-    thing = HeldObject(spec, "pin", FakePinner(), False, 0, Body(wall, 1.0, None))
-    placed_at(thing, with_anchors(frame, places))
+    thing = HeldObject(spec, "pin", FakePinner(), False, 0, Body(wall, 1.0, None), WORKER)
+    placed_at(thing, with_anchors(PLACES))
     assert thing.is_sure == (said is None) and str(said or None) in str(thing.unsure)
 
 
@@ -334,7 +316,7 @@ def test_points_that_lie_on_the_file_in_other_axes_only_are_unsure(
 )
 def test_what_was_registered_in_another_session_is_unsure(registration: Any, sure: bool) -> None:
     """`s` is the session of the frame."""
-    thing, frame = of_file(1e3 * local_places(), 1e-3, at_units="file", registration=registration)
+    thing, frame = of_file(1e3 * LOCAL, 1e-3, at_units="file", registration=registration)
     placed_at(thing, frame)
     assert thing.is_sure == sure and thing.unsure == (None if sure else ELSEWHERE)
 
@@ -342,15 +324,14 @@ def test_what_was_registered_in_another_session_is_unsure(registration: Any, sur
 def test_a_recording_that_loops_pins_again_where_it_was_pinned() -> None:
     """Only when it comes to the same place: until then the pixel shows other tissue. A model that is reset
     meanwhile stays lost until then."""
-    frame = plane_frame()
-    place = on_plane(frame, 30, 40)
+    place = on_plane(30, 40)
     thing = held([{"pixel": [30, 40]}], pinner=(pinner := FakePinner()))
-    here = with_anchors(frame, [place])
+    here = with_anchors([place])
     for recorded_s in (1.0, 1.1, 1.2):
         T = thing.place(replace(here, recorded_s=recorded_s))
     assert T is not None and len(pinner.asked) == 1
     gone = np.full(3, np.nan)
-    lost, again = with_anchors(frame, [gone]), with_anchors(frame, [gone, place])
+    lost, again = with_anchors([gone]), with_anchors([gone, place])
     for recorded_s in (1.3, 5.9, 0.0, 0.9):
         assert thing.place(replace(lost, recorded_s=recorded_s)) is None
         assert thing.reason == f"lost: {GONE}" and len(pinner.asked) == 1
@@ -360,25 +341,24 @@ def test_a_recording_that_loops_pins_again_where_it_was_pinned() -> None:
 
 
 def test_it_waits_for_tissue_with_depth_and_for_the_node() -> None:
-    frame = plane_frame()
     thing = held([{"pixel": [65, 30]}])  # columns 60 to 69 are an instrument
-    assert thing.place(frame) is None and str(thing.reason).startswith(
+    assert thing.place(FRAME) is None and str(thing.reason).startswith(
         "pixel 65 30 shows no tissue: an instrument"
     )
-    unknown = replace(frame, depth=frame.depth * np.float32(np.nan), tissue=np.ones_like(frame.tissue))
+    unknown = replace(FRAME, depth=FRAME.depth * np.float32(np.nan), tissue=np.ones_like(FRAME.tissue))
     assert thing.place(unknown) is None and thing.reason == "no depth at pixel 65 30"
     assert held([]).place(unknown) is None
     with pytest.raises(UsageError, match=r"pin 96 30 lies outside the left picture of 96x64"):
-        held([{"pixel": [96, 30]}]).place(frame)
+        held([{"pixel": [96, 30]}]).place(FRAME)
     thing = held([{"pixel": [30, 30]}], pinner=(pinner := FakePinner()))
     pinner.refusal = SagsError("there are 256 anchors already")
-    assert [thing.place(frame) for _ in range(2)] == [None, None]
+    assert [thing.place(FRAME) for _ in range(2)] == [None, None]
     assert thing.reason == "there are 256 anchors already"
 
 
 def test_the_default_place_is_the_middle_of_the_tissue() -> None:
     thing = held([], pinner=(pinner := FakePinner()))
-    thing.place(plane_frame())
+    thing.place(FRAME)
     ((asked,),) = pinner.asked
     assert abs(asked["u"] - 43) < 8 and abs(asked["v"] - 32) < 3
 
@@ -386,23 +366,22 @@ def test_the_default_place_is_the_middle_of_the_tissue() -> None:
 @pytest.mark.parametrize("how", ["model", "node", "removed"])
 @pytest.mark.parametrize("repin", [False, True])
 def test_after_a_new_start_it_is_lost_or_pinned_anew(how: str, repin: bool) -> None:
-    frame = plane_frame()
-    place = on_plane(frame, 30, 40)
+    place = on_plane(30, 40)
     thing = held([{"pixel": [30, 40]}], repin, pinner := FakePinner())
-    placed_at(thing, with_anchors(frame, [place]))
+    placed_at(thing, with_anchors([place]))
     after = {
-        "model": with_anchors(frame, [np.full(3, np.nan)]),
-        "node": replace(with_anchors(frame, [place]), session="another"),
-        "removed": with_anchors(frame, [None]),
+        "model": with_anchors([np.full(3, np.nan)]),
+        "node": replace(with_anchors([place]), session="another"),
+        "removed": with_anchors([None]),
     }[how]
     assert thing.place(after) is None and str(thing.reason).startswith("lost: ")
     kept = how == "model"  # the node looks for its anchors on
     assert (pinner.removed, pinner.forgotten) == (([], [1]) if how == "node" else ([] if kept else [1], []))
     if not repin:
         assert thing.place(after) is None and str(thing.reason).startswith("lost: ")
-        assert (thing.place(with_anchors(frame, [place])) is not None) == kept
+        assert (thing.place(with_anchors([place])) is not None) == kept
         return
-    fresh = replace(with_anchors(frame, [np.full(3, np.nan), place]), session=after.session)
+    fresh = replace(with_anchors([np.full(3, np.nan), place]), session=after.session)
     assert np.allclose(placed_at(thing, fresh)[:3, 3], place)
     assert thing.status()["pinned"] == 2 and pinner.removed == ([] if how == "node" else [1])
 
@@ -411,16 +390,15 @@ def test_after_a_new_start_it_is_lost_or_pinned_anew(how: str, repin: bool) -> N
 @pytest.mark.parametrize(("count", "least"), [(1, 1), (3, 3), (4, 3)])
 def test_what_lost_its_anchors_comes_back_with_them_where_they_are_then(count: int, least: int) -> None:
     """With the node's NaN for all of them or some, also before it was placed first; never beside them."""
-    frame = plane_frame()
-    places = np.stack([on_plane(frame, u, v) for u, v in PIXELS[:count]])
-    moved = places + frame.camera.T_world_cam[:3, :3] @ [0.004, 0.002, 0.0]
+    places = PLACES[:count]
+    moved = places + CAMERA.T_world_cam[:3, :3] @ [0.004, 0.002, 0.0]
     thing = held([{"pixel": p} for p in PIXELS[:count]], pinner=(pinner := FakePinner()))
     for _ in range(4):
-        assert thing.place(with_anchors(frame, [np.full(3, np.nan), *places[1:]])) is None
-    T = placed_at(thing, with_anchors(frame, places))
+        assert thing.place(with_anchors([np.full(3, np.nan), *places[1:]])) is None
+    T = placed_at(thing, with_anchors(places))
     for found in range(count + 1):
         now = [place if i < found else np.full(3, np.nan) for i, place in enumerate(moved)]
-        put = thing.place(with_anchors(frame, now))
+        put = thing.place(with_anchors(now))
         assert (put is not None) == (found >= least)
         if put is None:
             assert AGAIN in str(thing.reason) and thing.status()["sure"] is False

@@ -11,15 +11,8 @@ import pytest
 from command_line import refused
 
 from sags_node.clients.overlay.mesh import LEAN, mesh_of
-from sags_node.clients.overlay.polygons import triangulate
-from sags_node.clients.overlay.scene import SHAPES, ObjectSpec, built_in
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_built_in_shapes_stand_on_the_tissue(shape: str) -> None:
-    mesh = mesh_of(built_in((1, 2), shape).objects[0])
-    assert mesh is not None and 100 < len(mesh.triangles) < 5000
-    assert mesh.vertices[:, 2].min() > -0.0025 and np.ptp(mesh.vertices, axis=0).max() < 0.02
+from sags_node.clients.overlay.mesh_files import triangulate
+from sags_node.clients.overlay.scene import ObjectSpec, built_in
 
 
 def mesh_file(folder: Path, name: str, scale: float = 1.0) -> Path:

@@ -12,15 +12,14 @@ import pytest
 import yaml
 from command_line import figures_of, refused
 from running_node import RunningNode
+from test_overlay import overlay
+from waiting import until
 
-from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 from sags_node.clients.overlay.scene import read_scene
-from sags_node.clients.registration.certainty import nine_of_ten, of_pairs, picking_error
 from sags_node.clients.registration.register import Registration, register
-from sags_node.clients.registration.rigid import kabsch, rigid_fit
+from sags_node.clients.registration.rigid import kabsch, nine_of_ten, of_pairs, picking_error, rigid_fit
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.geometry import project, transform
-from sags_node.messaging.address import NodeAddress
 from sags_node.phantom import write_session
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.types import F64, I32, Camera
@@ -274,11 +273,16 @@ def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, 
     written = yaml.safe_load(scene.read_text())
     written["objects"] += [written["objects"][0] | {"deform": True}]
     scene.write_text(yaml.safe_dump(written))
-    played = run_overlay(OverlayOptions(NodeAddress(run_dir=node.run_dir), scene=scene, seconds=20))
-    assert played["overlay"] > 0, played
-    for held in played["objects"]:
-        assert held["sure"] and held["residual_mm"] <= held["residual_limit_mm"], held
-    assert played["objects"][1]["deform"]["pulling"] > 20, played
+    with overlay(node.run_dir, scene=scene) as (_, watcher):
+
+        def held() -> Any:
+            objects = watcher.status().get("objects", [{}])
+            checked = all(each.get("sure") and each["residual_mm"] is not None for each in objects)
+            return checked and objects[1]["deform"]["pulling"] > 20 and objects
+
+        for each in until(held):
+            assert each["residual_mm"] <= each["residual_limit_mm"], each
+        watcher.pictures(1, drawn=True)
     refused(2, "register", *given, said=(str(scene), "exists already", "--force"))
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import msgspec
@@ -17,10 +19,10 @@ from recorded_plane import by_topic, recording
 from synthetic import HEIGHT, WIDTH, at_frame, plane_camera, plane_result, publisher
 from waiting import beside, until
 
+from sags_node.bags.bag import BagMessage
 from sags_node.bags.pictures import decode_picture
 from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
-from sags_node.clients.recording.backlog import Arrived, Backlog, Ring
 from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
@@ -33,7 +35,6 @@ from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.cdr import Content
 from sags_node.messaging.stream import listen_to
-from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Message, encode
 from sags_node.node.recorder import LOW_SECONDS, SILENT_SECONDS, findings
 
@@ -44,19 +45,52 @@ def text_message(seq: int, text: str = "x") -> Message:
     return message_of("status", cdr.string(text), seq, seq, frame_id=-1)
 
 
-def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
+class Sender:
+    """A node that is the test itself."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket
+        socket.recv()  # the subscription
+
+    def send(self, *messages: Message) -> None:
+        for message in messages:
+            self.socket.send_multipart(encode(message))
+
+
+@contextmanager
+def recorded(tmp_path: Path, **options: Any) -> Iterator[tuple[Sender, Recorder, list[dict[str, Any]]]]:
+    """What the sender sends goes into `bag`; and what the recorder says."""
     endpoint = f"ipc://{tmp_path / 'data'}"
-    options = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))
-    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
-        with recording(options) as (recorder, said):
-            socket.recv()  # the subscription
-            for seq in (3, 4, 4, 7, 8, 3, 12):
-                socket.send_multipart(encode(text_message(seq)))
-            socket.send_multipart([b"sags/status", b"junk", b"junk"])
-            unknown = text_message(1)
-            of_own = msgspec.structs.replace(unknown.meta, type="my_msgs/msg/Own")
-            socket.send_multipart(encode(Message("sags/own", of_own, (b"1234",))))
-            until(lambda: recorder.summary()["rejected"])
+    asked = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint), **options)
+    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket, recording(asked) as (recorder, said):
+        yield Sender(socket), recorder, said
+
+
+def both(tmp_path: Path, name: str) -> list[list[BagMessage]]:
+    """The messages of a topic in the bag, and in what `recover` makes of it."""
+    if not (tmp_path / "saved").exists():
+        recover(tmp_path / "bag", tmp_path / "saved")
+    return [by_topic(tmp_path / folder)[name] for folder in ("bag", "saved")]
+
+
+@contextmanager
+def played(bag: Path, name: str) -> Iterator[Iterator[Message]]:
+    """The messages of a topic while a bag is played over and over."""
+    run_dir = bag.parent / "run"
+    player = Player(bag, PlayOptions(loop=True), PublishConfig(data=(), control=None, run_dir=run_dir))
+    with beside(player.play, player.stop):
+        until((run_dir / "sags.json").exists)
+        heard = listen_to(NodeAddress(run_dir=run_dir), [name], 60.0)
+        yield (arrived[0] for arrived in heard if arrived is not None)
+
+
+def test_gaps_repeats_and_strangers_are_counted(tmp_path: Path) -> None:
+    with recorded(tmp_path) as (sender, recorder, said):
+        sender.send(*map(text_message, (3, 4, 4, 7, 8, 3, 12)))
+        sender.socket.send_multipart([b"sags/status", b"junk", b"junk"])
+        of_own = msgspec.structs.replace(text_message(1).meta, type="my_msgs/msg/Own")
+        sender.send(Message("sags/own", of_own, (b"1234",)))
+        until(lambda: recorder.summary()["rejected"])
     row = said[-1]["topics"]["sags/status"]
     assert row == {"messages": 5, "dropped": 0, "lost": 2 + 3} and said[-1]["rejected"] == 1
     (listed,) = bag_info(tmp_path / "bag")["topics"]
@@ -68,21 +102,15 @@ def test_what_cannot_be_written_ends_nothing_in_silence(
     error: Exception | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A damaged message is left out and counted. A bug, and no memory, end the recording with an error."""
-    endpoint = f"ipc://{tmp_path / 'data'}"
-    options = RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))
     attach = Mock(side_effect=error)
     monkeypatch.setattr(BagWriter, "attach", attach)
     name, kind = ("left/camera_info", topics.CAMERA_INFO) if error is None else ("parameters", topics.STRING)
     body = Content(kind, (b"\0\1\0\0" + bytes(5),)) if error is None else cdr.string("{}")
     with (
-        zmq_socket(zmq.XPUB, endpoint, bind=True) as socket,
         nullcontext() if error is None else pytest.raises(SagsError, match=r"cannot write .*bag: .*Error"),
-        recording(options) as (recorder, said),
+        recorded(tmp_path) as (sender, recorder, said),
     ):
-        socket.recv()  # the subscription
-        socket.send_multipart(encode(message_of(name, body, 1, 1, frame_id=1)))
-        for seq in range(1, 9):
-            socket.send_multipart(encode(text_message(seq)))
+        sender.send(message_of(name, body, 1, 1, frame_id=1), *map(text_message, range(1, 9)))
         until(lambda: attach.called or recorder.summary()["messages"] == 8)
     if error is None:
         assert said[-1]["messages"] == 8 and said[-1]["rejected"] == 1
@@ -91,102 +119,64 @@ def test_what_cannot_be_written_ends_nothing_in_silence(
 
 def test_lengths_without_a_unit_stay_so_in_a_bag_and_when_it_is_played(tmp_path: Path) -> None:
     """Beside those of a node that is calibrated by then."""
-    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
     depth, info = cdr.image(np.ones((4, 4), np.float32), "32FC1", 1), cdr.camera_info(plane_camera(), 1)
-    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
-        with recording(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))) as (recorder, _):
-            socket.recv()
-            for seq, units in ((1, "relative"), (2, msgspec.UNSET)):
-                for name, body in (("left/depth", depth), ("left/camera_info", info)):
-                    socket.send_multipart(encode(message_of(name, body, seq, seq, units=units)))
-            until(lambda: recorder.summary()["messages"] == 4)
-    recover(tmp_path / "bag", tmp_path / "saved")
-    for folder in ("bag", "saved"):
-        found = by_topic(tmp_path / folder)
-        assert [message.relative for message in found["left/depth"]] == [True, False]
-        K = [cdr.decode(m.data, m.type).k.any() for m in found["left/camera_info"]]
-        assert K == [False, True]
-    config = PublishConfig(data=(), control=None, run_dir=run_dir)
-    player = Player(tmp_path / "bag", PlayOptions(loop=True), config)
-    with beside(player.play, player.stop):
-        until((run_dir / "sags.json").exists)
-        with Subscriber(["left/depth"], run_dir=run_dir) as subscriber:
-            until(lambda: (got := subscriber.wait("left/depth", 1)) is not None and not got.metric)
+    with recorded(tmp_path) as (sender, recorder, _):
+        for seq, units in ((1, "relative"), (2, msgspec.UNSET)):
+            for name, body in (("left/depth", depth), ("left/camera_info", info)):
+                sender.send(message_of(name, body, seq, seq, units=units))
+        until(lambda: recorder.summary()["messages"] == 4)
+    for depths, infos in zip(both(tmp_path, "left/depth"), both(tmp_path, "left/camera_info"), strict=True):
+        assert [message.relative for message in depths] == [True, False]
+        assert [cdr.decode(m.data, m.type).k.any() for m in infos] == [False, True]
+    with played(tmp_path / "bag", "left/depth") as heard:
+        assert any(message.meta.units == "relative" for message in heard)
 
 
 @pytest.mark.fault("node: started anew while it is recorded")
 @pytest.mark.parametrize("limits", [Limits(), Limits(bytes=60)], ids=["one file", "many"])
 def test_a_node_that_was_started_anew_is_played_as_such(limits: Limits, tmp_path: Path) -> None:
     """Anchors of one number are other points then; so are stamps and Gaussians in a new epoch."""
-    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
-    options = RecordOptions(tmp_path / "bag", limits=limits, node=NodeAddress(endpoint=endpoint))
-    recorded = [("a", 0)] * 3 + [("a", 1)] * 2 + [("b", 0)] * 3
-    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
-        with recording(options) as (recorder, _):
-            socket.recv()
-            for seq, (session, epoch) in enumerate(recorded, 1):
-                said = cdr.string(f"{session}{epoch}")
-                socket.send_multipart(encode(message_of("status", said, seq, session=session, epoch=epoch)))
-            until(lambda: recorder.summary()["messages"] == len(recorded))
-    recover(tmp_path / "bag", tmp_path / "saved")
-    for folder in ("bag", "saved"):
-        assert [(m.session, m.epoch) for m in by_topic(tmp_path / folder)["status"]] == recorded
-    config = PublishConfig(data=(), control=None, run_dir=run_dir)
-    player = Player(tmp_path / "bag", PlayOptions(loop=True), config)
-    played: dict[tuple[str, int], str] = {}
-    with beside(player.play, player.stop):
-        until((run_dir / "sags.json").exists)
-        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["status"], 60.0):
-            if arrived is not None:
-                message, _ = arrived
-                key = message.meta.session, message.meta.epoch
-                assert played.setdefault(key, cdr.parse(message).data) == cdr.parse(message).data
-            if len(played) > 8:  # more than two passes
-                break
-    assert {"a0", "a1", "b0"} == set(played.values())
+    sent = [("a", 0)] * 3 + [("a", 1)] * 2 + [("b", 0)] * 3
+    with recorded(tmp_path, limits=limits) as (sender, recorder, _):
+        for seq, (session, epoch) in enumerate(sent, 1):
+            said = cdr.string(f"{session}{epoch}")
+            sender.send(message_of("status", said, seq, session=session, epoch=epoch))
+        until(lambda: recorder.summary()["messages"] == len(sent))
+    for kept in both(tmp_path, "status"):
+        assert [(m.session, m.epoch) for m in kept] == sent
+    came: dict[tuple[str, int], str] = {}
+    with played(tmp_path / "bag", "status") as heard:
+        while len(came) <= 8:  # two passes
+            message = next(heard)
+            key = message.meta.session, message.meta.epoch
+            assert came.setdefault(key, cdr.parse(message).data) == cdr.parse(message).data
+    assert {"a0", "a1", "b0"} == set(came.values())
     of_session: dict[str, str] = {}
-    assert all(of_session.setdefault(session, said[0]) == said[0] for (session, _), said in played.items())
+    assert all(of_session.setdefault(session, said[0]) == said[0] for (session, _), said in came.items())
 
 
 def test_a_prediction_stays_one_when_it_is_played(tmp_path: Path) -> None:
-    endpoint, run_dir = f"ipc://{tmp_path / 'data'}", tmp_path / "run"
-    picture, aheads = cdr.image(np.ones((4, 4), np.uint8), "mono8", 1), (msgspec.UNSET, 93_400_000)
-    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
-        with recording(RecordOptions(tmp_path / "bag", node=NodeAddress(endpoint=endpoint))) as (recorder, _):
-            socket.recv()
-            for seq, ahead in enumerate(aheads, 1):
-                socket.send_multipart(encode(message_of("view/a/image", picture, seq, seq, ahead_ns=ahead)))
-            until(lambda: recorder.summary()["messages"] == 2)
-    recover(tmp_path / "bag", tmp_path / "saved")
-    for folder in ("bag", "saved"):
-        assert [message.ahead_ns for message in by_topic(tmp_path / folder)["view/a/image"]] == [
-            0,
-            100_000_000,
-        ]
-    player = Player(
-        tmp_path / "saved", PlayOptions(loop=True), PublishConfig(data=(), control=None, run_dir=run_dir)
-    )
+    picture, name = cdr.image(np.ones((4, 4), np.uint8), "mono8", 1), "view/a/image"
+    with recorded(tmp_path) as (sender, recorder, _):
+        for seq, ahead in enumerate((msgspec.UNSET, 93_400_000), 1):
+            sender.send(message_of(name, picture, seq, seq, ahead_ns=ahead))
+        until(lambda: recorder.summary()["messages"] == 2)
+    for kept in both(tmp_path, name):
+        assert [message.ahead_ns for message in kept] == [0, 100_000_000]
     came: set[object] = set()
-    with beside(player.play, player.stop):
-        until((run_dir / "sags.json").exists)
-        for arrived in listen_to(NodeAddress(run_dir=run_dir), ["view/a/image"], 60.0):
-            came |= set() if arrived is None else {arrived[0].meta.ahead_ns}
-            if len(came) > 1:
-                break
+    with played(tmp_path / "saved", name) as heard:
+        while len(came) < 2:
+            came.add(next(heard).meta.ahead_ns)
     assert came == {msgspec.UNSET, 100_000_000}
 
 
 def test_a_key_colour_stays_exact(tmp_path: Path) -> None:
     """A display shows the camera where the pixel is the key, and nowhere else."""
-    endpoint, picture = f"ipc://{tmp_path / 'data'}", np.full((32, 32, 3), (0, 0, 255), np.uint8)
+    picture = np.full((32, 32, 3), (0, 0, 255), np.uint8)
     picture[10:20, 11:21] = 255, 120, 0
-    options = RecordOptions(tmp_path / "bag", compression="jpeg", node=NodeAddress("sags", endpoint=endpoint))
-    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket:
-        with recording(options) as (recorder, _):
-            socket.recv()
-            said = message_of("left/overlay/color_key", cdr.image(picture, "rgb8", 1))
-            socket.send_multipart(encode(said))
-            until(lambda: recorder.summary()["messages"])
+    with recorded(tmp_path, compression="jpeg") as (sender, recorder, _):
+        sender.send(message_of("left/overlay/color_key", cdr.image(picture, "rgb8", 1)))
+        until(lambda: recorder.summary()["messages"])
     (kept,) = by_topic(tmp_path / "bag")["left/overlay/color_key/compressed"]
     assert np.array_equal(decode_picture(kept.data, kept.type, ""), picture)
 
@@ -214,20 +204,8 @@ def test_what_a_person_should_know_of_a_recording() -> None:
 
 @pytest.mark.fault("memory: too little for the seconds of a snapshot")
 def test_a_ring_says_how_much_it_holds(tmp_path: Path) -> None:
-    """Messages come every 10 ms by their times of arrival; five of ten fit."""
-    message = text_message(1, "y" * 1000)
-    ring = Ring(0.1, 5 * Arrived(message, 0).size)
-    for number in range(10):
-        ring.add(Arrived(message, number * 10_000_000), latched=False)
-    assert ring.seconds == pytest.approx(0.04)
-    endpoint = f"ipc://{tmp_path / 'data'}"
-    options = RecordOptions(
-        tmp_path / "bag", snapshot_seconds=60, max_cache_mb=0.005, node=NodeAddress(endpoint=endpoint)
-    )
-    with zmq_socket(zmq.XPUB, endpoint, bind=True) as socket, recording(options) as (recorder, said):
-        socket.recv()
-        for seq in range(1, 20):
-            socket.send_multipart(encode(text_message(seq, "y" * 1000)))
+    with recorded(tmp_path, snapshot_seconds=60, max_cache_mb=0.005) as (sender, recorder, said):
+        sender.send(*(text_message(seq, "y" * 1000) for seq in range(1, 20)))
         until(lambda: recorder.summary()["dropped"] >= 15)
         recorder.snapshot()
         until(lambda: "snapshot" in said[-1])
@@ -253,16 +231,6 @@ def test_a_recorder_says_that_nothing_comes(tmp_path: Path, monkeypatch: pytest.
         until(lambda: told[-1]["silent_s"] > 1)
     assert told[-1]["mb_per_s"] == rate
     assert "nothing came in the last" in str(recorded_table({**recorder.summary(), "silent_s": 12.3}).caption)
-
-
-def test_the_backlog_is_bounded() -> None:
-    backlog = Backlog(100)
-    arrived = Arrived(text_message(1, "y" * 50), 1)
-    assert backlog.put(arrived) and not backlog.put(arrived)
-    assert backlog.take(0.1) is arrived and backlog.put(arrived)
-    backlog.close()
-    assert not backlog.finished and backlog.take(0.1) is arrived and backlog.finished
-    assert backlog.take(5.0) is None  # at once
 
 
 @pytest.mark.fault("disk: too slow for the recorder")
@@ -301,20 +269,14 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "mine").write_text("mine")
+    node = NodeAddress(run_dir=tmp_path / "run")
+
+    def refused(folder: Path, kind: type[SagsError], said: str) -> None:
+        with pytest.raises(kind, match=said), recording(RecordOptions(folder, node=node)):
+            pass
+
     with publisher(tmp_path / "run"):
-        with (
-            pytest.raises(UsageError, match="taken exists already"),
-            recording(RecordOptions(taken, node=NodeAddress(run_dir=tmp_path / "run"))),
-        ):
-            pass
-        with (
-            pytest.raises(SagsError, match="cannot write"),
-            recording(RecordOptions(Path("/proc/nowhere/bag"), node=NodeAddress(run_dir=tmp_path / "run"))),
-        ):
-            pass
-    with (
-        pytest.raises(SagsError, match="no node runs as 'sags'"),
-        recording(RecordOptions(tmp_path / "none", node=NodeAddress(run_dir=tmp_path / "run"))),
-    ):
-        pass
+        refused(taken, UsageError, "taken exists already")
+        refused(Path("/proc/nowhere/bag"), SagsError, "cannot write")
+    refused(tmp_path / "none", SagsError, "no node runs as 'sags'")
     assert not (tmp_path / "none").exists()

@@ -8,12 +8,13 @@ import random
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import yaml
 from command_line import refused, sags
 from mcap.opcode import Opcode
-from recorded_plane import content
+from recorded_plane import content, record_plane
 
 from sags_node.bags.bag import BagMessage, read_messages, records_of
 from sags_node.bags.mcap_file import MAGIC, Entry, heads
@@ -21,6 +22,12 @@ from sags_node.clients.recording.bag_writer import BagWriter
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.recover import recover
 from sags_node.errors import SagsError
+
+
+@pytest.fixture(scope="module")
+def plane_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound recording of three chunks or more."""
+    return record_plane(tmp_path_factory.mktemp("plane"), seconds=0.5)[0]
 
 
 def recovered(file: bytes, tmp_path: Path, name: str) -> tuple[dict[str, Any] | None, list[BagMessage]]:
@@ -131,16 +138,10 @@ def test_recovery_that_is_broken_off_leaves_nothing(
 ) -> None:
     """A full disk, or Ctrl-C: half a copy would be taken for all that could be saved."""
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(BagWriter, "write", full)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(BagWriter, "write", Mock(side_effect=full))
     refused(1, "bag", "recover", plane_bag, "-o", tmp_path / "out", said=("No space left on device",))
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(BagWriter, "write", interrupted)
+    monkeypatch.setattr(BagWriter, "write", Mock(side_effect=KeyboardInterrupt))
     assert sags("bag", "recover", plane_bag, "-o", tmp_path / "out").exit_code == 130
     assert not any(tmp_path.iterdir())
 
@@ -180,6 +181,4 @@ def test_recover_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:
     for other in (tmp_path / "nowhere.mcap", tmp_path / "empty", __file__):
         assert sags("bag", "recover", other, "-o", tmp_path / "out").exit_code == 2
     listed = json.loads(sags("bag", "info", tmp_path / "again", "--json").stdout)
-    assert listed["messages"] == bag_info(plane_bag)["messages"] and {
-        t["lost"] for t in listed["topics"]
-    } == {0}
+    assert listed["topics"] == bag_info(plane_bag)["topics"]

@@ -24,8 +24,7 @@ from sags_node.bags.bag import read_messages
 from sags_node.bags.pictures import decode_picture, encode_file
 from sags_node.clients.overlay.run import OverlayOptions, run_overlay
 from sags_node.clients.recording.info import bag_info
-from sags_node.clients.recording.outgoing import outgoing
-from sags_node.clients.recording.player import PlayClock, Player, PlayOptions
+from sags_node.clients.recording.player import PlayClock, Player, PlayOptions, outgoing
 from sags_node.clients.recording.recover import recover
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import SagsError

@@ -22,11 +22,9 @@ import msgspec
 import numpy as np
 import pytest
 from browsers import new_page
-from click.testing import CliRunner
-from command_line import killed
+from command_line import killed, refused, start, stopped
 from waiting import START_SECONDS
 
-from sags_node.cli.main import main
 from sags_node.clients.viewer import splats as viewer_splats
 from sags_node.clients.viewer.cursor import depth_line
 from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, TISSUE, Moment, Rung, Status
@@ -35,6 +33,7 @@ from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
 from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.clients.viewer.still import SILENT_AFTER
 from sags_node.config.schema import PhantomSource
+from sags_node.messaging.address import THE_NODE
 from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
 from sags_node.messaging.subscriber import Subscriber
@@ -237,7 +236,7 @@ def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
         return replace(moment(), status=msgspec.structs.replace(moment().status, session=session))
 
     with serving("127.0.0.1", 0, False) as (server, _):
-        panel = Panel(server, Scene(server), None, None, "sags", 20.0)
+        panel = Panel(server, Scene(server), THE_NODE, None, 20.0)
         panel.show(seen("first"))
         panel.choose(1)
         panel.show(Moment("stale", Status(session="first")))
@@ -249,28 +248,21 @@ def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
 # ---- the command -----------------------------------------------------------------------------------------
 
 
-def refused(code: int, *arguments: str) -> str:
-    result = CliRunner().invoke(main, ["view", *arguments])
-    assert result.exit_code == code and "Traceback" not in result.output
-    return " ".join(result.output.split())
-
-
 def test_without_viser_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert "pip install '.[viewer]'" in refused(2)
+    refused(2, "view", said=("pip install '.[viewer]'",))
 
 
 @needs_viser
 def test_other_machines_and_taken_ports_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "nice", lambda increment: 0)  # that is for a process of its own
-    said = refused(2, "--host", "0.0.0.0")
-    assert "without keys" in said and "--insecure" in said and "ssh -L" in said
+    refused(2, "view", "--host", "0.0.0.0", said=("without keys", "--insecure", "ssh -L"))
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert f"port {port}" in refused(1, "--port", str(port))
-    assert "e.g. tcp://127.0.0.1:5556" in refused(1, "--port", "0", "--endpoint", "nonsense")
+        refused(1, "view", "--port", port, said=(f"port {port}",))
+    refused(1, "view", "--port", "0", "--endpoint", "nonsense", said=("e.g. tcp://127.0.0.1:5556",))
 
 
 class RunningView:
@@ -278,13 +270,7 @@ class RunningView:
 
     def __init__(self, runtime: Path) -> None:
         self.runtime = runtime
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "sags_node", "view", "--port", "0", "--json"],
-            env=os.environ | {"XDG_RUNTIME_DIR": str(runtime)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        self.process = start(["view", "--port", "0", "--json"], XDG_RUNTIME_DIR=runtime)
         self.where: dict[str, Any] = json.loads(self.process.stdout.readline())
 
     def upgrade(self, origin: str) -> int:
@@ -303,18 +289,13 @@ class RunningView:
             peer.sendall("\r\n".join((*lines, "", "")).encode())
             return int(peer.recv(100).split()[1])
 
-    def stop(self) -> tuple[str, str]:
-        """What it says after Ctrl-C."""
-        self.process.send_signal(signal.SIGINT)
-        return self.process.communicate(timeout=60)
-
 
 @pytest.fixture(scope="module")
 def view(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningView]:
     running = RunningView(tmp_path_factory.mktemp("runtime"))
     yield running
-    stdout, stderr = running.stop()
-    assert running.process.returncode == 0 and stdout == "" and "Traceback" not in stderr, stderr
+    stdout, _ = stopped(running.process)
+    assert running.process.returncode == 0 and stdout == ""
 
 
 @needs_viser

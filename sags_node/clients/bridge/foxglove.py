@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import foxglove
 import numpy as np
@@ -22,8 +22,7 @@ from foxglove.channels import CompressedVideoChannel
 from foxglove.messages import CompressedVideo, Timestamp
 from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener, WebSocketServer
 
-from sags_node.clients.bridge.options import ServerOptions
-from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source, silent
+from sags_node.clients.bridge.relay import Outlet, Output, Relay, ServerOptions, Source, silent
 from sags_node.clients.bridge.requests import Requests
 from sags_node.errors import SagsError
 from sags_node.messaging import cdr, topics
@@ -48,27 +47,14 @@ class FoxgloveOptions(ServerOptions):
 def outputs(options: FoxgloveOptions) -> list[Output]:
     """One channel for each topic of the node and of an overlay, and one more for each picture as H.264."""
     period = 0.0 if options.rate is None else 1 / options.rate
-    offered = [(options.node.ns, topic) for topic in topics.TOPICS]
-    offered += [(options.overlay.ns, topic) for topic in topics.OVERLAY_TOPICS]
-    channels = [
-        Output(
-            f"/{topics.full_name(ns, topic.name)}", (Source(ns, topic.name),), period, lengths=topic.in_metres
-        )
-        for ns, topic in offered
-    ]
-    if importlib.util.find_spec("av") is not None:
-        pictures = [(ns, topic) for ns, topic in offered if _is_picture(topic)]
-        channels += [
-            Output(f"/{topics.full_name(ns, topic.name)}{VIDEO}", (Source(ns, topic.name),), period)
-            for ns, topic in pictures
-        ]
-    status = (Source(options.node.ns, "status"),)
-    return [*channels, Output(f"/{options.node.ns}{FIGURES}", status)]
-
-
-def _is_picture(topic: topics.Topic) -> bool:
-    """Something to look at, in colour."""
-    return topic.type == topics.IMAGE and topic.content.startswith("rgb")
+    has_video, channels = importlib.util.find_spec("av") is not None, []
+    for ns, offered in ((options.node.ns, topics.TOPICS), (options.overlay.ns, topics.OVERLAY_TOPICS)):
+        for topic in offered:
+            name, sources = f"/{topics.full_name(ns, topic.name)}", (Source(ns, topic.name),)
+            channels.append(Output(name, sources, period, lengths=topic.in_metres))
+            if has_video and topic.type == topics.IMAGE and topic.content.startswith("rgb"):
+                channels.append(Output(f"{name}{VIDEO}", sources, period))
+    return [*channels, Output(f"/{options.node.ns}{FIGURES}", (Source(options.node.ns, "status"),))]
 
 
 def run_foxglove(options: FoxgloveOptions, ready: Callable[[str, int], None], stop: threading.Event) -> None:
@@ -208,18 +194,6 @@ class _Audience(ServerListener):
             self._pin(data)
 
 
-class _Way(Protocol):
-    """How one output reaches its channel."""
-
-    def show(self, received: Received, grown: bool) -> None:
-        """Send it; `grown`: somebody has begun to look."""
-        ...
-
-    def blank(self, shown: Received, reason: str) -> None:
-        """Send something empty in its place, where it is something to look at."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class _Messages:
     """One message for each that comes: the node's own, or its status as JSON."""
@@ -229,9 +203,11 @@ class _Messages:
     empty_of: Callable[[Received, int, str], bytes | str | None]
 
     def show(self, received: Received, grown: bool) -> None:
+        """Send it; `grown`: somebody has begun to look."""
         self.channel.log(self.made_of(received), log_time=received.stamp_ns)
 
     def blank(self, shown: Received, reason: str) -> None:
+        """Send something empty in its place, where it is something to look at."""
         now_ns = time.time_ns()
         if (empty := self.empty_of(shown, now_ns, reason)) is not None:
             self.channel.log(empty, log_time=now_ns)
@@ -263,7 +239,7 @@ class _Video:
         self._channel.log(frame, log_time=stamp_ns)
 
 
-def _way(output: Output, context: foxglove.Context) -> _Way:
+def _way(output: Output, context: foxglove.Context) -> _Messages | _Video:
     if output.name.endswith(VIDEO):
         return _Video(output, context)
     if output.name.endswith(FIGURES):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
+from typing import Any
 
 from foxglove import layouts as fl
 from foxglove.layouts import Layout, SplitContainer, SplitItem
@@ -15,42 +17,28 @@ COLORS = ("#4e98e2", "#f5774d", "#f7df71", "#a395e2")
 
 def layout_of(ns: str, overlay_ns: str) -> str:
     """The layout's file, for these namespaces."""
-    pictures = SplitContainer(
-        direction="column",
-        items=[
-            SplitItem(content=_picture(f"/{ns}/left/image_rect_color", ns)),
-            SplitItem(content=_picture(f"/{ns}/left/render/image", ns)),
-            SplitItem(content=_picture(f"/{overlay_ns}/left/overlay/image", ns)),
-        ],
-    )
-    figures = SplitContainer(
-        direction="column",
-        items=[
-            SplitItem(content=_plot(f"/{ns}{FIGURES}", "Hz", {"rate_hz": "rate, Hz"})),
-            SplitItem(
-                content=_plot(
-                    f"/{ns}{FIGURES}",
-                    "ms",
-                    {f"latency_ms.{part}": f"latency {part}, ms" for part in ("p50", "p90", "p99")},
-                )
-            ),
-            SplitItem(content=_plot(f"/{ns}{FIGURES}", "", {"gaussians": "Gaussians"})),
-            SplitItem(
-                content=fl.RawMessagesPanel(
-                    config=fl.RawMessagesConfig(topic_path=f"/{ns}{FIGURES}.warnings")
-                )
-            ),
-        ],
+    topic = f"/{ns}{FIGURES}"
+    shown = (f"/{ns}/left/image_rect_color", f"/{ns}/left/render/image", f"/{overlay_ns}/left/overlay/image")
+    latencies = {f"latency_ms.{part}": f"latency {part}, ms" for part in ("p50", "p90", "p99")}
+    figures = (
+        _plot(topic, "Hz", {"rate_hz": "rate, Hz"}),
+        _plot(topic, "ms", latencies),
+        _plot(topic, "", {"gaussians": "Gaussians"}),
+        fl.RawMessagesPanel(config=fl.RawMessagesConfig(topic_path=f"{topic}.warnings")),
     )
     content = SplitContainer(
         direction="row",
         items=[
-            SplitItem(proportion=3, content=pictures),
+            SplitItem(proportion=3, content=_column(_picture(name, ns) for name in shown)),
             SplitItem(proportion=4, content=_scene(ns)),
-            SplitItem(proportion=3, content=figures),
+            SplitItem(proportion=3, content=_column(figures)),
         ],
     )
     return json.dumps(json.loads(Layout(content=content).to_json()), indent=1) + "\n"
+
+
+def _column(panels: Iterable[Any]) -> SplitContainer:
+    return SplitContainer(direction="column", items=[SplitItem(content=panel) for panel in panels])
 
 
 def _picture(topic: str, ns: str) -> fl.ImagePanel:

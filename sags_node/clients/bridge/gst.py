@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sags_node.clients.bridge.options import MAX_AGE
-from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source
+from sags_node.clients.bridge.relay import MAX_AGE, Outlet, Output, Relay, Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.received import Frame, ReceivedImage, ReceivedText

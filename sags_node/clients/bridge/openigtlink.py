@@ -23,13 +23,12 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pyigtl.messages import MessageBase
 
 from sags_node.clients.bridge import igtl
 from sags_node.clients.bridge.compressed import over_black
-from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
-from sags_node.clients.bridge.options import ServerOptions
-from sags_node.clients.bridge.pins import MOST, Pin, Pins, Release
-from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source
+from sags_node.clients.bridge.pins import MOST, Pin, Pins
+from sags_node.clients.bridge.relay import Outlet, Output, Relay, ServerOptions, Source
 from sags_node.clients.bridge.requests import Requests
 from sags_node.clients.overlay.draw import over
 from sags_node.confidence import SURE, is_sure_in_space
@@ -140,12 +139,12 @@ class OpenIgtLink(Outlet):
         # Of pictures that are shown: one without light, and its place.
         self._shapes: dict[str, tuple[U8, F64]] = {}
         self._pins = Pins()
-        self._answers: deque[Callable[[], list[Release]]] = deque()  # for the peers' thread
+        self._answers: deque[Callable[[], list[int]]] = deque()  # for the peers' thread
         self._ns, self._now_ns = options.node.ns, options.node.now_ns
-        listener = options.listen(MOST_PEERS)
+        listener = options.listen(igtl.MOST_PEERS)
         self.port = int(listener.getsockname()[1])
         self._requests = Requests(options.node)
-        self._peers = Peers(listener, self._hear, self._idle)
+        self._peers = igtl.Peers(listener, self._hear, self._idle)
         self._peers.start()
 
     def close(self) -> None:
@@ -160,26 +159,24 @@ class OpenIgtLink(Outlet):
 
     def send(self, output: Output, frame: Frame) -> bool:
         stamp_ns = frame[output.sources[0].topic].stamp_ns
-        device, seconds = f"Sags{output.name}", stamp_ns * 1e-9
         try:
-            made = self._made(output.name, frame, device, seconds)
+            made = self._made(output.name, frame)
         except WireError:
             made = None
         if made is not None:
-            self._peers.send(device, made, valid=self._max_age - (self._now_ns() - stamp_ns) * 1e-9)
+            device, age = f"Sags{output.name}", (self._now_ns() - stamp_ns) * 1e-9
+            self._peers.send(device, igtl.packed(made, device, stamp_ns * 1e-9), valid=self._max_age - age)
         return made is not None
 
     def blank(self, output: Output, reason: str) -> None:
-        device, seconds = f"Sags{output.name}", time.time()
+        nothing, device = np.empty((0, 3)), f"Sags{output.name}"
         if output.name in self._shapes:
             dark, T = self._shapes.pop(output.name)
-            self._peers.send(device, igtl.image(device, seconds, _written(dark, reason), T))
+            self._send_now(device, igtl.image(_written(dark, reason), T))
         elif output.name == "Surface":
-            self._peers.send(
-                device, igtl.surface(device, seconds, np.empty((0, 3)), np.empty((0, 3), np.int64))
-            )
+            self._send_now(device, igtl.surface(nothing, nothing.astype(np.int64)))
         elif output.name == "Anchors":
-            self._peers.send(device, igtl.points(device, seconds, np.empty((0, 3)), [], []))
+            self._send_now(device, igtl.points(nothing))
 
     def started_anew(self, ns: str) -> None:
         if ns == self._ns:
@@ -191,31 +188,35 @@ class OpenIgtLink(Outlet):
             code, words = igtl.NOT_READY, words or "waiting for the node's first message"
         else:
             code, words = igtl.OK, "all is new"
-        self._peers.greet(STATE, igtl.status(STATE, time.time(), code, words))
+        self._peers.greet(STATE, igtl.packed(igtl.Status(code, words), STATE, time.time()))
 
-    def _made(self, name: str, frame: Frame, device: str, seconds: float) -> bytes | None:
+    def _send_now(self, device: str, message: MessageBase) -> None:
+        self._peers.send(device, igtl.packed(message, device, time.time()))
+
+    def _made(self, name: str, frame: Frame) -> MessageBase | None:
         """The message of an output; None when what came does not fit together."""
         if name == "Anchors":
-            return _anchors(frame[ANCHORS], device, seconds)
+            return _anchors(frame[ANCHORS])
         if name == "LeftCamera":
-            return igtl.transform(device, seconds, RAS @ _in_mm(frame[POSE].pose()) @ RAS)
+            T = frame[POSE].pose()
+            T[:3, 3] *= 1e3  # mm
+            return igtl.transform(RAS @ T @ RAS)
         if name == "Surface":
-            return self._surface(frame, device, seconds)
-        drawn, info = PICTURES[name], frame[INFO]
-        size = (info.height, info.width)
-        if any(frame[topic].array.shape != (*size, channels) for topic, channels in drawn.channels.items()):
+            return self._surface(frame)
+        (channels, draw), info = PICTURES[name], frame[INFO]
+        if any(frame[topic].array.shape != (info.height, info.width, n) for topic, n in channels.items()):
             return None
-        picture, T = drawn.draw(frame), _before_camera(info.K)
+        picture, T = draw(frame), _before_camera(info.K)
         self._shapes[name] = (np.zeros_like(picture), T)
-        return igtl.image(device, seconds, picture, T)
+        return igtl.image(picture, T)
 
-    def _surface(self, frame: Frame, device: str, seconds: float) -> bytes | None:
+    def _surface(self, frame: Frame) -> MessageBase | None:
         depth, confidence, info = frame[DEPTH].array, frame[CONFIDENCE].array, frame[INFO]
         if not depth.shape == confidence.shape == (info.height, info.width):
             return None
         camera = Camera(info.width, info.height, info.K, frame[POSE].pose())
         places, triangles = surface_of(camera, depth, confidence, self._step)
-        return igtl.surface(device, seconds, _ras(places), triangles)
+        return igtl.surface(_ras(places), triangles)
 
     # ---- in, on the peers' thread --------------------------------------------------------------------------
 
@@ -248,17 +249,17 @@ class OpenIgtLink(Outlet):
         if result is not None:
             self._answers.append(partial(self._pins.pinned, pin, int(result["id"])))
 
-    def _forget(self) -> list[Release]:
+    def _forget(self) -> list[int]:
         if self._pins.forget():
             self._say("the node was started anew: its anchors are gone; move a point to pin it again")
         return []
 
-    def _release(self, released: Sequence[Release]) -> None:
-        for release in released:
-            self._requests.ask("remove_anchor", {"id": release.anchor}, lambda _, words: self._say(words))
+    def _release(self, anchors: Sequence[int]) -> None:
+        for anchor in anchors:
+            self._requests.ask("remove_anchor", {"id": anchor}, lambda _, words: self._say(words))
 
     def _say(self, words: str) -> None:
-        self._peers.send(ANSWER, igtl.string(ANSWER, time.time(), words))
+        self._send_now(ANSWER, igtl.string(words))
 
 
 def request_of(text: str) -> tuple[str, dict[str, float]] | None:
@@ -274,7 +275,7 @@ def request_of(text: str) -> tuple[str, dict[str, float]] | None:
 # ---- what is sent ----------------------------------------------------------------------------------------
 
 
-def _anchors(cloud: ReceivedCloud, device: str, seconds: float) -> bytes | None:
+def _anchors(cloud: ReceivedCloud) -> MessageBase | None:
     """The anchors whose place is known, by number. Orange: not sure there; red: hidden."""
     rows = cloud.points
     if not {"id", "visibility", "confidence", "depth_confidence"} <= set(rows.dtype.names or ()):
@@ -286,23 +287,14 @@ def _anchors(cloud: ReceivedCloud, device: str, seconds: float) -> bytes | None:
         HIDDEN if row["visibility"] < LEAST_SEEN else SEEN if is_sure_in_space(row) else UNSURE
         for row in rows[known]
     ]
-    return igtl.points(device, seconds, _ras(places[known]), names, colors)
+    return igtl.points(_ras(places[known]), names, colors)
 
 
-@dataclass(frozen=True, slots=True)
-class _Picture:
-    """How an IMAGE is made."""
-
-    channels: Mapping[TopicName[ReceivedImage], int]  # of the pictures that it is made of
-    draw: Callable[[Frame], U8]
-
-
-PICTURES = {
-    "Picture": _Picture({PICTURE: 3}, lambda frame: frame[PICTURE].array),
-    "Render": _Picture({RENDER: 4}, lambda frame: over_black(frame[RENDER].array)),
-    "Overlay": _Picture(
-        {PICTURE: 3, OVERLAY: 4}, lambda frame: over(frame[PICTURE].array, frame[OVERLAY].array)
-    ),
+# Of each IMAGE: the pictures that it is made of, with their channels, and how.
+PICTURES: dict[str, tuple[dict[TopicName[ReceivedImage], int], Callable[[Frame], U8]]] = {
+    "Picture": ({PICTURE: 3}, lambda frame: frame[PICTURE].array),
+    "Render": ({RENDER: 4}, lambda frame: over_black(frame[RENDER].array)),
+    "Overlay": ({PICTURE: 3, OVERLAY: 4}, lambda frame: over(frame[PICTURE].array, frame[OVERLAY].array)),
 }
 
 
@@ -310,12 +302,6 @@ def _ras(places: F64) -> F64:
     """World coordinates [N, 3] in m as Slicer's, in mm."""
     turned: F64 = 1e3 * places @ RAS[:3, :3]
     return turned
-
-
-def _in_mm(T: F64) -> F64:
-    scaled = T.copy()
-    scaled[:3, 3] *= 1e3
-    return scaled
 
 
 def _before_camera(K: F64) -> F64:

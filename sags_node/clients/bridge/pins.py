@@ -24,12 +24,6 @@ class Pin(NamedTuple):
     number: int = 1  # among those of that name: names need not differ
 
 
-class Release(NamedTuple):
-    """Give this anchor back."""
-
-    anchor: int
-
-
 @dataclass(slots=True)
 class _Point:
     place: F64
@@ -44,19 +38,19 @@ class Pins:
     def __init__(self) -> None:
         self._points: dict[tuple[str, int], _Point] = {}  # by name, and number of that name
 
-    def hear(self, points: Iterable[tuple[str, F64]], now: float) -> list[Release]:
-        """The list as it is now; returns what is to be given back, since its point has gone or moved."""
+    def hear(self, points: Iterable[tuple[str, F64]], now: float) -> list[int]:
+        """The list as it is now; returns the anchors to give back, since their points have gone or moved."""
         listed: dict[tuple[str, int], F64] = {}
         named: Counter[str] = Counter()
         for name, place in list(points)[:MOST]:
             named[name] += 1
             listed[name, named[name]] = place
-        released: list[Release] = []
+        released: list[int] = []
         for key in list(self._points):
             point = self._points[key]
             if key not in listed or float(np.abs(listed[key] - point.place).max()) > STILL:
                 if point.anchor is not None:
-                    released.append(Release(point.anchor))
+                    released.append(point.anchor)
                 del self._points[key]
         for key, place in listed.items():
             self._points.setdefault(key, _Point(place, now))
@@ -73,11 +67,11 @@ class Pins:
             point.asked = True
         return [Pin(name, point.place, number) for (name, number), point in resting]
 
-    def pinned(self, pin: Pin, anchor: int) -> list[Release]:
+    def pinned(self, pin: Pin, anchor: int) -> list[int]:
         """The anchor of a point; it is given back at once if the point has gone or moved meanwhile."""
         point = self._points.get((pin.name, pin.number))
         if point is None or point.place is not pin.place:
-            return [Release(anchor)]
+            return [anchor]
         point.anchor = anchor
         return []
 

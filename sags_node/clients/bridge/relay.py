@@ -1,4 +1,4 @@
-"""The loop that all bridges share: what peers ask for is taken from the node, and the newest is passed on.
+"""What all bridges share: their options, and the loop that passes on the newest of what peers ask for.
 
 What has become too old is taken back, with the reason. The node never waits for a bridge, and the loop never
 waits for a peer.
@@ -7,23 +7,62 @@ waits for a peer.
 from __future__ import annotations
 
 import json
+import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from sags_node.clients.bridge.feed import EVERY_SECOND, SILENT_AFTER, Feed
-from sags_node.clients.bridge.options import MAX_AGE
+from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import topics
 from sags_node.messaging.address import NodeAddress
-from sags_node.messaging.received import Frame
+from sags_node.messaging.received import Frame, Received
+from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import Meta
 
+MAX_AGE = 0.4  # s since capture: with `LOOK` and the way to a peer, what stops is gone within 0.5 s
 LOOK = 0.04  # s; how soon it is noticed that something has become too old
 LEAD = 0.2  # s before it is due that a rare output's topics are asked for: a subscription takes up to 0.1 s
 NO_UNIT = "its lengths have no unit, as nobody has calibrated the eyes; docs/calibration.md"
 GRACE = 0.5  # s for the first message of what was asked for, before it is said that none comes
+LEAST_HZ = 0.5  # a bridge passes on the newest of what comes, so losing some of it is no fault; age is
+EVERY_SECOND = ("status", "diagnostics")
+SILENT_AFTER = 2.5  # s without one of these
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeOptions:
+    """How a bridge runs; the defaults are those of the command."""
+
+    node: NodeAddress
+    overlay: NodeAddress
+    max_age: float = MAX_AGE
+
+
+@dataclass(frozen=True, slots=True)
+class ServerOptions(BridgeOptions):
+    """How a bridge runs that peers connect to."""
+
+    host: str = "127.0.0.1"
+    port: int = 0  # 0: any free one
+
+    def listen(self, backlog: int) -> socket.socket:
+        """Bind the address.
+
+        Raises:
+            SagsError: it cannot be bound.
+        """
+        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+        try:
+            return socket.create_server((self.host, self.port), family=family, backlog=backlog)
+        except OSError as error:
+            raise SagsError(self.not_bound(error.strerror)) from None
+
+    def not_bound(self, why: object) -> str:
+        """The error of an address that cannot be bound."""
+        return f"cannot listen on {self.host} port {self.port}: {why}; choose another --port (0: any)"
 
 
 class Source(NamedTuple):
@@ -224,6 +263,62 @@ class Relay:
             for source in (*output.sources, *([] if output.pulse is None else [output.pulse]))
         ]
         return list(dict.fromkeys(source.topic for source in sources if source.ns == ns))
+
+
+class Feed:
+    """Follows one sender; used from one thread.
+
+    Args:
+        topics: all that may be asked for, without the namespace.
+        max_age: s since capture, after which nothing is new any more.
+        wake: called from another thread for each message that comes.
+
+    Raises:
+        UsageError: the node wants keys that are not given, or the other way round.
+        SagsError: the endpoint is malformed. That nobody is there yet is no error.
+    """
+
+    def __init__(
+        self, topics: Iterable[str], sender: NodeAddress, max_age: float, wake: Callable[[], None]
+    ) -> None:
+        self._max_age, self._session = max_age, ""
+        rates = dict.fromkeys(topics, LEAST_HZ)
+        self._subscriber = Subscriber.at(sender, rates, rates=rates, paused=True, may_be_absent=True)
+        self._resources = ExitStack()
+        self._resources.callback(self._subscriber.close)
+        self._resources.enter_context(self._subscriber.notified(wake))
+
+    def ask(self, names: Iterable[str]) -> None:
+        """Let the sender make and send these topics, and nothing else but `status`.
+
+        Raises:
+            UsageError: it has come, and wants keys that are not given, or the other way round.
+        """
+        if not self._subscriber.endpoint and self._subscriber.refusal is not None:
+            raise UsageError(self._subscriber.refusal)
+        self._subscriber.ask(names)
+
+    def problem(self, name: str) -> str | None:
+        """Why the newest message of a topic must not be shown as new; None when it may be."""
+        limit = SILENT_AFTER if name in EVERY_SECOND else self._max_age
+        return self._subscriber.problem(name, limit)
+
+    def started_anew(self) -> bool:
+        """Tell whether the sender is another one than when this was last asked."""
+        status, before = self._subscriber.latest("status"), self._session
+        self._session = before if status is None else status.meta.session
+        return before not in ("", self._session)
+
+    def latest(self, name: str) -> Received | None:
+        """The newest message of a topic, however old it is."""
+        return self._subscriber.latest(name)
+
+    def frame(self, names: Iterable[str], stamp_ns: int) -> Frame | None:
+        """The messages of these topics that show the frame captured at `stamp_ns`, if all have come."""
+        return self._subscriber.aligned(names, stamp_ns)
+
+    def close(self) -> None:
+        self._resources.close()
 
 
 def silent(reason: str) -> str:

@@ -18,8 +18,7 @@ from itertools import chain
 import numpy as np
 
 from sags_node.clients.bridge.compressed import LARGEST, Compressor, suffix
-from sags_node.clients.bridge.options import BridgeOptions
-from sags_node.clients.bridge.relay import Outlet, Output, Relay, Source, silent
+from sags_node.clients.bridge.relay import BridgeOptions, Outlet, Output, Relay, Source, silent
 from sags_node.clients.bridge.requests import Requests
 from sags_node.clients.bridge.ros2_requests import ANSWER, Inbox
 from sags_node.config.schema import RosGraph

@@ -13,7 +13,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any
@@ -24,9 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.sync.server import Server, ServerConnection, serve
 
-from sags_node.clients.bridge.feed import Feed
-from sags_node.clients.bridge.options import ServerOptions
-from sags_node.clients.bridge.relay import LOOK, Outlet, Output, Relay, Source
+from sags_node.clients.bridge.relay import LOOK, Feed, Outlet, Output, Relay, ServerOptions, Source
 from sags_node.clients.bridge.requests import Requests
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.received import Frame
@@ -80,8 +78,7 @@ def run_web(options: WebOptions, ready: Callable[[str, int], None], stop: thread
     """
     for sender in (options.overlay, options.node):  # what is wrong is said now, not to the first peer
         Feed((), sender, options.max_age, lambda: None).close()
-    requests = Requests(options.node)
-    try:
+    with closing(Requests(options.node)) as requests:
         server, port = _served(options, requests, stop)
         serving = threading.Thread(target=server.serve_forever, name="sags-web")
         serving.start()
@@ -92,8 +89,6 @@ def run_web(options: WebOptions, ready: Callable[[str, int], None], stop: thread
             stop.set()
             server.shutdown()
             serving.join()
-    finally:
-        requests.close()
 
 
 def _served(options: WebOptions, requests: Requests, stop: threading.Event) -> tuple[Server, int]:

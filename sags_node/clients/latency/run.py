@@ -7,9 +7,8 @@ import threading
 import time
 from collections.abc import Callable
 
-from sags_node.clients.latency.code import Reader
 from sags_node.clients.latency.ledger import Moment
-from sags_node.clients.latency.shown import Codes
+from sags_node.clients.latency.shown import Codes, Reader
 from sags_node.clients.overlay.draw import over
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress

@@ -17,7 +17,7 @@ from sags_node.clients.overlay.pinner import Pinner, Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
 from sags_node.clients.overlay.residual import Residual
 from sags_node.clients.overlay.scene import ObjectSpec
-from sags_node.clients.registration.misread import misread
+from sags_node.clients.registration.register import misread
 from sags_node.clients.registration.rigid import on_a_line, rigid_fit
 from sags_node.clients.registration.surfaces import Shape
 from sags_node.confidence import LEAST
@@ -31,6 +31,7 @@ MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of 
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
 ELSEWHERE = "it was registered in another session of the node, whose world is another: register it again"
 AGAIN = "it comes back once recognised; else pin it again, by four anchors or more"
+UNRECOGNISED = "its anchors were not recognised lately"
 GONE = f"the tissue at its anchors left the model; {AGAIN}"
 
 log = logging.getLogger(__name__)
@@ -41,14 +42,13 @@ class HeldObject:
 
     Attributes:
         reason: why it has no place in the newest frame; None: it has.
-        is_sure: enough of the anchors that place it are, and its shape fits them.
-        unsure: why it is not; None: it is, or it has no place.
+        unsure: why its place is not sure; None: it is, or it has none.
         error: how badly its anchors fit its rigid shape (m, RMS); 0 with one anchor.
 
     Args:
         repin: after the model or the node was started anew, pin it once more at the same pixels and places.
         ahead: how far ahead of its frames it is placed, ms or `auto`, see `add_anchor`.
-        body: what is placed; None: nobody looks whether it lies at its anchors, `placed` is not called.
+        body: what is placed.
         worker: for what takes longer than a frame.
     """
 
@@ -58,13 +58,12 @@ class HeldObject:
         where: str,
         pinner: Pinner,
         repin: bool,
-        ahead: float | str = 0.0,
-        body: Body | None = None,
-        worker: Executor | None = None,
+        ahead: float | str,
+        body: Body,
+        worker: Executor,
     ) -> None:
         self.spec = spec
         self.reason: str | None = None
-        self.is_sure = False
         self.unsure: str | None = None
         self.error = 0.0
         self.times_pinned = 0
@@ -96,8 +95,6 @@ class HeldObject:
     def _follow(self) -> None:
         """Begin to bend and to check it, anew where it was lost."""
         stated = self.spec.registration
-        if self._body is None or self._worker is None:
-            return
         if self.spec.deform:
             depth = 1e-3 * self.spec.deform_depth_mm
             self._bend = Deformation(self._body.vertices, depth, self._pinner, self._worker, self._asked)
@@ -109,16 +106,14 @@ class HeldObject:
         T = self.place(frame)
         if T is None:
             return None
-        assert self._body is not None
-        put, doubts = Placed(self._body, T), []
+        put, doubts = Placed(self._body, T), [self.unsure]
         if self._bend is not None:
             put = replace(put, vertices=self._bend.move(frame, T))
             doubts.append(self._bend.doubt and f"it is drawn rigid: {self._bend.doubt}")
         if self._residual is not None:
             # The surface is known for now only, not for the time for which it is placed ahead.
             doubts.append(self._residual.look(frame, put, again=self.ahead_s == 0))
-        for doubt in filter(None, doubts):
-            self.is_sure, self.unsure = False, self.unsure or doubt
+        self.unsure = next(filter(None, doubts), None)
         known = [state.depth_confidence for state in self._states]
         return replace(put, is_sure=self.is_sure, depth_confidence=float(np.median(known)))
 
@@ -128,14 +123,16 @@ class HeldObject:
         Raises:
             UsageError: a pixel to pin it to lies outside the picture.
         """
-        T, self.reason = None, self._unready(frame)
+        T, self.reason, self.unsure = None, self._unready(frame), None
         if self.reason is None:
             T, self.reason = self._held(frame, [frame.anchors.get(anchor) for anchor in self._ids])
-        if T is None or self.is_sure:
-            self.unsure = None
-        elif self.unsure is None:
-            self.unsure = "its anchors were not recognised lately"
         return T
+
+    @property
+    def is_sure(self) -> bool:
+        """Tell whether enough of the anchors that place it are, its shape fits them, and nothing speaks
+        against it."""
+        return self.times_pinned > 0 and self.reason is None and self.unsure is None
 
     def _unready(self, frame: TissueFrame) -> str | None:  # noqa: PLR0911, one return per reason
         """Why its anchors do not hold it, or not yet."""
@@ -178,7 +175,7 @@ class HeldObject:
         return {
             "name": self.spec.name,
             "reason": self.reason,
-            "sure": self.reason is None and self.is_sure,
+            "sure": self.is_sure,
             "unsure": self.unsure,
             "pinned": self.times_pinned,
             "error_mm": round(1e3 * self.error, 3),
@@ -288,7 +285,7 @@ class HeldObject:
     def _misreadings(self) -> dict[float, str | None]:
         """What is wrong with its `at`, for either unit (m) that they may be in; asked before frames wait."""
         said = [anchor.at for anchor in self.spec.anchors if anchor.at is not None]
-        if self.spec.file is None or self._body is None or len(said) < LEAST_ANCHORS:
+        if self.spec.file is None or len(said) < LEAST_ANCHORS:
             return {}
         shape, at = Shape(self._body.vertices, self._body.triangles), np.array(said, np.float64)
         return {unit: misread(shape, unit * at) for unit in {1.0, self.spec.scale}}
@@ -311,8 +308,6 @@ class HeldObject:
 
     def _distance(self, points: F64) -> float:
         """From the object to the nearest of its points [k, 3], m; 0: it is as near as an object may be."""
-        if self._body is None:
-            return 0.0
         low, high = self._body.corners
         aside = np.maximum(np.maximum(low - points, points - high), 0)
         distance = float(np.linalg.norm(aside, axis=1).min())
@@ -341,22 +336,20 @@ class HeldObject:
         elif self._bend is not None:  # what bends afterwards is no misfit
             off = np.array([self._off.get(i, each) for i, each in zip(chosen, off, strict=True)])
         sure = model[[state.is_sure for state in chosen.values()] & (off <= MISFIT)]
-        self.is_sure = len(sure) >= LEAST_ANCHORS and not on_a_line(sure)
-        self.unsure = None
-        if off.max() > MISFIT:
-            self.unsure = (
-                f"an anchor is {1e3 * off.max():.1f} mm from where its shape has it: check `at` and scale, "
-                "unless the tissue was bent"
-            )
-        if self._doubt is not None:
-            self.is_sure, self.unsure = False, self._doubt
+        self.unsure = self._doubt
+        if self.unsure is None and (len(sure) < LEAST_ANCHORS or on_a_line(sure)):
+            self.unsure = UNRECOGNISED
+            if off.max() > MISFIT:
+                self.unsure = (
+                    f"an anchor is {1e3 * off.max():.1f} mm from where its shape has it: check `at` and "
+                    "scale, unless the tissue was bent"
+                )
         return T, None
 
     def _on_surface(self, frame: TissueFrame, holding: Sequence[Anchor]) -> tuple[F64 | None, str | None]:
         assert self._model is not None
         if not holding:
             return None, f"its anchor was not recognised for too long; {AGAIN}"
-        self.is_sure, self.unsure = holding[0].is_sure, None
         normal = surface_normal(frame, holding[0].place)
         if normal is not None and self._normal is not None:
             normal = NORMAL_MEMORY * self._normal + (1 - NORMAL_MEMORY) * normal
@@ -364,6 +357,7 @@ class HeldObject:
         self._normal = self._normal if normal is None else normal
         if self._normal is None:
             return None, "no surface at its anchor"
+        self.unsure = None if holding[0].is_sure else UNRECOGNISED
         return on_surface(holding[0].place, self._model[0], self._normal, self._right), None
 
 

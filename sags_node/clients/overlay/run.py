@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,6 @@ import numpy as np
 
 from sags_node.clients.overlay import draw as overlay_draw
 from sags_node.clients.overlay.draw import Body, Placed
-from sags_node.clients.overlay.durations import REMEMBERED, Durations
 from sags_node.clients.overlay.frame import CONFIDENCE, NEEDED, RIGHT_INFO, TISSUE, TissueFrame, tissue_frame
 from sags_node.clients.overlay.held import HeldObject
 from sags_node.clients.overlay.mesh import mesh_of
@@ -42,7 +41,7 @@ from sags_node.messaging.received import Received, ReceivedImage, ReceivedText, 
 from sags_node.messaging.rundir import NoNodeError
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.topics import NO_RIGHT_EYE
-from sags_node.types import U8
+from sags_node.types import F32, U8
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +51,7 @@ WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
 WAIT_FOR_REST = 0.05  # s for what belongs to the frame
 PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
 UNSEEN = "nothing of it is in sight: beyond the picture, or behind an instrument"
+REMEMBERED = 54_000  # durations: half an hour at 30 Hz
 RECENT = 300  # durations are behind the figures in `status`
 
 
@@ -100,8 +100,12 @@ def run_overlay(options: OverlayOptions, tell: Callable[[str], object] = log.war
     scene = built_in(options.pin, options.shape) if options.scene is None else read_scene(options.scene)
     overlay_draw.warm_up()
     bodies = [Body(mesh_of(spec), spec.opacity, spec.label) for spec in scene.objects]
-    with OverlayStream(options.own_ns, options.node.run_dir, scene.color_key) as stream:
-        overlay = _Overlay(options, scene, bodies, stream, output, layers, tell)
+    is_elsewhere = options.node.endpoint is not None
+    with (
+        OverlayStream(options.own_ns, options.node.run_dir, scene.color_key) as stream,
+        NodeClock.at(options.node) if is_elsewhere else nullcontext() as clock,
+    ):
+        overlay = _Overlay(options, scene, bodies, stream, clock, output, layers, tell)
         try:
             overlay.run()
         except KeyboardInterrupt:
@@ -118,13 +122,17 @@ class _Overlay:
         scene: SceneSpec,
         bodies: Sequence[Body],
         stream: OverlayStream,
+        clock: NodeClock | None,  # of a node that may be on another machine
         output: Output,
         layers: Layers | None,
         tell: Callable[[str], object],
     ) -> None:
-        self._options = options
-        self._subscriber: Subscriber | None = None  # before there is a node
-        self._clock: NodeClock | None = None  # of a node that may be on another machine
+        self._options, self._clock = options, clock
+        # A mask comes with every frame, also while the camera is lost, and never before the picture.
+        self._leading = NEEDED[0] if options.save is None else TISSUE
+        wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
+        wanted += [INSTRUMENTS] if scene.asks_for_instruments else []
+        self._node = Subscriber.at(options.node, wanted, clock=clock, may_be_absent=True)
         self._stream, self._output, self._layers, self._tell = stream, output, layers, tell
         self._waiting_because = ""
         self._pinner = Pinner(partial(ControlClient.at, options.node))
@@ -151,24 +159,17 @@ class _Overlay:
             UsageError: a pixel lies outside the picture, or the node's keys do not fit.
             SagsError: no frame came, or the node refuses this client or has no control socket.
         """
-        # A mask comes with every frame, also while the camera is lost, and never before the picture.
-        leading = NEEDED[0] if self._options.save is None else TISSUE
-        options, seconds = self._options, self._options.seconds
+        seconds = self._options.seconds
         end = math.inf if seconds is None else time.monotonic() + seconds
-        wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
-        wanted += [] if self._proximity is None else [INSTRUMENTS]
-        if options.node.endpoint is not None:
-            self._clock = NodeClock.at(options.node)
-        self._subscriber = Subscriber.at(options.node, wanted, clock=self._clock, may_be_absent=True)
         patient_until = time.monotonic() + PATIENCE
         last: Received | None = None
         while time.monotonic() < end:
             self._stream.serve()
-            received = self._node.wait(leading, WAIT_FOR_FRAME, after=last)
+            received = self._node.wait(self._leading, WAIT_FOR_FRAME, after=last)
             if received is not None:
                 if last is None:  # a node without a control socket: better said now than never
                     with suppress(NoNodeError):  # it has ended since, and may come again
-                        options.node.control_socket()
+                        self._options.node.control_socket()
                 last = received
                 self._take(received)
             elif last is None and self._node.absent is not None:
@@ -192,24 +193,12 @@ class _Overlay:
             self._tell(f"waiting (Ctrl-C ends): {why}")
 
     @property
-    def _node(self) -> Subscriber:
-        assert self._subscriber is not None  # `run` begins with it
-        return self._subscriber
-
-    @property
-    def _now_ns(self) -> int:
-        return time.time_ns() if self._subscriber is None else self._subscriber.now_ns()
-
-    @property
     def _silence(self) -> str:
         return f"no frame came from {self._node.endpoint}; is the node running and not waiting?"
 
     def close(self) -> None:
         """Leave nothing standing: neither the last overlay nor anchors in the node."""
-        if self._subscriber is not None:
-            self._subscriber.close()  # what has come stays readable
-        if self._clock is not None:
-            self._clock.close()
+        self._node.close()  # what has come stays readable
         self._stream.blank("the overlay was stopped")
         self._stream.tell(self._facts())
         self._pinner.close()
@@ -220,8 +209,7 @@ class _Overlay:
 
     def summary(self) -> dict[str, Any]:
         """See `run_overlay`."""
-        node = self._subscriber
-        lost = [] if node is None else [node.lost(name) for name in NEEDED if node.latest(name) is not None]
+        lost = [self._node.lost(name) for name in NEEDED if self._node.latest(name) is not None]
         return {
             **self._figures(),
             "lost": sum(lost),
@@ -341,7 +329,7 @@ class _Overlay:
             "draw_ms": self._draw_ms.percentiles(recent),
             "freezes": self._freezes.status(),
             "objects": [held.status() for held in self._objects],
-            **({} if self._proximity is None else {"proximity": self._proximity.status(self._now_ns)}),
+            **({} if self._proximity is None else {"proximity": self._proximity.status(self._node.now_ns())}),
         }
 
     def _facts(self) -> dict[str, Any]:
@@ -356,7 +344,7 @@ class _Overlay:
     @property
     def _warnings(self) -> dict[str, str]:
         """Return what the node warned of last."""
-        status = None if self._subscriber is None else self._subscriber.latest("status")
+        status = self._node.latest("status")
         return status.warnings() if isinstance(status, ReceivedText) else {}
 
     def _note(self) -> str:
@@ -365,3 +353,27 @@ class _Overlay:
             return ""
         p50, p99 = np.percentile(recent, (50, 99))
         return f"{recent[-1]:.0f} ms (p50 {p50:.0f}, p99 {p99:.0f})"
+
+
+class Durations:
+    """The newest half hour of one duration, milliseconds, in memory that never grows."""
+
+    def __init__(self) -> None:
+        self._ms = np.full(REMEMBERED, np.nan, np.float32)  # written once, so that its pages are there
+        self._count = 0
+
+    def add(self, ms: float) -> None:
+        """Remember it in the place of the oldest."""
+        self._ms[self._count % REMEMBERED] = ms
+        self._count += 1
+
+    def last(self, count: int = REMEMBERED) -> F32:
+        """The newest `count` [N <= count], the newest last."""
+        known = min(count, self._count, REMEMBERED)
+        return self._ms[np.arange(self._count - known, self._count) % REMEMBERED]
+
+    def percentiles(self, count: int = REMEMBERED) -> dict[str, float | None]:
+        """p50, p90 and p99 of the newest `count`; None before there is one."""
+        values = self.last(count)
+        known = len(values) > 0
+        return {f"p{q}": round(float(np.percentile(values, q)), 2) if known else None for q in (50, 90, 99)}

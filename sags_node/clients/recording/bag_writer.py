@@ -6,10 +6,11 @@ recovered up to there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import yaml
 from mcap.records import Schema
@@ -17,12 +18,12 @@ from mcap.writer import CompressionType, Writer
 
 from sags_node import __version__
 from sags_node.bags.bag import METADATA
-from sags_node.clients.recording.bag_metadata import Part, Topic, describe, quality
 from sags_node.errors import UsageError
 from sags_node.files import writing
 
 CHUNK_BYTES = 1 << 20  # what is lost at most when the process is killed between two flushes
 MESSAGE_HEAD_BYTES = 31  # of an MCAP message record
+_NEVER = {"sec": 9223372036, "nsec": 854775807}
 
 T = TypeVar("T")
 
@@ -43,6 +44,28 @@ class Limits:
 NO_LIMITS = Limits()
 
 
+@dataclass(frozen=True, slots=True)
+class _Topic:
+    name: str
+    type: str  # ROS 2 name
+    type_hash: str
+    latched: bool  # late subscribers get the last message too
+
+
+@dataclass(slots=True)
+class _Part:
+    """What one file of a bag holds."""
+
+    file: str  # name
+    counts: Counter[int] = field(default_factory=Counter)  # messages of each topic, by its number
+    first_ns: int = 2**63 - 1
+    last_ns: int = 0
+
+    def add(self, topic: int, log_ns: int) -> None:
+        self.counts[topic] += 1
+        self.first_ns, self.last_ns = min(self.first_ns, log_ns), max(self.last_ns, log_ns)
+
+
 class BagWriter:
     """A bag that is being written: `<folder>_0.mcap` and so on, each of which can be read alone.
 
@@ -55,11 +78,11 @@ class BagWriter:
         self.folder = folder
         self.bytes = 0  # of messages
         self._limits = limits
-        self._topics: dict[int, Topic] = {}  # by channel, the same number in every file
+        self._topics: dict[int, _Topic] = {}  # by channel, the same number in every file
         self._beginning: list[Callable[[Writer], object]] = []  # what every file has to say first
         self._notes: dict[str, dict[str, str]] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._parts: list[Part] = []
+        self._parts: list[_Part] = []
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"{folder} exists already; name a new folder")
         self._is_new = not folder.exists()
@@ -88,7 +111,7 @@ class BagWriter:
         if key not in self._schemas:
             self._schemas[key] = self._say_first(lambda writer: writer.register_schema(*key))
         metadata = {
-            "offered_qos_profiles": yaml.safe_dump(quality(latched), sort_keys=False),
+            "offered_qos_profiles": yaml.safe_dump(_quality(latched), sort_keys=False),
             "topic_type_hash": type_hash,
             **(marks or {}),
         }
@@ -96,7 +119,7 @@ class BagWriter:
         channel: int = self._say_first(
             lambda writer: writer.register_channel(name, "cdr", schema_id, metadata)
         )
-        self._topics[channel] = Topic(name, kind, type_hash, latched)
+        self._topics[channel] = _Topic(name, kind, type_hash, latched)
         return channel
 
     def write(
@@ -141,7 +164,7 @@ class BagWriter:
         """
         self._end_file()
         text = yaml.safe_dump(
-            {"rosbag2_bagfile_information": describe(self._parts, self._topics)}, sort_keys=False
+            {"rosbag2_bagfile_information": _described(self._parts, self._topics)}, sort_keys=False
         )
         metadata = self.folder / METADATA
         try:
@@ -175,7 +198,7 @@ class BagWriter:
         return too_large or too_long
 
     def _begin_file(self) -> None:
-        self._parts.append(Part(f"{self.folder.resolve().name}_{len(self._parts)}.mcap"))
+        self._parts.append(_Part(f"{self.folder.resolve().name}_{len(self._parts)}.mcap"))
         self._file = (self.folder / self._parts[-1].file).open("xb")
         self._file_bytes = 0
         # Chunks are small and not compressed: pictures hardly shrink, and time is short.
@@ -187,7 +210,7 @@ class BagWriter:
             self._writer.add_metadata(name, values)
 
     def _end_file(self) -> None:
-        description = describe(self._parts[-1:], self._topics)
+        description = _described(self._parts[-1:], self._topics)
         serialized = yaml.safe_dump(description, sort_keys=False)
         self._writer.add_metadata("rosbag2", {"serialized_metadata": serialized})
         self._writer.finish()
@@ -201,3 +224,64 @@ class BagWriter:
             self.close()
         else:
             self._file.close()  # what has been written stays, for `recover`
+
+
+def _described(parts: Sequence[_Part], topics: Mapping[int, _Topic]) -> dict[str, Any]:
+    """The content of `rosbag2_bagfile_information` in `metadata.yaml` (version 9), see `rosbag2_storage`.
+
+    Args:
+        topics: by number.
+    """
+    counts = sum((part.counts for part in parts), Counter[int]())
+    return {
+        "version": 9,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [part.file for part in parts],
+        **_span(parts),
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic.name,
+                    "type": topic.type,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": _quality(topic.latched),
+                    "type_description_hash": topic.type_hash,
+                },
+                "message_count": counts[number],
+            }
+            for number, topic in topics.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "files": [{"path": part.file, **_span([part])} for part in parts],
+        "custom_data": None,
+        "ros_distro": "jazzy",
+    }
+
+
+def _span(parts: Sequence[_Part]) -> dict[str, Any]:
+    messages = sum(part.counts.total() for part in parts)
+    first, last = min(part.first_ns for part in parts), max(part.last_ns for part in parts)
+    return {
+        "starting_time": {"nanoseconds_since_epoch": first if messages else 0},
+        "duration": {"nanoseconds": max(0, last - first)},
+        "message_count": messages,
+    }
+
+
+def _quality(latched: bool) -> list[dict[str, Any]]:
+    """The quality of service of a publisher, as rosbag2 writes it down; a new object each time: YAML would
+    else write references."""
+    return [
+        {
+            "history": "keep_last",
+            "depth": 1 if latched else 5,
+            "reliability": "reliable" if latched else "best_effort",
+            "durability": "transient_local" if latched else "volatile",
+            "deadline": dict(_NEVER),
+            "lifespan": dict(_NEVER),
+            "liveliness": "automatic",
+            "liveliness_lease_duration": dict(_NEVER),
+            "avoid_ros_namespace_conventions": False,
+        }
+    ]

@@ -13,7 +13,6 @@ from sags_node.bags.bag import read_messages, storage_files
 
 @dataclass(slots=True)
 class _Seen:
-    type: str
     bytes: int = 0
     times_ns: list[int] = field(default_factory=list)
     sequences: list[int] = field(default_factory=list)
@@ -31,12 +30,12 @@ def bag_info(path: Path) -> dict[str, Any]:
     """
     seen: dict[tuple[str, str], _Seen] = {}
     for message in read_messages(path):
-        topic = seen.setdefault((message.topic, message.type), _Seen(message.type))
+        topic = seen.setdefault((message.topic, message.type), _Seen())
         topic.bytes += len(message.data)
         topic.times_ns.append(message.log_ns)
         topic.sequences.append(message.sequence)
     times = [time for topic in seen.values() for time in (min(topic.times_ns), max(topic.times_ns))]
-    rows = [_row(name, topic) for (name, _), topic in sorted(seen.items())]
+    rows = [_row(name, kind, topic) for (name, kind), topic in sorted(seen.items())]
     files = storage_files(path)[0]
     return {
         "path": str(path),
@@ -49,12 +48,12 @@ def bag_info(path: Path) -> dict[str, Any]:
     }
 
 
-def _row(name: str, topic: _Seen) -> dict[str, Any]:
+def _row(name: str, kind: str, topic: _Seen) -> dict[str, Any]:
     steps = np.diff(np.sort(np.array(topic.times_ns, np.int64))) * 1e-9
     span = float(steps.sum())
     return {
         "topic": name,
-        "type": topic.type,
+        "type": kind,
         "messages": len(topic.times_ns),
         "bytes": topic.bytes,
         "rate_hz": round(len(steps) / span, 2) if span > 0 else None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from hashlib import sha256
@@ -72,7 +72,7 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
         with bag:
             writer = _Writer(bag, done)
             for file in files:
-                _recover_file(file, writer, done)
+                _recover_file(file, writer)
             if done.messages == 0:
                 raise SagsError(f"{path} holds no whole message; nothing can be saved")
     except OSError as error:
@@ -104,7 +104,7 @@ class _Writer:
 
     def __init__(self, bag: BagWriter, done: Recovery) -> None:
         self._bag = bag
-        self._done = done
+        self.done = done
         self._known: dict[tuple[object, ...], int] = {}  # topic, type, schema, marks: channel
         self._attached: set[tuple[str, bytes]] = set()  # name and digest: each file of a bag has them all
 
@@ -122,7 +122,7 @@ class _Writer:
                 marks,
             )
         self._bag.write(self._known[key], entry.log_ns, entry.publish_ns, entry.sequence, entry.data)
-        self._done.messages += 1
+        self.done.messages += 1
 
     def attach(self, content: bytes) -> None:
         """Copy an attachment whose checksum is right, once."""
@@ -141,8 +141,8 @@ class _Writer:
             self._bag.note(RECORDED, metadata.metadata)
 
 
-def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
-    size = path.stat().st_size
+def _recover_file(path: Path, writer: _Writer) -> None:
+    size, done = path.stat().st_size, writer.done
     if size == 0:
         done.unclosed_files += 1
         return
@@ -158,7 +158,7 @@ def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
                     if head.opcode == Opcode.DATA_END:
                         in_data = False
                     if in_data:
-                        _copy(file, head, channels, writer, done)
+                        _copy(file, head, channels, writer)
                 return
             except DamagedError as error:
                 if not in_data:  # all messages lie before: only the index is damaged
@@ -167,13 +167,13 @@ def _recover_file(path: Path, writer: _Writer, done: Recovery) -> None:
             following = _next_chunk(mapped, position + 1)
             if following is None:
                 done.unclosed_files += 1
-                _copy_cut_off(mapped, position, channels, writer, done)
+                _copy_cut_off(mapped, position, channels, writer)
                 return
             done.bytes_skipped += following - position
             position = following
 
 
-def _copy(file: BinaryIO, head: Head, channels: Channels, writer: _Writer, done: Recovery) -> None:
+def _copy(file: BinaryIO, head: Head, channels: Channels, writer: _Writer) -> None:
     """One record of the old file; what is damaged inside it is counted and left out."""
     if head.opcode in (Opcode.ATTACHMENT, Opcode.METADATA):
         say = writer.attach if head.opcode == Opcode.ATTACHMENT else writer.note
@@ -182,15 +182,13 @@ def _copy(file: BinaryIO, head: Head, channels: Channels, writer: _Writer, done:
     try:
         records = list(records_of(file, head))
     except DamagedError:
-        done.chunks_damaged += 1
+        writer.done.chunks_damaged += 1
         return
-    done.chunks += head.opcode == Opcode.CHUNK
-    _copy_records(iter(records), head.position, channels, writer, done)
+    writer.done.chunks += head.opcode == Opcode.CHUNK
+    _copy_records(records, head.position, channels, writer)
 
 
-def _copy_records(
-    records: Iterator[Any], position: int, channels: Channels, writer: _Writer, done: Recovery
-) -> None:
+def _copy_records(records: Iterable[Any], position: int, channels: Channels, writer: _Writer) -> None:
     for record in records:
         if not isinstance(record, Entry):
             channels.add(record)
@@ -198,7 +196,7 @@ def _copy_records(
         try:
             channel, schema = channels.of(record, position)
         except DamagedError:
-            done.messages_lost += 1
+            writer.done.messages_lost += 1
             continue
         writer.write(record, channel, schema)
 
@@ -218,17 +216,15 @@ def _next_chunk(mapped: mmap.mmap, position: int) -> int | None:
     return None
 
 
-def _copy_cut_off(
-    mapped: mmap.mmap, position: int, channels: Channels, writer: _Writer, done: Recovery
-) -> None:
+def _copy_cut_off(mapped: mmap.mmap, position: int, channels: Channels, writer: _Writer) -> None:
     """The messages at the beginning of a chunk that the end of the file cuts off."""
     if mapped[position : position + 1] != bytes([Opcode.CHUNK]):
-        done.bytes_skipped += len(mapped) - position
+        writer.done.bytes_skipped += len(mapped) - position
         return
     content = mapped[position + HEAD.size : position + HEAD.size + MAX_RECORD_BYTES]
-    done.chunks_damaged += 1
+    writer.done.chunks_damaged += 1
     try:
         data = mcap_file.unpack_chunk(content, position, whole=False)
-        _copy_records(mcap_file.inner_records(data, position), position, channels, writer, done)
+        _copy_records(mcap_file.inner_records(data, position), position, channels, writer)
     except DamagedError:
         return  # here the file ends

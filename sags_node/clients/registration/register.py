@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
 
-from sags_node.clients.registration.certainty import nine_of_ten, of_pairs, picking_error
-from sags_node.clients.registration.misread import UNITS, farthest, misread
-from sags_node.clients.registration.rigid import kabsch, on_a_line
+from sags_node.clients.registration.rigid import kabsch, nine_of_ten, of_pairs, on_a_line, picking_error
 from sags_node.clients.registration.surface_fit import fit_surface
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.geometry import Array, invert, transform
@@ -35,6 +34,20 @@ MIRRORED = (
 )
 ASIDE = "a point `at` lies {:.3g} mm from the model: are these points of this file, in its unit and its axes?"
 UNSEEN = "no surface was measured where the pairs put the model: check them, and that it is in sight"
+UNITS = {1000: "mm for m", 100: "cm for m", 10: "mm for cm", 25.4: "mm for inch"}
+ON = 0.003  # m: so near to a surface a point is picked on it
+# Times nearer than they were, and than they lie apart: neither chance nor a scale that draws all of them
+# together brings them there.
+CLEARLY, APART = 3.0, 10.0
+LPS = "-x, -y, z"
+
+_TURNED = {
+    ", ".join(("-" if sign < 0 else "") + axis for sign, axis in zip(signs, "xyz", strict=True)): signs
+    for signs in product((1.0, -1.0), repeat=3)
+}
+_SCALED = {
+    f"x, y, z times {times:.3g}": (times, times, times) for unit in UNITS for times in (unit, 1 / unit)
+}
 Verdict = Literal["good", "doubtful", "refused"]
 
 
@@ -167,3 +180,31 @@ def _rms(lengths: F64) -> float:
 
 def _in_mm(metres: float) -> float:
     return round(1e3 * float(metres), 2)
+
+
+# ---- points of a model that were written in other axes or another unit than its file ----------------------
+
+
+def farthest(model: Shape, at: F64) -> float:
+    """How far the farthest of points [k, 3] (m) lies from a model's surface, m."""
+    return float(np.linalg.norm(model.nearest(at)[0] - at, axis=1).max())
+
+
+def misread(model: Shape, at: F64) -> str | None:
+    """Say how points [k, 3] (m) that lie aside of a model's surface would all lie on it; None: they do lie on
+    it, or they may be meant so, as those inside of a model or on an organ around it."""
+    off = farthest(model, at)
+    if off <= ON:
+        return None
+    others = {said: at * factors for said, factors in (_TURNED | _SCALED).items()}
+    left = {
+        said: near
+        for said, points in others.items()
+        if (near := farthest(model, points)) <= min(ON, off / CLEARLY, np.ptp(points, axis=0).max() / APART)
+    }
+    if not left:
+        return None
+    said = min(left, key=lambda each: left[each])
+    usual = " (one is RAS, the other LPS)" if said == LPS else ""
+    far = f"`at` lies up to {1e3 * off:.3g} mm from the file's surface"
+    return f"{far}, but on it as {said}{usual}: write each so"

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sags_node.clients.registration.certainty import motion_rows, of_pairs
+from sags_node.clients.registration.rigid import motion_rows, of_pairs
 from sags_node.clients.registration.surfaces import Shape, Surface
 from sags_node.geometry import invert, rigid, transform
 from sags_node.types import F64, I64

@@ -35,24 +35,6 @@ OLD = "what you see is old: Go on first"
 BRIGHT, BLUE, ORANGE = "#c9d1d9", "#4dabf7", "#ffa94d"
 
 
-class Asker:
-    """Asks the node on behalf of a browser and tells it the answer."""
-
-    def __init__(self, node: NodeAddress) -> None:
-        self._node = node
-
-    def ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> Any:
-        """One request of its own: callbacks come from several threads. None: it was refused."""
-        try:
-            with ControlClient.at(self._node) as control:
-                answer = control.request(op, args, ANSWER_TIME)
-        except SagsError as error:
-            tell(client, f"{title}: refused", str(error), "red")
-            return None
-        tell(client, title, _in_words(answer), "green")
-        return answer
-
-
 def tell(client: viser.ClientHandle | None, title: str, text: str, color: Any) -> None:
     """A notice in the browser that asked."""
     if client is not None:
@@ -67,14 +49,14 @@ class Panel:
     """
 
     def __init__(
-        self, server: viser.ViserServer, scene: Scene, asker: Asker, exporter: Exporter, ns: str, rate: float
+        self, server: viser.ViserServer, scene: Scene, node: NodeAddress, exporter: Exporter, rate: float
     ) -> None:
-        self._gui, self._scene, self._asker, self._exporter = server.gui, scene, asker, exporter
+        self._gui, self._scene, self._node, self._exporter = server.gui, scene, node, exporter
         self._sheet, self._history = Sheet(), History()
         self._moment, self._unit, self._session = Moment("connecting"), "mm", ""
         self._frozen_since: float | None = None
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(f"sags view · {ns}")
+        server.gui.set_panel_label(f"sags view · {node.ns}")
         server.gui.main_panel.dock_right()
         self._status = server.gui.add_html(status_line(self._moment))
         self._build_keeping()
@@ -204,7 +186,7 @@ class Panel:
         self, label: str, icon: viser.IconName, op: str, args: Callable[[], Mapping[str, Any]] = dict
     ) -> None:
         """A button for one operation of the node."""
-        self._button(label, icon, lambda client: self._asker.ask(client, label, op, args()))
+        self._button(label, icon, lambda client: self._ask(client, label, op, args()))
 
     def _build_pictures(self) -> None:
         panel = self._gui.add_panel()
@@ -254,6 +236,17 @@ class Panel:
 
     # ---- what is asked for ---------------------------------------------------------------------------
 
+    def _ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> Any:
+        """One request of its own: callbacks come from several threads. None: it was refused."""
+        try:
+            with ControlClient.at(self._node) as control:
+                answer = control.request(op, args, ANSWER_TIME)
+        except SagsError as error:
+            tell(client, f"{title}: refused", str(error), "red")
+            return None
+        tell(client, title, _in_words(answer), "green")
+        return answer
+
     def _freeze_or_go_on(self) -> None:
         if self.frozen:
             self.go_on()
@@ -283,7 +276,7 @@ class Panel:
             why = "choose an anchor first" if anchor is None else OLD
             tell(client, "Remove", why, "orange")
             return
-        self._asker.ask(client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
+        self._ask(client, f"Remove anchor {anchor}", "remove_anchor", {"id": anchor})
 
     def _clicked(self, event: viser.SceneClickEvent) -> None:
         """A click on an anchor chooses it; one on the tissue pins a new one."""
@@ -305,7 +298,7 @@ class Panel:
             tell(client, "Pin", "no tissue there", "orange")
             return
         place = {axis: float(x) for axis, x in zip("xyz", point, strict=True)}
-        answer = self._asker.ask(client, "Pin", "add_anchor", place)
+        answer = self._ask(client, "Pin", "add_anchor", place)
         if answer is not None:
             self.choose(int(answer["id"]))
 

@@ -11,7 +11,7 @@ from contextlib import redirect_stdout, suppress
 import viser
 
 from sags_node.clients.viewer.feed import Feed, Moment
-from sags_node.clients.viewer.panel import Asker, Panel
+from sags_node.clients.viewer.panel import Panel
 from sags_node.clients.viewer.pictures import needs_of, overlaid_in
 from sags_node.clients.viewer.saving import Exporter
 from sags_node.clients.viewer.scene import Scene
@@ -51,7 +51,7 @@ def run_viewer(
     try:
         with serving(host, port, insecure) as (server, url):
             scene = Scene(server)
-            panel = Panel(server, scene, Asker(node), export, node.ns, RATE)
+            panel = Panel(server, scene, node, export, RATE)
             server.on_client_connect(scene.look)
             server.on_client_connect(panel.fit)
             ready(url, server.get_port())
