@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 from places import ROOT
-from rounding import after
 from synthetic import health
 from watching import judged
 
@@ -21,9 +20,7 @@ from sags_node.messaging.content import diagnostics
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
 from sags_node.types import U8, StereoFrame
-from sags_node.vision.pyramid import gray_pyramid, inner
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.watch.clarity import LOCAL, small_level, structure
 from sags_node.vision.watch.judgement import Judgement
 from sags_node.vision.watch.pair_watch import PairWatch, is_blocky, row_correlation
 from sags_node.vision.watch.picture_fit import Fit, middle_of
@@ -337,14 +334,6 @@ def test_rows_correlate_where_they_lie(shift: int) -> None:
     match = row_correlation(left, right)
     assert len(match) == 81 and np.argmax(match) == 40 + shift
     assert match.max() == pytest.approx(1, abs=1e-5)
-
-
-def test_structure_is_what_a_small_picture_has_beside_the_mean_around() -> None:
-    noise = np.random.default_rng(5).integers(0, 256, (512, 640), np.uint8)
-    pyramid = gray_pyramid(cv2.GaussianBlur(noise, (0, 0), 5))
-    small = inner(small_level(pyramid))
-    around = cv2.blur(small, (LOCAL, LOCAL), borderType=cv2.BORDER_REPLICATE)
-    np.testing.assert_allclose(structure(pyramid), small - around, atol=255 * after(LOCAL**2))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
