@@ -79,9 +79,11 @@ class InstrumentFinder:
                 self._held, self._stamp_ns = np.zeros(red.shape, np.float32), stamp_ns
             # Not averaged: the model's picture has no noise, and reading all of it takes long.
             sampled = cv2.resize(expected.colours.small, size, interpolation=cv2.INTER_NEAREST)
-            drawn = cv2.split(_mean(sampled * np.float32(1 / 255), WINDOW))
-            alpha = _shrunk(expected.alpha, size)
-            doubtful = _doubtful(red, green, blue, *drawn, alpha, is_open, self._found, self._trusted)
+            drawn_red, drawn_green, drawn_blue = cv2.split(_mean(sampled * np.float32(1 / 255), WINDOW))
+            doubtful = _doubtful(
+                red, green, blue, drawn_red, drawn_green, drawn_blue, _shrunk(expected.alpha, size),
+                is_open, self._found, self._trusted,
+            )  # fmt: skip
             found = _regions(evidence + _mean(doubtful, WINDOW))
             step = min(max((stamp_ns - self._stamp_ns) * 1e-9, 0.0), LONGEST_STEP)
             _count_doubt(found, evidence, step, self._held, self._trusted)

@@ -218,8 +218,8 @@ def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowErr
     halvings = 1 if left.shape[1] >= FULL_SIZE_BELOW else 0
     disparities = smallest / 2**halvings, largest / 2**halvings
     found = match_patches(gray_pyramid(left), gray_pyramid(right), disparities, halvings)
-    turned = (gray_pyramid(np.ascontiguousarray(eye[:, ::-1])) for eye in (right, left))
-    mirrored = match_patches(*turned, disparities, halvings)
+    there, back = (gray_pyramid(np.ascontiguousarray(eye[:, ::-1])) for eye in (right, left))
+    mirrored = match_patches(there, back, disparities, halvings)
     known = found.good & _found_back(found, mirrored)
     if np.mean(known) < FEWEST_KNOWN:
         return None

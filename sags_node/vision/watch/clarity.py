@@ -80,7 +80,7 @@ class Clarity:
 def structure(pyramid: GrayPyramid) -> F32:
     """Return what is no shading, in a small picture [h, w]."""
     small = _small_level(pyramid)
-    return inner(small - cv2.blur(small, (LOCAL, LOCAL)))
+    return np.ascontiguousarray(inner(small - cv2.blur(small, (LOCAL, LOCAL))))
 
 
 def mean_difference(a: F32, b: F32) -> float:
@@ -99,7 +99,8 @@ def _usual(octaves: float) -> float:
 
 def _contrast(pyramid: GrayPyramid, structure: F32) -> float:
     """Octaves of local contrast over brightness."""
-    energy, brightness = float(np.square(structure).mean()), float(inner(_small_level(pyramid)).mean())
+    energy = float(np.vdot(structure, structure)) / structure.size
+    brightness = cv2.mean(inner(_small_level(pyramid)))[0]
     return 0.5 * math.log2((energy + 1e-3) / (brightness**2 + 1e-3))
 
 

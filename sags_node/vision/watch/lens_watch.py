@@ -139,10 +139,11 @@ def _octaves_apart(detail: F32, depth: F32, focal_baseline: float) -> F32:
     known = depth > 0
     inverse = np.divide(1, depth, out=np.zeros_like(depth), where=known)
     inverse[~known] = np.median(inverse[known]) if known.any() else 0
-    columns = np.arange(depth.shape[1])
+    row, columns = np.arange(len(depth))[:, None], np.arange(depth.shape[1])
     places = columns.astype(np.float32) - np.float32(focal_baseline) * inverse
-    before = places.clip(0).astype(np.intp)
-    near, far = (np.take_along_axis(detail[1], at.clip(0, columns[-1]), 1) for at in (before, before + 1))
-    other = near + (places.clip(0) - before.astype(np.float32)) * (far - near)
+    there = np.maximum(places, 0)
+    before = there.astype(np.intp)
+    near, far = detail[1, row, before], detail[1, row, np.minimum(before + 1, columns[-1])]
+    other = near + (there - before.astype(np.float32)) * (far - near)
     noise = np.float32(NOISE)
     return np.where(places >= 0, np.log2((detail[0] + noise) / (other + noise)), np.float32(0))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from sags_node.kernels.jit import kernel
-from sags_node.types import F32, U8, Finding, RectifiedPair, StereoFrame
+from sags_node.types import F32, I64, U8, Finding, RectifiedPair, StereoFrame
 from sags_node.vision.pyramid import pyramids
 from sags_node.vision.watch.clarity import LENS, SMOKE, Clarity, mean_difference, structure
 from sags_node.vision.watch.judgement import Evidence, Judgement
@@ -147,20 +147,39 @@ def _small(image: U8) -> Small:
 def _emptiness(rgb: U8) -> str:
     """Black, white or plain, of one colour, in the middle, where every scope shows something; else empty."""
     height, width = rgb.shape[:2]
-    middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4].reshape(-1, 3)
-    outliers = round(OUTLIERS * len(middle))
-    ends = outliers, -1 - outliers
-    dark, bright = np.partition(middle, ends, axis=0)[[*ends]].astype(np.int64)
-    if bright.max() < BLACK:
+    middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    dark, bright = _ends(middle, round(OUTLIERS * middle.shape[0] * middle.shape[1])).tolist()
+    if max(bright) < BLACK:
         return "black"
-    if dark.min() > WHITE:
+    if min(dark) > WHITE:
         return "white"
-    return "plain" if (bright - dark).max() < ONE_COLOR else ""
+    return "plain" if max(b - a for a, b in zip(dark, bright, strict=True)) < ONE_COLOR else ""
+
+
+@kernel
+def _ends(rgb: U8, outliers: int) -> I64:
+    """The darkest and the brightest of each channel, [2, 3], but for so many pixels at either end."""
+    counts, ends = np.zeros((3, 256), np.int64), np.empty((2, 3), np.int64)
+    for y in range(rgb.shape[0]):
+        for x in range(rgb.shape[1]):
+            for k in range(3):
+                counts[k, rgb[y, x, k]] += 1
+    for k in range(3):
+        dark, bright = 0, 255
+        left = right = outliers
+        while left >= counts[k, dark]:
+            left -= counts[k, dark]
+            dark += 1
+        while right >= counts[k, bright]:
+            right -= counts[k, bright]
+            bright -= 1
+        ends[0, k], ends[1, k] = dark, bright
+    return ends
 
 
 def _are_equal(left: F32, right: F32) -> bool:
     """Two captures of one picture differ by noise and brightness, far less than by a small shift."""
-    apart = mean_difference(left, right * (left.mean() / right.mean()))
+    apart = mean_difference(left, right * np.float32(cv2.mean(left)[0] / cv2.mean(right)[0]))
     return apart < EQUAL * mean_difference(left[:, 1:], left[:, :-1])
 
 

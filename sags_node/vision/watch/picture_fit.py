@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import cv2
@@ -46,13 +45,11 @@ class Fit:
             wrong, misfit = _misfit(seen, drawn, known, fair, unchanged)
             if misfit < self.misfit:
                 self.gain, self.wrong, self.misfit = unchanged, wrong, misfit
-        can, model = fair[..., GREEN], np.ascontiguousarray(drawn[..., GREEN])
-        # Where they cannot be compared both are the model: no edges.
-        picture = np.where(can, seen[..., GREEN] / self.gain[GREEN], model)
-        a, b = structure(picture)[can], structure(model)[can]
-        energy_a, energy_b, product = float(a @ a), float(b @ b), float(a @ b)
-        self.contrast = math.sqrt(energy_a / max(energy_b, 1e-9))
-        self.match = product / max(math.sqrt(energy_a * energy_b), 1e-9)
+        picture, model = np.empty((2, *known.shape), np.float32)
+        _take_green(seen, drawn, fair, self.gain[GREEN], picture, model)
+        energy_a, energy_b, product = _energies(structure(picture), structure(model), fair)
+        self.contrast = float(np.sqrt(energy_a / max(energy_b, 1e-9)))
+        self.match = product / max(float(np.sqrt(energy_a * energy_b)), 1e-9)
 
 
 def structure(gray: F32) -> F32:
@@ -131,3 +128,25 @@ def _judge(difference: F32, known: Bool, fair: Bool, wrong: Bool) -> Any:
                 count += 1
                 misfit += wrong[y, x]
     return count, misfit
+
+
+@kernel
+def _take_green(seen: F32, drawn: F32, fair: Bool, gain: Any, picture: F32, model: F32) -> None:
+    """One channel of both, less the gain. Where they cannot be compared both are the model: no edges."""
+    for y in range(model.shape[0]):
+        for x in range(model.shape[1]):
+            model[y, x] = drawn[y, x, GREEN]
+            picture[y, x] = seen[y, x, GREEN] / gain if fair[y, x, GREEN] else model[y, x]
+
+
+@kernel
+def _energies(a: F32, b: F32, fair: Bool) -> Any:
+    """Sums of a a, b b and a b over what can be compared."""
+    aa, bb, ab = 0.0, 0.0, 0.0
+    for y in range(a.shape[0]):
+        for x in range(a.shape[1]):
+            if fair[y, x, GREEN]:
+                aa += a[y, x] * a[y, x]
+                bb += b[y, x] * b[y, x]
+                ab += a[y, x] * b[y, x]
+    return aa, bb, ab

@@ -9,11 +9,12 @@ Another scene changes most of it, and no motion explains it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from sags_node.kernels.jit import kernel
 from sags_node.types import F32, U8, Bool, Finding, FrameResult, GrayPyramid, RectifiedPair
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.landmarks import Landmarks, find_again, motion
@@ -102,7 +103,8 @@ class SceneWatch(Debounced):
         step = max(1, pair.camera.width // WIDTH)
         if self._tissue is None or self._is_clear:
             self._tissue = np.ascontiguousarray(last.observation.tissue[::step, ::step])
-        picture = np.ascontiguousarray(pair.left[::step, ::step])
+        picture = np.empty((*self._tissue.shape, 3), np.uint8)
+        _every(step, pair.left, picture)
         seen = look(pair, last, picture, self._tissue)
         if seen.wrong is _UNKNOWN and self._moving:
             self._is_clear = False
@@ -169,6 +171,15 @@ class SceneWatch(Debounced):
         before, self._looked_ns = self._looked_ns, now
         unseen = 0 if before is None else now - before - watched_ns(before, now)
         self._since = {what: since + unseen for what, since in self._since.items()}
+
+
+@kernel
+def _every(step: int, picture: Any, small: Any) -> None:
+    """Every `step` th pixel of every `step` th row."""
+    for y in range(small.shape[0]):
+        for x in range(small.shape[1]):
+            for k in range(3):
+                small[y, x, k] = picture[y * step, x * step, k]
 
 
 def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
