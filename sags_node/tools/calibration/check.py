@@ -223,8 +223,7 @@ def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowErr
     known = found.good & _found_back(found, mirrored)
     if np.mean(known) < FEWEST_KNOWN:
         return None
-    errors = np.abs(found.field[..., 1][known]) * 2**halvings
-    median, p90 = np.percentile(errors, [50, 90])
+    median, p90 = np.percentile(np.abs(found.field[..., 1][known]) * 2**halvings, [50, 90])
     return RowError(float(median), float(p90), float(np.mean(known)))
 
 
