@@ -12,9 +12,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.instruments.agreement import agreements
 from sags_node.instruments.outlines import Outline
-from sags_node.kernels.jit import read_only
+from sags_node.kernels.jit import kernel, read_only
 from sags_node.types import F32, F64, I64, U8, Bool
 
 PATCHES = 12
@@ -32,6 +31,8 @@ CORE = 0.15  # of the width, around the midline, that is instrument where it is 
 AGREES = 0.6  # zero-mean normalised cross-correlation (ZNCC) from which on a patch counts
 LEAST_SPREAD = 0.25  # px, of the patches around their line: fewer would be chance
 BIAS = 0.3  # px, of each end: what lies behind an edge, and a mirror, moves a patch
+FLAT = 1.0  # grey levels^4, of patches in which nothing is seen
+HALF_SEEN = 127  # of a mask
 
 
 class Disparities(NamedTuple):
@@ -104,6 +105,55 @@ def _scores(seen: Eyes, centre: F64, radius: int, tried: F64, every: int) -> F32
     return agreements(
         seen.left, seen.right, seen.counts, u, v, seen.row_error, int(radius), int(every), tried
     )
+
+
+@kernel
+def _taken(picture: U8, u: float, v: float, radius: int, every: int, patch: F64) -> None:
+    """Fill a patch [n, n] around a place, bilinear; beyond the picture its edge goes on."""
+    height, width = picture.shape
+    column, row = int(np.floor(u)), int(np.floor(v))
+    fx, fy = u - column, v - row
+    for i in range(len(patch)):
+        y = row - radius + i * every
+        above, below = min(max(y, 0), height - 1), min(max(y + 1, 0), height - 1)
+        for j in range(len(patch)):
+            x = column - radius + j * every
+            before, after = min(max(x, 0), width - 1), min(max(x + 1, 0), width - 1)
+            upper = (1 - fx) * picture[above, before] + fx * picture[above, after]
+            lower = (1 - fx) * picture[below, before] + fx * picture[below, after]
+            patch[i, j] = (1 - fy) * upper + fy * lower
+
+
+@kernel
+def agreements(
+    left: U8, right: U8, counts: U8, u: float, v: float, row_error: float, radius: int, every: int, tried: F64
+) -> F32:
+    """Zero-mean normalised cross-correlation (ZNCC) [D] with the patches at disparities [D] that are tried;
+    -1: beyond the right picture.
+
+    Args:
+        left, right: gray pictures [H, W].
+        counts: [H, W] 255: what is compared of the left patch.
+        u, v: its middle, px; row_error: by so much the right picture is too low.
+        radius, every: every so many rows and columns of so many px around the middle are compared.
+    """
+    side = 2 * radius // every + 1
+    patch, there, share = np.empty((side, side)), np.empty((side, side)), np.empty((side, side))
+    _taken(counts, u, v, radius, every, share)
+    share = np.where(share > HALF_SEEN, 1.0, 0.0)
+    share /= max(1.0, share.sum())
+    _taken(left, u, v, radius, every, patch)
+    patch -= (patch * share).sum()
+    own = (patch * patch * share).sum()
+    found = np.full(len(tried), -1, np.float32)
+    for i in range(len(tried)):
+        at = u - tried[i]
+        if at - radius >= 0 and at - radius + (side - 1) * every <= right.shape[1] - 1:
+            _taken(right, at, v + row_error, radius, every, there)
+            there -= (there * share).sum()
+            other = (there * there * share).sum()
+            found[i] = (patch * there * share).sum() / np.sqrt(max(own * other, FLAT))
+    return found
 
 
 def _best_line(scores: F32, places: F64) -> I64:

@@ -32,8 +32,7 @@ from sags_node.types import (
     RenderedView,
     Snapshot,
 )
-from sags_node.vision.features import RATIO
-from sags_node.vision.landmarks import features_of
+from sags_node.vision.landmarks import RATIO, features_of
 from sags_node.vision.pyramid import pyramid_of
 
 MAX_ANCHORS = 256

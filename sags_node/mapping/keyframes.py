@@ -11,7 +11,7 @@ import numpy as np
 from sags_node.geometry import invert, project, rigid, unproject
 from sags_node.mapping.pose_agreement import Agreement, Small, agreement, shrunk, small_frame
 from sags_node.types import F32, F64, U8, Bool, Camera, Observation, RenderedView
-from sags_node.vision.features import Features, features_in, matched
+from sags_node.vision.landmarks import Features, features_in, matched
 
 MOST = 8
 PERIOD_NS = 500_000_000  # between keyframes

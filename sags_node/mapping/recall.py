@@ -1,7 +1,7 @@
 """Where anchors are that were out of sight for long: what surrounded them is recognised.
 
 Pictures are remembered in which anchors were seen, in several states of the tissue. In a later picture their
-features (ORB, `vision.features`) are looked for again. Around an anchor they tell how the tissue was moved,
+features (ORB, `vision.landmarks`) are looked for again. Around an anchor they tell how the tissue was moved,
 turned and scaled; the anchor's own patch must then fit, and the scale must agree with the change of depth.
 """
 
@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 
 from sags_node.types import F32, F64, I64, U8, Bool
-from sags_node.vision.features import Features, matched
-from sags_node.vision.landmarks import APART, FEWEST, agreeing
+from sags_node.vision.landmarks import APART, FEWEST, Features, agreeing, matched
 
 MOST_PICTURES = 12
 LIKE = 0.3  # share of features found again: a picture with fewer shows the tissue in another state

@@ -35,15 +35,10 @@ def look(
 ) -> tuple[F32, Bool]:
     """Linear-light picture [H, W, 3] along `directions` [H, W, 3], and where it shows instruments [H, W]."""
     rays = world_rays(directions, offset, T_world_cam)
-    hits = bodies.cast(rays)
-    return _shade(rays, hits, bodies, relief, skin, lamp), hits.tool
-
-
-def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp) -> F32:
-    directions = rays[..., 3:]
+    hits, towards = bodies.cast(rays), rays[..., 3:]
     distance = np.where(np.isfinite(hits.distance), hits.distance, np.float32(1))
-    points = np.asarray(rays[..., :3] + distance[..., None] * directions, np.float32)
-    view = -normalized(directions)
+    points = np.asarray(rays[..., :3] + distance[..., None] * towards, np.float32)
+    view = -normalized(towards)
     picture = shine(points, view, hits, bodies, relief, skin, lamp, _lit(points, bodies, lamp))
 
     if hits.tool.any():
@@ -56,7 +51,7 @@ def _shade(rays: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, la
         picture[hits.tool] = shade_metal(
             points[hits.tool], smooth.astype(np.float32), view[hits.tool], materials, lamp
         )
-    return picture
+    return picture, hits.tool
 
 
 def shine(

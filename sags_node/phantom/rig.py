@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sags_node.rig import rectify_eyes
 from sags_node.types import F64, Eye, StereoRig
 
 FOCAL_PER_WIDTH = 0.9  # of the longer side: about 58 degrees, a usual endoscope
@@ -26,23 +27,9 @@ def phantom_rig(width: int, height: int) -> StereoRig:
     K_right[:2, 2] = 0.5 * (width - 1) - 0.005 * width, 0.5 * (height - 1) + 0.006 * height
 
     R_right_left = cv2.Rodrigues(_TOE_IN)[0]
-    right_in_left = np.array([[BASELINE], [0.00006], [-0.00008]])
-    R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-        K_left,
-        _DISTORTION_LEFT,
-        K_right,
-        _DISTORTION_RIGHT,
-        (width, height),
-        R_right_left,
-        -R_right_left @ right_in_left,
-        flags=cv2.CALIB_ZERO_DISPARITY,
-        alpha=0,
-    )
-    return StereoRig(
-        name="phantom",
-        left=Eye(width, height, K_left, _DISTORTION_LEFT, R_left, P_left),
-        right=Eye(width, height, K_right, _DISTORTION_RIGHT, R_right, P_right),
-    )
+    T_right_left = -R_right_left @ np.array([BASELINE, 0.00006, -0.00008])
+    distortion = _DISTORTION_LEFT, _DISTORTION_RIGHT
+    return rectify_eyes("phantom", (width, height), (K_left, K_right), distortion, R_right_left, T_right_left)
 
 
 def raw_rays(eye: Eye) -> F64:

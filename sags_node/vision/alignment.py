@@ -40,7 +40,7 @@ class RowErrors(NamedTuple):
 
 
 class RowMonitor:
-    """A slow, robust look at the row errors that `InverseSearch` finds anyway.
+    """A slow, robust look at the row errors that `match_patches` finds anyway.
 
     Attributes:
         alignment: None before enough was seen. May be read from any thread.

@@ -1,8 +1,9 @@
-"""Places of the tissue that are found in a later picture, however far they moved: what tells a scene that
-was lost from sight from another one.
+"""Features of a picture that are recognised in another one, however far they moved.
 
-Tissue bends, so there is no common motion to vote for: a match of features counts when it moves as those
-around it do.
+Oriented binary features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011), matched
+where the best is clearly better than the second (Lowe, IJCV 2004). Landmarks are those of tissue that are
+found again: what tells a scene that was lost from sight from another one. Tissue bends, so there is no common
+motion to vote for: a match counts when it moves as those around it do.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import F32, U8, Bool, GrayPyramid
-from sags_node.vision.features import Features, features_in, matched
+from sags_node.types import F32, I64, U8, Bool, GrayPyramid
 from sags_node.vision.pyramid import inner
 
+RATIO = 0.8  # of the distance to the second best match
 WIDTH = 360  # px, at most, of the picture in which they are looked for
 COUNT = 600  # features of a picture
 FAST_THRESHOLD = 5  # grey levels: tissue is smooth, and smoke takes contrast away
@@ -30,6 +31,15 @@ CELLS = 16  # across the picture, of a field of motion
 NEAREST = 4  # matches that tell the motion of a cell
 
 
+class Features(NamedTuple):
+    """What can be recognised in a picture."""
+
+    places: F32  # [F, 2] px
+    angles: F32  # [F] degrees
+    codes: U8  # [F, 32] ORB
+    width: int  # px of the whole picture
+
+
 class Landmarks(NamedTuple):
     """Places in two pictures."""
 
@@ -37,17 +47,44 @@ class Landmarks(NamedTuple):
     after: F32  # [K, 2]
 
 
+def features_in(gray: U8, where: Bool | None, count: int, fast_threshold: int) -> Features:
+    """At most `count` features of a picture [H, W], where [H, W] it counts (None: everywhere).
+
+    Args:
+        fast_threshold: grey levels by which a corner differs from what surrounds it.
+    """
+    mask = None if where is None else where.view(np.uint8)
+    points, codes = cv2.ORB.create(count, fastThreshold=fast_threshold).detectAndCompute(gray, mask)
+    places = np.array([point.pt for point in points], np.float32).reshape(-1, 2)
+    angles = np.array([point.angle for point in points], np.float32)
+    codes = np.zeros((0, 32), np.uint8) if codes is None else np.asarray(codes, np.uint8)
+    return Features(places, angles, codes, gray.shape[1])
+
+
+def matched(before: Features, after: Features) -> tuple[I64, I64]:
+    """Rows [K] of both pictures' features that clearly look alike."""
+    none = np.zeros(0, np.int64)
+    if min(len(before.codes), len(after.codes)) < 2:
+        return none, none
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(before.codes, after.codes, 2)
+    clear = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    rows = np.array([(match.queryIdx, match.trainIdx) for match in clear], np.int64).reshape(-1, 2)
+    return rows[:, 0], rows[:, 1]
+
+
 def features_of(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
     """Features of a picture, px of the whole one, where `tissue` [H, W] is: everywhere by default."""
-    small, per_px = _small(pyramid)
+    halves = [inner(half) for half in pyramid.halves]
+    small = next((half for half in halves if half.shape[1] <= WIDTH), halves[-1]).astype(np.uint8)
+    width = pyramid.full.shape[1]
     mask = None
     if tissue is not None:
         resized = cv2.resize(tissue.view(np.uint8), small.shape[::-1], interpolation=cv2.INTER_NEAREST)
         mask = resized.view(np.bool_)
     found = features_in(small, mask, COUNT, FAST_THRESHOLD)
     # The middle of the first pixel is at 0 in both sizes.
-    places = (found.places + np.float32(0.5)) * np.float32(per_px) - np.float32(0.5)
-    return found._replace(places=places, width=pyramid.full.shape[1])
+    places = (found.places + np.float32(0.5)) * np.float32(width / small.shape[1]) - np.float32(0.5)
+    return found._replace(places=places, width=width)
 
 
 def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmarks | None:
@@ -83,13 +120,6 @@ def motion(start: F32, end: F32, width: int, height: int) -> F32:
     weights = 1 / np.take_along_axis(squares, nearest, 2)[..., None]
     field: F32 = (weights * (end - start)[nearest]).sum(2) / weights.sum(2)
     return field
-
-
-def _small(pyramid: GrayPyramid) -> tuple[U8, float]:
-    """The first half that is small enough, and how many px of the whole picture one of it is wide."""
-    halves = [inner(half) for half in pyramid.halves]
-    half = next((half for half in halves if half.shape[1] <= WIDTH), halves[-1])
-    return half.astype(np.uint8), pyramid.full.shape[1] / half.shape[1]
 
 
 def agreeing(start: F32, end: F32, apart: float) -> Bool:

@@ -35,65 +35,61 @@ class Patches(NamedTuple):
     good: Bool  # [rows, columns] the match is like those of the patches around
 
 
-class InverseSearch:
+def match_patches(
+    left: GrayPyramid, right: GrayPyramid, disparities: tuple[float, float], halvings: int
+) -> Patches:
     """Inverse search from a guess in a small picture up to the one wanted.
 
     On the smooth surface of organs it is more accurate than semi-global matching in less time, but it only
     refines a guess that is right to a few pixels. That is made afresh for every frame: it costs little and
     keeps no memory that could lock in an error.
+
+    Args:
+        disparities: the smallest and the largest to search, px of the matching picture.
+        halvings: which picture that is.
     """
+    finest = halvings
+    if finest == 0 and left.full.shape[1] < SMALL_WIDTH and left.halves:
+        finest = 1
+    field, good = _find(left, right, disparities, halvings, finest)
+    pictures = level(left, halvings), level(right, halvings)
+    if finest > halvings:
+        both = np.dstack([field, good.astype(np.float32) / 2])
+        both = start(pictures[0], PATCH_STRIDE, both, PATCH_STRIDE, CENTRE, 2)
+        field, good = np.ascontiguousarray(both[..., :2]), both[..., 2] > 0.5
+    return Patches(*pictures, PATCH_STRIDE, field, good)
 
-    def __init__(self, smallest: float, largest: float, halvings: int, stride: int = PATCH_STRIDE) -> None:
-        """
-        Args:
-            smallest, largest: disparities to search, px of the matching picture.
-            halvings: which picture that is.
-            stride: px between its patches, at most 8.
-        """
-        self._range = smallest, largest
-        self._halvings = halvings
-        self._stride = stride
 
-    def __call__(self, left: GrayPyramid, right: GrayPyramid) -> Patches:
-        finest = self._halvings
-        if finest == 0 and left.full.shape[1] < SMALL_WIDTH and left.halves:
-            finest = 1
-        field, good = self._find(left, right, finest)
-        pictures = level(left, self._halvings), level(right, self._halvings)
-        if finest > self._halvings:
-            both = np.dstack([field, good.astype(np.float32) / 2])
-            both = start(pictures[0], self._stride, both, self._stride, CENTRE, 2)
-            field, good = np.ascontiguousarray(both[..., :2]), both[..., 2] > 0.5
-        return Patches(*pictures, self._stride, field, good)
-
-    def _find(self, left: GrayPyramid, right: GrayPyramid, finest: int) -> tuple[F32, Bool]:
-        """Patches of the picture after `finest` halvings."""
-        top = finest
-        while top < len(left.halves) and left.full.shape[1] >> top > GUESS_WIDTH:
-            top += 1
-        smallest, largest = (disparity / 2 ** (top - self._halvings) for disparity in self._range)
-        guess = coarse_disparity(level(left, top), level(right, top), smallest, largest)
-        field, stride, corner, k = np.stack([-guess, np.zeros_like(guess)], -1), 1, 0.0, top
-        while k > finest + 1 or stride == 1:
-            scale = 2 if k > finest else 1
-            k = max(k - 1, finest)
-            pictures = level(left, k), level(right, k)
-            field = start(pictures[0], COARSE_STRIDE, field, stride, corner, scale)
-            for _ in range(2):  # the second time places spread from the right and from below
-                field = search(*pictures, COARSE_STRIDE, field, SEARCH_STEPS)
-            stride, corner = COARSE_STRIDE, CENTRE
-        # Calibrations are off by a row or so, smoothly over the picture. A wrong match jumps to another row.
+def _find(
+    left: GrayPyramid, right: GrayPyramid, disparities: tuple[float, float], halvings: int, finest: int
+) -> tuple[F32, Bool]:
+    """Patches of the picture after `finest` halvings."""
+    top = finest
+    while top < len(left.halves) and left.full.shape[1] >> top > GUESS_WIDTH:
+        top += 1
+    smallest, largest = (disparity / 2 ** (top - halvings) for disparity in disparities)
+    guess = coarse_disparity(level(left, top), level(right, top), smallest, largest)
+    field, stride, corner, k = np.stack([-guess, np.zeros_like(guess)], -1), 1, 0.0, top
+    while k > finest + 1 or stride == 1:
         scale = 2 if k > finest else 1
-        limit = LARGEST_ROW_ERROR / scale
-        rows = cv2.blur(np.clip(field[..., 1], -limit, limit), (WINDOW, WINDOW))
-        pictures = level(left, finest), level(right, finest)
-        begin = start(pictures[0], self._stride, np.dstack([field, rows]), stride, corner, scale)
-        field = search(*pictures, self._stride, begin, SEARCH_STEPS, TETHER)
-        down, rows = field[..., 1], begin[..., 2]
-        good = (np.abs(down - rows) < LARGEST_ROW_STEP) & (np.abs(down) < LARGEST_ROW_ERROR)
-        across = np.ascontiguousarray(field[..., 0])
-        around = cv2.medianBlur(across, WINDOW)
-        alone = np.abs(across - around) > LARGEST_STEP
-        field[..., 0] = np.where(alone, around, across)
-        good &= cv2.blur(alone.astype(np.float32), (WINDOW, WINDOW)) < MOST_ALONE
-        return field, good
+        k = max(k - 1, finest)
+        pictures = level(left, k), level(right, k)
+        field = start(pictures[0], COARSE_STRIDE, field, stride, corner, scale)
+        for _ in range(2):  # the second time places spread from the right and from below
+            field = search(*pictures, COARSE_STRIDE, field, SEARCH_STEPS)
+        stride, corner = COARSE_STRIDE, CENTRE
+    # Calibrations are off by a row or so, smoothly over the picture. A wrong match jumps to another row.
+    scale = 2 if k > finest else 1
+    limit = LARGEST_ROW_ERROR / scale
+    rows = cv2.blur(np.clip(field[..., 1], -limit, limit), (WINDOW, WINDOW))
+    pictures = level(left, finest), level(right, finest)
+    begin = start(pictures[0], PATCH_STRIDE, np.dstack([field, rows]), stride, corner, scale)
+    field = search(*pictures, PATCH_STRIDE, begin, SEARCH_STEPS, TETHER)
+    down, rows = field[..., 1], begin[..., 2]
+    good = (np.abs(down - rows) < LARGEST_ROW_STEP) & (np.abs(down) < LARGEST_ROW_ERROR)
+    across = np.ascontiguousarray(field[..., 0])
+    around = cv2.medianBlur(across, WINDOW)
+    alone = np.abs(across - around) > LARGEST_STEP
+    field[..., 0] = np.where(alone, around, across)
+    good &= cv2.blur(alone.astype(np.float32), (WINDOW, WINDOW)) < MOST_ALONE
+    return field, good

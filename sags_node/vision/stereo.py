@@ -11,11 +11,11 @@ from sags_node.config.schema import StereoConfig
 from sags_node.config.units import fitting_units, in_metres
 from sags_node.errors import UsageError
 from sags_node.rig.check import ENDOSCOPE_BASELINE
-from sags_node.types import F32, Bool, Camera, Finding, GrayPyramid, RectifiedPair
+from sags_node.types import F32, Bool, Camera, Finding, RectifiedPair
 from sags_node.vision.alignment import RowMonitor
 from sags_node.vision.dense_depth import depth_of_patches, depth_of_pixels
 from sags_node.vision.margin import clear_of_instruments
-from sags_node.vision.matchers import InverseSearch
+from sags_node.vision.matchers import match_patches
 from sags_node.vision.near_limit import NearLimit
 from sags_node.vision.pyramid import inner, level, pyramids
 
@@ -55,8 +55,7 @@ class StereoDepth:
         self._focal_baseline = float(camera.K[0, 0]) / scale * baseline
         self._smallest = self._focal_baseline / config.max_depth
         self._near = NearLimit(config, float(camera.K[0, 0]) * baseline)
-        self._end_at(self._near.limit)
-        if self._smallest >= self._largest or baseline > WIDEST * config.max_depth:
+        if self._smallest >= self._disparities()[1] or baseline > WIDEST * config.max_depth:
             units = fitting_units(baseline, *ENDOSCOPE_BASELINE)
             unit = f"{in_metres(units, path)}; " if units else ""
             raise UsageError(
@@ -73,8 +72,8 @@ class StereoDepth:
         """
         left, right = pyramids(pair)
         assert right is not None  # a frame without a right eye brings its depth
-        self._look_how_near(pair, left, right, tissue)
-        patches = self._match(left, right)
+        self._near.look(pair.t_capture_ns, left, right, tissue)
+        patches = match_patches(left, right, self._disparities(), self._halvings)
         self.rows.update(patches.field[..., 1], patches.good, self._size[0])
         clear = clear_of_instruments(tissue, self._halvings)
         _leave_out_unseen(clear, -patches.field[..., 0][patches.good])
@@ -82,7 +81,7 @@ class StereoDepth:
             patches,
             clear,
             tissue.shape[1::-1],
-            (self._smallest, self._largest),
+            self._disparities(),
             round(SMOOTHING_RADIUS * self._size[0]),
             self._focal_baseline,
         )
@@ -97,7 +96,7 @@ class StereoDepth:
         trusted only as far as the pictures agree, as its own is."""
         left, right = pyramids(pair)
         assert right is not None  # there is no disparity without
-        self._look_how_near(pair, left, right, tissue)
+        self._near.look(pair.t_capture_ns, left, right, tissue)
         if self._size != disparity.shape[1::-1]:
             ratio = np.float32(self._size[0] / disparity.shape[1])
             disparity = ratio * cv2.resize(disparity, self._size, interpolation=cv2.INTER_AREA)
@@ -117,22 +116,13 @@ class StereoDepth:
             known,
             clear,
             tissue.shape[1::-1],
-            (self._smallest, self._largest),
+            self._disparities(),
             self._focal_baseline,
         )
 
-    def _look_how_near(
-        self, pair: RectifiedPair, left: GrayPyramid, right: GrayPyramid, tissue: Bool
-    ) -> None:
-        before = self._near.limit
-        self._near.look(pair.t_capture_ns, left, right, tissue)
-        if self._near.limit != before:
-            self._end_at(self._near.limit)
-
-    def _end_at(self, nearest: float) -> None:
-        """Match down to a depth, m."""
-        self._largest = min(self._focal_baseline / nearest, self._size[0] - 1.0)
-        self._match = InverseSearch(self._smallest, self._largest, self._halvings)
+    def _disparities(self) -> tuple[float, float]:
+        """The smallest and the largest that are matched, px of the matching picture."""
+        return self._smallest, min(self._focal_baseline / self._near.limit, self._size[0] - 1.0)
 
 
 def _leave_out_unseen(clear: Bool, disparities: F32) -> None:

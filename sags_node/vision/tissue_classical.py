@@ -53,7 +53,10 @@ class InstrumentFinder:
     """
 
     def __init__(self) -> None:
-        self._memory: _Memory | None = None
+        self._found: Bool | None = None  # [h, w] in the frame before; None: it was judged alone
+        self._held: F32 = np.zeros((1, 1), np.float32)  # [h, w] s, for which it is so on doubtful grounds
+        self._trusted: Bool = np.ones((1, 1), np.bool_)  # [h, w] where these count
+        self._stamp_ns = 0
 
     def __call__(self, image: U8, expected: RenderedView | None = None, stamp_ns: int = 0) -> Bool:
         """Instruments [H, W] of a picture [H, W, 3].
@@ -69,48 +72,24 @@ class InstrumentFinder:
         red, green, blue = cv2.split(cv2.blur(small, (WINDOW, WINDOW)))
         evidence, is_open = _evidence(red, green, blue)
         if expected is None:
-            self._memory = None
-            found = _regions(evidence)
+            found, self._found = _regions(evidence), None
         else:
-            memory = self._memory or _Memory(evidence.shape, stamp_ns)
+            if self._found is None:
+                self._found, self._trusted = np.zeros(red.shape, np.bool_), np.ones(red.shape, np.bool_)
+                self._held, self._stamp_ns = np.zeros(red.shape, np.float32), stamp_ns
             # Not averaged: the model's picture has no noise, and reading all of it takes long.
             sampled = cv2.resize(expected.colours.small, size, interpolation=cv2.INTER_NEAREST)
-            drawn = _mean(sampled * np.float32(1 / 255), WINDOW)
-            drawn_red, drawn_green, drawn_blue = cv2.split(drawn)
+            drawn_red, drawn_green, drawn_blue = cv2.split(_mean(sampled * np.float32(1 / 255), WINDOW))
             doubtful = _doubtful(
                 red, green, blue, drawn_red, drawn_green, drawn_blue, _shrunk(expected.alpha, size),
-                is_open, memory.found, memory.trusted,
+                is_open, self._found, self._trusted,
             )  # fmt: skip
             found = _regions(evidence + _mean(doubtful, WINDOW))
-            memory.update(found, evidence, stamp_ns)
-            self._memory = memory
+            step = min(max((stamp_ns - self._stamp_ns) * 1e-9, 0.0), LONGEST_STEP)
+            _count_doubt(found, evidence, step, self._held, self._trusted)
+            self._found, self._stamp_ns = found, stamp_ns
         enlarged: U8 = cv2.resize(found * np.uint8(255), (width, height))
         return enlarged > 127
-
-
-class _Memory:
-    """What was found in the frame before, and for how long on doubtful grounds.
-
-    Attributes:
-        found: [h, w]
-        trusted: [h, w] False where doubtful grounds do not count for now.
-    """
-
-    def __init__(self, shape: tuple[int, ...], stamp_ns: int) -> None:
-        self.found: Bool = np.zeros(shape, np.bool_)
-        self.trusted: Bool = np.ones(shape, np.bool_)
-        self._held: F32 = np.zeros(shape, np.float32)  # s
-        self._stamp_ns = stamp_ns
-
-    def update(self, found: Bool, evidence: F32, stamp_ns: int) -> None:
-        """
-        Args:
-            found: [h, w] in the newest frame.
-            evidence: [h, w] what spoke for it without doubt.
-        """
-        step = min(max((stamp_ns - self._stamp_ns) * 1e-9, 0.0), LONGEST_STEP)
-        _count_doubt(found, evidence, step, self._held, self.trusted)
-        self.found, self._stamp_ns = found, stamp_ns
 
 
 def _evidence(red: U8, green: U8, blue: U8) -> tuple[F32, F32]:

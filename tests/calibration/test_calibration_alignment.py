@@ -21,7 +21,7 @@ from sags_node.sources.pictures import read_picture
 from sags_node.tools.calibration.check import measure_rows
 from sags_node.types import F32, U8, Bool, StereoFrame, StereoRig
 from sags_node.vision.alignment import FEWEST_FIELDS, WINDOW, RowMonitor
-from sags_node.vision.matchers import InverseSearch
+from sags_node.vision.matchers import match_patches
 from sags_node.vision.pyramid import gray_pyramid
 from sags_node.vision.rectify import Rectifier
 
@@ -42,7 +42,7 @@ def rectified(session: Path, degrees: tuple[float, float, float]) -> tuple[U8, U
 
 
 def field(session: Path, degrees: tuple[float, float, float]) -> Field:
-    patches = InverseSearch(*DISPARITIES, halvings=1)(*map(gray_pyramid, rectified(session, degrees)))
+    patches = match_patches(*map(gray_pyramid, rectified(session, degrees)), DISPARITIES, 1)
     return patches.field[..., 1], patches.good, SIZE[0] // 2
 
 

@@ -14,11 +14,9 @@ from running_node import RunningNode
 
 from sags_node.confidence import confidence_of, error_of
 from sags_node.config.schema import LaunchConfig
-from sags_node.instruments.agreement import agreements
-from sags_node.instruments.depths import disparities, eyes
-from sags_node.instruments.geodesic import geodesic
+from sags_node.instruments.depths import agreements, disparities, eyes
 from sags_node.instruments.instruments import Instruments
-from sags_node.instruments.outlines import outlines
+from sags_node.instruments.outlines import geodesic, outlines
 from sags_node.mapping.budget import StepBudget
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.types import Bool, InstrumentStates

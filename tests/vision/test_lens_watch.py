@@ -107,23 +107,18 @@ def test_a_veil_over_one_lens_is_no_drop(
     def veiled(frame: StereoFrame) -> StereoFrame:
         return replace(frame, left=np.asarray(cv2.GaussianBlur(frame.left, (0, 0), sigma)))
 
-    results, codes = _play(session, frames, veiled)
+    results, codes = _play(session, frames[: FIRST + COUNT], veiled)
     assert not {code for found in codes for code in found if code.endswith("drops")}
-    for result, true in zip(results, clean, strict=True):
+    for result, true in zip(results, clean, strict=False):
         if not result.held:
             assert result.observation.tissue.mean() > 0.95 * true.observation.tissue.mean()
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        lambda picture: cv2.blur(picture, (9, 1)),  # it shakes
-        lambda picture: (picture * 0.5).astype(np.uint8),
-    ],
-    ids=["shaken", "darker"],
+    "change", [lambda eye: cv2.blur(eye, (9, 1)), lambda eye: 0.5 * eye], ids=["shaken", "darker"]
 )
 def test_what_both_eyes_lose_is_no_drop(
-    change: Callable[[U8], U8], session: Session, frames: list[StereoFrame]
+    change: Callable[[U8], np.ndarray], session: Session, frames: list[StereoFrame]
 ) -> None:
-    _, codes = _play(session, frames, lambda frame: both(frame, change))
+    _, codes = _play(session, frames[: FIRST + COUNT], lambda frame: both(frame, change))
     assert not {code for found in codes for code in found if code.endswith("drops")}

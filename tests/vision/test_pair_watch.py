@@ -11,19 +11,20 @@ import cv2
 import numpy as np
 import pytest
 from places import ROOT
-from rounding import after
+from recorded_session import both, noisy
 from synthetic import health
 from watching import judged
 
+from sags_node.config.schema import FoldersSource
+from sags_node.errors import UsageError
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
-from sags_node.types import U8, StereoFrame
-from sags_node.vision.pyramid import gray_pyramid, inner
+from sags_node.sources.replay import Replay, refuse_one_eye_twice
+from sags_node.types import U8, Finding, StereoFrame
 from sags_node.vision.rectify import Rectifier
-from sags_node.vision.watch.clarity import LOCAL, small_level, structure
 from sags_node.vision.watch.judgement import Judgement
 from sags_node.vision.watch.pair_watch import PairWatch, is_blocky, row_correlation
 from sags_node.vision.watch.picture_fit import Fit, middle_of
@@ -50,18 +51,33 @@ def frames(moving: list[StereoFrame]) -> list[StereoFrame]:
     return moving[:6]
 
 
-def watched(session: Session, frames: list[StereoFrame], step_ns: int = STEP_NS) -> Iterator[str]:
+def looked_at(session: Session, frames: list[StereoFrame]) -> Iterator[tuple[Judgement, list[Finding]]]:
+    """What is judged of each frame, and what is said after it."""
+    watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
+    for frame in frames:
+        yield judged(watch, frame, rectify(frame)), list(watch.findings)
+
+
+def stamped(frames: list[StereoFrame], step_ns: int = STEP_NS, begin_ns: int = 10**18) -> list[StereoFrame]:
+    return [replace(frame, t_capture_ns=begin_ns + n * step_ns) for n, frame in enumerate(frames)]
+
+
+def watched(session: Session, frames: list[StereoFrame], step_ns: int = STEP_NS) -> list[str]:
     """What is said after each frame."""
-    watch = PairWatch()
-    rectify = Rectifier(session.rig, *session.working_size)
-    for number, frame in enumerate(frames):
-        stamped = replace(frame, t_capture_ns=10**18 + number * step_ns)
-        judged(watch, stamped, rectify(stamped))
-        yield "; ".join(finding.text for finding in watch.findings)
+    return [in_a_line(found) for _, found in looked_at(session, stamped(frames, step_ns))]
 
 
-def both(change: Callable[[U8], U8]) -> Spoil:
-    return lambda frame: replace(frame, left=change(frame.left), right=change(_right(frame)))
+def in_a_line(found: list[Finding]) -> str:
+    return "; ".join(finding.text for finding in found)
+
+
+def codes(found: list[Finding]) -> list[str]:
+    return [finding.code for finding in found]
+
+
+def spoilt(change: Callable[[U8], np.ndarray]) -> Spoil:
+    """Both eyes."""
+    return lambda frame: both(frame, change)
 
 
 def _right(frame: StereoFrame) -> U8:
@@ -70,8 +86,7 @@ def _right(frame: StereoFrame) -> U8:
 
 
 def _noisy(picture: np.ndarray, sigma: float = 4.0) -> U8:
-    noise = np.random.default_rng(int(picture.sum()) % 1000).normal(0, sigma, picture.shape)
-    return np.clip(picture + noise, 0, 255).round().astype(np.uint8)
+    return noisy(picture, np.random.default_rng(int(picture.sum()) % 1000), sigma)
 
 
 def _jpeg(picture: U8, quality: int = 50) -> U8:
@@ -87,12 +102,12 @@ def _plain(frame: StereoFrame, color: tuple[int, int, int], sigma: float = 2.0) 
 
 SOUND: dict[str, Spoil] = {
     "as it is": lambda frame: frame,
-    "dim": both(lambda picture: (picture * 0.2).astype(np.uint8)),
-    "bright": both(lambda picture: np.clip(picture * 1.8, 0, 255).astype(np.uint8)),
-    "noise": both(lambda picture: _noisy(picture, 12.0)),
-    "smoke": both(lambda picture: (picture * 0.25 + 150).astype(np.uint8)),
-    "out of focus": both(lambda picture: cv2.GaussianBlur(picture, (0, 0), 6)),
-    "jpeg": both(_jpeg),
+    "dim": spoilt(lambda picture: picture * 0.2),
+    "bright": spoilt(lambda picture: picture * 1.8),
+    "noise": spoilt(lambda picture: _noisy(picture, 12.0)),
+    "smoke": spoilt(lambda picture: picture * 0.25 + 150),
+    "out of focus": spoilt(lambda picture: cv2.GaussianBlur(picture, (0, 0), 6)),
+    "jpeg": spoilt(_jpeg),
     "one eye darker": lambda frame: replace(frame, right=(_right(frame) * 0.6).astype(np.uint8)),
     "one camera": lambda frame: replace(frame, right=None),
 }
@@ -110,9 +125,9 @@ def test_real_recordings_are_let_pass_and_exchanged_ones_noticed(launch: str, da
     with session.source as source:
         frames = list(islice(source, 20))
     assert set(watched(session, frames)) == {""}
-    said = list(watched(session, [_exchanged(frame) for frame in frames]))
+    said = watched(session, [_exchanged(frame) for frame in frames])
     assert all("exchanged" in warning for warning in said[NEEDED - 1 :])
-    said = list(watched(session, [replace(frame, right=frame.left) for frame in frames]))
+    said = watched(session, [replace(frame, right=frame.left) for frame in frames])
     assert all("the same picture" in warning for warning in said[NEEDED - 1 :])
 
 
@@ -130,7 +145,7 @@ WRONG: dict[str, tuple[Spoil, str]] = {
     "white": (lambda f: replace(f, right=_plain(f, (255, 255, 255))), "the right picture is white: lower"),
     "blue": (lambda f: replace(f, left=_plain(f, (0, 0, 200))), "the left picture is of one colour: check"),
     "grey": (lambda f: replace(f, right=_plain(f, (128, 128, 128))), "the right picture is of one colour"),
-    "both black": (both(np.zeros_like), "the left picture is black"),
+    "both black": (spoilt(np.zeros_like), "the left picture is black"),
     "one eye twice": (lambda f: replace(f, right=f.left), "both eyes show the same picture"),
     "captured twice": (
         lambda f: replace(f, left=_noisy(f.left), right=_jpeg(_noisy(f.left * 0.8 + 10))),
@@ -145,7 +160,7 @@ def test_what_is_wrong_is_said_and_how_to_fix_it(
     name: str, session: Session, frames: list[StereoFrame]
 ) -> None:
     spoil, said = WRONG[name]
-    warnings = list(watched(session, [spoil(frame) for frame in frames]))
+    warnings = watched(session, [spoil(frame) for frame in frames])
     assert warnings[: NEEDED - 1] == [""] * (NEEDED - 1)  # one bad frame is none
     assert all(warning.startswith(said) for warning in warnings[NEEDED - 1 :]), warnings
     if name == "both black":
@@ -159,52 +174,36 @@ def test_a_warning_begins_and_ends_within_half_a_second(
     rate: int, session: Session, frames: list[StereoFrame]
 ) -> None:
     black = replace(frames[0], left=np.zeros_like(frames[0].left))
-    said = list(watched(session, [frames[0]] * rate + [black] * rate + [frames[0]] * rate, 10**9 // rate))
+    said = watched(session, [frames[0]] * rate + [black] * rate + [frames[0]] * rate, 10**9 // rate)
     warned = [number for number, text in enumerate(said) if text]
     assert rate < warned[0] <= 1.5 * rate and 2 * rate <= warned[-1] < 2.5 * rate
     assert warned == list(range(warned[0], warned[-1] + 1))
 
 
 def test_a_clock_may_jump_back(session: Session, frames: list[StereoFrame]) -> None:
-    black = [replace(frame, left=np.zeros_like(frame.left)) for frame in frames]
-    watch = PairWatch()
-    rectify = Rectifier(session.rig, *session.working_size)
-    for number, frame in enumerate([*black, *black]):
-        stamped = replace(frame, t_capture_ns=number % len(black) * STEP_NS)
-        judged(watch, stamped, rectify(stamped))
-    assert [finding.code for finding in watch.findings] == ["left_eye_black"]
+    black = stamped([replace(frame, left=np.zeros_like(frame.left)) for frame in frames])
+    *_, (_, found) = looked_at(session, [*black, *black])
+    assert codes(found) == ["left_eye_black"]
 
 
 def _fogged(picture: U8) -> U8:
     return (cv2.GaussianBlur(picture, (0, 0), 4) * 0.4 + 100).astype(np.uint8)
 
 
-NO_LEFT, NO_RIGHT = Judgement(hold="x", no_stereo="x"), Judgement(no_stereo="x")
+NO_LEFT, NO_RIGHT, NOT_LEARNT = (
+    Judgement(hold="x", no_stereo="x"), Judgement(no_stereo="x"), Judgement(learn=False)
+)  # fmt: skip
+BLURRED = spoilt(lambda picture: cv2.GaussianBlur(picture, (0, 0), 4))
+BLOCKY = spoilt(lambda picture: _jpeg(picture, 6))
 LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str, Judgement]] = {
-    "right fogged": (
-        lambda f, before: replace(f, right=_fogged(_right(f))),
-        "right_eye_fogged",
-        NO_RIGHT,
-    ),
-    "left fogged": (lambda f, before: replace(f, left=_fogged(f.left)), "left_eye_fogged", NO_LEFT),
+    "right fogged": (lambda f, _: replace(f, right=_fogged(_right(f))), "right_eye_fogged", NO_RIGHT),
+    "left fogged": (lambda f, _: replace(f, left=_fogged(f.left)), "left_eye_fogged", NO_LEFT),
     "right frozen": (lambda f, before: replace(f, right=before.right), "right_eye_frozen", NO_RIGHT),
     "left frozen": (lambda f, before: replace(f, left=before.left), "left_eye_frozen", NO_LEFT),
-    "both blurred": (
-        lambda f, before: both(lambda picture: cv2.GaussianBlur(picture, (0, 0), 4))(f),
-        "picture_blurred",
-        Judgement(learn=False),
-    ),
-    "both veiled": (
-        lambda f, before: both(lambda picture: (picture * 0.3 + 120).astype(np.uint8))(f),
-        "picture_smoke",
-        Judgement(learn=False),
-    ),
-    "both compressed": (
-        lambda f, before: both(lambda picture: _jpeg(picture, 6))(f),
-        "picture_compressed",
-        Judgement(),
-    ),
-}  # fmt: skip
+    "both blurred": (lambda f, _: BLURRED(f), "picture_blurred", NOT_LEARNT),
+    "both veiled": (lambda f, _: both(f, lambda eye: eye * 0.3 + 120), "picture_smoke", NOT_LEARNT),
+    "both compressed": (lambda f, _: BLOCKY(f), "picture_compressed", Judgement()),
+}
 
 
 @pytest.mark.fault("picture: the left eye is frozen")
@@ -215,20 +214,18 @@ def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
 ) -> None:
     """At once it is not used; and it is said when it lasts."""
     spoil, code, expected = LASTING[name]
-    watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
-    for number, frame in enumerate(moving):
-        given = spoil(frame, moving[9]) if 10 <= number < 20 else frame
-        verdict = judged(watch, given, rectify(given))
-        codes = [finding.code for finding in watch.findings]
+    given = [spoil(frame, moving[9]) if 10 <= n < 20 else frame for n, frame in enumerate(moving)]
+    for number, (verdict, found) in enumerate(looked_at(session, given)):
         if 11 <= number < 20:  # the first may be taken for the other eye's fault
             assert bool(verdict.hold) == bool(expected.hold)
             assert bool(verdict.no_stereo) == bool(expected.no_stereo)
             assert verdict.learn == expected.learn
         elif number not in (10, 20):
             assert verdict == Judgement()
-        assert codes == ([code] if 14 <= number < 20 else codes)
+        if 14 <= number < 20:
+            assert codes(found) == [code]
         if number < 10 or number >= 24:
-            assert codes == []
+            assert not found
 
 
 @pytest.mark.fault("picture: blurred after the lens was out for cleaning")
@@ -237,26 +234,21 @@ def test_a_blur_that_begins_while_nobody_looks_has_not_lasted(
     between: str, session: Session, moving: list[StereoFrame]
 ) -> None:
     """Twelve seconds in which no picture was seen make no blur usual."""
-    watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
-    blurred = [LASTING["both blurred"][0](frame, frame) for frame in moving[10:20]]
-    out = [both(np.zeros_like)(moving[9])] * (120 if between == "black" else 0)
-    for number, frame in enumerate([*moving[:10], *out, *blurred]):
-        later = 0 if number < 10 or out else 12 * 10**9
-        given = replace(frame, t_capture_ns=10**18 + number * STEP_NS + later)
-        verdict = judged(watch, given, rectify(given))
-        if number >= 10 + len(out):
-            assert not verdict.learn
-    assert [finding.code for finding in watch.findings] == ["picture_blurred"]
+    first, out = moving[:10], [both(moving[9], np.zeros_like)] * 120
+    given = stamped([*first, *out, *map(BLURRED, moving[10:20])])
+    if between == "nothing":
+        del given[10:130]
+    seen = list(looked_at(session, given))
+    assert not any(verdict.learn for verdict, _ in seen[-10:])
+    assert codes(seen[-1][1]) == ["picture_blurred"]
 
 
 def test_what_is_compressed_hard_from_the_first_picture_on_is_said_too(
     session: Session, moving: list[StereoFrame]
 ) -> None:
-    watch, rectify = PairWatch(), Rectifier(session.rig, *session.working_size)
-    for frame in moving[:10]:
-        given = both(lambda picture: _jpeg(picture, 6))(frame)
-        assert judged(watch, given, rectify(given)) == Judgement()
-    assert [finding.code for finding in watch.findings] == ["picture_compressed"]
+    seen = list(looked_at(session, list(map(BLOCKY, moving[:10]))))
+    assert all(verdict == Judgement() for verdict, _ in seen)
+    assert codes(seen[-1][1]) == ["picture_compressed"]
 
 
 @pytest.mark.parametrize("across", [2, 4])
@@ -264,6 +256,39 @@ def test_a_picture_that_was_enlarged_has_no_blocks(across: int, moving: list[Ste
     small = np.ascontiguousarray(moving[0].left[::across, ::across])
     large = small.repeat(across, 0).repeat(across, 1)
     assert not is_blocky(large) and is_blocky(_jpeg(large, 6))
+
+
+# ---- one eye that is fed to both inputs is refused at the start ------------------------------------------
+
+
+def test_the_same_folder_twice_is_refused(phantom_session: Path) -> None:
+    left = phantom_session / "left"
+    with Replay(FoldersSource(left=left, right=left, pace="step")) as source:
+        with pytest.raises(UsageError, match=r"both eyes get the same picture.*source\.right"):
+            next(iter(source))
+
+
+def test_captured_twice_is_refused(frames: list[StereoFrame]) -> None:
+    """Noise and compression of two captures are no second eye."""
+    rng = np.random.default_rng(0)
+    once, again = (noisy(frames[0].left, rng, 3) for _ in range(2))
+    with pytest.raises(UsageError):
+        refuse_one_eye_twice(once, _jpeg(again, 60))
+
+
+@pytest.mark.parametrize("launch", ["d4d_pull", "hamlyn_heart"])
+@pytest.mark.usefixtures("data_folder")
+def test_two_eyes_pass(launch: str) -> None:
+    session = open_session(ROOT / f"launch/{launch}.yaml", ["source.pace:=step", "source.stride:=30"])
+    with session.source as source:
+        assert len(list(islice(source, 3))) == 3
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_a_picture_of_nothing_tells_nothing(level: int) -> None:
+    plain = _noisy(np.full((512, 640, 3), level, np.uint8), 3)
+    refuse_one_eye_twice(plain, plain)
+    refuse_one_eye_twice(plain, None)
 
 
 # ---- in the node -----------------------------------------------------------------------------------------
@@ -277,16 +302,14 @@ def test_the_pipeline_warns_also_while_frames_are_skipped(
     the session those that are equal but for noise are not matched."""
     pipeline = Pipeline(session.config, session.rig)
     rng = np.random.default_rng(0)
-    shown = [*frames[:2], *[frames[2]] * 8]
     skipped = set()
-    for number, frame in enumerate(shown):
+    for number, frame in enumerate(stamped([*frames[:2], *[frames[2]] * 8])):
         pulled = number >= 2
         right = np.zeros_like(frame.left) if pulled else frame.right
-        noisy = np.clip(frame.left + rng.normal(0, noise, frame.left.shape), 0, 255).astype(np.uint8)
+        left = noisy(frame.left, rng, noise)
         depth = np.full(frame.left.shape[:2], 0.08, np.float32)
-        spoilt = replace(frame, left=noisy, right=right, depth=depth)
-        stamped = replace(spoilt, frame_id=number, t_capture_ns=number * STEP_NS)
-        skipped |= set(pipeline.process(stamped, StepBudget(0)).skipped)
+        shown = replace(frame, left=left, right=right, depth=depth, frame_id=number)
+        skipped |= set(pipeline.process(shown, StepBudget(0)).skipped)
         assert ("eyes" in pipeline.warnings) == (number >= 2 + NEEDED - 1)
     assert skipped == {0.0: {"frame"}, 2.0: {"depth", "motion"}, 12.0: set()}[noise]
     content = diagnostics(replace(health(), warnings=pipeline.warnings), 0)
@@ -337,14 +360,6 @@ def test_rows_correlate_where_they_lie(shift: int) -> None:
     match = row_correlation(left, right)
     assert len(match) == 81 and np.argmax(match) == 40 + shift
     assert match.max() == pytest.approx(1, abs=1e-5)
-
-
-def test_structure_is_what_a_small_picture_has_beside_the_mean_around() -> None:
-    noise = np.random.default_rng(5).integers(0, 256, (512, 640), np.uint8)
-    pyramid = gray_pyramid(cv2.GaussianBlur(noise, (0, 0), 5))
-    small = inner(small_level(pyramid))
-    around = cv2.blur(small, (LOCAL, LOCAL), borderType=cv2.BORDER_REPLICATE)
-    np.testing.assert_allclose(structure(pyramid), small - around, atol=255 * after(LOCAL**2))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])

@@ -34,7 +34,7 @@ from sags_node.tools.calibration.principal_points import judge_known_depths
 from sags_node.tools.calibration.rows import Rows, judge_matches, judge_rectified, judge_scale, rectified_rows
 from sags_node.types import F32, U8, Bool, StereoFrame, StereoRig
 from sags_node.vision.inverse_search import at_pixels, centres
-from sags_node.vision.matchers import InverseSearch, Patches
+from sags_node.vision.matchers import Patches, match_patches
 from sags_node.vision.pyramid import gray_pyramid
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import FULL_SIZE_BELOW
@@ -216,14 +216,14 @@ def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowErr
         smallest, largest: disparities to search, px.
     """
     halvings = 1 if left.shape[1] >= FULL_SIZE_BELOW else 0
-    match = InverseSearch(smallest / 2**halvings, largest / 2**halvings, halvings)
-    found = match(gray_pyramid(left), gray_pyramid(right))
-    mirrored = match(*(gray_pyramid(np.ascontiguousarray(eye[:, ::-1])) for eye in (right, left)))
+    disparities = smallest / 2**halvings, largest / 2**halvings
+    found = match_patches(gray_pyramid(left), gray_pyramid(right), disparities, halvings)
+    there, back = (gray_pyramid(np.ascontiguousarray(eye[:, ::-1])) for eye in (right, left))
+    mirrored = match_patches(there, back, disparities, halvings)
     known = found.good & _found_back(found, mirrored)
     if np.mean(known) < FEWEST_KNOWN:
         return None
-    errors = np.abs(found.field[..., 1][known]) * 2**halvings
-    median, p90 = np.percentile(errors, [50, 90])
+    median, p90 = np.percentile(np.abs(found.field[..., 1][known]) * 2**halvings, [50, 90])
     return RowError(float(median), float(p90), float(np.mean(known)))
 
 

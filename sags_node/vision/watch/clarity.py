@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from sags_node.kernels.jit import kernel
 from sags_node.types import F32, Finding, GrayPyramid
-from sags_node.vision.pyramid import BORDER, inner
+from sags_node.vision.pyramid import inner
 from sags_node.vision.watch.standing import watched_ns
 
 WIDTH = 160  # px, at most, of the picture in which contrast is measured, with its border
@@ -80,10 +79,8 @@ class Clarity:
 
 def structure(pyramid: GrayPyramid) -> F32:
     """Return what is no shading, in a small picture [h, w]."""
-    small = small_level(pyramid)
-    found = np.empty(inner(small).shape, np.float32)
-    _leave_shading_out(small, found)
-    return found
+    small = _small_level(pyramid)
+    return np.ascontiguousarray(inner(small - cv2.blur(small, (LOCAL, LOCAL))))
 
 
 def mean_difference(a: F32, b: F32) -> float:
@@ -91,41 +88,9 @@ def mean_difference(a: F32, b: F32) -> float:
     return cv2.norm(a, b, cv2.NORM_L1) / a.size
 
 
-def small_level(pyramid: GrayPyramid) -> F32:
+def _small_level(pyramid: GrayPyramid) -> F32:
     """The first half that is small enough, with its border."""
     return next((half for half in pyramid.halves if half.shape[1] <= WIDTH), pyramid.halves[-1])
-
-
-@kernel
-def _leave_shading_out(bordered: F32, found: F32) -> None:
-    """A picture less the mean of the window around each pixel."""
-    height, width = found.shape
-    radius, share = LOCAL // 2, np.float32(1 / LOCAL**2)
-    first = BORDER - radius
-    line = np.empty(width + 2 * radius, np.float32)  # sums over columns
-    for y in range(height):
-        line[:] = np.float32(0)
-        for row in range(y + first, y + first + LOCAL):
-            for i in range(line.size):
-                x = np.uint64(i)
-                line[x] += bordered[row, x + np.uint64(first)]
-        for i in range(width):
-            x, total = np.uint64(i), np.float32(0)
-            for k in range(LOCAL):
-                total += line[x + np.uint64(k)]
-            found[y, x] = bordered[y + BORDER, x + np.uint64(BORDER)] - share * total
-
-
-@kernel
-def _sums(structure: F32, bordered: F32) -> Any:
-    """The sums of the squares of the structure, and of the picture that it was found in."""
-    squares, light = np.float32(0), np.float32(0)
-    for y in range(structure.shape[0]):
-        for i in range(structure.shape[1]):
-            x = np.uint64(i)
-            squares += structure[y, x] * structure[y, x]
-            light += bordered[y + BORDER, x + np.uint64(BORDER)]
-    return squares, light
 
 
 def _usual(octaves: float) -> float:
@@ -134,8 +99,8 @@ def _usual(octaves: float) -> float:
 
 def _contrast(pyramid: GrayPyramid, structure: F32) -> float:
     """Octaves of local contrast over brightness."""
-    squares, light = _sums(structure, small_level(pyramid))
-    energy, brightness = squares / structure.size, light / structure.size
+    energy = float(np.vdot(structure, structure)) / structure.size
+    brightness = cv2.mean(inner(_small_level(pyramid)))[0]
     return 0.5 * math.log2((energy + 1e-3) / (brightness**2 + 1e-3))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sags_node.types import U8, Finding
 from sags_node.vision.watch.judgement import Evidence, Judgement
-from sags_node.vision.watch.picture_fit import BRIGHT
+from sags_node.vision.watch.palette import Colors
 from sags_node.vision.watch.standing import Debounced
 
 ACROSS = 64  # pixels across the picture that are looked at
@@ -38,10 +38,10 @@ class ColorWatch(Debounced):
 def is_blue(picture: U8) -> bool:
     """Tell whether most of a picture [H, W, 3] is far bluer than red."""
     step = max(1, picture.shape[1] // ACROSS)
-    pixels = picture[::step, ::step].reshape(-1, 3).astype(np.int32)
-    light = pixels.sum(axis=1)
-    seen = (light > 3 * 255 * DARK) & (pixels.max(axis=1) < 255 * BRIGHT)
-    if np.count_nonzero(seen) < LEAST_SEEN * len(pixels):
+    colors = Colors(picture[::step, ::step], DARK)
+    if np.count_nonzero(colors.fair) < LEAST_SEEN * colors.fair.size:
         return False
-    red, _, blue = pixels[seen].T
-    return bool(np.median((blue - red) / light[seen]) > BLUE)
+    red, blue, light = (
+        each[colors.fair].astype(np.int32) for each in (colors.red, colors.blue, colors.light)
+    )
+    return bool(np.median((blue - red) / light) > BLUE)

@@ -117,14 +117,15 @@ class FreezeWatch:
     def _squares(self, eyes: Eyes, others: Eyes) -> list[F32]:
         """The squares of the differences of each eye, the mean in each cell [rows, columns]; 0 under known
         captions."""
-        return [self._squares_of(eye, other) for eye, other in zip(eyes, others, strict=True)]
-
-    def _squares_of(self, picture: U8, other: U8) -> F32:
-        height, width = picture.shape[:2]
-        apart = self._apart(picture, other, EVERY)
-        size = min(CELLS, apart.shape[1]), max(1, min(CELLS * height // width, apart.shape[0]))
-        squares = cv2.multiply(apart, apart, dtype=cv2.CV_32F)
-        return np.asarray(cv2.resize(squares, size, interpolation=cv2.INTER_AREA).max(axis=2), np.float32)
+        found = []
+        for eye, other in zip(eyes, others, strict=True):
+            height, width = eye.shape[:2]
+            apart = self._apart(eye, other, EVERY)
+            size = min(CELLS, apart.shape[1]), max(1, min(CELLS * height // width, apart.shape[0]))
+            squares = cv2.multiply(apart, apart, dtype=cv2.CV_32F)
+            cells = cv2.resize(squares, size, interpolation=cv2.INTER_AREA)
+            found.append(np.asarray(cells.max(axis=2), np.float32))
+        return found
 
     def _is_plainly_new(self, picture: U8, other: U8) -> bool:
         """A few rows show that most are."""

@@ -179,23 +179,8 @@ def _ends(rgb: U8, outliers: int) -> I64:
 
 def _are_equal(left: F32, right: F32) -> bool:
     """Two captures of one picture differ by noise and brightness, far less than by a small shift."""
-    apart, step = _differences(left, right)
-    return bool(apart < EQUAL * step)
-
-
-@kernel
-def _differences(left: F32, right: F32) -> Any:
-    """Mean of the absolute differences between two pictures, brought to one brightness, and between the left
-    one and itself, shifted by a pixel."""
-    height, width = left.shape
-    gain = left.mean() / right.mean()
-    apart, step = np.float32(0), np.float32(0)
-    for y in range(height):
-        for x in range(width):
-            apart += abs(left[y, x] - gain * right[y, x])
-        for x in range(width - 1):
-            step += abs(left[y, x + 1] - left[y, x])
-    return apart / (height * width), step / (height * (width - 1))
+    apart = mean_difference(left, right * np.float32(cv2.mean(left)[0] / cv2.mean(right)[0]))
+    return apart < EQUAL * mean_difference(left[:, 1:], left[:, :-1])
 
 
 def _are_exchanged(left: F32, right: F32) -> bool:
