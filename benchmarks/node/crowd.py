@@ -21,6 +21,7 @@ from rich.table import Table
 
 from benchmarks.node.neighbours import everything, give_way
 from benchmarks.node.processes import program
+from benchmarks.tables import filled
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.received import ReceivedText, TopicName
@@ -225,16 +226,13 @@ def _figures(seen: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def table(measured: dict[str, Any]) -> Table:
     """For people; `measured` as `measure_crowd` returns it."""
     made = Table("phase", "rate, Hz", "latency p50, p99, ms", "RSS, MB", "MB per minute", "others saw")
-    for row in measured["phases"]:
-        made.add_row(
-            row["phase"],
-            f"{row['rate_hz']['p50']:.1f}",
-            f"{row['latency_p50_ms']:.0f}, {row['latency_p99_ms']:.0f}",
-            f"{row['rss_mb']['start']:.0f} - {row['rss_mb']['end']:.0f}",
-            f"{row['rss_mb_per_minute']:+.2f}",
-            "\n".join(_seen(name, peer) for name, peer in row["peers"].items()),
-        )
-    return made
+    latency, memory = "{latency_p50_ms:.0f}, {latency_p99_ms:.0f}", "{rss_mb[start]:.0f} - {rss_mb[end]:.0f}"
+    rows = [
+        row | {"saw": "\n".join(_seen(name, peer) for name, peer in row["peers"].items())}
+        for row in measured["phases"]
+    ]
+    cells = "{phase}", "{rate_hz[p50]:.1f}", latency, memory, "{rss_mb_per_minute:+.2f}", "{saw}"
+    return filled(made, rows, *cells)
 
 
 def _seen(name: str, peer: dict[str, Any]) -> str:

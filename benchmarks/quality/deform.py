@@ -17,6 +17,7 @@ from rich.table import Table
 
 from benchmarks.quality.depth import Advance, rounded
 from benchmarks.quality.registration import SIZE, part, shown_to_node
+from benchmarks.tables import filled
 from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
 from sags_node.clients.overlay.held import HeldObject
@@ -162,7 +163,5 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     """For people."""
     columns = [f"{which}_{name}" for which in ("all", "moved") for name in MODES]
     errors = Table("below, mm", *columns, "worse, mm", title="median, nine of ten, mm")
-    for row in measured["rows"]:
-        said = [f"{row[name]['median_mm']}, {row[name]['p90_mm']}" for name in columns]
-        errors.add_row(str(row["below_mm"]), *said, str(row["worse_mm"]))
-    return [errors]
+    cells = [f"{{{name}[median_mm]}}, {{{name}[p90_mm]}}" for name in columns]
+    return [filled(errors, measured["rows"], "{below_mm}", *cells, "{worse_mm}")]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from benchmarks.tables import filled
 from sags_node.config.schema import TissueConfig
 from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
@@ -130,7 +131,4 @@ def _mean(values: Sequence[float]) -> float | None:
 def table(rows: Sequence[Row]) -> Table:
     """For people; each row as `measure_masks` returns it."""
     columns = [key for key in rows[0] if key != "receipt"]
-    made = Table(*columns)
-    for row in rows:
-        made.add_row(*("-" if row[key] is None else str(row[key]) for key in columns))
-    return made
+    return filled(Table(*columns), rows, *(f"{{{key}}}" for key in columns))

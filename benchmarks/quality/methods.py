@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from benchmarks.tables import filled
 from sags_node.config.schema import MappingMethod
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
@@ -111,16 +112,11 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
         "window", "depth mm", "track px", "ms",
     )  # fmt: skip
     shown = Table(*columns, title="Control nodes, and the paper's field")
-    for row in rows:
-        live, step = row["live"], row["step"]
-        latency = f"{live['latency_ms']['p50']:.0f} / {live['latency_ms']['p99']:.0f}"
-        shown.add_row(
-            f"{row['width']} x {row['height']}", row["method"], f"{live['rate_hz']:.1f}", latency,
-            f"{live['psnr']:.1f}",
-            *(
-                f"{step[key]:.2f}" if key in step else "-"
-                for key in ("online", "predict", "heldout", "window", "depth", "track")
-            ),
-            f"{step['frame_ms']['p50']:.0f}",
-        )  # fmt: skip
-    return shown
+    live = (
+        "{live[rate_hz]:.1f}",
+        "{live[latency_ms][p50]:.0f} / {live[latency_ms][p99]:.0f}",
+        "{live[psnr]:.1f}",
+    )
+    steps = (f"{{step[{key}]:.2f}}" for key in ("online", "predict", "heldout", "window", "depth", "track"))
+    cells = "{width} x {height}", "{method}", *live, *steps, "{step[frame_ms][p50]:.0f}"
+    return filled(shown, rows, *cells)

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from benchmarks.quality.tracking import RIGHT, RIGHT_MM, reliability_rows
 from benchmarks.quality.tracking_report import reliability_tables
+from benchmarks.tables import filled
 from sags_lab.protocols.point_tracks import SURE
 from sags_node.config.schema import PhantomSource
 from sags_node.errors import SagsError, UsageError
@@ -266,7 +267,6 @@ def tables(measured: dict[str, Any]) -> list[Table]:
         "out of sight", "anchors", "right before", "wrong", "found again", "wrong", "had they not moved",
         title=f"{measured['away_s']:g} s out of sight",
     )  # fmt: skip
-    for row in measured["rows"]:
-        shares = (row["before"]["found"], row["before"]["wrong"], row["found"], row["wrong"], row["unmoved"])
-        made.add_row(row["scenario"], str(row["anchors"]), *(f"{share:.0%}" for share in shares))
+    shares = "{before[found]:.0%}", "{before[wrong]:.0%}", "{found:.0%}", "{wrong:.0%}", "{unmoved:.0%}"
+    filled(made, measured["rows"], "{scenario}", "{anchors}", *shares)
     return [made, *reliability_tables(measured)]

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from benchmarks.quality.depth import Advance, rounded
 from benchmarks.quality.depth_ct import CTPair, configured_depth, read_ct_pair
+from benchmarks.tables import filled
 from sags_node.clients.registration.register import Registration, Verdict, register
 from sags_node.clients.registration.rigid import kabsch
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
@@ -298,14 +299,8 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     )
     for scene in ("phantom", "ct"):
         for name in ("by_pairs", "fitted", "open3d") if scene in measured else ():
-            row = measured[scene][name]
-            within = f"{row['within_told']:.0%}" if "within_told" in row else ""
-            errors.add_row(
-                scene, name, str(row["median_mm"]), str(row["p90_mm"]), str(row.get("told_mm", "")), within
-            )
+            cells = scene, name, "{median_mm}", "{p90_mm}", "{told_mm}", "{within_told:.0%}"
+            filled(errors, [measured[scene][name]], *cells, unknown="")
     refused = Table("what", "refused", "with its remedy", "said", title="to be refused")
-    for row in measured["refused"]:
-        refused.add_row(
-            row["what"], f"{row['refused']} of {row['of']}", str(row["with_its_remedy"]), row["said"]
-        )
+    filled(refused, measured["refused"], "{what}", "{refused} of {of}", "{with_its_remedy}", "{said}")
     return [errors, refused]

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
 from sags_node.geometry import project, rigid
@@ -215,19 +216,12 @@ def table(measured: dict[str, Any]) -> Table:
         title=f"{measured['seconds']:g} s at {measured['rate']:g} Hz",
     )  # fmt: skip
     for row in measured["rows"]:
-        shown = "psnr" in row
-        made.add_row(
-            row["motion"],
-            row["way"],
-            f"{row['ate_mm']:.2f} / {row['max_mm']:.2f}",
-            f"{row['rpe_mm']:.3f} / {row['rpe_deg']:.3f}",
-            f"{row['end_mm']:.2f} / {row['end_deg']:.2f}",
-            f"{row['drift_mm']:.2f} / {row['drift_deg']:.2f}",
-            f"{row['worst_drift_mm']:.2f} / {row['worst_drift_deg']:.2f}",
-            f"{row['psnr']:.2f}" if shown else "",
-            f"{row['depth_median_mm']:.2f} / {row['depth_p90_mm']:.2f}" if shown else "",
-            str(row["held"]) if shown else "",
-        )
+        shown = ("{psnr:.2f}", "{depth_median_mm:.2f} / {depth_p90_mm:.2f}", "{held}")
+        filled(
+            made, [row], "{motion}", "{way}", "{ate_mm:.2f} / {max_mm:.2f}", "{rpe_mm:.3f} / {rpe_deg:.3f}",
+            *(f"{{{each}_mm:.2f}} / {{{each}_deg:.2f}}" for each in ("end", "drift", "worst_drift")),
+            *(shown if "psnr" in row else ()),
+        )  # fmt: skip
     return made
 
 

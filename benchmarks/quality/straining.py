@@ -8,6 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.quality.depth import Advance, rounded, spread
+from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import STRAIN_FIELDS, points
@@ -116,6 +117,6 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     table = Table("points", "strain", "known", "true, p90", "error", "0 is told", title="median, nine of ten")
     for part in ("all", "strained", "back"):
         for name, row in measured[part].items():
-            figures = [f"{row[n]['median']}, {row[n]['p90']}" for n in ("error", "zero")]
-            table.add_row(part, name, str(row["known"]), str(row["true_p90"]), *figures)
+            figures = "{error[median]}, {error[p90]}", "{zero[median]}, {zero[p90]}"
+            filled(table, [row], part, name, "{known}", "{true_p90}", *figures)
     return [table]
