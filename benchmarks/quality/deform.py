@@ -28,6 +28,7 @@ from sags_node.clients.overlay.scene import ObjectSpec
 from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.relief import SPACING
+from sags_node.phantom.rig import phantom_rig
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.phantom.tissue import LIFT
 from sags_node.pipeline.pipeline import Pipeline
@@ -64,7 +65,7 @@ def measure_deform(seeds: int, advance: Advance) -> dict[str, Any]:
     scene = PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1])
     config = LaunchConfig(source=scene)
     prepare(config)
-    receipt = Receipt(Phantom(scene).rig, SIZE, None)
+    receipt = Receipt(phantom_rig(*SIZE), SIZE, None)
     found, checked = [], []
     for seed in range(seeds):
         advance(seed, seeds, "pulling")

@@ -314,6 +314,12 @@ def measure_faults(
     }
 
 
+def frame_of(number: int, rate: float, truth: PhantomFrame) -> StereoFrame:
+    """What a camera of so many frames a second gives of a phantom, with its true mask."""
+    stamp = round((1 + number / rate) * 1e9)
+    return StereoFrame(number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool)
+
+
 def _phantom_frames(phantom: Phantom, count: int) -> Iterable[tuple[StereoFrame, PhantomFrame]]:
     for index in range(count):
         truth = phantom.frame(index, count)

@@ -7,7 +7,7 @@ error is a matter of definition, since the motion that all tissue shares cannot 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks.quality.depth import Advance, frame_of
 from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
@@ -42,8 +43,6 @@ TURNED = np.radians([0.6, 0.5, -0.6])  # 1 degree
 HAND_EYE = np.radians([0.6, -0.6, 0.5])  # of the camera on the hand: 1 degree
 JITTER = 1e-4  # m, along each axis (standard deviation)
 JITTER_TURN = np.radians(0.03)  # about each
-
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
 class Robot:
@@ -148,7 +147,7 @@ def _measured(
     for number in range(count):
         truth = phantom.frame(number, count)
         given = robot.gives(truth.T_world_cam, number / rate)
-        frame = _stereo(number, rate, truth)
+        frame = frame_of(number, rate, truth)
         for name, each in played.items():
             pose = given if name in ("robot", "refine") else truth.T_world_cam
             each.take(replace(frame, T_world_cam=pose), truth.depth)
@@ -173,11 +172,6 @@ def _measured(
 def _with_pose(config: LaunchConfig, way: PoseWay) -> LaunchConfig:
     vision = config.vision.model_copy(update={"pose": way})
     return config.model_copy(update={"vision": vision})
-
-
-def _stereo(number: int, rate: float, truth: PhantomFrame) -> StereoFrame:
-    stamp = round((1 + number / rate) * 1e9)
-    return StereoFrame(number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool)
 
 
 class _Points:
