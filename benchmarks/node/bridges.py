@@ -24,7 +24,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
-from benchmarks.node.crowd import STARTING, STATUS, STOPPING, Advance, node_beside, watched
+from benchmarks import Advance
+from benchmarks.node.crowd import STARTING, STATUS, STOPPING, node_beside, watched
 from benchmarks.node.processes import cpu_seconds
 from benchmarks.tables import filled
 from sags_node.bags.pictures import header_stamp

@@ -19,6 +19,7 @@ import numpy as np
 import zmq
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.node.neighbours import OWN_PORTS, everything, give_way, read_everything
 from benchmarks.node.processes import parent_lives, program
 from benchmarks.tables import filled
@@ -39,7 +40,6 @@ STOPPING = 30.0  # s for it to end
 SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = *OWN_PORTS, "source.loop:=true"
 
-Advance = Callable[[int, int | None, str], None]  # done, of, what
 Task = Callable[[Path, float, Event, Connection], None]  # of a subscriber
 Work = tuple[Task, float]  # with its argument
 

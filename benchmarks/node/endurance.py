@@ -9,13 +9,14 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.tables import filled
 from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
@@ -30,7 +31,6 @@ from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import U8, StereoFrame
 
 Order = Literal["there-and-back", "wrap", "walk"]
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 MOST_BYTES = 4_000_000_000  # of pictures kept in memory
 TURN = 0.05  # chance per frame that a walk goes the other way

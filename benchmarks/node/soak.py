@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.node import neighbours
-from benchmarks.node.crowd import Advance, is_over, node_beside, peers_of
+from benchmarks.node.crowd import is_over, node_beside, peers_of
 from benchmarks.node.endurance import SIGNIFICANT, slope, trends
 from benchmarks.node.processes import listed, own_run_dir
 from sags_node.errors import SagsError

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.tables import filled
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
@@ -63,7 +64,6 @@ PARTS: Mapping[str, tuple[str, str, float | None]] = {
     "self-adaptive block, after the online start": ("online", "online_no_adaptive", None),
 }
 
-Advance = Callable[[int, int | None, str], None]  # done, of, what
 Row = dict[str, Any]
 
 

@@ -7,7 +7,7 @@ filters, and drawn where nothing was trained, against the ray-cast truth.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.quality.alias_truth import AliasTruth, Shot
 from benchmarks.tables import filled
 from sags_node.config.schema import PhantomSource
@@ -39,8 +40,6 @@ SIZES = (0.25, 0.5, 1.0, 2.0, 4.0)
 DISTANCES = (0.5, 1.0, 2.0, 4.0)
 DRIFT_SIZE, DRIFT_STEP = 0.25, 0.1  # of the trained size; px per frame
 STEPS_PER_ROUND = 50  # between two looks for holes
-
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 
 @dataclass(frozen=True, slots=True)

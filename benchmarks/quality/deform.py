@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks import Advance
+from benchmarks.quality.depth import rounded
 from benchmarks.quality.registration import SIZE, part, shown_to_node
 from benchmarks.tables import filled
 from sags_node.clients.overlay.draw import Body

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import Advance
 from benchmarks.disturbances import DISTURBANCES, Disturbance, Scene, Taken, disturbed
 from benchmarks.quality.tracking import true_points
 from sags_node.errors import SagsError, UsageError
@@ -36,7 +37,6 @@ ANCHORS = 24
 ANCHOR_WRONG = 2e-3  # m: an instrument led to such a target misses it
 ANCHOR_WRONG_PX = 8 / 640  # of the width, where depth has no truth: 1.1 mm sideways at 80 mm
 
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 Row = dict[str, Any]
 
 

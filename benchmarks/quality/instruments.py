@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, frame_of, rounded, spread
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, rounded, spread
 from benchmarks.tables import filled
 from sags_node.confidence import SURE, error_of
 from sags_node.config.schema import LaunchConfig

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, frame_of, spread
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, spread
 from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, add, placed, tally
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import rigid

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.tables import filled
 from sags_node.config.schema import TissueConfig
 from sags_node.errors import SagsError
@@ -21,7 +22,6 @@ from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import Bool, FrameResult, Reference, StereoFrame
 from sags_node.vision.tissue import TissueMask
 
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 Row = dict[str, Any]
 
 

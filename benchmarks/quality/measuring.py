@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks import Advance
+from benchmarks.quality.depth import rounded
 from benchmarks.quality.tracking import middle, pin, true_points
 from benchmarks.tables import filled
 from sags_node.errors import SagsError

@@ -7,13 +7,14 @@ time; nodes only have what they are now.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.tables import filled
 from sags_node.config.schema import MappingMethod
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
@@ -33,8 +34,6 @@ METHODS: tuple[MappingMethod, ...] = ("nodes", "sags")
 SIZES = ((320, 256), (640, 512))
 WINDOW_NS = 2_000_000_000  # as long as the field remembers
 SHOWN = {"online": "psnr", "predict": "psnr", "heldout": "psnr", "depth": "median_mm", "track": "median_px"}
-
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 
 def measure_methods(

@@ -6,7 +6,7 @@ the scope moves. Its pose is given, as by a robot, unless the node is to estimat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.quality.tracking import RIGHT, RIGHT_MM, reliability_rows
 from benchmarks.quality.tracking_report import reliability_tables
 from benchmarks.tables import filled
@@ -46,8 +47,6 @@ TURNING = 1.5  # s, there and back
 MOVED = np.array([0.006, -0.004, 0.004])  # m, in the dark
 ROLLED = 8.0  # degrees, in the dark
 WRONG = 6.0 / 640  # of the width: one that is farther, and sure, is wrong
-
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
 @dataclass(frozen=True, slots=True)

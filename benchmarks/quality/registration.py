@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, frame_of, rounded, spread
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, rounded, spread
 from benchmarks.quality.depth_ct import CTPair, configured_depth, read_ct_pair
 from benchmarks.tables import filled
 from sags_node.clients.registration.register import Registration, Verdict, register

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, frame_of
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of
 from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError

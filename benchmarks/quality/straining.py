@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, frame_of, rounded, spread
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, rounded, spread
 from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget

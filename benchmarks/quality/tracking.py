@@ -4,12 +4,13 @@ methods that know no model (`followers`)."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from benchmarks import Advance
 from benchmarks.quality.followers import CONSISTENT, FOLLOWERS, Follower, dis_flow, sample
 from sags_lab.protocols.point_tracks import (
     average_jaccard,
@@ -35,8 +36,6 @@ BORDER = 60  # px: what is nearer to the picture's edge soon leaves it
 RIGHT = 4.0 / 640  # of the width: so near to its point a confident anchor should be
 RIGHT_MM = 2.0  # the same in space
 WRONG = 8.0 / 640  # of the width: what is farther, and said to be seen there, is wrong
-
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
 @dataclass(frozen=True, slots=True)
