@@ -69,7 +69,8 @@ def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[s
                 raise SagsError(f"{session.name} has no true points; a session of the phantom has")
             if rows is None:
                 places = np.asarray(project(result.pair.camera, truth)[0], np.float64)
-                rows = pin(pipeline, result, places, frame.reference.points_visible & middle(places, result))
+                wanted = np.flatnonzero(frame.reference.points_visible & middle(places, result))
+                rows = [*pin(pipeline, result, places, wanted).values()]
                 shapes = _shapes(len(rows), seed)
             elif number % EVERY == 0:
                 receipt.add(frame, result.observation.tissue)

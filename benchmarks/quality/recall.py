@@ -15,12 +15,12 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks import Advance
-from benchmarks.quality.tracking import RIGHT, RIGHT_MM, reliability_rows
+from benchmarks.quality.tracking import RIGHT, RIGHT_MM, pin, reliability_rows
 from benchmarks.quality.tracking_report import reliability_tables
 from benchmarks.tables import filled
 from sags_lab.protocols.point_tracks import SURE
 from sags_node.config.schema import PhantomSource
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomFrame
@@ -133,7 +133,11 @@ def _played(
         receipt.add(frame, result.observation.tissue)
         truth, visible = _truth(result, moment)
         if number == before // 3:
-            pinned = _pin(pipeline, result, truth, visible)
+            last = result.pair.camera.width - BORDER, result.pair.camera.height - BORDER
+            middle = (truth > BORDER).all(1) & (truth < last).all(1)
+            wanted = np.flatnonzero(visible & middle)[:MOST]
+            otherwise = "nothing could be pinned; choose another source.seed"
+            pinned = pin(pipeline, result, truth, wanted, otherwise)
         if number == before - 1:
             at_last = _scored(result.anchors, pinned, truth, visible, width)
             standing = result.anchors
@@ -239,25 +243,6 @@ def _truth(result: FrameResult, moment: _Moment) -> tuple[F64, Bool]:
 def _inside(pixels: F64, camera: Camera) -> Bool:
     inside = (pixels > 0) & (pixels < [camera.width - 1, camera.height - 1])
     return np.asarray(inside.all(1))
-
-
-def _pin(pipeline: Pipeline, result: FrameResult, truth: F64, visible: Bool) -> dict[int, int]:
-    """Anchors at some of the points: id -> number of the point."""
-    camera = result.pair.camera
-    middle = (truth > BORDER).all(1) & (truth < [camera.width - BORDER, camera.height - BORDER]).all(1)
-    pinned: dict[int, int] = {}
-    for point in np.flatnonzero(visible & middle)[:MOST]:
-        try:
-            u, v = (float(x) for x in truth[point])
-            anchor = pipeline.anchors.add_pixel(
-                u, v, result.observation, result.snapshot, result.views["left"]
-            )
-        except SagsError:
-            continue  # no depth there
-        pinned[anchor] = int(point)
-    if not pinned:
-        raise SagsError("nothing could be pinned; choose another source.seed")
-    return pinned
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
