@@ -18,7 +18,6 @@ from golden import Golden, Tolerance, compare, read_golden, write_golden
 from places import ROOT
 
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import LaunchConfig
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
@@ -134,15 +133,10 @@ def measured_run(
                 continue
             result = frame_result(frame, velocity, late)
             run.add(with_right_eye(result) if right else result, 21.0, frame.t_capture_ns)
-        return measured(run, frames, options)
-
-
-def measured(
-    run: Run, frames: list[StereoFrame], options: MeasureOptions, config: LaunchConfig = CONFIG
-) -> Measurer:
-    receipt = Receipt(rig(), (WIDTH, HEIGHT), options.lpips_weights)
-    measurer = Measurer(run, Rectifier(rig(), WIDTH, HEIGHT), config, options, receipt)
-    measurer.run(frames, lambda what, done: None)
+        receipt = Receipt(rig(), (WIDTH, HEIGHT), options.lpips_weights)
+        rectifier = Rectifier(rig(), WIDTH, HEIGHT)
+        measurer = Measurer(run, rectifier, CONFIG, options, receipt)
+        measurer.run(frames, lambda what, done: None)
     return measurer
 
 
@@ -304,7 +298,9 @@ def test_papers_count_with_the_masks_as_they_were_given(frames: list[StereoFrame
             result = frame_result(frames[0], SPEED, late=0.1)
             tissue = cv2.erode(result.observation.tissue.view(np.uint8), np.ones((2 * margin + 1,) * 2)) > 0
             run.add(replace(result, observation=replace(result.observation, tissue=tissue)), 21.0, 0)
-            measurer = measured(run, frames[:2], options, config)
+            receipt = Receipt(rig(), (WIDTH, HEIGHT), None)
+            measurer = Measurer(run, Rectifier(rig(), WIDTH, HEIGHT), config, options, receipt)
+            measurer.run(frames[:2], lambda what, done: None)
         found.append({group: row.figures[group] for row in measurer.rows for group in row.figures})
     plain, margined = found
     for group in ("online", "heldout"):
