@@ -1,1 +1,5 @@
 """How fast and how good the node is, measured; see README.md here. Not part of the installed package."""
+
+from collections.abc import Callable
+
+Advance = Callable[[int, int | None, str], None]  # done, of, what is measured now

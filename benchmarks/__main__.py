@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.commands import disturbances, engine, node, quality
+from benchmarks.commands import engine, node, quality
 from sags_node.cli.main import begin, sags_group
 
 
@@ -15,7 +15,7 @@ def main(verbose: bool, form: str) -> None:
     begin(verbose, form)
 
 
-for module in (quality, disturbances, node, engine):
+for module in (quality, node, engine):
     for name, command in vars(module).items():
         if name.startswith("bench_"):
             main.add_command(command)

@@ -7,10 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from sags_lab.archive.command import archive
 from sags_lab.lerobot.option import version_option
-from sags_lab.protocols.option import evaluate_protocol, protocol_option
+from sags_node.cli.launching import check_files, words_of, write_json
+from sags_node.errors import UsageError
+from sags_node.terminal import text
+from sags_node.terminal.console import progress, show
+from sags_node.tools.evaluation.figures import flat
 
 if TYPE_CHECKING:
     from sags_lab.lerobot.form import Version
@@ -23,6 +28,11 @@ def extend(sags: click.Group) -> None:
     _wrap(sags.commands["export"], _with_lerobot, lerobot_option, version_option)
 
 
+protocol_option = click.option(
+    "--protocol",
+    type=click.Choice(["d4d", "endonerf", "scared", "stereomis", "stir"]),
+    help="Measure a public data set, in its own layout, by its own rules (docs/evaluation.md).",
+)
 lerobot_option = click.option(
     "--lerobot",
     metavar="FOLDER",
@@ -44,6 +54,67 @@ def _by_protocol(own: Callable[..., None], protocol: str | None, **arguments: An
         own(**arguments)
     else:
         evaluate_protocol(protocol, **arguments)
+
+
+def evaluate_protocol(
+    protocol: str,
+    launch: tuple[str, ...],
+    iterations: int | None,
+    lpips_weights: Path | None,
+    out: Path | None,
+    json_out: bool,
+    **others: Any,
+) -> None:
+    """Measure a data set by its protocol.
+
+    Args:
+        others: options of `sags eval` that no protocol takes.
+
+    Raises:
+        UsageError: one of these is given, or the folder is wrong.
+        SagsError: the data set cannot be measured.
+    """
+    from sags_lab.protocols import run
+    from sags_lab.protocols.d4d import measure_d4d
+
+    source_of = click.get_current_context().get_parameter_source
+    idle = others.keys() - {"verbose"} | ({"lpips_weights"} if protocol != "endonerf" else set())
+    given = [name for name in sorted(idle) if source_of(name) is ParameterSource.COMMANDLINE]
+    if given:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise UsageError(f"--protocol {protocol} measures by rules of its own: leave out {options}")
+    path, overrides = words_of(launch)
+    if path is None:
+        raise UsageError(f"--protocol {protocol} needs the data set's folder")
+    if iterations is not None:
+        overrides = [*overrides, f"mapping.iterations:={iterations}"]
+    check_files(out)
+    with progress("measuring") as advance:
+
+        def tell(done: int, what: str) -> None:
+            advance(done, None, what)
+
+        if protocol == "endonerf":
+            found = run.measure_endonerf(Path(path), overrides, lpips_weights, tell)
+        else:
+            measures = {
+                "d4d": measure_d4d,
+                "scared": run.measure_scared,
+                "stereomis": run.measure_stereomis,
+                "stir": run.measure_stir,
+            }
+            found = measures[protocol](Path(path), overrides, tell)
+    found = {"protocol": protocol, **found}
+    if json_out:
+        show(found)
+    else:
+        table = text.table()
+        for key, value in flat(found).items():
+            table.add_row(
+                key, "–" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+            )
+        show(table)
+    write_json(out, found)
 
 
 def _with_lerobot(own: Callable[..., None], lerobot_version: Version, **arguments: Any) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -72,13 +70,15 @@ def bench_kernels(
     python -m benchmarks kernels --check benchmarks/results/kernels.json
     """
     from benchmarks.kernels import check as guard
+    from benchmarks.kernels import measure as kernels
     from benchmarks.kernels import report
 
     if check is not None and out is not None:
         raise UsageError("give --out or --check: a check measures up to three times and keeps no table")
-    checks = check is not None
-    measure = _kernels(quick, large, contention, no_twin, checks)
+    settings = kernels.QUICK if quick else kernels.Settings()
+    counts = (*settings.counts, kernels.MILLION) if large else settings.counts
     if check is None:
+        settings = replace(settings, counts=counts, twin=not no_twin, contention=contention)
         drawn = None if out is None else out.with_suffix(".svg")
         check_files(out)
         if out is not None:
@@ -86,7 +86,7 @@ def bench_kernels(
             if not out.exists():  # else it is the earlier figures' plot
                 check_files(drawn)
         with progress("measuring") as advance:
-            measured = measure(advance)
+            measured = kernels.measure_kernels(settings, advance)
         for table in [measured] if json_out else report.tables(measured):
             show(table)
         write_json(out, measured)
@@ -94,33 +94,13 @@ def bench_kernels(
             with whole(drawn) as partial:
                 partial.write_text(report.plot(measured), encoding="utf-8")
         return
-    kept = guard.read_table(check)
+    kept, settings = guard.read_table(check), replace(settings, counts=counts, twin=False, rhythm=False)
     with progress("measuring") as advance:
-        compared = guard.check(lambda: measure(advance), kept, tolerance)
+        compared = guard.check(lambda: kernels.measure_kernels(settings, advance), kept, tolerance)
     show([asdict(each) for each in compared] if json_out else report.check_table(compared, tolerance))
     slower = [f"{each.kernel} {each.ratio:.2f} times" for each in compared if each.ratio > tolerance]
     if slower:
         raise SagsError(f"slower than in {check}, three times in a row: {'; '.join(slower)}")
-
-
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
-Measure = Callable[[Advance], dict[str, Any]]
-
-
-def _kernels(quick: bool, large: bool, contention: bool, no_twin: bool, checks: bool) -> Measure:
-    """What measures the CPU's table; of what is only to be checked, the kernels alone."""
-    from dataclasses import replace
-
-    from benchmarks.kernels import measure as kernels
-
-    settings = kernels.QUICK if quick else kernels.Settings()
-    if large:
-        settings = replace(settings, counts=(*settings.counts, kernels.MILLION))
-    if checks:
-        settings = replace(settings, twin=False, rhythm=False)
-    else:
-        settings = replace(settings, twin=not no_twin, contention=contention)
-    return lambda advance: kernels.measure_kernels(settings, advance)
 
 
 @click.command("alias")

@@ -3,8 +3,7 @@
 Imports phantom.
 """
 
-from benchmarks.disturbances.catalogue import DISTURBANCES, Disturbance
+from benchmarks.disturbances.catalogue import DISTURBANCES, Disturbance, Taken, disturbed
 from benchmarks.disturbances.scene import Scene
-from benchmarks.disturbances.stream import Taken, disturbed
 
 __all__ = ["DISTURBANCES", "Disturbance", "Scene", "Taken", "disturbed"]

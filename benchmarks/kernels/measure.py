@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import Advance
 from benchmarks.kernels.contention import measure_contention, measure_rhythm
 from benchmarks.kernels.rasterizing import RasterCase, measure_rasterizer
 from benchmarks.kernels.scenes import surface
-from benchmarks.kernels.timing import median_ms
-from benchmarks.kernels.work import Work, bytes_of, share_of_peak, stage_rows
+from benchmarks.kernels.timing import Work, bytes_of, median_ms, share_of_peak, stage_rows
 from sags_node.engine.adam import AdamState, adam_step
 from sags_node.engine.losses import tissue as losses
 from sags_node.engine.rasterizer import views
@@ -26,8 +26,6 @@ DEPTH_WEIGHT, DEPTH_SCALE = 2e-3, 1e-3  # as the mapper's
 
 # per value: it and its two momenta are read and written, its gradient is read
 ADAM_FLOATS, ADAM_OPERATIONS = 7, 14
-
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 MILLION = 1_000_000
 GAUSSIAN_COLUMNS, CELL_COLUMNS = 14, 32

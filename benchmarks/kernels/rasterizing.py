@@ -10,8 +10,15 @@ import numpy as np
 
 from benchmarks.kernels.reference import ReferenceRasterizer
 from benchmarks.kernels.scenes import SCENES, with_harmonics
-from benchmarks.kernels.timing import Stages, StageTimes, median_ms, stage_clock
-from benchmarks.kernels.work import Work, share_of_peak, stage_rows
+from benchmarks.kernels.timing import (
+    Stages,
+    StageTimes,
+    Work,
+    median_ms,
+    share_of_peak,
+    stage_clock,
+    stage_rows,
+)
 from sags_node.engine.rasterizer import (
     binning,
     compositing,

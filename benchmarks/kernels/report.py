@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from rich.table import Table
 
 from benchmarks.kernels.check import Compared
-from benchmarks.kernels.plot import Bar, stacked_bars
+from benchmarks.tables import filled, plain_table
+from sags_node.tools.evaluation.plots import as_svg, new_figure
+
+WIDTH, HEAD, BAR, NAMED = 860, 70, 28, 17  # px
 
 Row = Mapping[str, Any]
 
 
 def tables(measured: Row) -> Iterator[Table]:
     """`measured` as `measure_kernels` returns it."""
-    peaks = measured["peaks"]
-    names = [f"{each['threads']} thread{'s' if each['threads'] > 1 else ''}" for each in peaks]
-    yield peaks_table(peaks, names, measured["machine"])
+    yield _peaks(measured)
     yield _drawings(measured["rasterize"])
     yield _stages(measured)
     yield from _contention(measured)
@@ -25,67 +27,75 @@ def tables(measured: Row) -> Iterator[Table]:
 
 def check_table(compared: Sequence[Compared], tolerance: float) -> Table:
     """The slowest kernel first."""
-    made = new_table("kernel", "ms", "kept ms", "ratio", "")
-    for each in compared:
-        verdict = "slower" if each.ratio > tolerance else ""
-        made.add_row(each.kernel, f"{each.ms:.2f}", f"{each.kept_ms:.2f}", f"{each.ratio:.2f}", verdict)
-    return made
+    rows = [asdict(each) | {"verdict": "slower" * (each.ratio > tolerance)} for each in compared]
+    made = plain_table("kernel", "ms", "kept ms", "ratio", "")
+    return filled(made, rows, "{kernel}", "{ms:.2f}", "{kept_ms:.2f}", "{ratio:.2f}", "{verdict}")
 
 
 def plot(measured: Row) -> str:
-    """Where the time goes, as SVG."""
-    drawings: list[Bar] = [
-        (f"{_count(row['n'])}, {row['width']}x{row['height']}", by_stage(row))
-        for row in measured["rasterize"]
-        if _is_plain(row, measured["threads"])
-    ]
-    threads = f"{measured['threads']} threads"
-    return stacked_bars([(f"Rasteriser, forward and backward, {threads}", drawings)])
+    """Where the time goes, as SVG: of each drawing a bar that is divided into its stages and ends with its
+    total."""
+    bars = {
+        f"{_count(row['n'])}, {row['width']}x{row['height']}": {
+            each["stage"]: each["ms"] for each in row["stages"]
+        }
+        for row in _plain(measured)
+    }
+    stages = list(dict.fromkeys(stage for times in bars.values() for stage in times))
+    with new_figure(WIDTH, max(HEAD + BAR * len(bars), NAMED * len(stages) + HEAD // 2)) as figure:
+        axes = figure.subplots()
+        title = f"Rasteriser, forward and backward, {measured['threads']} threads"
+        axes.set_title(title, loc="left", fontweight="bold")
+        ends = [0.0] * len(bars)
+        for stage in stages:
+            times = [each.get(stage, 0.0) for each in bars.values()]
+            axes.barh(list(bars), times, left=ends, label=stage)
+            ends = [end + ms for end, ms in zip(ends, times, strict=True)]
+        for place, end in enumerate(ends):
+            axes.annotate(f"{end:.1f} ms", (end, place), (4, -3), textcoords="offset points")
+        axes.invert_yaxis()
+        axes.margins(x=0.1)  # for the totals
+        axes.grid(visible=False)
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+        return as_svg(figure)
 
 
-def peaks_table(peaks: Sequence[Row], names: Sequence[str], title: str) -> Table:
-    """What each of `names` reached."""
+def _peaks(measured: Row) -> Table:
+    peaks = measured["peaks"]
     sizes = [f"{int(size) >> 20} MiB" for size in peaks[0]["bytes_per_s_over"]]
-    made = new_table("peak of this machine", "multiply-adds", *sizes, title=title)
-    for name, peak in zip(names, peaks, strict=True):
+    made = plain_table("peak of this machine", "multiply-adds", *sizes, title=measured["machine"])
+    for peak in peaks:
+        name = f"{peak['threads']} thread{'s' if peak['threads'] > 1 else ''}"
         bandwidths = [f"{rate / 1e9:.0f} GB/s" for rate in peak["bytes_per_s_over"].values()]
         made.add_row(name, f"{peak['operations_per_s'] / 1e9:.0f} G/s", *bandwidths)
     return made
 
 
 def _drawings(rows: Sequence[Row]) -> Table:
-    made = new_table(
+    made = plain_table(
         "drawing", "threads", "forward ms", "+ backward ms", "of peak", "torch twin ms", "faster"
     )
+    cells = "{threads}", "{forward_ms:.2f}", "{forward_backward_ms:.2f}", "{share_of_peak:.0%}"
     for row in rows:
-        twin = row.get("twin_forward_backward_ms")
-        made.add_row(
-            drawing_name(row),
-            str(row["threads"]),
-            f"{row['forward_ms']:.2f}",
-            f"{row['forward_backward_ms']:.2f}",
-            f"{row['share_of_peak']:.0%}",
-            "" if twin is None else f"{twin:.0f}",
-            "" if twin is None else f"{row['speedup_over_twin']:.0f}x",
+        twin = (
+            ("{twin_forward_backward_ms:.0f}", "{speedup_over_twin:.0f}x")
+            if "speedup_over_twin" in row
+            else ()
         )
+        filled(made, [row], drawing_name(row), *cells, *twin)
     return made
 
 
 def _stages(measured: Row) -> Table:
-    made = new_table("stage", "of", "ms", "of peak", "bound by", "pairs/s")
-    for row in measured["rasterize"]:
-        if _is_plain(row, measured["threads"]):
-            add_stages(made, row, drawing_name(row))
-    for section in ("losses", "adam"):
-        for row in measured[section]:
-            add_stages(made, row, _kernel(section, row))
+    named = [(drawing_name(row), row) for row in _plain(measured)]
+    named += [(f"losses, {row['width']}x{row['height']}", row) for row in measured["losses"]]
+    named += [(f"adam, {_count(row['n'])}", row) for row in measured["adam"]]
+    made = plain_table("stage", "of", "ms", "of peak", "bound by", "pairs/s")
+    for name, row in named:
+        for stage in row["stages"]:
+            pairs = f"{stage['pairs_per_s'] / 1e9:.2f} G" if "pairs_per_s" in stage else ""
+            filled(made, [stage], "{stage}", name, "{ms:.3f}", "{share_of_peak:.0%}", "{bound}", pairs)
     return made
-
-
-def _kernel(section: str, row: Row) -> str:
-    if section == "losses":
-        return f"losses, {row['width']}x{row['height']}"
-    return f"{section}, {_count(row['n'])}"
 
 
 def _contention(measured: Row) -> Iterator[Table]:
@@ -93,25 +103,18 @@ def _contention(measured: Row) -> Iterator[Table]:
     for section in ("rhythm", "contention"):
         for row in measured.get(section, []):
             what = f"forward and backward, {_count(row['n'])} at {row['width']}x{row['height']}"
-            made = new_table(what, "p50 ms", "p90 ms")
-            for key, spread in row.items():
-                if isinstance(spread, Mapping):
-                    situation = key.removesuffix("_ms").replace("_", " ")
-                    made.add_row(situation, f"{spread['p50']:.2f}", f"{spread['p90']:.2f}")
-            yield made
+            spreads = [
+                {**spread, "what": key.removesuffix("_ms").replace("_", " ")}
+                for key, spread in row.items()
+                if isinstance(spread, Mapping)
+            ]
+            yield filled(plain_table(what, "p50 ms", "p90 ms"), spreads, "{what}", "{p50:.2f}", "{p90:.2f}")
 
 
-def add_stages(made: Table, row: Row, of: str) -> None:
-    for stage in row["stages"]:
-        share, pairs = f"{stage['share_of_peak']:.0%}", ""
-        if "pairs_per_s" in stage:
-            pairs = f"{stage['pairs_per_s'] / 1e9:.2f} G"
-        made.add_row(stage["stage"], of, f"{stage['ms']:.3f}", share, stage["bound"], pairs)
-
-
-def _is_plain(row: Row, threads: int) -> bool:
-    special = row["sh_degree"] > 0 or row["active_tiles"] < 1
-    return not special and row["scene"] == "surface" and row["threads"] == threads
+def _plain(measured: Row) -> list[Row]:
+    """The drawings of which nothing is special."""
+    special = {"sh_degree": 0, "active_tiles": 1, "scene": "surface", "threads": measured["threads"]}
+    return [row for row in measured["rasterize"] if special.items() <= row.items()]
 
 
 def drawing_name(row: Row) -> str:
@@ -125,19 +128,7 @@ def drawing_name(row: Row) -> str:
     return ", ".join(parts)
 
 
-def by_stage(row: Row) -> dict[str, float]:
-    return {stage["stage"]: stage["ms"] for stage in row["stages"]}
-
-
 def _count(n: int) -> str:
     if n < 1000:
         return str(n)
     return f"{n / 1e3:.0f}k" if n < 999_500 else f"{n / 1e6:.2g}M"
-
-
-def new_table(first: str, *others: str, title: str | None = None) -> Table:
-    made = Table(box=None, padding=(0, 3, 0, 0), pad_edge=False, title=title, title_justify="left")
-    made.add_column(first)
-    for heading in others:
-        made.add_column(heading, justify="right")
-    return made

@@ -24,8 +24,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
-from benchmarks.node.crowd import STARTING, STATUS, STOPPING, Advance, node_beside, watched
+from benchmarks import Advance
+from benchmarks.node.crowd import STARTING, STATUS, STOPPING, node_beside, watched
 from benchmarks.node.processes import cpu_seconds
+from benchmarks.tables import filled
 from sags_node.bags.pictures import header_stamp
 from sags_node.config.schema import RosGraph
 from sags_node.errors import SagsError
@@ -110,14 +112,15 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
     made = Table(
         "bridge", "pictures, Hz", "MB/s", "age p50, p90, ms", "CPU ms a frame", "node: Hz", "p50, p99, ms"
     )
-    for row in rows:
-        given = ["", "", "", ""]
-        if (ages := row.get("age_ms")) is not None:
-            given = [f"{row[key]:.1f}" for key in ("pictures_hz", "mb_per_s", "cpu_ms_per_frame")]
-            given.insert(2, f"{ages['p50']:.0f}, {ages['p90']:.0f}")
-        node = [f"{row['node_rate_hz']:.1f}", f"{row['node_p50_ms']:.0f}, {row['node_p99_ms']:.0f}"]
-        made.add_row(row["bridge"], *given, *node)
-    return made
+    peer = (
+        "{pictures_hz:.1f}",
+        "{mb_per_s:.1f}",
+        "{age_ms[p50]:.0f}, {age_ms[p90]:.0f}",
+        "{cpu_ms_per_frame:.1f}",
+    )
+    node = "{node_rate_hz:.1f}", "{node_p50_ms:.0f}, {node_p99_ms:.0f}"
+    filled(made, rows[:1], "{bridge}", "", "", "", "", *node)  # nobody listens
+    return filled(made, rows[1:], "{bridge}", *peer, *node)
 
 
 # ---- the node ----------------------------------------------------------------------------------------------

@@ -19,8 +19,10 @@ import numpy as np
 import zmq
 from rich.table import Table
 
-from benchmarks.node.neighbours import everything, give_way
-from benchmarks.node.processes import program
+from benchmarks import Advance
+from benchmarks.node.neighbours import OWN_PORTS, everything, give_way, read_everything
+from benchmarks.node.processes import parent_lives, program
+from benchmarks.tables import filled
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.received import ReceivedText, TopicName
@@ -36,9 +38,8 @@ WARM_UP = 10.0  # s
 STARTING = 60.0  # s for a node to bind its sockets
 STOPPING = 30.0  # s for it to end
 SLOW = 0.2  # s that the slow subscriber takes for each frame
-PHASE = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*", "source.loop:=true"
+PHASE = *OWN_PORTS, "source.loop:=true"
 
-Advance = Callable[[int, int | None, str], None]  # done, of, what
 Task = Callable[[Path, float, Event, Connection], None]  # of a subscriber
 Work = tuple[Task, float]  # with its argument
 
@@ -67,7 +68,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
                 ("crowd", crowded, _crowd(many)),
                 ("alone again", alone, {}),
             ):
-                with _peers(Path(folder), work) as stop:
+                with peers_of(Path(folder), work) as stop:
                     seen = watched(observer, seconds, node, advance, name)
                     peers = stop()
                 phases.append({"phase": name, **_figures(seen), "peers": peers})
@@ -119,33 +120,37 @@ def _crowd(many: int) -> dict[str, Work]:
 
 
 @contextmanager
-def _peers(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict[str, Any]]]:
-    """Subscribers in processes of their own; what is given ends them and returns what they saw."""
+def peers_of(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict[str, Any]]]:
+    """Subscribers that run, in processes of their own; what is given ends them and returns what they saw."""
     spawn = multiprocessing.get_context("spawn")
     ending = spawn.Event()
     members: dict[str, Connection] = {}
 
     def stop() -> dict[str, Any]:
         ending.set()
-        return {name: here.recv() for name, here in members.items() if here.poll(10.0)}
+        return {name: here.recv() for name, here in members.items() if here.poll(STARTING)}
 
     with ExitStack() as running:
         for name, (target, argument) in work.items():
             members[name], there = spawn.Pipe()
             running.enter_context(program(_with_what_is_left, target, folder, argument, ending, there))
+        for name, here in members.items():
+            if not here.poll(STARTING):
+                raise SagsError(f"{name}: the subscribers did not start")
+            here.recv()
         yield stop
 
 
-def _with_what_is_left(work: Task, *arguments: Any) -> None:
+def _with_what_is_left(work: Task, folder: Path, argument: float, ending: Event, there: Connection) -> None:
     """Work at the lowest priority: a subscriber stands for another machine."""
+    there.send(None)  # it runs
     give_way()
-    work(*arguments)
+    work(folder, argument, ending, there)
 
 
-def _is_over(ending: Event) -> bool:
+def is_over(ending: Event) -> bool:
     """Also when the benchmark was killed."""
-    parent = multiprocessing.parent_process()
-    return ending.is_set() or parent is None or not parent.is_alive()
+    return ending.is_set() or not parent_lives()
 
 
 def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> None:
@@ -154,7 +159,7 @@ def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> Non
     with Subscriber(PICTURES, run_dir=folder) as subscriber:
         newest = subscriber.wait(PICTURES[0], timeout=STARTING)
         begun = time.monotonic()
-        while not _is_over(ending):
+        while not is_over(ending):
             newest = subscriber.wait(PICTURES[0], timeout=1.0, after=newest) or newest
             if newest is None or subscriber.aligned(PICTURES, newest.stamp_ns, timeout=0.1) is None:
                 continue
@@ -169,19 +174,13 @@ def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> Non
 
 def _read(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Take everything there is, as fast as it comes."""
-    taken = 0
-    with everything(folder) as socket:
-        while not _is_over(ending):
-            if socket.poll(100):
-                socket.recv_multipart(copy=False)
-                taken += 1
-    there.send({"messages": taken})
+    there.send({"messages": read_everything(folder, lambda: not is_over(ending))})
 
 
 def _sleep(folder: Path, _: float, ending: Event, there: Connection) -> None:
     """Be connected to everything and never read."""
     with everything(folder):
-        while not _is_over(ending):
+        while not is_over(ending):
             ending.wait(1.0)
     there.send({})
 
@@ -197,7 +196,7 @@ def _listen(folder: Path, count: float, ending: Event, there: Connection) -> Non
         connect(socket, address, MAX_MESSAGE_BYTES)
         poller.register(socket, zmq.POLLIN)
     heard = 0
-    while not _is_over(ending):
+    while not is_over(ending):
         for socket, _event in poller.poll(100):
             socket.recv_multipart()
             heard += 1
@@ -225,16 +224,13 @@ def _figures(seen: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def table(measured: dict[str, Any]) -> Table:
     """For people; `measured` as `measure_crowd` returns it."""
     made = Table("phase", "rate, Hz", "latency p50, p99, ms", "RSS, MB", "MB per minute", "others saw")
-    for row in measured["phases"]:
-        made.add_row(
-            row["phase"],
-            f"{row['rate_hz']['p50']:.1f}",
-            f"{row['latency_p50_ms']:.0f}, {row['latency_p99_ms']:.0f}",
-            f"{row['rss_mb']['start']:.0f} - {row['rss_mb']['end']:.0f}",
-            f"{row['rss_mb_per_minute']:+.2f}",
-            "\n".join(_seen(name, peer) for name, peer in row["peers"].items()),
-        )
-    return made
+    latency, memory = "{latency_p50_ms:.0f}, {latency_p99_ms:.0f}", "{rss_mb[start]:.0f} - {rss_mb[end]:.0f}"
+    rows = [
+        row | {"saw": "\n".join(_seen(name, peer) for name, peer in row["peers"].items())}
+        for row in measured["phases"]
+    ]
+    cells = "{phase}", "{rate_hz[p50]:.1f}", latency, memory, "{rss_mb_per_minute:+.2f}", "{saw}"
+    return filled(made, rows, *cells)
 
 
 def _seen(name: str, peer: dict[str, Any]) -> str:

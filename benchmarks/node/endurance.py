@@ -9,13 +9,15 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
+from benchmarks.tables import filled
 from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import Budget
@@ -29,7 +31,6 @@ from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import U8, StereoFrame
 
 Order = Literal["there-and-back", "wrap", "walk"]
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 MOST_BYTES = 4_000_000_000  # of pictures kept in memory
 TURN = 0.05  # chance per frame that a walk goes the other way
@@ -262,20 +263,9 @@ HEADINGS = (
 def table(measured: Mapping[str, Any]) -> Table:
     """For people; `measured` as `measure_endurance` returns it."""
     made = Table(*HEADINGS, title=f"{measured['session']}, {measured['order'].replace('-', ' ')}")
-    for row in measured["windows"]:
-        made.add_row(
-            str(row["frames"]),
-            f"{row['ms_p50']:.1f}",
-            f"{row['ms_p99']:.1f}",
-            f"{row['psnr']:.2f}",
-            str(row["gaussians"]),
-            str(row["nodes"]),
-            f"{row['rss_mb']:.0f}",
-            str(row["still"]),
-            str(row["hurried"]),
-            str(row["restarts"]),
-        )
-    return made
+    times, sizes = ("{ms_p50:.1f}", "{ms_p99:.1f}"), ("{gaussians}", "{nodes}", "{rss_mb:.0f}")
+    counts = "{still}", "{hurried}", "{restarts}"
+    return filled(made, measured["windows"], "{frames}", *times, "{psnr:.2f}", *sizes, *counts)
 
 
 def statement(measured: Mapping[str, Any]) -> str:

@@ -7,14 +7,14 @@ takes only what the node leaves of the cores.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 from benchmarks.kernels.contention import burning_core
-from benchmarks.node.neighbours import NS, find_browser, overlay, reader, viewer
+from benchmarks.node.neighbours import NS, OWN_PORTS, find_browser, overlay, reader, viewer
+from benchmarks.node.processes import own_run_dir
 from sags_node.messaging.address import NodeAddress
 from sags_node.pipeline.session import open_session
 from sags_node.pipeline.warm_up import warm_up
@@ -39,16 +39,12 @@ def measure_hosts(launch: str | None, overrides: Sequence[str], progress: Callab
     rows = []
     for name, beside in neighbours().items():
         progress(f"live: {name}")
-        with tempfile.TemporaryDirectory(prefix="sags-hosts-") as folder, ExitStack() as stack:
-            run_dir = Path(folder) / "sags"  # where a process with this XDG_RUNTIME_DIR looks for it
-            run_dir.mkdir(mode=0o700)
-            if beside is not None:
-                stack.enter_context(beside(run_dir))
+        with own_run_dir() as run_dir, nullcontext() if beside is None else beside(run_dir):
             cores = 1 if name == "one core" else None
             row = {"name": name, "part": "hosts", **_played(launch, overrides, run_dir, cores)}
         if name == "alone":  # what reading costs
-            with tempfile.TemporaryDirectory(prefix="sags-hosts-") as folder:
-                row["unread"] = _played(launch, overrides, Path(folder) / "sags", cores, read=False)
+            with own_run_dir() as run_dir:
+                row["unread"] = _played(launch, overrides, run_dir, cores, read=False)
         rows.append(row)
     return rows
 
@@ -71,10 +67,9 @@ def _played(
     launch: str | None, overrides: Sequence[str], run_dir: Path, cores: int | None, read: bool = True
 ) -> Row:
     """One run, seen from outside; pictures are compared at the full working size."""
-    sockets = ["publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"]
     played = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
     alone = "publish.detail:=false"  # what is looked at is the model, not the camera's pictures
-    forced = [*sockets, *played, alone, f"publish.run_dir:={run_dir}"]
+    forced = [*OWN_PORTS, *played, alone, f"publish.run_dir:={run_dir}"]
     session = open_session(launch, [*overrides, *forced])
     warm_up(session.config)
     arguments = [*([] if launch is None else [launch]), *overrides, *forced]

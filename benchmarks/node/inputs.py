@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import threading
 import time
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.node.processes import children, cpu_seconds, program
+from benchmarks.node.processes import children, cpu_seconds, parent_lives, program
 from sags_node.client import FrameSender
 from sags_node.config.schema import GeometryConfig, GstSource, PushSource, Ros2Source, RosGraph
 from sags_node.errors import SagsError, UsageError
@@ -85,9 +84,8 @@ def _publishing(domain: int, *names: str) -> None:
 def _send_always(send: Send) -> None:
     """The same picture at the camera's rate, stamped just before it is sent; also a parent's end ends it."""
     picture: U8 = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    parent = multiprocessing.parent_process()
     due = time.monotonic()
-    while parent is not None and parent.is_alive():
+    while parent_lives():
         send(picture, time.time_ns())
         due += 1 / RATE
         time.sleep(max(0.0, due - time.monotonic()))

@@ -6,13 +6,12 @@ Who reads stands for another machine, and takes only what the node leaves of the
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import select
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
@@ -20,7 +19,7 @@ from typing import Any
 
 import zmq
 
-from benchmarks.node.processes import program
+from benchmarks.node.processes import parent_lives, program
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress, connect
 from sags_node.messaging.rundir import connection_path
@@ -28,6 +27,7 @@ from sags_node.messaging.stream import MAX_MESSAGE_BYTES
 from sags_node.processes import end
 
 NS = "sags"
+OWN_PORTS = "publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*"
 STARTING = 60.0  # s for a process to be ready
 STOPPING = 5.0  # s for one to end
 BROWSERS = "chromium", "chromium-browser", "google-chrome"
@@ -99,21 +99,26 @@ def _still_runs(process: Popen[Any], name: str) -> None:
 
 def reader(run_dir: Path) -> AbstractContextManager[None]:
     """Who takes everything, as fast as it comes."""
-    return program(_read, str(run_dir))
+    return program(_read, run_dir)
 
 
-def _read(run_dir: str) -> None:
-    """Take everything that the node in this run directory sends, as fast as it comes."""
+def _read(run_dir: Path) -> None:
+    """Take everything that a node sends that may start later in this run directory."""
     give_way()
-    folder, parent = Path(run_dir), multiprocessing.parent_process()
-    while parent is not None and parent.is_alive():
-        if not connection_path(folder, NS).exists():
-            time.sleep(0.05)
-            continue
-        with everything(folder) as socket:
-            while parent.is_alive():
-                if socket.poll(100):
-                    socket.recv_multipart(copy=False)
+    while parent_lives() and not connection_path(run_dir, NS).exists():
+        time.sleep(0.05)
+    read_everything(run_dir, parent_lives)
+
+
+def read_everything(run_dir: Path, goes_on: Callable[[], bool]) -> int:
+    """Take all that a node sends, as fast as it comes; how many messages that were."""
+    taken = 0
+    with everything(run_dir) as socket:
+        while goes_on():
+            if socket.poll(100):
+                socket.recv_multipart(copy=False)
+                taken += 1
+    return taken
 
 
 def give_way() -> None:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 STOPPING = 5.0  # s for a process to end
@@ -41,6 +42,21 @@ def listed(process: int, what: Literal["fd", "task"]) -> int:
         OSError: it has ended, or is another user's.
     """
     return len(os.listdir(f"/proc/{process}/{what}"))
+
+
+def parent_lives() -> bool:
+    """Whether the process that started this one with `program` still runs."""
+    parent = multiprocessing.parent_process()
+    return parent is not None and parent.is_alive()
+
+
+@contextmanager
+def own_run_dir() -> Iterator[Path]:
+    """An empty run directory; a process whose XDG_RUNTIME_DIR is its parent looks there."""
+    with TemporaryDirectory(prefix="sags-benchmarks-") as folder:
+        run_dir = Path(folder) / "sags"
+        run_dir.mkdir(mode=0o700)
+        yield run_dir
 
 
 @contextmanager

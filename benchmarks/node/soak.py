@@ -7,13 +7,11 @@ The recorder and the subscribers come and go. Every frame is timed by its own st
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import random
 import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,10 +25,11 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.node import neighbours
-from benchmarks.node.crowd import Advance, node_beside
+from benchmarks.node.crowd import is_over, node_beside, peers_of
 from benchmarks.node.endurance import SIGNIFICANT, slope, trends
-from benchmarks.node.processes import listed, program
+from benchmarks.node.processes import listed, own_run_dir
 from sags_node.errors import SagsError
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.freezes import Freezes
@@ -52,6 +51,7 @@ RECORDED = ("left/image_rect_color", SHOWN, "anchors", EACH_FRAME, "status")
 WARM_UP = 10.0  # s before frames count
 COMPARED = 3  # pictures of each window
 SUBSCRIBERS = 3
+NO_VISITS = {"visits": 0, "pictures": 0}
 STAY, AWAY = (2.0, 20.0), (1.0, 5.0)  # s, of a subscriber, from and to
 RECORDING = 60.0  # s of one recording
 SILENCE = 30.0  # s without a frame: the node hangs
@@ -130,13 +130,11 @@ def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: A
     """
     heard, windows = _Heard(), list[Window]()
     interrupted = False
-    with tempfile.TemporaryDirectory(prefix="sags-soak-") as folder, ExitStack() as stack:
-        run_dir = Path(folder) / "sags"  # where a process with this XDG_RUNTIME_DIR looks for it
-        run_dir.mkdir(mode=0o700)
+    with own_run_dir() as run_dir, ExitStack() as stack:
         node = stack.enter_context(node_beside(launch, run_dir))
         overlay = stack.enter_context(neighbours.overlay(run_dir))
         viewer = stack.enter_context(neighbours.viewer(run_dir)) if neighbours.find_browser() else None
-        visits = stack.enter_context(_visitors(run_dir))
+        visitors = stack.enter_context(peers_of(run_dir, {"visits": (_visit, 0.0)}))
         recordings = stack.enter_context(_recordings(run_dir))
         quality: list[float] = []
         shown = 0  # up to the last window
@@ -155,7 +153,7 @@ def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: A
                     break
         except KeyboardInterrupt:
             interrupted = True
-        came = {"visits": visits(), "recordings": recordings()}
+        came = {"visits": NO_VISITS, **visitors(), "recordings": recordings()}
     return {
         "machine": machine_name(),
         "launch": list(launch),
@@ -242,28 +240,9 @@ def _overall(heard: _Heard) -> dict[str, Any]:
 # ---- who comes and goes ----------------------------------------------------------------------------------
 
 
-@contextmanager
-def _visitors(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
-    """Subscribers that come, take pictures for a while, and leave; what is given ends them, and counts."""
-    spawn = multiprocessing.get_context("spawn")
-    ending = spawn.Event()
-    here, there = spawn.Pipe()
-
-    def stop() -> dict[str, int]:
-        ending.set()
-        return here.recv() if here.poll(neighbours.STARTING) else {"visits": 0, "pictures": 0}
-
-    with program(_visit, run_dir, ending, there):
-        if not here.poll(neighbours.STARTING):
-            raise SagsError("the subscribers did not start")
-        here.recv()
-        yield stop
-
-
-def _visit(run_dir: Path, ending: Event, there: Connection) -> None:
-    there.send(None)  # it runs
-    neighbours.give_way()
-    counted = [{"visits": 0, "pictures": 0} for _ in range(SUBSCRIBERS)]
+def _visit(run_dir: Path, _: float, ending: Event, there: Connection) -> None:
+    """Subscribers that come, take pictures for a while, and leave; it counts both."""
+    counted = [NO_VISITS.copy() for _ in range(SUBSCRIBERS)]
     working = [
         threading.Thread(target=_come_and_go, args=(run_dir, ending, random.Random(seed), counts))
         for seed, counts in enumerate(counted)
@@ -276,8 +255,7 @@ def _visit(run_dir: Path, ending: Event, there: Connection) -> None:
 
 
 def _come_and_go(run_dir: Path, ending: Event, chance: random.Random, counts: dict[str, int]) -> None:
-    parent = multiprocessing.parent_process()
-    while not ending.is_set() and parent is not None and parent.is_alive():
+    while not is_over(ending):
         leaves = time.monotonic() + chance.uniform(*STAY)
         with Subscriber(TAKEN, run_dir=run_dir) as subscriber:
             counts["visits"] += 1

@@ -6,10 +6,11 @@ of time. Rules that leave work out are compared with a fixed number of steps, so
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from benchmarks import Advance
 from benchmarks.node.hosts import measure_hosts
 from benchmarks.pareto.baselines import baselines_of_run, measured_baselines
 from benchmarks.pareto.settings import (
@@ -43,7 +44,6 @@ KEPT = (
 )  # fmt: skip
 
 Row = dict[str, Any]
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
 def measure_pareto(

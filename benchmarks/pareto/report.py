@@ -7,7 +7,21 @@ from typing import Any
 
 from rich.table import Table
 
+from benchmarks.tables import filled
+
 Row = Mapping[str, Any]
+
+PICTURES = "online", "online_at_full_size", "predict", "heldout", "novel"
+SETTING = (
+    "", "", "ms p50", "p99", "CPU", "online, dB", "at full size", "predict", "held out", "right eye",
+    "depth, mm", "p90", "cover", "points, mm", "N",
+)  # fmt: skip
+SKIP = "rule", "online, dB: on", "off", "change", "depth, mm: on", "off", "change", "saved, ms"
+HOST = (
+    "host", "frames after the first second", "first render, ms", "frame, ms: p50", "p99",
+    "latency, ms: p50", "p99", "size, px", "online at full size, dB", "N",
+)  # fmt: skip
+TIMES = "{frame_ms[p50]:.1f}", "{frame_ms[p99]:.1f}", "{latency_ms[p50]:.1f}", "{latency_ms[p99]:.1f}"
 
 
 def tables(measured: Row) -> Iterator[Table]:
@@ -15,37 +29,22 @@ def tables(measured: Row) -> Iterator[Table]:
     for session in measured["sessions"]:
         yield _settings(session)
         if session["skips"]:
-            yield _skips(session)
+            depths = "{on[depth][median_mm]:.3f}", "{off[depth][median_mm]:.3f}", "{depth_mm:+.3f}"
+            psnrs = "{on[online][psnr]:.2f}", "{off[online][psnr]:.2f}", "{online_db:+.2f}"
+            cells = "{rule}", *psnrs, *depths, "{saved_ms:.2f}"
+            yield filled(_table(session, *SKIP), session["skips"], *cells, unknown="–")
         if session["hosts"]:
             yield _hosts(session)
 
 
 def _settings(session: Row) -> Table:
-    made = _table(
-        session,
-        "",
-        "",
-        "ms p50",
-        "p99",
-        "CPU",
-        "online, dB",
-        "at full size",
-        "predict",
-        "held out",
-        "right eye",
-        "depth, mm",
-        "p90",
-        "cover",
-        "points, mm",
-        "N",
-    )
-    segments = list(session["segments"])
+    made, segments = _table(session, *SETTING), list(session["segments"])
     for place, row in enumerate(session["settings"]):
         marks = ("*" if row["non_dominated"] else " ") + ("default" if place == 0 else "")
-        made.add_row(marks, row["name"], *_figures(row, segments))
+        _add(made, row, segments, marks)
     made.add_section()
     for row in session["baselines"]:
-        made.add_row("", row["name"], *_figures(row, segments))
+        _add(made, row, segments, "")
     made.add_section()
     parts = f"; dB: all / {' / '.join(segments)}" if segments else ""
     stars = f"* no other setting is better in both, time and picture at full size{parts}"
@@ -53,89 +52,39 @@ def _settings(session: Row) -> Table:
     return made
 
 
-def _skips(session: Row) -> Table:
-    made = _table(
-        session, "rule", "online, dB: on", "off", "change", "depth, mm: on", "off", "change", "saved, ms"
-    )
-    for row in session["skips"]:
-        on, off = row["on"], row["off"]
-        made.add_row(
-            row["rule"],
-            _number(on["online"]["psnr"], ".2f"),
-            _number(off["online"]["psnr"], ".2f"),
-            _number(row["online_db"], "+.2f"),
-            *(_number((each["depth"] or {}).get("median_mm"), ".3f") for each in (on, off)),
-            _number(row["depth_mm"], "+.3f"),
-            _number(row["saved_ms"], ".2f"),
-        )
-    return made
+def _add(made: Table, row: Row, segments: Sequence[str], marks: str) -> None:
+    """A setting or a baseline; a dash for what it does not have."""
+    times = "{frame_ms[p50]:.1f}", "{frame_ms[p99]:.1f}", "{cpu_ms[p50]:.1f}"
+    pictures = (_decibels(row, group, segments) for group in PICTURES)
+    depth = "{depth[median_mm]:.2f}", "{depth[p90_mm]:.2f}", "{depth[coverage]:.1%}"
+    cells = *times, *pictures, *depth, "{track[median_mm]:.2f}", "{gaussians[mean]:,.0f}"
+    filled(made, [row], marks, "{name}", *cells, unknown="–")
 
 
 def _hosts(session: Row) -> Table:
-    made = _table(
-        session, "host", "frames after the first second", "first render, ms", "frame, ms: p50", "p99",
-        "latency, ms: p50", "p99", "size, px", "online at full size, dB", "N",
-    )  # fmt: skip
+    made, segments = _table(session, *HOST), list(session["segments"])
     for row in session["hosts"]:
-        made.add_row(
-            row["name"],
-            _number(row["share_after_first_second"], ".1%"),
-            _number(row["first_render_ms"], ".0f"),
-            *_times(row),
-            "x".join(map(str, row["size"])),
-            _decibels(row["online_at_full_size"], list(session["segments"])),
-            _number(row["gaussians"]["mean"], ",.0f"),
-        )
+        share, first = "{share_after_first_second:.1%}", "{first_render_ms:.0f}"
+        shown = _decibels(row, "online_at_full_size", segments)
+        cells = "{name}", share, first, *TIMES, "{size[0]}x{size[1]}", shown, "{gaussians[mean]:,.0f}"
+        filled(made, [row], *cells, unknown="–")
         if "unread" in row:  # by its own account: nobody saw a picture
-            unread = row["unread"]
-            gaussians = _number(unread["gaussians"], ",.0f")
-            made.add_row("alone, nobody reads", "-", "-", *_times(unread), "-", "-", gaussians)
+            cells = "alone, nobody reads", "-", "-", *TIMES, "-", "-", "{gaussians:,.0f}"
+            filled(made, [row["unread"]], *cells, unknown="–")
     return made
 
 
-def _times(row: Row) -> list[str]:
-    """The median and p99 of a frame's time, then of its latency."""
-    return [_number(row[key][place], ".1f") for key in ("frame_ms", "latency_ms") for place in ("p50", "p99")]
-
-
-def _figures(row: Row, segments: Sequence[str]) -> list[str]:
-    """The cells of a setting or a baseline; a dash for what it does not have."""
-    times, depth = row.get("frame_ms") or {}, row.get("depth") or {}
-    pictures = ("online", "online_at_full_size", "predict", "heldout", "novel")
-    return [
-        _number(times.get("p50"), ".1f"),
-        _number(times.get("p99"), ".1f"),
-        _number((row.get("cpu_ms") or {}).get("p50"), ".1f"),
-        *(_decibels(row.get(group), segments) for group in pictures),
-        _number(depth.get("median_mm"), ".2f"),
-        _number(depth.get("p90_mm"), ".2f"),
-        _number(depth.get("coverage"), ".1%"),
-        _number((row.get("track") or {}).get("median_mm"), ".2f"),
-        _number((row.get("gaussians") or {}).get("mean"), ",.0f"),
-    ]
-
-
-def _decibels(group: Row | None, segments: Sequence[str]) -> str:
-    if group is None:
+def _decibels(row: Row, group: str, segments: Sequence[str]) -> str:
+    """The cell of a group of figures, of all frames and of each segment."""
+    if row.get(group) is None:
         return "–"
-    parts = [group["psnr"], *((group.get(name) or {}).get("psnr") for name in segments)]
-    return " / ".join(_number(value, ".2f") for value in parts)
-
-
-def _number(value: float | None, shown: str) -> str:
-    return "–" if value is None else format(value, shown)
+    return " / ".join(f"{{{group}{part}[psnr]:.2f}}" for part in ("", *(f"[{name}]" for name in segments)))
 
 
 def _table(session: Row, *headings: str) -> Table:
     title = f"{session['session']}, {session['frames']} frames"
-    made = Table(
-        box=None,
-        padding=(0, 3, 0, 0),
-        pad_edge=False,
-        title=title,
-        title_justify="left",
-        caption_justify="left",
-    )
+    made = Table(box=None, padding=(0, 3, 0, 0), pad_edge=False, title=title, title_justify="left")
+    made.caption_justify = "left"
     for place, heading in enumerate(headings):
         made.add_column(heading, justify="right" if place > 1 else "left", no_wrap=True)
     return made

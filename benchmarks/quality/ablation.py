@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
+from benchmarks.tables import filled
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
@@ -62,7 +64,6 @@ PARTS: Mapping[str, tuple[str, str, float | None]] = {
     "self-adaptive block, after the online start": ("online", "online_no_adaptive", None),
 }
 
-Advance = Callable[[int, int | None, str], None]  # done, of, what
 Row = dict[str, Any]
 
 
@@ -247,15 +248,10 @@ def tables(measured: dict[str, Any]) -> list[Table]:
         columns += [[row[key] for row in rows] for key in ("gaussians", "ms_per_iteration")]
         made.add_row(name, *(_spread(column) for column in columns))
     parts = table("dB", "held-out", "lowest to highest", "train", "half size", "quarter", "paper")
+    cells = ["{heldout[mean]:+.2f}", "{heldout[lowest]:+.2f} to {heldout[highest]:+.2f}"]
+    cells += [f"{{{key}[mean]:+.2f}}" for key in ("train", "half", "quarter")]
     for name, part in measured["parts"].items():
-        held, claim = part["heldout"], part["paper_db"]
-        parts.add_row(
-            name,
-            f"{held['mean']:+.2f}",
-            f"{held['lowest']:+.2f} to {held['highest']:+.2f}",
-            *(f"{part[key]['mean']:+.2f}" for key in ("train", "half", "quarter")),
-            "–" if claim is None else f"{claim:+.2f}",
-        )
+        filled(parts, [part], name, *cells, "{paper_db:+.2f}", unknown="–")
     return [made, parts]
 
 

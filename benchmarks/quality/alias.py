@@ -7,7 +7,7 @@ filters, and drawn where nothing was trained, against the ray-cast truth.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
 from benchmarks.quality.alias_truth import AliasTruth, Shot
+from benchmarks.tables import filled
 from sags_node.config.schema import PhantomSource
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
@@ -38,8 +40,6 @@ SIZES = (0.25, 0.5, 1.0, 2.0, 4.0)
 DISTANCES = (0.5, 1.0, 2.0, 4.0)
 DRIFT_SIZE, DRIFT_STEP = 0.25, 0.1  # of the trained size; px per frame
 STEPS_PER_ROUND = 50  # between two looks for holes
-
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,25 +199,21 @@ def _requested_view(model: Trained, truth: AliasTruth) -> list[dict[str, Any]]:
 
 def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
     """`measured` as `measure_alias` returns it."""
-    yield _by_factor("PSNR, dB, at a picture size of", measured["psnr_at_size"], "{:.2f}")
-    yield _by_factor("PSNR, dB, from a distance of", measured["psnr_at_distance"], "{:.2f}")
+    yield _by_factor("PSNR, dB, at a picture size of", measured["psnr_at_size"], ".2f")
+    yield _by_factor("PSNR, dB, from a distance of", measured["psnr_at_distance"], ".2f")
     changes = measured["thin_vessel_brightness_change"]
-    yield _by_factor("brightness of thin vessels, at a picture size of", changes, "{:+.2%}")
+    yield _by_factor("brightness of thin vessels, at a picture size of", changes, "+.2%")
     flicker = measured["flicker"]
     for part in ("picture", "error"):
         row = {"factor": flicker["size"]} | {name: flicker[name][part] for name in VARIANTS}
-        yield _by_factor(f"flicker of the {part} against the truth's, at a size of", [row], "{:.2f}")
+        yield _by_factor(f"flicker of the {part} against the truth's, at a size of", [row], ".2f")
     joined = Table("view from nearer by", "PSNR, dB", "its camera in the 3D filter")
-    for row in measured["requested_view_in_filter"]:
-        joined.add_row(row["view"], f"{row['no']:.2f}", f"{row['yes']:.2f}")
-    yield joined
+    yield filled(joined, measured["requested_view_in_filter"], "{view}", "{no:.2f}", "{yes:.2f}")
 
 
 def _by_factor(title: str, rows: list[dict[str, Any]], shown: str) -> Table:
     made = Table(title, *(name.replace("_", " ") for name in VARIANTS))
-    for row in rows:
-        made.add_row(f"x {row['factor']:g}", *(shown.format(row[name]) for name in VARIANTS))
-    return made
+    return filled(made, rows, "x {factor:g}", *(f"{{{name}:{shown}}}" for name in VARIANTS))
 
 
 def picture(truth: AliasTruth, models: Mapping[str, Trained]) -> bytes:

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks import Advance
+from benchmarks.quality.depth import rounded
 from benchmarks.quality.registration import SIZE, part, shown_to_node
+from benchmarks.tables import filled
 from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
 from sags_node.clients.overlay.held import HeldObject
@@ -27,6 +29,7 @@ from sags_node.clients.overlay.scene import ObjectSpec
 from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.relief import SPACING
+from sags_node.phantom.rig import phantom_rig
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.phantom.tissue import LIFT
 from sags_node.pipeline.pipeline import Pipeline
@@ -63,7 +66,7 @@ def measure_deform(seeds: int, advance: Advance) -> dict[str, Any]:
     scene = PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1])
     config = LaunchConfig(source=scene)
     prepare(config)
-    receipt = Receipt(Phantom(scene).rig, SIZE, None)
+    receipt = Receipt(phantom_rig(*SIZE), SIZE, None)
     found, checked = [], []
     for seed in range(seeds):
         advance(seed, seeds, "pulling")
@@ -162,7 +165,5 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     """For people."""
     columns = [f"{which}_{name}" for which in ("all", "moved") for name in MODES]
     errors = Table("below, mm", *columns, "worse, mm", title="median, nine of ten, mm")
-    for row in measured["rows"]:
-        said = [f"{row[name]['median_mm']}, {row[name]['p90_mm']}" for name in columns]
-        errors.add_row(str(row["below_mm"]), *said, str(row["worse_mm"]))
-    return [errors]
+    cells = [f"{{{name}[median_mm]}}, {{{name}[p90_mm]}}" for name in columns]
+    return [filled(errors, measured["rows"], "{below_mm}", *cells, "{worse_mm}")]

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import Advance
 from benchmarks.quality.sgbm import JudgedSGBM, PlainSGBM
 from sags_node.config.schema import OnnxConfig, StereoConfig, VisionConfig
 from sags_node.errors import SagsError
@@ -49,7 +50,6 @@ FAULTS: dict[str, tuple[float, ...]] = {  # what `PhantomScene` calls it -> leve
 }
 
 Matcher = Callable[[RectifiedPair, Bool], tuple[F32, F32]]  # depth (m, 0 unknown) and confidence, [H, W]
-Advance = Callable[[int, int | None, str], None]  # done, of, what
 
 
 def network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: float) -> Matcher:
@@ -312,6 +312,12 @@ def measure_faults(
         "machine": machine_name(),
         "faults": rows,
     }
+
+
+def frame_of(number: int, rate: float, truth: PhantomFrame) -> StereoFrame:
+    """What a camera of so many frames a second gives of a phantom, with its true mask."""
+    stamp = round((1 + number / rate) * 1e9)
+    return StereoFrame(number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool)
 
 
 def _phantom_frames(phantom: Phantom, count: int) -> Iterable[tuple[StereoFrame, PhantomFrame]]:

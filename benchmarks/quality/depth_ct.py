@@ -13,8 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from benchmarks import Advance
 from benchmarks.kernels.timing import median_ms
-from benchmarks.quality.depth import Advance, Matcher, by_confidence, error_figures, make_matchers, rounded
+from benchmarks.quality.depth import Matcher, by_confidence, error_figures, make_matchers, rounded
 from sags_node.config.schema import StereoConfig
 from sags_node.errors import UsageError
 from sags_node.geometry import project, unproject

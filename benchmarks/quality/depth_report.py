@@ -7,7 +7,10 @@ from typing import Any
 
 from rich.table import Table
 
+from benchmarks.tables import filled
+
 Row = Mapping[str, Any]
+ERRORS = "{median_mm:.2f}", "{p90_mm:.2f}", "{bias_mm:+.2f}"
 
 
 def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
@@ -17,47 +20,32 @@ def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
         return
     title = f"{measured['session']}, depth against truth: {measured['truth'].replace('_', ' ')}"
     yield _settings_table(title, measured["settings"])
-    yield _confidence_table(measured["confidence"])
+    confidence = Table("confidence, as configured", "share", "median, mm", "p90", "too far by")
+    yield filled(confidence, measured["confidence"], "{above:g} to {up_to:g}", "{share:.1%}", *ERRORS)
     if "regions" in measured:
         yield _regions_table(measured["regions"])
 
 
 def _settings_table(title: str, rows: Sequence[Row]) -> Table:
-    made = Table("setting", "median, mm", "p90", "too far by", "coverage", title=title)
-    to_surface = "nearest_median_mm" in rows[0]
-    made.add_column("to the surface, p90" if to_surface else "where the first knows, p90")
-    made.add_column("ms")
-    for row in rows:
-        if to_surface:
-            beside = _two(row["nearest_median_mm"], row["nearest_p90_mm"])
-        else:
-            there = row["where_configured_knows"]
-            beside = _two(there["median_mm"], there["p90_mm"])
-        coverage = "-" if row["coverage"] is None else f"{row['coverage']:.1%}"
-        made.add_row(row["name"], *_errors(row), coverage, beside, _number(row["ms"], ".1f"))
-    return made
-
-
-def _confidence_table(rows: Sequence[Row]) -> Table:
-    made = Table("confidence, as configured", "share", "median, mm", "p90", "too far by")
-    for row in rows:
-        made.add_row(f"{row['above']:g} to {row['up_to']:g}", _number(row["share"], ".1%"), *_errors(row))
-    return made
+    if "nearest_median_mm" in rows[0]:
+        where, beside = "to the surface", "{nearest_median_mm:.2f}, {nearest_p90_mm:.2f}"
+    else:
+        where = "where the first knows"
+        beside = "{where_configured_knows[median_mm]:.2f}, {where_configured_knows[p90_mm]:.2f}"
+    made = Table("setting", "median, mm", "p90", "too far by", "coverage", f"{where}, p90", "ms", title=title)
+    return filled(made, rows, "{name}", *ERRORS, "{coverage:.1%}", beside, "{ms:.1f}")
 
 
 def _regions_table(rows: Sequence[Row]) -> Table:
-    made = Table("region", "stage: median, p90, mm", "too far by", "coverage", title="by region")
-    for head in ("drawn: median, p90, mm", "too far by", "coverage", "too far by, where the stage knows"):
-        made.add_column(head)
-    for row in rows:
-        cells = []
-        for side in (row["stage"], row["drawn"]):
-            coverage = _number(side["coverage"], ".1%")
-            cells += [_two(side["median_mm"], side["p90_mm"]), _number(side["bias_mm"], "+.2f"), coverage]
-        made.add_row(
-            row["region"], *cells, _number(row["drawn"]["where_configured_knows"]["bias_mm"], "+.2f")
-        )
-    return made
+    made = Table("region", title="by region")
+    cells = ["{region}"]
+    for side in ("stage", "drawn"):
+        for heading in (f"{side}: median, p90, mm", "too far by", "coverage"):
+            made.add_column(heading)
+        cells += [f"{{{side}[median_mm]:.2f}}, {{{side}[p90_mm]:.2f}}", f"{{{side}[bias_mm]:+.2f}}"]
+        cells.append(f"{{{side}[coverage]:.1%}}")
+    made.add_column("too far by, where the stage knows")
+    return filled(made, rows, *cells, "{drawn[where_configured_knows][bias_mm]:+.2f}")
 
 
 def _fault_tables(rows: Sequence[Row]) -> Iterator[Table]:
@@ -76,15 +64,3 @@ def _brief(row: Row) -> str:
     if row["median_mm"] is None:
         return "-"
     return f"{row['median_mm']:.2f}, {row['p90_mm']:.2f}, {row['coverage']:.0%}"
-
-
-def _errors(row: Row) -> tuple[str, str, str]:
-    return _number(row["median_mm"], ".2f"), _number(row["p90_mm"], ".2f"), _number(row["bias_mm"], "+.2f")
-
-
-def _two(median: float | None, p90: float | None) -> str:
-    return f"{_number(median, '.2f')}, {_number(p90, '.2f')}"
-
-
-def _number(value: float | None, shown: str) -> str:
-    return "-" if value is None else format(value, shown)

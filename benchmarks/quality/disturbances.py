@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import Advance
 from benchmarks.disturbances import DISTURBANCES, Disturbance, Scene, Taken, disturbed
 from benchmarks.quality.tracking import true_points
 from sags_node.errors import SagsError, UsageError
@@ -36,7 +37,6 @@ ANCHORS = 24
 ANCHOR_WRONG = 2e-3  # m: an instrument led to such a target misses it
 ANCHOR_WRONG_PX = 8 / 640  # of the width, where depth has no truth: 1.1 mm sideways at 80 mm
 
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 Row = dict[str, Any]
 
 
@@ -241,7 +241,7 @@ class _Run:
             for frame, shown in self._shown.items()
             if first <= frame < stop + RECOVERY and shown.depth is not None
         ]
-        psnr_before = _mean([shown.psnr for shown in before])
+        psnr_before = _over(shown.psnr for shown in before)
         psnr = {frame: shown.psnr for frame, shown in self._shown.items()}
         clean_psnr = {frame: shown.psnr for frame, shown in self._clean._shown.items()}
         known = frozenset[str]().union(*(shown.warnings for shown in before))
@@ -253,14 +253,14 @@ class _Run:
             "name": self._name,
             "frames": len(self.during),
             "psnr_before": psnr_before,
-            "psnr_during": _mean([shown.psnr for shown in within]),
-            "psnr_after": _mean([shown.psnr for shown in after]),
-            "confident_depth_p90_mm": _worst([depth.confident.p90_mm for depth in depths]),
-            "depth_median_mm": _worst([depth.all.median_mm for depth in depths]),
-            "coverage": _least([depth.all.coverage for depth in depths]),
-            "confident_coverage": _least([depth.confident.coverage for depth in depths]),
-            "borrowed_share": _mean([shown.borrowed for shown in within]),
-            "confident_borrowed_share": _mean([shown.confident_borrowed for shown in within]),
+            "psnr_during": _over(shown.psnr for shown in within),
+            "psnr_after": _over(shown.psnr for shown in after),
+            "confident_depth_p90_mm": _over((depth.confident.p90_mm for depth in depths), max),
+            "depth_median_mm": _over((depth.all.median_mm for depth in depths), max),
+            "coverage": _over((depth.all.coverage for depth in depths), min),
+            "confident_coverage": _over((depth.confident.coverage for depth in depths), min),
+            "borrowed_share": _over(shown.borrowed for shown in within),
+            "confident_borrowed_share": _over(shown.confident_borrowed for shown in within),
             "warned_after_s": _round(warned),
             "cleared_after_s": _round(cleared),
             "warned_of": sorted(frozenset[str]().union(*fresh.values())),
@@ -399,21 +399,10 @@ def _share(part: Bool, whole: Bool) -> float:
     return np.count_nonzero(part & whole) / count if count else float("nan")
 
 
-def _known(values: Sequence[float]) -> list[float]:
-    return [value for value in values if np.isfinite(value)]
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    known = _known(values)
-    return _round(float(np.mean(known))) if known else None
-
-
-def _worst(values: Sequence[float]) -> float | None:
-    return _round(max(_known(values), default=None))
-
-
-def _least(values: Sequence[float]) -> float | None:
-    return _round(min(_known(values), default=None))
+def _over(values: Iterable[float], figure: Callable[..., Any] = np.mean) -> float | None:
+    """Of those that are known: their mean, or another figure."""
+    known = [value for value in values if np.isfinite(value)]
+    return _round(float(figure(known))) if known else None
 
 
 def _round(value: float | None) -> float | None:

@@ -9,36 +9,25 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.kernels.report import new_table
 from benchmarks.quality.disturbances import Shot
+from benchmarks.tables import filled, plain_table
 from sags_node.quality.gallery import Picture, depth_range, depth_tile, shrunk
 
 _COLUMNS = {
-    "PSNR* before": "psnr_before", "during": "psnr_during", "after, dB": "psnr_after",
-    "depth p90, mm": "confident_depth_p90_mm", "median": "depth_median_mm",
-    "coverage": "coverage", "borrowed": "borrowed_share",
-    "warned, s": "warned_after_s", "cleared": "cleared_after_s",
-    "recovers, frames": "frames_to_recover", "restarts": "restarts",
-    "anchors back": "anchors_back", "wrong": "anchors_wrong",
+    "PSNR* before": "{psnr_before:.1f}", "during": "{psnr_during:.1f}", "after, dB": "{psnr_after:.1f}",
+    "depth p90, mm": "{confident_depth_p90_mm:.1f}", "median": "{depth_median_mm:.1f}",
+    "coverage": "{coverage:.0%}", "borrowed": "{borrowed_share:.0%}",
+    "warned, s": "{warned_after_s:.1f}", "cleared": "{cleared_after_s:.1f}",
+    "recovers, frames": "{frames_to_recover}", "restarts": "{restarts}",
+    "anchors back": "{anchors_back:.0%}", "wrong": "{anchors_wrong:.0%}",
 }  # fmt: skip
-_SHARES = ("coverage", "borrowed_share", "anchors_back", "anchors_wrong")
 
 
 def table(measured: Mapping[str, Any]) -> Table:
     """`measured` as `measure_disturbances` returns it."""
-    settings = measured["settings"]
-    made = new_table(measured["session"], *_COLUMNS, title=f"from frame {settings['from']}")
-    for row in measured["rows"]:
-        made.add_row(row["name"], *(_cell(key, row[key]) for key in _COLUMNS.values()))
-    return made
-
-
-def _cell(key: str, value: float | None) -> str:
-    if value is None:
-        return "-"
-    if key in _SHARES:
-        return f"{value:.0%}"
-    return str(value) if isinstance(value, int) else f"{value:.1f}"
+    title = f"from frame {measured['settings']['from']}"
+    made = plain_table(measured["session"], *_COLUMNS, title=title)
+    return filled(made, measured["rows"], "{name}", *_COLUMNS.values())
 
 
 def strip(shots: Sequence[Shot]) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,18 +10,21 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded, spread
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, rounded, spread
+from benchmarks.tables import filled
 from sags_node.confidence import SURE, error_of
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import project, unproject
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.casting import Bodies
 from sags_node.phantom.instruments import NOTHING, OPENING, Instruments, Mesh, joined
+from sags_node.phantom.rig import phantom_rig
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
-from sags_node.types import F32, F64, Bool, Camera, FrameResult, StereoFrame
+from sags_node.types import F32, F64, Bool, Camera, FrameResult, InstrumentStates
 from sags_node.vision.stereo import StereoDepth
 
 SIZE = (640, 512)
@@ -129,24 +133,21 @@ def measure_instruments(seeds: int, advance: Advance) -> dict[str, Any]:
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     prepare(config)
     rows: list[dict[str, Any]] = []
-    receipt: Receipt | None = None
+    receipt = Receipt(phantom_rig(*SIZE), SIZE, None)
     for seed in range(FIRST, FIRST + seeds):
         advance(seed - FIRST, seeds, "phantom")
         scene = Scene(seed)
-        receipt = receipt or Receipt(scene.phantom.rig, SIZE, None)
         pipeline = Pipeline(config, scene.phantom.rig, rate=RATE)
         cases: list[tuple[str, float]] = [("", 0.0)] * BEFORE
         cases += [(setting, distance) for setting in SIDES for distance in DISTANCES]
         for number, (setting, distance) in enumerate(cases):
             tools = [scene.tool(setting, side, distance) for side in SIDES.get(setting, ())]
             seen = scene.phantom.frame(number, len(cases), tools=joined([NOTHING, *(t.mesh for t in tools)]))
-            stamp = round((1 + number / RATE) * 1e9)
-            frame = StereoFrame(number, stamp, stamp, seen.left, seen.right, tissue=~seen.tool)
+            frame = frame_of(number, RATE, seen)
             result = pipeline.process(frame, StepBudget(STEPS), FrameRequest(instruments=True))
             receipt.add(frame, result.observation.tissue)
             shown = ~pipeline.rectifier.mask(~seen.tool)
             rows += [{"seed": seed, "setting": setting, **row} for row in _compared(tools, result, shown)]
-    assert receipt is not None
     summaries = {setting: _summary([row for row in rows if row["setting"] == setting]) for setting in SIDES}
     apart = [row for row in rows if row["setting"] in ("one", "two")]
     return {
@@ -181,16 +182,25 @@ def _compared(tools: list[Tool], result: FrameResult, shown: Bool) -> list[dict[
             at = known[found[number]]
             said = {"distance": states.distance[at], "clearance": states.clearance[at]}
             row |= {f"{name}_mm": 1e3 * abs(float(value) - row[name]) for name, value in said.items()}
-            row["tip_mm"] = off(tool, states.tips[at].astype(np.float64))
-            row["axis_deg"] = float(np.degrees(np.arccos(np.clip(states.axes[at] @ tool.axis, -1, 1))))
-            row["told_mm"] = 1e3 * float(error_of(states.confidence[at]))
-            row["sure"] = bool(states.confidence[at] >= SURE)
+            row |= placed(tool, states, at)
             row["distance_told_mm"] = 1e3 * float(error_of(states.distance_confidence[at]))
         for name, places in ends.items():
             if len(places):
                 row[f"{name}_mm"] = min(off(tool, place) for place in places)
         rows.append({k: v for k, v in row.items() if isinstance(v, str | bool) or np.isfinite(v)})
     return rows
+
+
+def placed(tool: Tool, states: InstrumentStates, at: int) -> dict[str, Any]:
+    """How far off a tip is, as it is and as it is told, and the axis."""
+    row = {
+        "tip_mm": off(tool, states.tips[at].astype(np.float64)),
+        "told_mm": 1e3 * float(error_of(states.confidence[at])),
+        "sure": bool(states.confidence[at] >= SURE),
+    }
+    if np.isfinite(states.axes[at, 0]):
+        row["axis_deg"] = float(np.degrees(np.arccos(np.clip(states.axes[at] @ tool.axis, -1, 1))))
+    return row
 
 
 def _far_ends(shown: Bool, result: FrameResult) -> dict[str, F64]:
@@ -224,18 +234,23 @@ def _around(depth: F32, pixel: F64) -> float:
     return float(np.median(near[near > 0])) if (near > 0).any() else 0.0
 
 
+def tally(what: str, rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The rows that have a place, and how many they are, of so many `what`."""
+    there = [row for row in rows if "tip_mm" in row]
+    said: dict[str, Any] = {what: len(rows), "placed": len(there), "sure": sum(row["sure"] for row in there)}
+    if there:
+        said["within_told"] = rounded(np.mean([row["tip_mm"] <= row["told_mm"] for row in there]))
+    return there, said
+
+
 def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Medians and nine of ten, of those of which there is something."""
-    placed = [row for row in rows if "tip_mm" in row]
-    said: dict[str, Any] = {"instruments": len(rows), "placed": len(placed)}
-    said["sure"] = sum(row["sure"] for row in placed)
-    if placed:
-        said["within_told"] = rounded(np.mean([row["tip_mm"] <= row["told_mm"] for row in placed]))
-    met = [row for row in placed if "distance_mm" in row]
+    there, said = tally("instruments", rows)
+    met = [row for row in there if "distance_mm" in row]
     if met:
         within = [row["distance_mm"] <= row["distance_told_mm"] for row in met]
         said["distance_within_told"] = rounded(np.mean(within))
-    parts = [("", (*SAID, *BESIDE), rows), ("sure_", SAID, [row for row in placed if row["sure"]])]
+    parts = [("", (*SAID, *BESIDE), rows), ("sure_", SAID, [row for row in there if row["sure"]])]
     for prefix, columns, among in parts:
         for name in columns:
             values = [row[name] for row in among if name in row]
@@ -250,7 +265,12 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     table = Table("", "placed", "sure", "within told", *names, title="errors: median, nine of ten")
     for part in ("settings", "distances_mm", "kinds"):
         for name, row in measured[part].items():
-            figures = [f"{row[n]['median']}, {row[n]['p90']}" if n in row else "" for n in names]
-            placed = f"{row['placed']} of {row['instruments']}"
-            table.add_row(name, placed, str(row["sure"]), str(row.get("within_told", "")), *figures)
+            add(table, row, "instruments", names, name)
     return [table]
+
+
+def add(table: Table, row: dict[str, Any], what: str, names: Sequence[str], *head: str) -> None:
+    """What `tally` counted, and the median and nine of ten of each figure that there is."""
+    figures = [f"{row[n]['median']}, {row[n]['p90']}" if n in row else "" for n in names]
+    cells = f"{{placed}} of {{{what}}}", "{sure}", "{within_told}"
+    filled(table, [row], *head, *cells, *figures, unknown="")

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded, spread
-from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, off
-from sags_node.confidence import SURE, error_of
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, spread
+from benchmarks.quality.instruments import FIRST, KINDS, SIZE, STEPS, TROCARS, Scene, Tool, add, placed, tally
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import rigid
 from sags_node.instruments.instruments import Instruments
@@ -19,13 +19,14 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.instruments import NOTHING, joined
 from sags_node.phantom.scene import PhantomScene
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
-from sags_node.types import F64, InstrumentStates, StereoFrame, ToolPose
+from sags_node.types import F64, InstrumentStates, ToolPose
 from sags_node.vision.pyramid import pyramids
 
 RATE, SECONDS, LEAVES = 5.0, 8.0, 6.0  # a second; s; s after which the tip leaves the picture
 SETTLED = 2.0  # s, after which corrections are counted apart
 SHIFT, TURN = 0.005, np.radians(5.0)  # m, and about MIDDLE: how far kinematics are off
 MIDDLE = np.array([0.0, 0.0, 0.06])  # m, of where instruments work
+FIGURES = ("tip_mm", "axis_deg")
 ERROR = 0.010  # m, as robot.tools says unless it is told better
 CASES = {  # whether the picture is used, and whether the robot's kinematics are: exact, or off
     "picture": (True, None), "exact": (False, "exact"), "off": (False, "off"),
@@ -55,8 +56,7 @@ def measure_kinematics(seeds: int, advance: Advance) -> dict[str, Any]:
             tool = scene.moving(kind, trocar, _pixel(number / RATE), number / RATE) if number >= 0 else None
             tools = joined([NOTHING] if tool is None else [NOTHING, tool.mesh])
             seen = scene.phantom.frame(number + 3, count + 3, tools=tools)
-            stamp = round((1 + (number + 3) / RATE) * 1e9)
-            frame = StereoFrame(number + 3, stamp, stamp, seen.left, seen.right, tissue=~seen.tool)
+            frame = frame_of(number + 3, RATE, seen)
             result = pipeline.process(frame, StepBudget(STEPS), FrameRequest(instruments=True))
             right, row_error = pyramids(result.pair)[1], pipeline.depth.stereo.rows.newest
             if tool is None:
@@ -113,11 +113,7 @@ def _compared(tool: Tool, states: InstrumentStates) -> dict[str, Any]:
     if len(known):
         tips = states.tips[known].astype(np.float64)
         at = known[int(np.linalg.norm(tips - tool.tip, axis=1).argmin())]
-        row["tip_mm"] = off(tool, states.tips[at].astype(np.float64))
-        row["told_mm"] = 1e3 * float(error_of(states.confidence[at]))
-        row["sure"], row["source"] = bool(states.confidence[at] >= SURE), int(states.sources[at])
-        if np.isfinite(states.axes[at, 0]):
-            row["axis_deg"] = float(np.degrees(np.arccos(np.clip(states.axes[at] @ tool.axis, -1, 1))))
+        row |= placed(tool, states, int(at)) | {"source": int(states.sources[at])}
     return row
 
 
@@ -131,28 +127,17 @@ def _parts(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    placed = [row for row in rows if "tip_mm" in row]
-    said: dict[str, Any] = {
-        "frames": len(rows),
-        "placed": len(placed),
-        "sure": sum(r["sure"] for r in placed),
-    }
-    for name in ("tip_mm", "axis_deg"):
-        values = [row[name] for row in placed if name in row]
-        if values:
+    there, said = tally("frames", rows)
+    for name in FIGURES:
+        if values := [row[name] for row in there if name in row]:
             said[name] = spread(values)
-    if placed:
-        said["within_told"] = rounded(np.mean([row["tip_mm"] <= row["told_mm"] for row in placed]))
     return said
 
 
 def table(measured: dict[str, Any]) -> Table:
     """For people."""
-    names = "tip_mm", "axis_deg"
-    shown = Table("", "", "placed", "sure", "within told", *names, title="kinematics: median, nine of ten")
+    shown = Table("", "", "placed", "sure", "within told", *FIGURES, title="kinematics: median, nine of ten")
     for case in CASES:
         for part, row in measured[case].items():
-            figures = [f"{row[n]['median']}, {row[n]['p90']}" if n in row else "" for n in names]
-            placed = f"{row['placed']} of {row['frames']}"
-            shown.add_row(case, part, placed, str(row["sure"]), str(row.get("within_told", "")), *figures)
+            add(shown, row, "frames", FIGURES, case, part)
     return shown

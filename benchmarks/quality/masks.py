@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
+from benchmarks.tables import filled
 from sags_node.config.schema import TissueConfig
 from sags_node.errors import SagsError
 from sags_node.kernels.threads import configure_threads
@@ -20,7 +22,6 @@ from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import Bool, FrameResult, Reference, StereoFrame
 from sags_node.vision.tissue import TissueMask
 
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 Row = dict[str, Any]
 
 
@@ -130,7 +131,4 @@ def _mean(values: Sequence[float]) -> float | None:
 def table(rows: Sequence[Row]) -> Table:
     """For people; each row as `measure_masks` returns it."""
     columns = [key for key in rows[0] if key != "receipt"]
-    made = Table(*columns)
-    for row in rows:
-        made.add_row(*("-" if row[key] is None else str(row[key]) for key in columns))
-    return made
+    return filled(Table(*columns), rows, *(f"{{{key}}}" for key in columns))

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks import Advance
+from benchmarks.quality.depth import rounded
 from benchmarks.quality.tracking import middle, pin, true_points
+from benchmarks.tables import filled
 from sags_node.errors import SagsError
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
@@ -67,7 +69,8 @@ def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[s
                 raise SagsError(f"{session.name} has no true points; a session of the phantom has")
             if rows is None:
                 places = np.asarray(project(result.pair.camera, truth)[0], np.float64)
-                rows = pin(pipeline, result, places, frame.reference.points_visible & middle(places, result))
+                wanted = np.flatnonzero(frame.reference.points_visible & middle(places, result))
+                rows = [*pin(pipeline, result, places, wanted).values()]
                 shapes = _shapes(len(rows), seed)
             elif number % EVERY == 0:
                 receipt.add(frame, result.observation.tissue)
@@ -166,12 +169,9 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     for kind in CORNERS:
         for which in ("all", "changed"):
             row = measured[kind][which]
-            shares = [
-                "-" if row[key] is None else f"{row[key]:.0%}"
-                for key in ("within_told", "stretch_within_told")
-            ]
-            cells = [_two(row[key]) for key in ("error", "told", "kept", "stretch_error")]
-            made.add_row(kind, which, str(row["values"]), *cells[:2], shares[0], *cells[2:], shares[1])
+            error, told, kept, stretch = (_two(row[k]) for k in ("error", "told", "kept", "stretch_error"))
+            cells = error, told, "{within_told:.0%}", kept, stretch, "{stretch_within_told:.0%}"
+            filled(made, [row], kind, which, "{values}", *cells)
         unsure = measured[kind]["unsure"]
         made.add_row(kind, "unsure", str(unsure["values"]), _two(unsure["error"]))
     return [made]

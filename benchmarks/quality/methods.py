@@ -7,13 +7,15 @@ time; nodes only have what they are now.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
+from benchmarks.tables import filled
 from sags_node.config.schema import MappingMethod
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
@@ -32,8 +34,6 @@ METHODS: tuple[MappingMethod, ...] = ("nodes", "sags")
 SIZES = ((320, 256), (640, 512))
 WINDOW_NS = 2_000_000_000  # as long as the field remembers
 SHOWN = {"online": "psnr", "predict": "psnr", "heldout": "psnr", "depth": "median_mm", "track": "median_px"}
-
-Advance = Callable[[int, int, str], None]  # done, total, what comes next
 
 
 def measure_methods(
@@ -111,16 +111,11 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
         "window", "depth mm", "track px", "ms",
     )  # fmt: skip
     shown = Table(*columns, title="Control nodes, and the paper's field")
-    for row in rows:
-        live, step = row["live"], row["step"]
-        latency = f"{live['latency_ms']['p50']:.0f} / {live['latency_ms']['p99']:.0f}"
-        shown.add_row(
-            f"{row['width']} x {row['height']}", row["method"], f"{live['rate_hz']:.1f}", latency,
-            f"{live['psnr']:.1f}",
-            *(
-                f"{step[key]:.2f}" if key in step else "-"
-                for key in ("online", "predict", "heldout", "window", "depth", "track")
-            ),
-            f"{step['frame_ms']['p50']:.0f}",
-        )  # fmt: skip
-    return shown
+    live = (
+        "{live[rate_hz]:.1f}",
+        "{live[latency_ms][p50]:.0f} / {live[latency_ms][p99]:.0f}",
+        "{live[psnr]:.1f}",
+    )
+    steps = (f"{{step[{key}]:.2f}}" for key in ("online", "predict", "heldout", "window", "depth", "track"))
+    cells = "{width} x {height}", "{method}", *live, *steps, "{step[frame_ms][p50]:.0f}"
+    return filled(shown, rows, *cells)

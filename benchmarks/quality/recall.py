@@ -6,7 +6,7 @@ the scope moves. Its pose is given, as by a robot, unless the node is to estimat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -14,11 +14,13 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.tracking import RIGHT, RIGHT_MM, reliability_rows
+from benchmarks import Advance
+from benchmarks.quality.tracking import RIGHT, RIGHT_MM, pin, reliability_rows
 from benchmarks.quality.tracking_report import reliability_tables
+from benchmarks.tables import filled
 from sags_lab.protocols.point_tracks import SURE
 from sags_node.config.schema import PhantomSource
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomFrame
@@ -45,8 +47,6 @@ TURNING = 1.5  # s, there and back
 MOVED = np.array([0.006, -0.004, 0.004])  # m, in the dark
 ROLLED = 8.0  # degrees, in the dark
 WRONG = 6.0 / 640  # of the width: one that is farther, and sure, is wrong
-
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,11 @@ def _played(
         receipt.add(frame, result.observation.tissue)
         truth, visible = _truth(result, moment)
         if number == before // 3:
-            pinned = _pin(pipeline, result, truth, visible)
+            last = result.pair.camera.width - BORDER, result.pair.camera.height - BORDER
+            middle = (truth > BORDER).all(1) & (truth < last).all(1)
+            wanted = np.flatnonzero(visible & middle)[:MOST]
+            otherwise = "nothing could be pinned; choose another source.seed"
+            pinned = pin(pipeline, result, truth, wanted, otherwise)
         if number == before - 1:
             at_last = _scored(result.anchors, pinned, truth, visible, width)
             standing = result.anchors
@@ -241,32 +245,12 @@ def _inside(pixels: F64, camera: Camera) -> Bool:
     return np.asarray(inside.all(1))
 
 
-def _pin(pipeline: Pipeline, result: FrameResult, truth: F64, visible: Bool) -> dict[int, int]:
-    """Anchors at some of the points: id -> number of the point."""
-    camera = result.pair.camera
-    middle = (truth > BORDER).all(1) & (truth < [camera.width - BORDER, camera.height - BORDER]).all(1)
-    pinned: dict[int, int] = {}
-    for point in np.flatnonzero(visible & middle)[:MOST]:
-        try:
-            u, v = (float(x) for x in truth[point])
-            anchor = pipeline.anchors.add_pixel(
-                u, v, result.observation, result.snapshot, result.views["left"]
-            )
-        except SagsError:
-            continue  # no depth there
-        pinned[anchor] = int(point)
-    if not pinned:
-        raise SagsError("nothing could be pinned; choose another source.seed")
-    return pinned
-
-
 def tables(measured: dict[str, Any]) -> list[Table]:
     """For people; `measured` as `measure_recall` returns it."""
     made = Table(
         "out of sight", "anchors", "right before", "wrong", "found again", "wrong", "had they not moved",
         title=f"{measured['away_s']:g} s out of sight",
     )  # fmt: skip
-    for row in measured["rows"]:
-        shares = (row["before"]["found"], row["before"]["wrong"], row["found"], row["wrong"], row["unmoved"])
-        made.add_row(row["scenario"], str(row["anchors"]), *(f"{share:.0%}" for share in shares))
+    shares = "{before[found]:.0%}", "{before[wrong]:.0%}", "{found:.0%}", "{wrong:.0%}", "{unmoved:.0%}"
+    filled(made, measured["rows"], "{scenario}", "{anchors}", *shares)
     return [made, *reliability_tables(measured)]

@@ -6,7 +6,7 @@ Each seed is another phantom, another part of its surface, and other errors of t
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -14,14 +14,17 @@ import cv2
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, rounded, spread
 from benchmarks.quality.depth_ct import CTPair, configured_depth, read_ct_pair
+from benchmarks.tables import filled
 from sags_node.clients.registration.register import Registration, Verdict, register
 from sags_node.clients.registration.rigid import kabsch
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.config.schema import LaunchConfig
 from sags_node.geometry import invert, project, rigid, transform
 from sags_node.mapping.budget import StepBudget
+from sags_node.phantom.rig import phantom_rig
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import prepare
@@ -91,13 +94,12 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
     prepare(config)
     placings: list[Placing] = []
     refusals: list[tuple[str, Registration, str]] = []
-    receipt: Receipt | None = None
+    receipt = Receipt(phantom_rig(*SIZE), SIZE, None)
     for seed in range(seeds):
         advance(seed, seeds, "phantom")
         phantom = Phantom(
             PhantomScene(seconds=1.0, width=SIZE[0], height=SIZE[1], seed=seed, still_tissue=True)
         )
-        receipt = receipt or Receipt(phantom.rig, SIZE, None)
         camera, surface = _node_sees(config, phantom, receipt)
         rng = np.random.default_rng(seed)
         used, triangles = part(rng, phantom, camera)
@@ -105,7 +107,6 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
         placings.append(_registered(case, surface))
         refusals += _spoilt(case, surface)
     refusals += _even(np.random.default_rng(0))
-    assert receipt is not None
     measured: dict[str, Any] = {
         "picked_mm": 1e3 * PICKED,
         "below_mm": 1e3 * BELOW,
@@ -126,10 +127,8 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
 
 def shown_to_node(phantom: Phantom, number: int, count: int, rate: float) -> StereoFrame:
     """Frame `number` of `count`, with its true masks and pose."""
-    truth, stamp = phantom.frame(number, count), round((1 + number / rate) * 1e9)
-    return StereoFrame(
-        number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool, T_world_cam=truth.T_world_cam
-    )
+    truth = phantom.frame(number, count)
+    return replace(frame_of(number, rate, truth), T_world_cam=truth.T_world_cam)
 
 
 def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tuple[Camera, Surface]:
@@ -265,7 +264,7 @@ def _summary(placings: list[Placing]) -> dict[str, Any]:
     said["verdicts"] = {verdict: verdicts.count(verdict) for verdict in get_args(Verdict)}
     for name in ("by_pairs", "fitted", "open3d"):
         errors = np.array([error for each in placings for error in each.errors_mm.get(name, ())])
-        said[name] = {"median_mm": rounded(np.median(errors)), "p90_mm": rounded(np.quantile(errors, 0.9))}
+        said[name] = {f"{which}_mm": length for which, length in spread(errors).items()}
     for name in ("by_pairs", "fitted"):
         pairs = [
             pair
@@ -298,14 +297,8 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     )
     for scene in ("phantom", "ct"):
         for name in ("by_pairs", "fitted", "open3d") if scene in measured else ():
-            row = measured[scene][name]
-            within = f"{row['within_told']:.0%}" if "within_told" in row else ""
-            errors.add_row(
-                scene, name, str(row["median_mm"]), str(row["p90_mm"]), str(row.get("told_mm", "")), within
-            )
+            cells = scene, name, "{median_mm}", "{p90_mm}", "{told_mm}", "{within_told:.0%}"
+            filled(errors, [measured[scene][name]], *cells, unknown="")
     refused = Table("what", "refused", "with its remedy", "said", title="to be refused")
-    for row in measured["refused"]:
-        refused.add_row(
-            row["what"], f"{row['refused']} of {row['of']}", str(row["with_its_remedy"]), row["said"]
-        )
+    filled(refused, measured["refused"], "{what}", "{refused} of {of}", "{with_its_remedy}", "{said}")
     return [errors, refused]

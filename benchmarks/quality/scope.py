@@ -7,7 +7,7 @@ error is a matter of definition, since the motion that all tissue shares cannot 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -15,6 +15,9 @@ import cv2
 import numpy as np
 from rich.table import Table
 
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of
+from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig, PhantomSource, PoseWay
 from sags_node.errors import UsageError
 from sags_node.geometry import project, rigid
@@ -41,8 +44,6 @@ TURNED = np.radians([0.6, 0.5, -0.6])  # 1 degree
 HAND_EYE = np.radians([0.6, -0.6, 0.5])  # of the camera on the hand: 1 degree
 JITTER = 1e-4  # m, along each axis (standard deviation)
 JITTER_TURN = np.radians(0.03)  # about each
-
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
 class Robot:
@@ -147,7 +148,7 @@ def _measured(
     for number in range(count):
         truth = phantom.frame(number, count)
         given = robot.gives(truth.T_world_cam, number / rate)
-        frame = _stereo(number, rate, truth)
+        frame = frame_of(number, rate, truth)
         for name, each in played.items():
             pose = given if name in ("robot", "refine") else truth.T_world_cam
             each.take(replace(frame, T_world_cam=pose), truth.depth)
@@ -172,11 +173,6 @@ def _measured(
 def _with_pose(config: LaunchConfig, way: PoseWay) -> LaunchConfig:
     vision = config.vision.model_copy(update={"pose": way})
     return config.model_copy(update={"vision": vision})
-
-
-def _stereo(number: int, rate: float, truth: PhantomFrame) -> StereoFrame:
-    stamp = round((1 + number / rate) * 1e9)
-    return StereoFrame(number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool)
 
 
 class _Points:
@@ -215,19 +211,12 @@ def table(measured: dict[str, Any]) -> Table:
         title=f"{measured['seconds']:g} s at {measured['rate']:g} Hz",
     )  # fmt: skip
     for row in measured["rows"]:
-        shown = "psnr" in row
-        made.add_row(
-            row["motion"],
-            row["way"],
-            f"{row['ate_mm']:.2f} / {row['max_mm']:.2f}",
-            f"{row['rpe_mm']:.3f} / {row['rpe_deg']:.3f}",
-            f"{row['end_mm']:.2f} / {row['end_deg']:.2f}",
-            f"{row['drift_mm']:.2f} / {row['drift_deg']:.2f}",
-            f"{row['worst_drift_mm']:.2f} / {row['worst_drift_deg']:.2f}",
-            f"{row['psnr']:.2f}" if shown else "",
-            f"{row['depth_median_mm']:.2f} / {row['depth_p90_mm']:.2f}" if shown else "",
-            str(row["held"]) if shown else "",
-        )
+        shown = ("{psnr:.2f}", "{depth_median_mm:.2f} / {depth_p90_mm:.2f}", "{held}")
+        filled(
+            made, [row], "{motion}", "{way}", "{ate_mm:.2f} / {max_mm:.2f}", "{rpe_mm:.3f} / {rpe_deg:.3f}",
+            *(f"{{{each}_mm:.2f}} / {{{each}_deg:.2f}}" for each in ("end", "drift", "worst_drift")),
+            *(shown if "psnr" in row else ()),
+        )  # fmt: skip
     return made
 
 

@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.quality.depth import Advance, rounded, spread
+from benchmarks import Advance
+from benchmarks.quality.depth import frame_of, rounded, spread
+from benchmarks.tables import filled
 from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.content import STRAIN_FIELDS, points
+from sags_node.phantom.rig import phantom_rig
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.warm_up import prepare
 from sags_node.tools.evaluation.receipt import Receipt
-from sags_node.types import F32, F64, I64, StereoFrame
+from sags_node.types import F32, F64, I64
 
 SIZE = (640, 512)
 SECONDS, RATE, STEPS = 4.0, 15.0, 2  # of one pull; frames a second; steps of the mapper, each frame
@@ -30,17 +33,15 @@ def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
     """Of what each message of `points` says while the tissue is pulled, and once it is back."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     prepare(config)
-    told, true, back, receipt, count = [], [], [], None, round(SECONDS * RATE)
+    told, true, back, count = [], [], [], round(SECONDS * RATE)
+    receipt = Receipt(phantom_rig(*SIZE), SIZE, None)
     for seed in range(seeds):
         phantom = Phantom(PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1], seed=seed))
         pipeline = Pipeline(config, phantom.rig, rate=RATE)
-        receipt = receipt or Receipt(phantom.rig, SIZE, None)
         before = phantom.tissue.vertices(SINCE / count)
         for number in range(count):
             advance(number, count, f"seed {seed}")
-            seen = phantom.frame(number, count)
-            stamp = round((1 + number / RATE) * 1e9)
-            frame = StereoFrame(number, stamp, stamp, seen.left, seen.right, tissue=~seen.tool)
+            frame = frame_of(number, RATE, phantom.frame(number, count))
             result = pipeline.process(frame, StepBudget(STEPS))
             receipt.add(frame, result.observation.tissue)
             if number == SINCE:
@@ -56,7 +57,6 @@ def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
             told.append(rows[on][:, [names.index(name) for name in STRAIN_FIELDS[:2]]])
             true.append(true_strain(before, now).reshape(-1, 2)[vertex[on]])
             back.append(np.full(np.count_nonzero(on), number >= BACK * count))
-    assert receipt is not None
     found, exact = np.concatenate(told), np.concatenate(true)
     rest = np.concatenate(back)
     parts = {"all": ~rest, "strained": ~rest & (np.abs(exact).max(1) >= STRAINED), "back": rest}
@@ -116,6 +116,6 @@ def tables(measured: dict[str, Any]) -> list[Table]:
     table = Table("points", "strain", "known", "true, p90", "error", "0 is told", title="median, nine of ten")
     for part in ("all", "strained", "back"):
         for name, row in measured[part].items():
-            figures = [f"{row[n]['median']}, {row[n]['p90']}" for n in ("error", "zero")]
-            table.add_row(part, name, str(row["known"]), str(row["true_p90"]), *figures)
+            figures = "{error[median]}, {error[p90]}", "{zero[median]}, {zero[p90]}"
+            filled(table, [row], part, name, "{known}", "{true_p90}", *figures)
     return [table]

@@ -4,12 +4,14 @@ methods that know no model (`followers`)."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from benchmarks import Advance
 from benchmarks.quality.followers import CONSISTENT, FOLLOWERS, Follower, dis_flow, sample
 from sags_lab.protocols.point_tracks import (
     average_jaccard,
@@ -35,8 +37,6 @@ BORDER = 60  # px: what is nearer to the picture's edge soon leaves it
 RIGHT = 4.0 / 640  # of the width: so near to its point a confident anchor should be
 RIGHT_MM = 2.0  # the same in space
 WRONG = 8.0 / 640  # of the width: what is farther, and said to be seen there, is wrong
-
-Advance = Callable[[int, int | None, str], None]  # frames done, of, what
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +120,8 @@ class _Run:
         else:
             places = np.asarray(project(result.pair.camera, points)[0], np.float64)
             wanted = _visible(frame) & middle(places, result)
-        pinned = pin(pipeline, result, places, wanted)
-        self._rows, self._places, self.count = pinned, places[pinned], len(pinned)
+        pinned = [*pin(pipeline, result, places, np.flatnonzero(wanted)).values()]
+        self._rows, self._places, self.count = np.array(pinned), places[pinned], len(pinned)
         self._shared = np.unique(np.linspace(0, self.count - 1, BESIDE).round().astype(np.int64))
         picture, places = result.pair.left, self._places[self._shared]
         self._followers = {name: FOLLOWERS[name](picture, places) for name in beside}
@@ -264,19 +264,25 @@ def middle(places: F64, result: FrameResult) -> Bool:
     return np.asarray(inside.all(1))
 
 
-def pin(pipeline: Pipeline, result: FrameResult, places: F64, wanted: Bool) -> I64:
-    """Anchors at the wanted ones of some pixels [P, 2]; returns the rows of those that could be pinned."""
-    pinned = []
-    for row in np.flatnonzero(wanted):
-        u, v = (float(x) for x in places[row])
-        try:
-            pipeline.anchors.add_pixel(u, v, result.observation, result.snapshot, result.views["left"])
-        except SagsError:
-            continue  # an instrument, or no depth there
-        pinned.append(row)
+NO_TISSUE = "no tissue with depth was found in the first frame; set source.start to a better one"
+
+
+def pin(
+    pipeline: Pipeline, result: FrameResult, places: F64, rows: I64, otherwise: str = NO_TISSUE
+) -> dict[int, int]:
+    """Anchors at these rows of pixels [P, 2], where that can be: id -> row.
+
+    Raises:
+        SagsError: `otherwise`, where none can.
+    """
+    pinned, shown = dict[int, int](), (result.observation, result.snapshot, result.views["left"])
+    for row in rows.tolist():
+        u, v = places[row].tolist()
+        with suppress(SagsError):  # an instrument, or no depth there
+            pinned[pipeline.anchors.add_pixel(u, v, *shown)] = row
     if not pinned:
-        raise SagsError("no tissue with depth was found in the first frame; set source.start to a better one")
-    return np.array(pinned, np.int64)
+        raise SagsError(otherwise)
+    return pinned
 
 
 def _follow(places: F64, there: F32, back: F32, tissue: Bool) -> tuple[F64, Bool]:

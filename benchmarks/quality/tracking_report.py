@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 from rich.table import Table
 
 from benchmarks.quality.tracking import RIGHT, RIGHT_MM
+from benchmarks.tables import filled
 from sags_lab.protocols.point_tracks import Bin
 
 
@@ -21,16 +21,9 @@ def _by_frame(measured: dict[str, Any]) -> Table:
         "frame", "motion p50, p90, px", "anchors", "off by, px", "Gaussians", "off by, px",
         title=f"{measured['session']}, against the {measured['truth']} truth; Gaussians against direct flow",
     )  # fmt: skip
-    rows: Iterable[dict[str, Any]] = measured["frames"]
-    for row in rows:
-        made.add_row(
-            str(row["frame"]),
-            _two(row["motion_px"]),
-            str(row["anchors"]),
-            _two(row["anchors_px"]),
-            str(row["gaussians"]),
-            _two(row["gaussians_px"]),
-        )
+    for row in measured["frames"]:
+        motion, anchors, gaussians = (_two(row[f"{what}_px"]) for what in ("motion", "anchors", "gaussians"))
+        filled(made, [row], "{frame}", motion, "{anchors}", anchors, "{gaussians}", gaussians)
     return made
 
 
@@ -41,25 +34,17 @@ def _by_method(measured: dict[str, Any]) -> Table:
         "sure", "sure and wrong", "average Jaccard", "us a point",
         title=f"{measured['points_beside']} points in {len(measured['frames'])} frames",
     )  # fmt: skip
+    cells = [f"{{within[{key}]:.1%}}" for key in thresholds]
+    cells += ["{sure:.1%}", "{wrong:.1%}", "{average_jaccard:.3f}", "{us_per_point:.0f}"]
     for name, row in measured["methods"].items():
-        made.add_row(
-            name.replace("_", " "),
-            _two(row["off_by_px"]),
-            *(f"{row['within'][key]:.1%}" for key in thresholds),
-            f"{row['sure']:.1%}",
-            f"{row['wrong']:.1%}",
-            "-" if row["average_jaccard"] is None else f"{row['average_jaccard']:.3f}",
-            f"{row['us_per_point']:.0f}",
-        )
+        filled(made, [row], name.replace("_", " "), _two(row["off_by_px"]), *cells)
     return made
 
 
 def reliability_tables(measured: dict[str, Any]) -> list[Table]:
     """How often anchors of some confidence are right, in figures that say so."""
     limits = {"reliability_px": f"{RIGHT * 640:g} px of 640", "reliability_mm": f"{RIGHT_MM:g} mm"}
-    return [
-        _reliability(measured[key], limit) for key, limit in limits.items() if measured.get(key) is not None
-    ]
+    return [_reliability(measured[key], limit) for key, limit in limits.items() if key in measured]
 
 
 def _reliability(found: dict[str, Any], limit: str) -> Table:

@@ -14,13 +14,11 @@ from sags_lab.protocols.arithmetic import depth_figures
 from sags_lab.protocols.d4d_files import D4dClip, Scan, d4d_clips, instruments_are_white, read_tools
 from sags_lab.protocols.d4d_population import in_population
 from sags_lab.protocols.d4d_scan import check_scan, read_surface, scan_depth
-from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
-from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import LaunchConfig, RecordedSource
+from sags_lab.protocols.playing import AS_GIVEN, Progress, configured, stride_of
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_posed
-from sags_node.pipeline.warm_up import prepare
 from sags_node.quality import metrics
 from sags_node.sources.pictures import list_pictures
 from sags_node.sources.truth import load_npy
@@ -61,9 +59,7 @@ def _measure_clip(clip: D4dClip, overrides: Sequence[str], progress: Progress) -
     white = instruments_are_white(list(clip.masks.values()))
     given = ["source.kind:=folders", f"source.left:={clip.left}", f"source.right:={clip.right}"]
     pose = ["vision.pose:=estimate"] if clip.is_moved else []
-    launch = [*given, f"source.rate:={clip.rate}", AS_GIVEN, *pose, *STEP, *overrides]
-    config = load_launch(None, launch)
-    prepare(config)
+    config = configured([*given, f"source.rate:={clip.rate}", AS_GIVEN, *pose], overrides)
     run = _Run(clip, config)
     with open_posed(config, clip.rig, references=False) as frames:
         for frame in frames:
@@ -82,7 +78,7 @@ class _Run:
 
     def __init__(self, clip: D4dClip, config: LaunchConfig) -> None:
         self._clip = clip
-        self._stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
+        self._stride = stride_of(config)
         self._last = len(list_pictures(clip.left)) - 1
         self.pipeline = Pipeline(config, clip.rig)
         self.budget = self.pipeline.make_budget()

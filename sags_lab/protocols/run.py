@@ -19,13 +19,13 @@ from sags_lab.protocols.layouts import (
     stereomis_sequence,
     stir_clips,
 )
-from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress
+from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress, configured, stride_of
 from sags_lab.protocols.point_tracker import Followed, PointTracker, raw_pair
 from sags_lab.protocols.point_tracks import shares_within
 from sags_lab.protocols.stir_2026 import is_stir_2026, measure_stir_2026
 from sags_lab.protocols.tracked_points import is_tracked, measure_tracked
 from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import LaunchConfig, RecordedSource
+from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError
 from sags_node.geometry import rigid
 from sags_node.media.video import Video
@@ -105,7 +105,7 @@ def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> 
     deep, deep_unmoved = [], []
     for clip in stir_clips(folder):
         given = ["source.kind:=videos", f"source.left:={clip.left}", f"source.right:={clip.right}"]
-        tracks = _follow([*given, *STEP, *overrides], clip.rig, clip.starts, clip.name, progress)
+        tracks = _follow(configured(given, overrides), clip.rig, clip.starts, clip.name, progress)
         clips[clip.name] = arithmetic.nearest_distances(tracks.pixels, clip.ends)
         distances.append(clips[clip.name])
         unmoved.append(arithmetic.nearest_distances(clip.starts, clip.ends))
@@ -143,8 +143,7 @@ def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress
     sequence = stereomis_sequence(folder)
     check_sizes(Video(sequence.video), sequence.rig)
     given = ["source.kind:=videos", f"source.left:={sequence.video}", "source.geometry.layout:=over_under"]
-    config = load_launch(None, [*given, "vision.pose:=estimate", *STEP, *overrides])
-    prepare(config)
+    config = configured([*given, "vision.pose:=estimate"], overrides)
     ways = [_way(config, sequence, frames, progress) for frames in sequence.ranges]
     ways = [(estimated, known) for estimated, known in ways if len(known) >= LEAST_POSES]
     if not ways:
@@ -164,7 +163,7 @@ def _way(
     config: LaunchConfig, sequence: StereoMisSequence, frames: range, progress: Progress
 ) -> tuple[list[F64], list[F64]]:
     """Estimated and known poses [4, 4] of the frames of one range whose pose is known."""
-    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
+    stride = stride_of(config)
     pipeline = Pipeline(config, sequence.rig)
     budget, T_rectified_raw = pipeline.make_budget(), rigid(sequence.rig.left.R, np.zeros(3))
     known_at = dict(zip(sequence.frames, sequence.poses, strict=True))
@@ -195,10 +194,8 @@ class _Tracks:
     times_ms: list[float]  # of calls; the first takes two frames
 
 
-def _follow(launch: Sequence[str], rig: StereoRig, starts: F64, name: str, progress: Progress) -> _Tracks:
+def _follow(config: LaunchConfig, rig: StereoRig, starts: F64, name: str, progress: Progress) -> _Tracks:
     """As STIR's evaluator drives a method: each call is given what the one before it returned."""
-    config = load_launch(None, launch)
-    prepare(config)
     tracker, followed = PointTracker(config, rig), Followed.unknown(starts)
     points_mm = np.full((len(starts), 3), np.inf)
     times: list[float] = []

@@ -20,15 +20,12 @@ import numpy as np
 
 from sags_lab.protocols.arithmetic import stir_2026_figures
 from sags_lab.protocols.layouts import LARGEST_TEXT, as_stir_counts, stir_rig
-from sags_lab.protocols.playing import STEP, Progress
+from sags_lab.protocols.playing import Progress, configured, stride_of
 from sags_lab.protocols.point_tracker import Followed, PointTracker, raw_pair
-from sags_node.config.launch_file import load_launch
-from sags_node.config.schema import RecordedSource
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
 from sags_node.media.video import Video
 from sags_node.pipeline.session import open_posed
-from sags_node.pipeline.warm_up import prepare
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
 
 QUERIES, TRUTH = "queries.json", "annotations.json"
@@ -170,9 +167,8 @@ def _play(
     """Judge one sequence; times of the frames whose latency counts, ms."""
     left, right = sequence.folder / "left.mp4", sequence.folder / "right.mp4"
     given = ["source.kind:=videos", f"source.left:={left}", f"source.right:={right}"]
-    config = load_launch(None, [*given, *STEP, *overrides])
-    stride = config.source.stride if isinstance(config.source, RecordedSource) else 1
-    prepare(config)
+    config = configured(given, overrides)
+    stride = stride_of(config)
     tracker = PointTracker(config, sequence.rig)
     pixels, times = sequence.queries, list[float]()
     before: StereoFrame | None = None

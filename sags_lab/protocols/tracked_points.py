@@ -19,15 +19,13 @@ import numpy as np
 
 from sags_lab.protocols import arithmetic
 from sags_lab.protocols.layouts import read_tum
-from sags_lab.protocols.playing import STEP, Progress
+from sags_lab.protocols.playing import Progress, configured
 from sags_lab.protocols.point_tracker import Followed, PointTracker
 from sags_node import geometry
-from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
-from sags_node.pipeline.warm_up import prepare
 from sags_node.rig import rectified_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
@@ -145,14 +143,8 @@ def measure_tracked(folder: Path, overrides: Sequence[str], progress: Progress) 
     """Points of the first frame followed to the last, with the camera's poses given as their authors give
     them; beside points that never move."""
     sequence = tracked_sequence(folder)
-    given = [
-        "source.kind:=folders",
-        f"source.left:={folder}",
-        f"source.right:={folder}",
-        f"source.rate:={RATE}",
-    ]
-    config = load_launch(None, [*given, *STEP, *overrides])
-    prepare(config)
+    eyes = [f"source.{eye}:={folder}" for eye in ("left", "right")]
+    config = configured(["source.kind:=folders", *eyes, f"source.rate:={RATE}"], overrides)
     found = _followed(sequence, config, progress)
     size = sequence.rig.left.width, sequence.rig.left.height
     truth, visible = sequence.pixels[:, : found.shape[1]], sequence.visible[:, : found.shape[1]]

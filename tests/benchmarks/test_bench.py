@@ -18,8 +18,7 @@ from benchmarks.kernels import contention, rasterizing
 from benchmarks.kernels import measure as kernels
 from benchmarks.kernels.check import SECTIONS, check, compare
 from benchmarks.kernels.scenes import SCENES
-from benchmarks.kernels.timing import stage_clock
-from benchmarks.kernels.work import Work, stage_rows
+from benchmarks.kernels.timing import Work, stage_clock, stage_rows
 from sags_node.engine.interface import MIN_ALPHA
 from sags_node.engine.rasterizer import compositing
 from sags_node.engine.rasterizer.layout import PAIR

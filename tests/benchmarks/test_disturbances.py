@@ -54,9 +54,9 @@ def made(left: U8, right: U8 | None = None, count: int = 30) -> list[StereoFrame
     return [StereoFrame(i, i, i, left, left if right is None else right) for i in range(count)]
 
 
-def on_plane(depth: F32) -> Scene:
+def on_plane(depths: dict[int, F32]) -> Scene:
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
-    return Scene(rectified_rig("plane", WIDTH, HEIGHT, K, BASELINE), {0: depth})
+    return Scene(rectified_rig("plane", WIDTH, HEIGHT, K, BASELINE), depths)
 
 
 def changed(name: str, frames: list[StereoFrame], scene: Scene) -> Iterator[StereoFrame]:
@@ -119,7 +119,7 @@ def test_how_long_each_lasts() -> None:
 
 def test_a_fifth_of_the_frames_is_lost() -> None:
     frames = made(np.zeros((HEIGHT, WIDTH, 3), np.uint8), count=400)
-    scene = on_plane(np.full((HEIGHT, WIDTH), np.float32(0.06)))
+    scene = on_plane({0: np.full((HEIGHT, WIDTH), np.float32(0.06))})
     came = [given for _, given in disturbed(DISTURBANCES["lost_frames"], frames, range(400), 30.0, scene)]
     assert came.count(None) == pytest.approx(80, abs=4 * np.sqrt(400 * 0.2 * 0.8))  # four standard deviations
 
@@ -140,7 +140,7 @@ def test_light(session: Session, frames: list[StereoFrame]) -> None:
 def test_smoke_thickens_with_depth_and_in_time() -> None:
     """Stripes at twice the distance, which the smooth clouds do not tell from those beside them."""
     near = np.indices((HEIGHT, WIDTH))[1] // 8 % 2 == 0
-    scene = on_plane(np.where(near, np.float32(0.04), np.float32(0.08)))
+    scene = on_plane({0: np.where(near, np.float32(0.04), np.float32(0.08))})
     frames = made(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
 
     def thickness(picture: U8) -> F32:
@@ -165,7 +165,7 @@ def test_blood_lies_on_the_tissue() -> None:
     texture = np.random.default_rng(0).integers(110, 240, (HEIGHT, WIDTH + disparity, 3), np.uint8)
     left, right = texture[:, :WIDTH], texture[:, disparity:]
     frames = made(np.ascontiguousarray(left), np.ascontiguousarray(right))
-    given = list(changed("blood", frames, on_plane(depth)))[20]
+    given = list(changed("blood", frames, on_plane({0: depth})))[20]
     assert given.right is not None
     covered_left, covered_right = (np.median(cv2.blur(p, (5, 5)), -1) < 70 for p in (given.left, given.right))
     assert covered_left.mean() == pytest.approx(0.5, abs=0.12)  # its front is not straight
@@ -203,15 +203,13 @@ def test_the_right_eye_knows_its_depths(session: Session, frames: list[StereoFra
 
 
 def test_depth_between_references_is_interpolated() -> None:
-    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
-    rig = rectified_rig("plane", WIDTH, HEIGHT, K, BASELINE)
     near, far = (np.full((HEIGHT // 2, WIDTH // 2), np.float32(z)) for z in (0.05, 0.09))
     near[:20] = 0  # unknown
-    scene = Scene(rig, {10: near, 20: far})
+    scene = on_plane({10: near, 20: far})
     expected = {3: 0.05, 10: 0.05, 15: 0.07, 20: 0.09, 30: 0.09}
     for frame_id, depth in expected.items():
         assert scene.depths(frame_id)[0] == pytest.approx(depth, rel=1e-4)
-    assert np.isfinite(Scene(rig, {}).depths(0)[1]).all()
+    assert np.isfinite(on_plane({}).depths(0)[1]).all()
 
 
 def test_the_other_scene_fits_the_rig(session: Session, frames: list[StereoFrame]) -> None:

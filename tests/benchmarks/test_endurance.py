@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from command_line import refused
 from places import SESSION
 
 from benchmarks.__main__ import main
@@ -16,19 +16,9 @@ from benchmarks.node import endurance
 from benchmarks.node.endurance import FIGURES, Window, measure_endurance, slope, statement
 from benchmarks.node.soak import worsening
 from sags_node.errors import SagsError
-from sags_node.pipeline.session import Session, open_session
+from sags_node.pipeline.session import open_session
 
 QUIET = Window(0, 25.0, 30.0, 35.0, 30_000, 500, 400.0, 0, 0, 0)
-
-
-def bench(*arguments: object) -> Result:
-    return CliRunner().invoke(main, ["endurance", *(str(argument) for argument in arguments)])
-
-
-def opened(*overrides: str) -> Session:
-    return open_session(
-        SESSION, ["source.pace:=step", "mapping.max_gaussians:=2000", "mapping.iterations:=1", *overrides]
-    )
 
 
 # ---- the order of frames ---------------------------------------------------------------------------------
@@ -107,7 +97,8 @@ def test_ctrl_c_keeps_what_is_known_so_far() -> None:
         if done == 25:
             raise KeyboardInterrupt
 
-    found = measure_endurance(opened(), 1000, 10, "walk", stop)
+    small = ["source.pace:=step", "mapping.max_gaussians:=2000", "mapping.iterations:=1"]
+    found = measure_endurance(open_session(SESSION, small), 1000, 10, "walk", stop)
     assert found["interrupted"] and [window["frames"] for window in found["windows"]] == [10, 20]
     assert found["still"] is None and "stopped early" in statement(found)
 
@@ -115,8 +106,7 @@ def test_ctrl_c_keeps_what_is_known_so_far() -> None:
 @pytest.mark.fault("memory: a recording does not fit")
 def test_a_recording_that_does_not_fit_into_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(endurance, "MOST_BYTES", 2_000_000)
-    result = bench(SESSION, "--frames", 5)
-    assert result.exit_code == 1 and "source.frames:=" in result.output and "Traceback" not in result.output
+    refused(1, "endurance", SESSION, "--frames", 5, said=("source.frames:=",), command=main)
 
 
 # ---- when `python -m benchmarks soak --check` fails ----------------------------------------------------

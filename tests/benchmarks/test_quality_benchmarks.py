@@ -27,7 +27,7 @@ from sags_node.errors import SagsError
 from sags_node.mapping.anchors import Anchors
 from sags_node.mapping.camera_pose import exponential
 from sags_node.phantom import PhantomScene
-from sags_node.pipeline.session import Session, open_session
+from sags_node.pipeline.session import open_session
 from sags_node.tools.fitting import start
 from sags_node.tools.fitting.fit import Fit
 from sags_node.tools.fitting.settings import FieldShape
@@ -38,24 +38,20 @@ SMALL = [
 ]
 
 
-def measured(monkeypatch: pytest.MonkeyPatch, scenario: recall.Scenario) -> dict[str, Any]:
-    monkeypatch.setattr(recall, "SCENARIOS", [scenario])
+def test_most_anchors_come_back_after_the_scope_looked_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recall, "SCENARIOS", ["turned away"])
     monkeypatch.setattr(recall, "BEFORE", 1.2)
     monkeypatch.setattr(recall, "AFTER", 1.2)
-    session = open_session("launch/phantom.yaml", SMALL)
-    found = recall.measure_recall(session, 2.0, lambda done, of, what: None)
+    found = recall.measure_recall(
+        open_session("launch/phantom.yaml", SMALL), 2.0, lambda done, of, what: None
+    )
     assert next(table.row_count for table in recall.tables(found)) == 1
     for key in ("reliability_px", "reliability_mm"):
         bins = found[key]["bins"]
         assert sum(row["count"] for row in bins) > 500
         assert bins[-1]["right"] > max(0.9, bins[0]["right"])  # who says to be sure is
-    row = dict(found["rows"][0])
+    (row,) = found["rows"]
     assert row["receipt"]["frames"]["count"] == round((1.2 + 2.0 + 1.2) * recall.RATE)
-    return row
-
-
-def test_most_anchors_come_back_after_the_scope_looked_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    row = measured(monkeypatch, "turned away")
     assert row["anchors"] > 30 and row["found"] > max(0.5, row["unmoved"]) and row["wrong"] < 0.1
 
 
@@ -84,12 +80,9 @@ def test_what_is_told_is_exact_and_what_a_robot_is_off_by_is_what_was_planted() 
 # ---- `benchmarks tracking`: its truths, and what it says of the node on the phantom --------------------
 
 
-def opened(*overrides: str) -> Session:
-    return open_session(SESSION, ["source.pace:=step", "source.loop:=false", *overrides])
-
-
 def tracked(*overrides: str, frames: Sequence[int] = (4, 12), beside: Sequence[str] = ()) -> dict[str, Any]:
-    return measure_tracking(opened(*overrides), frames, lambda done, of, what: None, beside)
+    session = open_session(SESSION, ["source.pace:=step", "source.loop:=false", *overrides])
+    return measure_tracking(session, frames, lambda done, of, what: None, beside)
 
 
 def test_anchors_stay_where_the_flow_goes() -> None:
@@ -215,10 +208,9 @@ def test_all_variants_are_measured_on_the_same_frames(
 
     monkeypatch.setattr(Fit, "start", noted)
     out = tmp_path / "ablation.json"
-    arguments = ["source.frames:=12", "--warm-up", "2", "--iterations", "3", "--seeds", "2"]
-    arguments += ["--set", "max_gaussians=800"]
-    arguments += [f"--variant={name}" for name in small if name != "nodes"] + ["--out", str(out), "--json"]
-    found = figures_of("ablation", str(phantom_session), *arguments, command=main)
+    asked = "source.frames:=12 --warm-up 2 --iterations 3 --seeds 2 --set max_gaussians=800 --json".split()
+    asked += [f"--variant={name}" for name in small if name != "nodes"]
+    found = figures_of("ablation", phantom_session, *asked, "--out", out, command=main)
     assert json.loads(out.read_text()) == {"provenance": ANY} | found
     assert found["receipt"]["frames"]["count"] == 12
     del small["nodes"]

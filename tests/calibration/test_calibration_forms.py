@@ -61,6 +61,13 @@ def refusal(path: Path, size: tuple[int, int] | None = None) -> str:
     return str(caught.value)
 
 
+def converted(folder: Path, out: Path, *more: str, size: str | None = "640x480") -> tuple[int, str]:
+    """The exit code of `sags calib convert`, and what it says."""
+    asked = () if size is None else ("--size", size)
+    code, _, said = ran("calib", "convert", folder, "-o", out, *asked, *more)
+    return code, said
+
+
 # ---- ROS -------------------------------------------------------------------------------------------------
 
 
@@ -219,13 +226,12 @@ def test_four_coefficients_of_a_wide_view_are_asked_about(focal: float, asked: b
 )
 def test_a_wrong_unit_is_refused_and_the_right_one_named(unit: str, said: str, tmp_path: Path) -> None:
     folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T / UNITS[unit])
-    command = ("calib", "convert", folder, "-o", tmp_path / "out", "--size", "640x480", "--unit")
-    code, _, text = ran(*command, said)
+    code, text = converted(folder, tmp_path / "out", "--unit", said)
     assert code == 2 and f"--unit {said} makes the baseline" in text and not (tmp_path / "out").exists()
     assert re.findall(r"say --unit (\w+) \(5.2 mm\)", text) == [unit]
-    code, text, _ = ran("calib", "check", folder, *command[-3:], said, "--json")
+    code, text, _ = ran("calib", "check", folder, "--size", "640x480", "--unit", said, "--json")
     assert code == 1 and f"say --unit {unit} (5.2 mm)" in text
-    assert ran(*command, unit)[0] == 0
+    assert converted(folder, tmp_path / "out", "--unit", unit)[0] == 0
     assert_same(load_rig(tmp_path / "out"), make_rig())
 
 
@@ -237,21 +243,20 @@ def test_a_rig_that_is_no_endoscope_is_taken_as_the_refusal_says(
     """Its baseline reads as that of an endoscope in another unit, which does not make it one."""
     T_rig = T * (baseline / np.linalg.norm(T))
 
-    def converted(metres: float, unit: str) -> tuple[int, str]:
+    def in_unit(metres: float, unit: str) -> tuple[int, str]:
         folder = tmp_path / f"{unit}-{metres}"
         if form == "OpenCV":
             write_pair(folder, ".yml", PLUMB_BOB, T_rig / metres)
         else:
             save_rig(rectify_eyes("rig", SIZE, K, PLUMB_BOB, R, T_rig / metres), folder)
-        size = ("--size", "640x480") if form == "OpenCV" else ()
-        code, _, text = ran("calib", "convert", folder, "-o", tmp_path / "out", *size, "--unit", unit)
-        return code, text
+        size = "640x480" if form == "OpenCV" else None
+        return converted(folder, tmp_path / "out", "--unit", unit, size=size)
 
-    code, text = converted(UNITS[said], said)
+    code, text = in_unit(UNITS[said], said)
     if said != "m":  # as where no unit is said
         assert code == 2 and f"--unit {said} makes the baseline {1e3 * baseline:g} mm" in text
         (factor,) = re.findall(r"divide the baseline in the files by (\S+) .*, and say --unit m$", text, re.M)
-        code, text = converted(UNITS[said] * float(factor), "m")
+        code, text = in_unit(UNITS[said] * float(factor), "m")
     assert code == 0, text
     assert load_rig(tmp_path / "out").baseline == pytest.approx(baseline, rel=1e-5)
 
@@ -259,9 +264,7 @@ def test_a_rig_that_is_no_endoscope_is_taken_as_the_refusal_says(
 def test_a_unit_that_no_other_one_betters_is_taken(tmp_path: Path) -> None:
     """20 mm: of no endoscope in any unit."""
     folder = write_pair(tmp_path / "rig", ".yml", PLUMB_BOB, T * 20 / 5.2e-3)
-    code, _, text = ran(
-        "calib", "convert", folder, "-o", tmp_path / "out", "--size", "640x480", "--unit", "mm"
-    )
+    code, text = converted(folder, tmp_path / "out", "--unit", "mm")
     assert code == 0 and "baseline 20 mm" in text
 
 
@@ -430,16 +433,15 @@ def test_what_was_looked_for_is_said(tmp_path: Path) -> None:
 
 def test_convert(tmp_path: Path) -> None:
     folder = write_pair(tmp_path / "scope", ".yml", PLUMB_BOB, T * 1000)
-    size = ("--size", "640x480")
-    code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "out", *size, "--unit", "mm")
+    code, said = converted(folder, tmp_path / "out", "--unit", "mm")
     assert code == 0 and "baseline 5.2 mm" in said
     assert_same(load_rig(tmp_path / "out"), make_rig())
-    code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", *size)
+    code, said = converted(folder, tmp_path / "no")
     assert code == 2 and "looks like millimetres" in said and not (tmp_path / "no").exists()
     assert f"sags calib convert {folder} -o FOLDER --unit mm" in said
-    code, _, said = ran("calib", "convert", folder, "-o", tmp_path / "no", "--size", "640")
+    code, said = converted(folder, tmp_path / "no", size="640")
     assert code == 2 and "'640' is not like 720x576" in said
-    code, _, _ = ran("calib", "convert", tmp_path / "out", "-o", tmp_path / "double", "--scale", "2")
+    code, _ = converted(tmp_path / "out", tmp_path / "double", "--scale", "2", size=None)
     double, rig = load_rig(tmp_path / "double"), make_rig()
     assert code == 0 and (double.left.width, double.left.height) == (1280, 960)
     assert double.baseline == pytest.approx(rig.baseline)

@@ -29,7 +29,7 @@ from sags_node.tools.calibration.matches import match_eyes
 from sags_node.tools.calibration.pictures import pairs_of_files, pairs_of_session
 from sags_node.tools.calibration.principal_points import judge_known_depths
 from sags_node.tools.calibration.rows import judge_scale, rectified_rows
-from sags_node.types import F64, U8, Eye, StereoFrame, StereoRig
+from sags_node.types import F64, U8, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
 Pairs = list[tuple[U8, U8]]
@@ -372,13 +372,9 @@ def test_principal_points_far_apart_are_not_taken_for_an_exchange(phantom: tuple
 
 def plain_rig(rectifier: Rectifier, shift: float) -> StereoRig:
     """Of rectified pictures; the right eye's principal point lies `shift` px farther to the right."""
-    K, none = rectifier.camera.K, np.zeros(5)
-    K_right = K + np.array([[0, 0, shift], [0, 0, 0], [0, 0, 0]])
-    size = rectifier.camera.width, rectifier.camera.height
-    P, P_right = (np.column_stack([K, [-K[0, 0] * baseline, 0, 0]]) for baseline in (0.0, rectifier.baseline))
-    return StereoRig(
-        "plain", Eye(*size, K, none, np.eye(3), P), Eye(*size, K_right, none, np.eye(3), P_right)
-    )
+    camera = rectifier.camera
+    rig = rectified_rig("plain", camera.width, camera.height, camera.K, rectifier.baseline)
+    return with_principal_point_moved(rig, shift, 0.0)
 
 
 def rectified(rectifier: Rectifier, pair: tuple[U8, U8]) -> tuple[U8, U8]:

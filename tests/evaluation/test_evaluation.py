@@ -12,12 +12,11 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import refused
 from engine_scenes import as_bytes, rasterize, round_gaussians
 from golden import Golden, Tolerance, compare, read_golden, write_golden
 from places import ROOT
 
-from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of
@@ -427,9 +426,8 @@ def test_without_matplotlib_it_says_at_once_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(plots, "find_spec", lambda name: None)
-    for command in (["eval", "--report", str(tmp_path / "out")], ["demo", "--out", str(tmp_path / "out")]):
-        result = CliRunner().invoke(main, command)
-        assert result.exit_code == 2 and "pip install '.[report]'" in result.stderr
+    for command in (("eval", "--report"), ("demo", "--out")):
+        refused(2, *command, tmp_path / "out", said=("pip install '.[report]'",))
     assert not (tmp_path / "out").exists()
 
 

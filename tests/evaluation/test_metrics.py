@@ -261,19 +261,26 @@ def test_right_eye_mask_of_a_plane_is_the_shifted_tissue() -> None:
 # ---- tracking --------------------------------------------------------------------------------------------
 
 
+ALL = np.ones(40, bool)
+
+
 def surface_points() -> np.ndarray:
     return np.random.default_rng(9).uniform([-0.02, -0.015, 0.0995], [0.02, 0.015, 0.1005], (40, 3))
 
 
+def bound(start: Gaussians, points: np.ndarray) -> PointTracks:
+    """Tracks that have seen all points in the first frame."""
+    tracks = PointTracks(40)
+    first = tracks.update(start, points, ALL, CAMERA)
+    assert len(first.errors_mm) == 0 and first.lost == 0  # binding says nothing of following
+    return tracks
+
+
 def test_a_cloud_that_moves_with_the_tissue_has_no_track_error() -> None:
     start, points = cloud(), surface_points()
-    visible = np.ones(40, bool)
-    tracks = PointTracks(40)
-    first = tracks.update(start, points, visible, CAMERA)
-    assert len(first.errors_mm) == 0 and first.lost == 0  # binding says nothing of following
-    step = np.array([0.0004, -0.0002, 0.0003])
+    tracks, step = bound(start, points), np.array([0.0004, -0.0002, 0.0003])
     for frame in range(1, 6):
-        errors = tracks.update(moved(start, step * frame), points + step * frame, visible, CAMERA)
+        errors = tracks.update(moved(start, step * frame), points + step * frame, ALL, CAMERA)
         assert errors.lost == 0 and len(errors.errors_mm) == 40
         assert errors.errors_mm.max() < 1e-4  # float32 means
         assert errors.errors_px.max() < 1e-3
@@ -281,25 +288,19 @@ def test_a_cloud_that_moves_with_the_tissue_has_no_track_error() -> None:
 
 def test_a_frozen_cloud_is_wrong_by_the_whole_motion() -> None:
     start, points = cloud(), surface_points()
-    visible = np.ones(40, bool)
-    tracks = PointTracks(40)
-    tracks.update(start, points, visible, CAMERA)
-    errors = tracks.update(start, points + np.array([0.003, 0, 0]), visible, CAMERA)
+    errors = bound(start, points).update(start, points + np.array([0.003, 0, 0]), ALL, CAMERA)
     np.testing.assert_allclose(errors.errors_mm, 3.0, atol=1e-6)
     np.testing.assert_allclose(errors.errors_px, 200 * 0.003 / points[:, 2], rtol=1e-6)
 
 
 def test_points_survive_as_long_as_one_neighbour_does() -> None:
     start, points = cloud(), surface_points()
-    visible = np.ones(40, bool)
-    tracks = PointTracks(40)
-    tracks.update(start, points, visible, CAMERA)
-    rng = np.random.default_rng(1)
+    tracks, rng = bound(start, points), np.random.default_rng(1)
     order = rng.permutation(len(start))[:3000]  # rows shuffled, a quarter pruned: ids must do the work
     step = np.array([0.001, 0, 0])
-    errors = tracks.update(rows(moved(start, step), order), points + step, visible, CAMERA)
+    errors = tracks.update(rows(moved(start, step), order), points + step, ALL, CAMERA)
     assert errors.lost == 0 and errors.errors_mm.max() < 1e-4
-    nothing_left = tracks.update(rows(start, np.zeros(0, int)), points, visible, CAMERA)
+    nothing_left = tracks.update(rows(start, np.zeros(0, int)), points, ALL, CAMERA)
     assert nothing_left.lost == 40 and len(nothing_left.errors_mm) == 0
 
 

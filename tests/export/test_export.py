@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ pytestmark = pytest.mark.usefixtures("run_dir")
 STEP = ("source.pace:=step", "mapping.iterations:=2")
 FRAME, FRAMES = 20, 40  # the lift, at 2 s
 MM = 1e3
+SeenAt = Callable[[Scene, np.ndarray], np.ndarray]
 
 
 @pytest.fixture(scope="module")
@@ -48,26 +50,20 @@ def scene(phantom_session: Path) -> Scene:
     return from_session(open_session(phantom_session, STEP), 2.0, lambda *said: None)
 
 
-@dataclass(frozen=True)
-class Picture:
-    """What the left camera really saw."""
-
-    rgb: np.ndarray  # [H, W, 3] 0..1
-
-    def at(self, scene: Scene, points: np.ndarray) -> np.ndarray:
-        """Colours [N, 3] where points [N, 3] (m) are seen."""
-        pixels = np.rint(project(scene.camera, points)[0]).astype(int)
-        u, v = np.clip(pixels, 0, (scene.camera.width - 1, scene.camera.height - 1)).T
-        return np.asarray(self.rgb[v, u])
-
-
 @pytest.fixture(scope="module")
-def picture(phantom_session: Path) -> Picture:
+def seen_at(phantom_session: Path) -> SeenAt:
+    """Colours [N, 3] 0..1 that the left camera really saw where points [N, 3] (m) are."""
     session = open_session(phantom_session, STEP)
     pipeline = Pipeline(session.config, session.rig)
     with session.source as source:
-        frame = next(frame for frame in source if frame.frame_id == FRAME)
-    return Picture(pipeline.rectifier(frame).left / 255)
+        picture = pipeline.rectifier(next(frame for frame in source if frame.frame_id == FRAME)).left / 255
+
+    def at(scene: Scene, points: np.ndarray) -> np.ndarray:
+        pixels = np.rint(project(scene.camera, points)[0]).astype(int)
+        u, v = np.clip(pixels, 0, (scene.camera.width - 1, scene.camera.height - 1)).T
+        return np.asarray(picture[v, u])
+
+    return at
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +124,7 @@ def test_splats_are_read_by_their_names_and_by_another_program(
 
 @pytest.mark.parametrize("ending", [".ply", ".pcd"])
 def test_points_lie_on_the_surface_in_its_colours(
-    scene: Scene, truth: Truth, picture: Picture, tmp_path: Path, ending: str
+    scene: Scene, truth: Truth, seen_at: SeenAt, tmp_path: Path, ending: str
 ) -> None:
     file = tmp_path / f"points{ending}"
     count = export_surface.write_points(file, scene)
@@ -136,7 +132,7 @@ def test_points_lie_on_the_surface_in_its_colours(
     points, colors = np.asarray(cloud.points), np.asarray(cloud.colors)
     assert len(points) == count > 0.8 * scene.camera.width * scene.camera.height
     assert np.median(truth.distances(points)) < 0.5
-    assert np.abs(colors - picture.at(scene, points)).mean(axis=0).max() < 0.04
+    assert np.abs(colors - seen_at(scene, points)).mean(axis=0).max() < 0.04
 
 
 @pytest.mark.parametrize("ending", [".ply", ".pcd", ".obj", ".stl"])
@@ -154,7 +150,7 @@ def test_colours_beyond_white_are_white_and_nobody_says_so(
 
 @pytest.mark.parametrize("ending", [".ply", ".obj", ".stl"])
 def test_the_mesh_is_the_true_surface(
-    scene: Scene, truth: Truth, picture: Picture, tmp_path: Path, ending: str
+    scene: Scene, truth: Truth, seen_at: SeenAt, tmp_path: Path, ending: str
 ) -> None:
     file = tmp_path / f"mesh{ending}"
     count = export_surface.write_mesh(file, scene)
@@ -178,7 +174,7 @@ def test_the_mesh_is_the_true_surface(
     vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     away = np.sum(normals * (scene.camera.T_world_cam[:3, 3] - vertices), axis=1) < 0
     assert mesh.has_vertex_normals() and away.mean() < 0.1
-    apart = np.asarray(mesh.vertex_colors) - picture.at(scene, vertices)
+    apart = np.asarray(mesh.vertex_colors) - seen_at(scene, vertices)
     assert np.median(np.abs(apart), axis=0).max() < 0.04
 
 

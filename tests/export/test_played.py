@@ -135,9 +135,14 @@ def test_what_is_exported_of_some_frames_is_read_back_for_the_same(exported: Pat
             assert np.array_equal(each.points, tracks["points"][row], equal_nan=True)
 
 
+def pictures_of(file: Path) -> list[np.ndarray]:
+    """Of a video, RGB."""
+    with av.open(str(file)) as video:
+        return [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+
+
 def test_the_video_has_every_frame(exported: Path) -> None:
-    with av.open(str(exported / "0/model.mp4")) as video:
-        pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    pictures = pictures_of(exported / "0/model.mp4")
     assert len(pictures) == TINY_FRAMES
     shown = rectified(exported / "session0")[3].left
     known = pictures[3].max(-1) > 0
@@ -340,9 +345,7 @@ def test_gaps_that_lerobot_does_not_know_are_told(
 def test_what_does_not_go_together_is_refused(exported: Path, tmp_path: Path) -> None:
     session = exported / "session0"
     refused(2, "export", "--depth", tmp_path / "d", said=("--depth exports all frames",))
-    refused(
-        2, "export", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",)
-    )  # fmt: skip
+    refused(2, "export", session, "--at", "0.1", "--tracks", tmp_path / "t.npz", said=("--tracks",))
     refused(2, "export", session, "--depth", exported / "0/depth", said=("is not empty",))
 
 
@@ -384,10 +387,8 @@ def test_every_frame_that_shows_something_is_a_file_and_the_video_comes_back(tmp
     for frame in range(1, FRAMES):
         cloud = open3d.io.read_point_cloud(tmp_path / f"out/frame_{frame:05d}.ply")
         assert np.asarray(cloud.points)[:, 0].mean() == pytest.approx(0.004 * frame, abs=1e-3)
-    capture, middles = cv2.VideoCapture(str(tmp_path / "out/loop.mp4")), []
-    while (read := capture.read())[0]:
-        bright = np.argwhere(read[1][..., 0] > 128)
-        middles.append(bright[:, 1].mean())
+    pictures = pictures_of(tmp_path / "out/loop.mp4")
+    middles = [np.argwhere(picture[..., 2] > 128)[:, 1].mean() for picture in pictures]
     assert len(middles) == loop["holds"]
     steps = np.diff([*middles, middles[0]])
     assert (steps[: FRAMES - 2] > 0).all() and (steps[FRAMES - 2 :] < 0).all()  # there, and back to the first

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
+from command_line import figures_of, ran
 from engine_scenes import camera
 from warp_on_cpu import use_warp_on_cpu
 
 from sags_node.cli import fit_folder
-from sags_node.cli.main import main
 from sags_node.errors import UsageError
 from sags_node.field import twins
 from sags_node.field.adam import RowAdam
@@ -123,14 +121,12 @@ def test_a_gpu_that_fails_leaves_a_checkpoint_to_go_on_from(
             raise RuntimeError("CUDA error: an illegal memory access was encountered\nmore of it")
         iterate(fit)
 
-    command = ["fit", str(phantom_session), *SMALL, "--out", str(tmp_path / "fit"), "--json"]
-    command += ["--schedule", "paper", "--warm-up", "2", "--iterations", "2", "--max-gaussians", "300"]
+    command = ["fit", phantom_session, *SMALL, "--out", tmp_path / "fit", "--json"]
+    command += "--schedule paper --warm-up 2 --iterations 2 --max-gaussians 300".split()
     with monkeypatch.context() as patch:
         patch.setattr(fit_folder, "device_of", lambda wanted, schedule: "cpu")
         patch.setattr(Fit, "iterate", failing)
-        failed = CliRunner().invoke(main, command)
-    assert failed.exit_code == 1 and "illegal memory access" in failed.stderr and "more" not in failed.stderr
-    assert "--resume and set device:=cpu" in failed.stderr and "Traceback" not in failed.output
-    again = CliRunner().invoke(main, [*command, "--resume", "device:=cpu"])
-    assert again.exit_code == 0, again.output
-    assert json.loads(again.stdout)["device"] == "cpu"
+        code, out, said = ran(*command)
+    assert code == 1 and "illegal memory access" in said and "more" not in said
+    assert "--resume and set device:=cpu" in said and "Traceback" not in out + said
+    assert figures_of(*command, "--resume", "device:=cpu")["device"] == "cpu"

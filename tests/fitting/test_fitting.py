@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import ANY
@@ -13,10 +14,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from click.testing import CliRunner
-from command_line import figures_of
+from command_line import figures_of, refused, sags
 
-from sags_node.cli.main import main
 from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.field.decoder import Decoder
@@ -426,8 +425,7 @@ def test_a_checkpoint_of_another_fit_is_refused(clip: Clip, tmp_path: Path) -> N
         checkpoint.load(Fit(clip, settings), path)
 
 
-def sags_fit(*arguments: str | Path) -> Any:
-    return CliRunner().invoke(main, ["fit", *map(str, arguments)])
+sags_fit = partial(sags, "fit")
 
 
 def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tmp_path: Path) -> None:
@@ -444,9 +442,8 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
     in_file = int(header.split(b"element vertex ")[1].split()[0])
     assert found["gaussians"] < in_file <= 2 * found["gaussians"]  # steep ones in two
 
-    again = sags_fit(phantom_session, "source.frames:=10", *options, "--resume")
-    assert again.exit_code == 0, again.output
-    assert json.loads(again.stdout)["heldout"]["psnr"] == found["heldout"]["psnr"]
+    again = figures_of("fit", phantom_session, "source.frames:=10", *options, "--resume")
+    assert again["heldout"]["psnr"] == found["heldout"]["psnr"]
 
 
 def test_a_folder_holds_one_fit_alone(
@@ -454,7 +451,7 @@ def test_a_folder_holds_one_fit_alone(
 ) -> None:
     """A new one, also one that was interrupted, keeps nothing of the one before, and no file of somebody."""
     out = tmp_path / "fit"
-    options = ["--schedule", "paper", "--warm-up", "1", "--iterations", "1", "--max-gaussians", "300"]
+    options = "--schedule paper --warm-up 1 --iterations 1 --max-gaussians 300".split()
     options += ["--set", "midway=false", "--set", "coarse=0", "--out", str(out)]
 
     def left() -> set[str]:
@@ -507,9 +504,9 @@ def test_a_fit_that_holds_nothing_out_says_what_it_learnt(phantom_session: Path,
 def test_a_fit_that_cannot_be_says_why(
     phantom_session: Path, tmp_path: Path, arguments: list[str], code: int, said: str
 ) -> None:
-    result = sags_fit(phantom_session, *arguments, "--out", tmp_path / "fit", "--iterations", "1")
-    assert result.exit_code == code, result.output
-    assert said in result.output and "Traceback" not in result.output
+    refused(
+        code, "fit", phantom_session, *arguments, "--out", tmp_path / "fit", "--iterations", 1, said=(said,)
+    )
 
 
 def test_beyond_the_last_frame_the_model_moves_on_and_comes_to_rest(clip: Clip, refined: Refined) -> None:
@@ -531,22 +528,9 @@ def test_beyond_the_last_frame_the_model_moves_on_and_comes_to_rest(clip: Clip, 
 
 
 def test_monocular_depth_is_for_the_papers_schedule(phantom_session: Path, tmp_path: Path) -> None:
-    wrong = sags_fit(phantom_session, "--monocular", "--out", tmp_path / "fit")
-    assert wrong.exit_code == 2 and "--schedule paper" in wrong.output
-    options = [
-        "--schedule",
-        "paper",
-        "--warm-up",
-        "2",
-        "--iterations",
-        "2",
-        "--set",
-        "max_gaussians=500",
-        "--json",
-    ]
-    result = sags_fit(phantom_session, "source.frames:=6", "--monocular", *options, "--out", tmp_path / "fit")
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    refused(2, "fit", phantom_session, "--monocular", "--out", tmp_path / "fit", said=("--schedule paper",))
+    options = "--schedule paper --warm-up 2 --iterations 2 --set max_gaussians=500 --json --out".split()
+    found = figures_of("fit", phantom_session, "source.frames:=6", "--monocular", *options, tmp_path / "fit")
     assert found["settings"]["weights"]["inverse_depth"] == 0
     assert 0 < found["gaussians"] <= found["cap"] == 500
 

@@ -53,15 +53,8 @@ def test_the_released_preset_has_the_numbers_of_the_released_code() -> None:
 
 
 def test_any_setting_can_be_changed() -> None:
-    changes = [
-        "shape.levels=4",
-        "rates.decaying=[means, colors]",
-        "decay=5e-2",
-        "block=mlp",
-        "tokens=self",
-        "weights.color=2",
-    ]
-    found = with_changes(ONLINE, changes)
+    changes = "shape.levels=4 decay=5e-2 block=mlp tokens=self weights.color=2".split()
+    found = with_changes(ONLINE, [*changes, "rates.decaying=[means, colors]"])
     assert found.shape.levels == 4 and found.rates.decaying == ("means", "colors")
     assert found.decay == 0.05 and found.block == "mlp" and found.weights.color == 2
     assert with_changes(ONLINE, []) == ONLINE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 import shutil
@@ -13,13 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from command_line import figures_of, ran, refused
 from numbered_pictures import write_video
 from places import SESSION
 from stamped_videos import write
 
 from sags_node.checks import Finding, parted
-from sags_node.cli.main import main
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.pipeline.session import open_session
@@ -56,9 +54,10 @@ def made(folder: Path) -> Path:
     return folder
 
 
-def odd(folder: Path) -> list[Finding]:
+def odd(folder: Path, *overrides: str) -> list[Finding]:
     """What is not well, but for the calibration that these folders lack."""
-    return [each for each in check_folder(folder) if each.level != "ok" and "no calibration" not in each.what]
+    found = check_folder(folder, overrides)
+    return [each for each in found if each.level != "ok" and "no calibration" not in each.what]
 
 
 def edit(folder: Path, change: object) -> None:
@@ -461,7 +460,7 @@ def test_a_camera_that_looks_farther_is_asked_how_far(tmp_path: Path) -> None:
     save_rig(StereoRig("wide", *wide), tmp_path / "calib")
     (far,) = [each for each in odd(tmp_path) if "nothing is matched beyond 0.3 m" in each.what]
     assert re.search(r"points lie at (0.9|1.0)\d? m", far.what) and "vision.stereo.max_depth" in far.fix
-    (left_over,) = odd_of(check_folder(tmp_path, ["vision.stereo.max_depth:=3"]))
+    (left_over,) = odd(tmp_path, "vision.stereo.max_depth:=3")
     assert "is unusual for a stereo endoscope" in left_over.what
 
 
@@ -494,13 +493,12 @@ def test_the_command_that_plays_a_folder_with_spaces_is_one_for_a_shell(tmp_path
 
 def test_the_command(tmp_path: Path) -> None:
     folder = made(tmp_path / "case")
-    result = CliRunner().invoke(main, ["import", "--check", str(folder), "--json"])
-    assert result.exit_code == 0 and json.loads(result.stdout)[0]["what"] == "case is two folders of pictures"
+    found = figures_of("import", "--check", folder, "--json")
+    assert found[0]["what"] == "case is two folders of pictures"
     edit(folder / "masks", invert)
-    result = CliRunner().invoke(main, ["import", "--check", str(folder)])
-    assert result.exit_code == 1 and "cannot be played" in result.stderr and "polarity" in result.stdout
-    missing = CliRunner().invoke(main, ["import", "--check", str(tmp_path / "none")])
-    assert missing.exit_code == 2 and "does not exist" in missing.stderr
+    code, out, said = ran("import", "--check", folder)
+    assert code == 1 and "cannot be played" in said and "polarity" in out
+    refused(2, "import", "--check", tmp_path / "none", said=("does not exist",))
 
 
 # ---- what sags run would refuse --------------------------------------------------------------------------
@@ -537,10 +535,8 @@ def test_videos_that_cannot_be_played_are_refused(
     if as_session:
         source = "{kind: videos, left: left.avi, right: right.avi}"
         (folder / "launch.yaml").write_text(f"source: {source}\nrig: {SESSION / 'calib'}\n")
-    result = CliRunner().invoke(main, ["import", "--check", str(folder), "--json"])
-    assert result.exit_code == 1 and "cannot be played" in result.stderr
-    for part in said:
-        assert part in result.stdout
+    code, out, error = ran("import", "--check", folder, "--json")
+    assert code == 1 and "cannot be played" in error and all(part in out for part in said)
 
 
 @pytest.mark.fault("file: a video is cut off")
@@ -578,10 +574,6 @@ def test_a_video_that_is_cut_off_is_refused_by_check_and_run_alike(
         assert len(list(source)) == int(remedy.removeprefix("source.frames:="))
 
 
-def odd_of(found: list[Finding]) -> list[Finding]:
-    return [each for each in found if each.level != "ok"]
-
-
 @pytest.mark.parametrize("late", [3, 1, 0, -2])
 @pytest.mark.parametrize("how", ["videos", "pictures", "a session"])
 def test_an_eye_that_is_late_is_found(tmp_path: Path, late: int, how: str) -> None:
@@ -617,7 +609,7 @@ def test_of_videos_of_other_lengths_it_is_told_whether_one_was_begun_later(tmp_p
         eye = "left" if late > 0 else "right"
         assert f"the {eye} eye is 14 frames late" in said[0] and f"first 14 frames off the {eye}" in said[0]
     else:
-        assert not odd_of(check_folder(folder, ["source.frames:=46"]))[:-1]  # it lacks a calibration
+        assert not odd(folder, "source.frames:=46")
 
 
 def test_where_nothing_moves_no_eye_is_late(tmp_path: Path) -> None:
@@ -635,8 +627,8 @@ def test_what_cannot_be_played_has_exit_code_1(tmp_path: Path, what: str) -> Non
         (tmp_path / "launch.yaml").write_text("sorce: {}")
     if what == "text":
         (tmp_path / "notes.txt").write_text("mine")
-    result = CliRunner().invoke(main, ["import", "--check", str(tmp_path)])
-    assert result.exit_code == 1 and "cannot be played" in result.stderr and "error" in result.stdout
+    code, out, error = ran("import", "--check", tmp_path)
+    assert code == 1 and "cannot be played" in error and "error" in out
 
 
 def test_a_calibration_beside_videos_is_compared_with_them(tmp_path: Path) -> None:

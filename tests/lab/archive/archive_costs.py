@@ -77,7 +77,7 @@ def efficiency(folder: Path) -> None:
     began = time.monotonic()
     subprocess.run(command(folder, folder / "out"), check=True, timeout=2 * PATIENCE)
     wall, half = time.monotonic() - began, sum(seconds) / 2
-    assert len(markers(folder / "out")) == 40
+    assert len([*(folder / "out/done").glob("[!.]*")]) == 40
     say(f"one after the other {2 * half:.1f} s; as an archive {wall:.1f} s: {wall / half:.3f} of half of it")
 
 
@@ -144,11 +144,6 @@ def timed(what: str, count: int) -> Iterator[None]:
     yield
     seconds = time.monotonic() - began
     say(f"{what}: {seconds:.1f} s, {seconds / count * 1e3:.2f} ms each")
-
-
-def markers(out: Path) -> dict[str, int]:
-    """What is done, and when it was."""
-    return {file.name: file.stat().st_mtime_ns for file in (out / "done").glob("[!.]*")}
 
 
 def below(process: int) -> list[int]:

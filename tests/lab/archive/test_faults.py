@@ -164,6 +164,11 @@ def test_a_killed_worker_and_a_lost_machine(cluster: Any, tmp_path: Path) -> Non
     assert not (tmp_path / "out/partial").exists()
 
 
+def written(folder: Path) -> dict[str, int]:
+    """Its files, and when they were written."""
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+
 DRIVER = """
 import sys
 from pathlib import Path
@@ -207,16 +212,13 @@ def test_a_killed_driver_and_ctrl_c(cluster: Any, tmp_path: Path, how: signal.Si
         driver.kill()
     assert code == (130 if how == signal.SIGINT else -signal.SIGKILL)
     until(lambda: not is_alive(stuck))
-    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out/done").iterdir()}
+    before = written(tmp_path / "out/done")
     assert not any(name.startswith(recordings[3].id) for name in before)
 
     marker.touch()
     store, tally = gone_through(tmp_path / "out", recordings, cluster)
     assert (tally.kept, tally.done) == (len(before), 5 - len(before))
-    assert (
-        before.items()
-        <= {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out/done").iterdir()}.items()
-    )
+    assert before.items() <= written(tmp_path / "out/done").items()
     _, _ = gone_through(tmp_path / "whole", recordings, cluster)
     assert table(store) == table(Store(str(tmp_path / "whole")))
 

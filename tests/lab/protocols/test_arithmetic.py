@@ -41,7 +41,7 @@ def test_stir_makes_points_of_pixels_of_both_eyes() -> None:
     assert shares_within(distances, arithmetic.STIR_MM)["average"] == pytest.approx(4 / 5 / 2)
 
 
-def test_stir_of_2026() -> None:
+def test_stir_of_2026_counts_places_and_visibility() -> None:
     """Four points: near; 5 px off; visible but not said to be; hidden but said to be visible.
 
     Within 2 and 4 px one of the three visible ones is right, and two of those said are wrong: 1 / (3 + 2).
@@ -51,6 +51,11 @@ def test_stir_of_2026() -> None:
     distances = np.array([1.0, 5.0, 40.0, 1.0])
     visible, said = np.array([1, 1, 1, 0], bool), np.array([1, 1, 0, 1], bool)
     figures = arithmetic.stir_2026_figures(distances, visible, said)
+    assert average_jaccard(distances, visible, said) == figures["average_jaccard"]
+    assert average_jaccard(np.zeros(4), visible, visible) == 1
+    assert average_jaccard(np.zeros(4), visible, ~visible) == 0
+    assert average_jaccard(np.array([2.0]), np.array([True]), np.array([True]), [2]) == 0  # TAP-Vid: below it
+    assert average_jaccard(np.full(4, np.inf), visible, said) == 0
     assert figures == {
         "average_jaccard": pytest.approx((2 * 1 / 5 + 3 * 2 / 4) / 5),
         "average_tracking_accuracy": pytest.approx((2 * 1 / 3 + 3 * 2 / 3) / 5),
@@ -171,21 +176,6 @@ def test_stereomis_tracks_by_hand() -> None:
     # Of 3, 20, 2 and 2: none below 1 or 2, three below 4, 8 and 16.
     assert figures["delta"] == pytest.approx((0 + 0 + 3 * 0.75) / 5)
     assert figures["survival"] == pytest.approx((2 + 4) / 8)
-
-
-def test_average_jaccard_counts_places_and_visibility() -> None:
-    """Four points: near; 5 px off; seen but not said to be; hidden but said to be seen. Three are seen.
-
-    Within 2 and 4 px one is right, and two of those said are not: 1 / (3 + 2). Within 8, 16 and 32 px two are
-    right, and one is not: 2 / (3 + 1).
-    """
-    distances = np.array([1.0, 5.0, 40.0, 1.0])
-    visible, said = np.array([1, 1, 1, 0], bool), np.array([1, 1, 0, 1], bool)
-    assert average_jaccard(distances, visible, said) == pytest.approx((2 / 5 + 3 * 2 / 4) / 5)
-    assert average_jaccard(np.zeros(4), visible, visible) == 1
-    assert average_jaccard(np.zeros(4), visible, ~visible) == 0
-    assert average_jaccard(np.array([2.0]), np.array([True]), np.array([True]), [2]) == 0  # TAP-Vid: below it
-    assert average_jaccard(np.full(4, np.inf), visible, said) == 0
 
 
 def test_reliability_tells_what_was_said_from_what_was_right() -> None:

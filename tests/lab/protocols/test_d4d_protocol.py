@@ -191,37 +191,35 @@ def test_a_moved_endoscope_is_known_by_its_poses(d4d: Path, tmp_path: Path) -> N
     assert d4d_clips(clip)[0].is_moved
 
 
-@pytest.mark.parametrize("what", ["inverted", "points", "pose", "other"])
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("inverted", "the pose taken the other way round it would in 100%"),
+        ("points", "with the points in mm it would"),
+        ("pose", "with the pose in mm it would"),
+        ("other", "do pose and scan belong together"),
+    ],
+)
 def test_a_scan_that_is_elsewhere_is_refused_with_what_would_fit(
-    what: str, d4d: Path, tmp_path: Path
+    what: str, said: str, d4d: Path, tmp_path: Path
 ) -> None:
     """Nothing is turned or scaled in silence."""
     clip = copied(d4d, tmp_path / "wrong")
-    cloud, file = clip.parents[1] / "pointcloud/start.ply", clip / "curated_camera_pose_start.txt"
     (right,) = d4d_clips(clip)
     points, _ = read_surface(right.scans[0])
     camera = Camera(right.rig.left.width, right.rig.left.height, right.rig.left.K, np.eye(4))
     truth = scan_depth(points, right.scans[0].T_cloud_cam, camera)
     check_scan(right.scans[0], points, camera, truth)
     pose = scanner_pose()
-    if what == "inverted":
-        np.savetxt(file, invert(pose))
-    elif what == "points":
-        write_cloud(cloud, points * 1e3)
-    elif what == "pose":
-        pose[:3, 3] *= 1e3
-        np.savetxt(file, pose)
-    else:
-        pose[:3, 3] += 0.1
-        np.savetxt(file, pose)
+    millimetres, elsewhere = pose.copy(), pose.copy()
+    millimetres[:3, 3] *= 1e3
+    elsewhere[:3, 3] += 0.1
+    given = {"inverted": invert(pose), "points": pose, "pose": millimetres, "other": elsewhere}[what]
+    np.savetxt(clip / "curated_camera_pose_start.txt", given)
+    if what == "points":
+        write_cloud(clip.parents[1] / "pointcloud/start.ply", points * 1e3)
     scan = d4d_clips(clip)[0].scans[0]
-    said = {
-        "inverted": "the pose taken the other way round it would in 100%",
-        "points": "with the points in mm it would",
-        "pose": "with the pose in mm it would",
-        "other": "do pose and scan belong together",
-    }
-    with pytest.raises(SagsError, match=said[what]):
+    with pytest.raises(SagsError, match=said):
         check_scan(scan, read_surface(scan)[0], camera, truth)
 
 
@@ -264,18 +262,15 @@ def test_which_colour_is_instrument(tmp_path: Path) -> None:
 
 def test_wrong_files_are_named(d4d: Path, tmp_path: Path, rig: StereoRig) -> None:
     clip = copied(d4d, tmp_path / "wrong")
-    good = (clip / "camera_info/right_rect.yaml").read_text()
-    (clip / "camera_info/right_rect.yaml").write_text(good.replace("projection_matrix", "P3"))
-    with pytest.raises(UsageError, match=r"right_rect\.yaml is no camera_info"):
-        d4d_clips(clip)
-    P = rig.right.P[0, 3]
-    (clip / "camera_info/right_rect.yaml").write_text(good.replace(str(float(P)), str(float(P) * 1e3)))
-    with pytest.raises(UsageError, match="P is in metres times pixels"):
-        d4d_clips(clip)
-    (clip / "camera_info/right_rect.yaml").write_text(good)
-    (clip / "curated_camera_pose_end.txt").write_text("1 2 3")
-    with pytest.raises(UsageError, match="is no pose: 16 numbers"):
-        d4d_clips(clip)
-    (clip.parents[1] / "clips.json").write_text("[]")
-    with pytest.raises(UsageError, match=r"clips\.json is no table"):
-        d4d_clips(clip)
+    eye, P = "camera_info/right_rect.yaml", float(rig.right.P[0, 3])
+    good = (clip / eye).read_text()
+    for name, text, said in (
+        (eye, good.replace("projection_matrix", "P3"), r"right_rect\.yaml is no camera_info"),
+        (eye, good.replace(str(P), str(P * 1e3)), "P is in metres times pixels"),
+        ("curated_camera_pose_end.txt", "1 2 3", "is no pose: 16 numbers"),
+        ("../../clips.json", "[]", r"clips\.json is no table"),
+    ):
+        (clip / eye).write_text(good)
+        (clip / name).write_text(text)
+        with pytest.raises(UsageError, match=said):
+            d4d_clips(clip)

@@ -174,12 +174,8 @@ def stereomis(
     lines = []
     for name, matrix, lens in zip(("StereoLeft", "StereoRight"), K, distortion, strict=True):
         lines += [f"[{name}]", f"res_x={rig.left.width}", f"res_y={rig.left.height}"]
-        lines += [
-            f"fc_x={matrix[0, 0]}",
-            f"fc_y={matrix[1, 1]}",
-            f"cc_x={matrix[0, 2]}",
-            f"cc_y={matrix[1, 2]}",
-        ]
+        lines += [f"fc_{axis}={matrix[row, row]}" for row, axis in enumerate("xy")]
+        lines += [f"cc_{axis}={matrix[row, 2]}" for row, axis in enumerate("xy")]
         lines += [f"kc_{k}={value}" for k, value in enumerate(lens)]
         first = name == "StereoLeft"
         turn, way = (np.eye(3), np.zeros(3)) if first else (R, T * 1e3)

@@ -126,11 +126,8 @@ def tracked(frames: list[StereoFrame], rig: StereoRig, tmp_path_factory: pytest.
     (folder / "groundtruth.txt").write_text(rows)
     P = rig.left.P
     cam = {"W": rig.left.width, "H": rig.left.height, "fx": float(P[0, 0]), "fy": float(P[1, 1])}
-    cam |= {
-        "cx": float(P[0, 2]),
-        "cy": float(P[1, 2]),
-        "stereo_baseline": float(P[0, 0] * rig.baseline * 1e3),
-    }
+    product = float(P[0, 0] * rig.baseline * 1e3)
+    cam |= {"cx": float(P[0, 2]), "cy": float(P[1, 2]), "stereo_baseline": product}
     said = {"dataset": "stereoMIS", "cam": cam, "data": {"start": 0, "stop": 200, "step": 1}}
     (folder / "P3_1.yaml").write_text(yaml.safe_dump(said))
     pixels, seen = truth(frames, rig)
@@ -160,8 +157,7 @@ def test_stereomis_tracking_end_to_end(tracked: Path, frames: list[StereoFrame],
 
 
 def test_a_pickle_is_not_opened(tracked: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "P3_1"
-    shutil.copytree(tracked, folder)
+    folder = Path(shutil.copytree(tracked, tmp_path / "P3_1"))
     (folder / "track_pts.json").unlink()
     (folder / "track_pts.pckl").write_bytes(b"cos\n_exit\n(I7\ntR.")  # ends the process that opens it
     with pytest.raises(UsageError, match=r"is a pickle.*import json, pickle"):
@@ -175,16 +171,14 @@ def test_a_pickle_is_not_opened(tracked: Path, tmp_path: Path) -> None:
      json.dumps({"points": [[[1, 2], None]], "not_visible": [[False]]})],
 )  # fmt: skip
 def test_damaged_points_are_said(tracked: Path, tmp_path: Path, content: str) -> None:
-    folder = tmp_path / "P3_1"
-    shutil.copytree(tracked, folder)
+    folder = Path(shutil.copytree(tracked, tmp_path / "P3_1"))
     (folder / "track_pts.json").write_text(content)
     with pytest.raises(UsageError, match=r"track_pts\.json holds no tracked points"):
         tracked_sequence(folder)
 
 
 def test_what_is_missing_is_said(tracked: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "P3_1"
-    shutil.copytree(tracked, folder)
+    folder = Path(shutil.copytree(tracked, tmp_path / "P3_1"))
     (folder / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     with pytest.raises(UsageError, match=r"not whole: \{'poses': 2\}, of 8"):
         tracked_sequence(folder)

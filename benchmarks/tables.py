@@ -1,0 +1,44 @@
+"""Tables of figures for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from string import Formatter
+from typing import Any
+
+from rich.table import Table
+
+Row = Mapping[str, Any]
+
+
+class _Cell(Formatter):
+    """`str.format` for figures of which some are not known: None, missing, or in a group that is None."""
+
+    def __init__(self, unknown: str) -> None:
+        self._unknown = unknown
+
+    def get_field(self, field_name: str, args: Any, kwargs: Any) -> Any:
+        try:
+            return super().get_field(field_name, args, kwargs)
+        except (KeyError, TypeError):
+            return None, field_name
+
+    def format_field(self, value: Any, format_spec: str) -> Any:
+        return self._unknown if value is None else super().format_field(value, format_spec)
+
+
+def filled(made: Table, rows: Iterable[Row], *cells: str, unknown: str = "-") -> Table:
+    """The table with a line for each row; cells are as `str.format` takes them: "{depth[p90_mm]:.2f}"."""
+    cell = _Cell(unknown)
+    for row in rows:
+        made.add_row(*(cell.vformat(each, (), row) for each in cells))
+    return made
+
+
+def plain_table(first: str, *others: str, title: str | None = None) -> Table:
+    """An empty table without lines, its columns of figures flush right."""
+    made = Table(box=None, padding=(0, 3, 0, 0), pad_edge=False, title=title, title_justify="left")
+    made.add_column(first)
+    for heading in others:
+        made.add_column(heading, justify="right")
+    return made
