@@ -9,12 +9,12 @@ both eyes.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
-import cv2
 import numpy as np
 
 from sags_node.kernels.jit import kernel
-from sags_node.types import F32, I8, U8, Bool, Finding
+from sags_node.types import F32, I8, Bool, Finding
 from sags_node.vision.pyramid import BORDER, inner, pyramids
 from sags_node.vision.watch.clarity import LOST_CONTRAST, REMEMBERED_S, USUAL_DIFFERENCE
 from sags_node.vision.watch.judgement import Evidence, Judgement
@@ -61,43 +61,29 @@ class LensWatch(Debounced):
         detail = np.empty((2, rows, columns), np.float32)
         _measure(left.halves[0], side, detail[0])
         _measure(right.halves[0], side, detail[1])
-        # The middles of the cells, in the whole picture.
-        depth = last.views["left"].depth[side :: 2 * side, side :: 2 * side][:rows, :columns]
-        tissue = last.observation.tissue[side :: 2 * side, side :: 2 * side][:rows, :columns]
-        apart = _octaves_apart(detail, depth, pair.camera.K[0, 0] * pair.baseline / (2 * side))
+        apart = np.empty((rows, columns), np.float32)
+        focal_baseline = np.float32(pair.camera.K[0, 0] * pair.baseline / (2 * side))
+        _compare(detail, last.views["left"].depth, 2 * side, focal_baseline, apart)
         if self._usual is None or self._usual.shape != apart.shape or self._stamp_ns is None:
             self._usual = apart.clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
             self._hidden = np.zeros(apart.shape, np.int8)
             self._stamp_ns = pair.t_capture_ns
         passed = watched_ns(self._stamp_ns, pair.t_capture_ns) * 1e-9
         self._stamp_ns = pair.t_capture_ns
+        share = np.float32(min(1.0, passed / REMEMBERED_S))
         off = apart - self._usual
-        followed = self._usual + np.float32(min(1.0, passed / REMEMBERED_S)) * off
-        followed = followed.clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
         if abs(middle_of(off[apart != 0])) > VEIL:
-            self._usual = followed
+            self._usual = (self._usual + share * off).clip(-USUAL_DIFFERENCE, USUAL_DIFFERENCE)
             self.note(pair.t_capture_ns, [])
             return judged
-        stays = self._hidden * off > 0
-        lost = (stays | tissue) & (np.abs(off) > np.where(stays, BACK, LOST))
-        self._usual = np.where(lost, self._usual, followed)
-        self._hidden = np.zeros(apart.shape, np.int8)
-        covered: list[Bool | None] = []
-        for eye in (-1, 1):
-            alike = lost & (np.sign(off) == eye)
-            around = cv2.boxFilter(
-                alike.view(np.uint8), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT
-            )
-            hidden = alike & (around >= ALIKE)
-            self._hidden[hidden] = eye
-            is_so = np.count_nonzero(hidden) >= FEWEST
-            grown: U8 = cv2.dilate(hidden.view(np.uint8), np.ones((3, 3), np.uint8))
-            covered.append(grown.view(np.bool_) if is_so else None)
+        covered = np.zeros((2, rows, columns), np.bool_)
+        counts = _judge(apart, last.observation.tissue, 2 * side, share, self._usual, self._hidden, covered)
+        many = [count >= FEWEST for count in counts]
         self.note(
-            pair.t_capture_ns,
-            [found for found, mask in zip((_LEFT, _RIGHT), covered, strict=True) if mask is not None],
+            pair.t_capture_ns, [found for found, is_so in zip((_LEFT, _RIGHT), many, strict=True) if is_so]
         )
-        return replace(judged, covered_left=covered[0], covered_right=covered[1])
+        hidden = (mask if is_so else None for mask, is_so in zip(covered, many, strict=True))
+        return replace(judged, covered_left=next(hidden), covered_right=next(hidden))
 
 
 @kernel
@@ -128,22 +114,67 @@ def _add_bends(above: F32, row: F32, below: F32, line: F32) -> None:
         line[x] += abs(row[x] + row[x + two] - twice) + abs(above[x] + below[x] - twice)
 
 
-def _octaves_apart(detail: F32, depth: F32, focal_baseline: float) -> F32:
-    """Octaves of the left eye's detail over that of the right eye, where it sees the same tissue; else 0.
+@kernel
+def _compare(detail: F32, depth: F32, side: int, focal_baseline: Any, apart: F32) -> None:
+    """Octaves of the left eye's detail over that of the right eye, where it sees the same tissue.
 
     Args:
-        detail: [left or right, rows, columns].
-        depth: [rows, columns] m, of the left eye; 0: unknown, taken for the median.
+        depth: [H, W] m, of the left eye's pixels; 0: unknown, taken for the median.
+        side: px of it in a cell.
         focal_baseline: a distance of 1 m is so many cells of disparity.
     """
-    known = depth > 0
-    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=known)
-    inverse[~known] = np.median(inverse[known]) if known.any() else 0
-    row, columns = np.arange(len(depth))[:, None], np.arange(depth.shape[1])
-    places = columns.astype(np.float32) - np.float32(focal_baseline) * inverse
-    there = np.maximum(places, 0)
-    before = there.astype(np.intp)
-    near, far = detail[1, row, before], detail[1, row, np.minimum(before + 1, columns[-1])]
-    other = near + (there - before.astype(np.float32)) * (far - near)
+    rows, columns = apart.shape
+    inverse, known = np.zeros((rows, columns), np.float32), np.empty(rows * columns, np.float32)
+    count = 0
+    for row in range(rows):
+        for column in range(columns):
+            z = depth[row * side + side // 2, column * side + side // 2]
+            if z > 0:
+                inverse[row, column] = known[count] = np.float32(1) / z
+                count += 1
+    usual = np.median(known[:count]) if count else np.float32(0)
     noise = np.float32(NOISE)
-    return np.where(places >= 0, np.log2((detail[0] + noise) / (other + noise)), np.float32(0))
+    for row in range(rows):
+        for column in range(columns):
+            nearness = inverse[row, column]
+            place = np.float32(column) - focal_baseline * (nearness if nearness > 0 else usual)
+            apart[row, column] = 0
+            if place >= 0 and place < columns:  # else the right eye does not see it
+                before = int(place)
+                after, share = min(before + 1, columns - 1), place - np.float32(before)
+                other = detail[1, row, before] + share * (detail[1, row, after] - detail[1, row, before])
+                apart[row, column] = np.log2((detail[0, row, column] + noise) / (other + noise))
+
+
+@kernel
+def _judge(apart: F32, tissue: Bool, side: int, share: Any, usual: F32, hidden: I8, covered: Bool) -> Any:
+    """Carry on what is usual and what is hidden of each cell, in place. Writes what is `covered`
+    [left or right, rows, columns], a cell wider than what is hidden. Returns how many are hidden."""
+    rows, columns = apart.shape
+    lost, back, most = np.float32(LOST), np.float32(BACK), np.float32(USUAL_DIFFERENCE)
+    found = np.zeros((rows, columns), np.int8)
+    for row in range(rows):
+        for column in range(columns):
+            off = apart[row, column] - usual[row, column]
+            stays = hidden[row, column] * off > 0
+            shown = stays or tissue[row * side + side // 2, column * side + side // 2]
+            if shown and abs(off) > (back if stays else lost):
+                found[row, column] = 1 if off > 0 else -1
+    counts = np.zeros(2, np.int64)
+    for row in range(rows):
+        for column in range(columns):
+            alike = 0
+            for y in range(max(row - 1, 0), min(row + 2, rows)):
+                for x in range(max(column - 1, 0), min(column + 2, columns)):
+                    alike += found[y, x] == found[row, column]
+            hidden[row, column] = found[row, column] if alike >= ALIKE else 0
+            if hidden[row, column] != 0:
+                eye = 0 if hidden[row, column] < 0 else 1
+                counts[eye] += 1
+                for y in range(max(row - 1, 0), min(row + 2, rows)):
+                    for x in range(max(column - 1, 0), min(column + 2, columns)):
+                        covered[eye, y, x] = True
+            elif found[row, column] == 0:
+                off = apart[row, column] - usual[row, column]
+                usual[row, column] = min(max(usual[row, column] + share * off, -most), most)
+    return counts
