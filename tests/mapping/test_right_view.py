@@ -53,7 +53,7 @@ def qualities(result: FrameResult) -> tuple[float, float]:
 
 
 def shown(result: FrameResult) -> U8:
-    return published.colours(result.pair, result.views["right"])
+    return published.colours(result.views["right"], published.size_of(result.pair))
 
 
 def model_alone(result: FrameResult) -> U8:
