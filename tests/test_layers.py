@@ -57,7 +57,7 @@ LINES = {
     "sags_node/quality": 267,
     "sags_node/rig": 1174,
     "sags_node/ros": 322,
-    "sags_node/sources": 5869,
+    "sags_node/sources": 5875,
     "sags_node/terminal": 397,
     "sags_node/tools": 573,
     "sags_node/tools/calibration": 1883,

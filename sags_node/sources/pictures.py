@@ -78,6 +78,7 @@ class Pairs:
     cut_off = ""
     reach: int
     judged: tuple[Finding, ...] = ()
+    _next = 0
 
     @property
     def findings(self) -> list[Finding]:
@@ -97,6 +98,11 @@ class Pairs:
             SagsError: it is damaged, or does not fit those before.
         """
         raise NotImplementedError
+
+    def read(self) -> RawPair | None:
+        """The next pair, from the first on: for who wants all. As `at`."""
+        self._next += 1
+        return self.at(self._next - 1)
 
     def close(self) -> None:
         """Release the files, where they stay open between pairs."""

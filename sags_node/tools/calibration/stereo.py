@@ -60,7 +60,7 @@ def calibrate_folders(
     views: list[StereoView] = []
     unseen: list[str] = []
     for index, file in enumerate(pictures.files):
-        pair = pictures.at(index)
+        pair = pictures.read()
         assert pair is not None and pair.right is not None  # there are as many as files, with both eyes
         view = find_in_both(board, file.name, pair.left, pair.right)
         if view is None:
