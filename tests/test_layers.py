@@ -35,7 +35,7 @@ LINES = {
     "sags_node/bags": 981,
     "sags_node/cli": 3556,
     "sags_node/clients": 1,
-    "sags_node/clients/bridge": 2537,
+    "sags_node/clients/bridge": 2545,
     "sags_node/clients/latency": 427,
     "sags_node/clients/overlay": 3136,
     "sags_node/clients/recording": 1467,
@@ -47,7 +47,7 @@ LINES = {
     "sags_node/instruments": 820,
     "sags_node/field": 1747,
     "sags_node/kernels": 1231,
-    "sags_node/mapping": 5557,
+    "sags_node/mapping": 5564,
     "sags_node/media": 896,
     "sags_node/messaging": 5365,
     "sags_node/model": 1094,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1844,
     "sags_node/tools/importing": 1171,
     "sags_node/vision": 5420,
-    "tests": 49113,
+    "tests": 49114,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

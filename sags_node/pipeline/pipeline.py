@@ -28,10 +28,11 @@ from sags_node.mapping.budget import Budget, FramePlan
 from sags_node.mapping.camera_tracker import CameraTracker
 from sags_node.mapping.depth_memory import UNWATCHED
 from sags_node.mapping.devices import ALL_SKIPS, Skips, affordable, make_budget, make_refiner
-from sags_node.mapping.given_camera import GivenCamera, Localizer, PoseRefiner
+from sags_node.mapping.given_camera import GivenCamera, Localizer
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.motion import Drawn, SurfaceTracker, Tracks
+from sags_node.mapping.pose_refiner import PoseRefiner
 from sags_node.mapping.right_view import LEARN_EVERY, RightView
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.messaging import published

@@ -1,10 +1,9 @@
-"""What else becomes of a mapped frame's result: it is shown again under the ids of a frame that is not
-mapped, it is doubted, or its calibration is a guess.
+"""Changes to the result of a mapped frame: it is repeated for a frame that is not mapped, doubted while
+frames are held, or unsure where the calibration is a guess.
 
-What is made with a guessed calibration, or at a declared scale, says so: its lengths are right up to a factor
-that nobody knows. How sure a depth is, is an error in mm, and there is none to state. So no confidence
-reaches `SURE`: programs that decide something by a depth, or show it as sure, take none of these, also those
-that know no more.
+Lengths of a guessed calibration, or of a declared scale, are right up to a factor that nobody knows. The
+confidence of a depth states an error in mm, and there is none to state. So no confidence reaches `SURE`:
+programs that decide something by a depth, or show it as sure, take none of these.
 """
 
 from __future__ import annotations

@@ -25,7 +25,8 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bri
 from pyigtl.messages import PointMessage
 
 from sags_node.clients.bridge import igtl
-from sags_node.clients.bridge.igtl import MAX_BODY_BYTES, Peers
+from sags_node.clients.bridge.igtl import MAX_BODY_BYTES
+from sags_node.clients.bridge.igtl_peers import Peers
 from sags_node.clients.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
 from sags_node.clients.bridge.pins import Pins
 from sags_node.clients.overlay.stream import OverlayStream

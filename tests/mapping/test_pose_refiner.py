@@ -15,8 +15,8 @@ from sags_node.geometry import invert
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.camera_pose import exponential, towards
 from sags_node.mapping.first_views import FirstViews
-from sags_node.mapping.given_camera import SECONDS, PoseRefiner
 from sags_node.mapping.motion import Tracks
+from sags_node.mapping.pose_refiner import SECONDS, PoseRefiner
 from sags_node.mapping.resting_tissue import RestingTissue, TissueFit
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.phantom.scene import Phantom

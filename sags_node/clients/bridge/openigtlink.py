@@ -27,6 +27,7 @@ from pyigtl.messages import MessageBase
 
 from sags_node.clients.bridge import igtl
 from sags_node.clients.bridge.compressed import over_black
+from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
 from sags_node.clients.bridge.pins import MOST, Pin, Pins
 from sags_node.clients.bridge.relay import Outlet, Output, Relay, ServerOptions, Source
 from sags_node.clients.bridge.requests import Requests
@@ -141,10 +142,10 @@ class OpenIgtLink(Outlet):
         self._pins = Pins()
         self._answers: deque[Callable[[], list[int]]] = deque()  # for the peers' thread
         self._ns, self._now_ns = options.node.ns, options.node.now_ns
-        listener = options.listen(igtl.MOST_PEERS)
+        listener = options.listen(MOST_PEERS)
         self.port = int(listener.getsockname()[1])
         self._requests = Requests(options.node)
-        self._peers = igtl.Peers(listener, self._hear, self._idle)
+        self._peers = Peers(listener, self._hear, self._idle)
         self._peers.start()
 
     def close(self) -> None:
