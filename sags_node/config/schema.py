@@ -8,7 +8,15 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    model_validator,
+)
 
 from sags_node.geometry import is_rotation
 
@@ -76,8 +84,24 @@ FARTHEST_BASE = 10.0  # m
 NAMESPACE = r"^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$"
 
 
+def _taken_for_a_number(said: object, value: object) -> bool:
+    if isinstance(said, list | tuple) and isinstance(value, list | tuple):
+        return any(map(_taken_for_a_number, said, value))
+    return isinstance(said, bool) and type(value) in (int, float)
+
+
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _yes_is_no_number(cls, said: object, read: ModelWrapValidatorHandler[Self]) -> Self:
+        """Refuse `true` and `yes` where a number belongs: pydantic takes them for 1."""
+        section = read(said)
+        for key, value in said.items() if isinstance(said, dict) else ():
+            if _taken_for_a_number(value, getattr(section, key, None)):
+                raise ValueError(f"{key} should be a number, not true or false")
+        return section
 
 
 # ---- source ----------------------------------------------------------------------------------------------

@@ -52,6 +52,7 @@ class AnchorName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`remove_anchor`."""
 
     id: int
+    session: str | None = None  # that pinned it; in another one the number is somebody else's
 
 
 class MeasureRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -103,7 +103,10 @@ class Node:
             backend=backend,
             detail=config.publish.detail,
         )
-        self._state = NodeState(config, pipeline, pipeline.make_budget(), views, statistics=statistics)
+        session = uuid.uuid4().hex
+        self._state = NodeState(
+            config, pipeline, pipeline.make_budget(), views, session, statistics=statistics
+        )
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
         self._clock = CaptureClock()  # of live pictures
@@ -126,7 +129,7 @@ class Node:
         self._sent = 0
         self._working_since: float | None = None  # when the frame came that is worked on
         self._publisher = Publisher(
-            config.publish, config.ns, uuid.uuid4().hex, self._handlers(), thins=True, metric=rig.metric
+            config.publish, config.ns, session, self._handlers(), thins=True, metric=rig.metric
         )
         ipc = [endpoint for endpoint in self.endpoints if endpoint.startswith("ipc:")]
         self._recorder = RecorderProcess(config.ns, ipc[0] if ipc else None)

@@ -42,6 +42,7 @@ class NodeState:
     pipeline: Pipeline  # of the mapping thread
     budget: Budget  # of the mapping thread
     views: Views  # of the drawing thread
+    session: str  # of this start
     statistics: Statistics = field(default_factory=Statistics)
     paused: threading.Event = field(default_factory=threading.Event)
     parameters_changed: threading.Event = field(default_factory=threading.Event)
@@ -133,10 +134,14 @@ class Operations:
             self._state.pipeline.anchors.look_ahead(anchor, seconds)
             self._state.pipeline.predict_motion()
         sure = self._state.pipeline.anchor_confidence(anchor)
-        return {"id": anchor, "frame_id": newest.pair.frame_id, "depth_confidence": round(sure, 3)}
+        said = {"id": anchor, "session": self._state.session, "frame_id": newest.pair.frame_id}
+        return {**said, "depth_confidence": round(sure, 3)}
 
     def _remove_anchor(self, args: dict[str, Any]) -> dict[str, Any]:
-        self._state.pipeline.anchors.remove(parse(AnchorName, args).id)
+        request = parse(AnchorName, args)
+        if request.session not in (None, self._state.session):
+            raise SagsError(f"anchor {request.id} was of the node's start before, and is gone with it")
+        self._state.pipeline.anchors.remove(request.id)
         return {}
 
     def _measure(self, args: dict[str, Any]) -> dict[str, Any]:

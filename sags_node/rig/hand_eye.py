@@ -44,8 +44,10 @@ def read_hand_eye(file: Path) -> HandEye:
     if other := [str(key) for key in said if key not in KEYS]:
         raise UsageError(f"{file}: unknown key '{other[0]}'; known: {', '.join(KEYS)}")
     try:
-        T = np.array(said["T_hand_cam"], np.float64)
-        offset_ns = round(float(said.get("offset_ms", 0.0)) * 1e6)
+        rows, offset_ms = said["T_hand_cam"], said.get("offset_ms", 0.0)
+        if bool in map(type, [offset_ms, *(number for row in rows for number in row)]):
+            raise ValueError("true would be taken for 1")
+        T, offset_ns = np.array(rows, np.float64), round(float(offset_ms) * 1e6)
     except (KeyError, TypeError, ValueError, OverflowError):
         raise UsageError(f"{file}: T_hand_cam must be 4 rows of 4 numbers, offset_ms a number") from None
     if not is_rigid(T):

@@ -199,7 +199,7 @@ def _read_yaml(content: bytes, file: str) -> dict[str, Any]:
 def _count(tree: Any, key: str, file: str) -> int:
     """A number of pixels of a region; 0 where it is not said."""
     value = tree.get(key, 0) if isinstance(tree, dict) else None
-    if not isinstance(value, int) or not 0 <= value <= LARGEST_SIDE:
+    if type(value) is not int or not 0 <= value <= LARGEST_SIDE:  # a bool is one of int's kinds
         raise UsageError(f"{file}: {key}: {brief(value)} is not a number of pixels up to {LARGEST_SIDE}")
     return value
 
@@ -212,7 +212,7 @@ def _field(tree: dict[str, Any], key: str, file: str) -> Any:
 
 def _side(tree: dict[str, Any], key: str, file: str) -> int:
     value = _field(tree, key, file)
-    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= LARGEST_SIDE:
+    if type(value) is not int or not 1 <= value <= LARGEST_SIDE:
         raise UsageError(
             f"{file}: {key}: {brief(value)} is not a number of pixels between 1 and {LARGEST_SIDE}"
         )
@@ -251,6 +251,6 @@ def _numbers(tree: dict[str, Any], key: str, file: str) -> F64:
         numbers = np.array(data, dtype=np.float64)
     except (TypeError, ValueError):
         numbers = np.zeros(())
-    if not isinstance(data, list) or numbers.ndim != 1:
+    if not isinstance(data, list) or numbers.ndim != 1 or bool in map(type, data):
         raise UsageError(f"{file}: {key}.data: {brief(data)} is not a list of numbers")
     return numbers

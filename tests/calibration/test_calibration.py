@@ -125,6 +125,9 @@ def test_not_a_camera_info_file(folder: Path, text: str) -> None:
         ("camera_matrix", {"data": [1.0] * 8}),
         ("camera_matrix", [1.0] * 9),
         ("rectification_matrix", {"data": ["a"] * 9}),
+        ("rectification_matrix", {"data": [True, 0, 0, 0, 1, 0, 0, 0, 1]}),
+        ("roi", {"x_offset": False, "y_offset": 0, "width": True, "height": 480}),
+        ("binning_x", True),
         ("projection_matrix", {"data": [[1.0, 2.0], 3.0] + [0.0] * 10}),
     ],
 )
@@ -132,7 +135,8 @@ def test_wrong_value_is_named(folder: Path, key: str, value: Any) -> None:
     edit(folder, "left", {key: value})
     message = refusal(folder)
     assert "left.yaml" in message
-    assert (f"{key} is missing" if value is None else key) in message
+    named = {"roi": "x_offset"}.get(key, key)
+    assert (f"{key} is missing" if value is None else named) in message
 
 
 def exchanged(folder: Path) -> None:

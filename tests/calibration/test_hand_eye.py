@@ -176,6 +176,8 @@ def test_the_file_says_what_was_saved(tmp_path: Path) -> None:
         (f"T_hand_cam: {(2 * np.eye(4)).tolist()}", "no rotation"),
         (f"T_hand_cam: {rigid((0, 0, 0), (0, 0, 220)).tolist()}", "220 m from the hand"),
         (f"T_hand_cam: {np.eye(4).tolist()}\noffset_ms: .inf", "offset_ms a number"),
+        (f"T_hand_cam: {np.eye(4).tolist()}\noffset_ms: yes", "offset_ms a number"),
+        (f"T_hand_cam: {np.eye(4).tolist()}".replace("1.0", "true"), "4 rows of 4 numbers"),
         (
             f"T_hand_cam: {np.eye(4).tolist()}\noffset_s: 0.04",
             "unknown key 'offset_s'; known: T_hand_cam, offset_ms",

@@ -133,7 +133,7 @@ def test_a_live_feed_that_freezes_is_held_and_said(
 @pytest.mark.fault("picture: both eyes of a live feed are frozen, and an anchor is pinned")
 def test_a_pixel_of_a_picture_that_is_held_is_not_pinned(session: Session, frames: list[StereoFrame]) -> None:
     pipeline = Pipeline(session.config, session.rig)
-    operations = Operations(NodeState(session.config, pipeline, None, None), lambda *_: None)  # type: ignore[arg-type]
+    operations = Operations(NodeState(session.config, pipeline, None, None, ""), lambda *_: None)  # type: ignore[arg-type]
 
     def pin(**place: float) -> dict[str, Any]:
         asked = operations.handlers()["add_anchor"](place)
@@ -157,7 +157,7 @@ def test_a_view_that_is_opened_while_nothing_new_is_seen_waits(
     session: Session, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch, why: str
 ) -> None:
     pipeline, shown = Pipeline(session.config, session.rig), list[tuple[str, DrawnView | None]]()
-    state = NodeState(session.config, pipeline, None, Views(Allowance()))  # type: ignore[arg-type]
+    state = NodeState(session.config, pipeline, None, Views(Allowance()), "")  # type: ignore[arg-type]
     operations = Operations(state, lambda name, drawn: shown.append((name, drawn)))
 
     def ask(operation: str, **args: Any) -> dict[str, Any]:

@@ -234,7 +234,7 @@ def test_the_latency_is_told_while_the_health_is_being_counted(monkeypatch: pyte
 
 def operations(newest: FrameResult | None, metric: bool = True) -> Operations:
     pipeline = SimpleNamespace(newest=newest, mapper=None, metric=metric, may_be_sure=metric)
-    return Operations(NodeState(LaunchConfig(), pipeline, None, None), lambda *_: None)  # type: ignore[arg-type]
+    return Operations(NodeState(LaunchConfig(), pipeline, None, None, ""), lambda *_: None)  # type: ignore[arg-type]
 
 
 @pytest.mark.fault("disk: hangs while a model is saved")

@@ -93,7 +93,7 @@ def test_pictures_and_cameras_are_those_of_the_calibration_at_any_working_size(
 @pytest.mark.parametrize("scale", ["1", *SCALES])
 def test_a_pixel_that_is_asked_for_is_one_of_the_published_picture(phantom_session: Path, scale: str) -> None:
     pipeline, result = played(phantom_session, f"vision.scale:={scale}")
-    state: Any = NodeState(None, pipeline, None, None)  # type: ignore[arg-type]
+    state: Any = NodeState(None, pipeline, None, None, "")  # type: ignore[arg-type]
     operations = Operations(state, lambda *_: None)
     asked = operations.handlers()["add_anchor"]({"u": PINNED[0], "v": PINNED[1]})
     beyond = operations.handlers()["add_anchor"]({"u": 320, "v": 4})

@@ -92,7 +92,10 @@ def test_anchors_are_added_followed_and_removed(node: RunningNode, control: Cont
         with pytest.raises(SagsError, match=why):
             control.request("measure", {"anchors": wrong})
     assert "no anchor 999" in control.request("measure", {"anchors": [by_pixel, 999]})["unsure"]
-    assert control.request("remove_anchor", {"id": by_pixel}) == {}
+    with pytest.raises(SagsError, match="start before"):
+        control.request("remove_anchor", {"id": by_pixel, "session": "another"})
+    session = messages[-1].meta["session"]
+    assert control.request("remove_anchor", {"id": by_pixel, "session": session}) == {}
     left = anchor_rows(collect(node, ["anchors"], count=3)["anchors"][-1])
     assert by_pixel not in left and by_point in left
     with pytest.raises(SagsError, match=f"no anchor {by_pixel}"):

@@ -18,13 +18,35 @@ from sags_node.clients.overlay.draw import Body
 from sags_node.clients.overlay.frame import Anchor, TissueFrame
 from sags_node.clients.overlay.held import AGAIN, ELSEWHERE, GONE, HeldObject
 from sags_node.clients.overlay.mesh import Mesh, rod
-from sags_node.clients.overlay.pinner import Request
+from sags_node.clients.overlay.pinner import Pinner, Request
 from sags_node.clients.overlay.pose import on_surface, surface_normal
 from sags_node.clients.overlay.scene import ObjectSpec
 from sags_node.clients.registration.rigid import on_a_line, rigid_fit
 from sags_node.errors import SagsError, UsageError
 from sags_node.geometry import invert, quat_to_matrix, transform
 from sags_node.mapping.anchors import Anchors
+
+
+def test_what_was_pinned_is_given_back_to_the_start_that_has_it() -> None:
+    asked: list[Any] = []
+
+    class Client:
+        def __enter__(self) -> Client:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def request(self, op: str, args: Request, timeout: float) -> Any:
+            asked.append((op, args))
+            return {"id": len(asked), "session": "first"}
+
+    pinner = Pinner(Client)  # type: ignore[arg-type]
+    assert pinner.pin([{"u": 1, "v": 2}]).result(5) == [1]
+    assert pinner.pin([{"u": 3, "v": 4}]).result(5) == [2]
+    pinner.forget([1])
+    pinner.close()
+    assert asked[2:] == [("remove_anchor", {"id": 2, "session": "first"})]
+
 
 # ---- poses -----------------------------------------------------------------------------------------------
 

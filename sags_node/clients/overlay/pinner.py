@@ -25,7 +25,7 @@ class Pinner:
     def __init__(self, connect: Callable[[], ControlClient]) -> None:
         self._connect = connect
         self._worker = ThreadPoolExecutor(1, "sags-pinner")
-        self._held: list[int] = []  # ids of anchors that are ours; only the worker uses it
+        self._held: dict[int, str | None] = {}  # our anchors, and in which session; the worker's alone
 
     def pin(self, requests: Sequence[Request]) -> Future[list[int]]:
         """Ids of new anchors, all or none; or the node's `SagsError`."""
@@ -41,21 +41,22 @@ class Pinner:
 
     def close(self) -> None:
         """Give all anchors back, and wait for that."""
-        self._worker.submit(lambda: self._remove(self._held.copy()))
+        self._worker.submit(lambda: self._remove(list(self._held)))
         self._worker.shutdown()
 
     def _pin(self, requests: Sequence[Request]) -> list[int]:
         answers, error = self._ask("add_anchor", requests, ANSWER)
-        added = [int(answers[number]["id"]) for number in sorted(answers)]
+        added = {int(answers[number]["id"]): answers[number].get("session") for number in sorted(answers)}
+        self._held |= added
         if error is not None:
-            self._remove(added)
+            self._remove(list(added))
             raise error
-        self._held += added
-        return added
+        return list(added)
 
     def _remove(self, ids: list[int]) -> None:
-        self._disown(ids)
-        self._ask("remove_anchor", [{"id": anchor} for anchor in ids], GOODBYE)  # or the node is gone
+        named = [(anchor, self._held.pop(anchor, None)) for anchor in ids]
+        requests = [{"id": anchor} | ({"session": session} if session else {}) for anchor, session in named]
+        self._ask("remove_anchor", requests, GOODBYE)  # or the node is gone
 
     def _ask(
         self, op: str, requests: Sequence[Request], timeout: float
@@ -73,4 +74,5 @@ class Pinner:
         return answers, next(filter(None, (each.exception() for each in asked)), None)
 
     def _disown(self, ids: list[int]) -> None:
-        self._held = [anchor for anchor in self._held if anchor not in ids]
+        for anchor in ids:
+            self._held.pop(anchor, None)
