@@ -106,8 +106,9 @@ def test_a_point_is_not_followed_into_another_session_of_the_node(tmp_path: Path
     assert example.returncode == 1 and "started anew" in errors and asked == [(1, "add")]
 
 
-def test_the_node_of_rclpy_ends_with_the_node_that_it_follows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its own code, beside stand-ins for ROS; tests/bridge/test_ros2_rclpy.py has ROS."""
+@pytest.fixture
+def follow(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The node of rclpy, its own code beside stand-ins for ROS; tests/bridge/test_ros2_rclpy.py has ROS."""
 
     class Node:
         def __init__(self, name: str) -> None:
@@ -122,7 +123,20 @@ def test_the_node_of_rclpy_ends_with_the_node_that_it_follows(monkeypatch: pytes
     for name in ("rclpy", "geometry_msgs.msg", "sensor_msgs.msg", "std_msgs.msg"):
         monkeypatch.setitem(sys.modules, name, MagicMock())
     monkeypatch.setitem(sys.modules, "rclpy.node", SimpleNamespace(Node=Node))
-    follow = runpy.run_path(str(ROOT / "examples/ros2/follow_tissue.py"))["FollowTissue"]()
+    return runpy.run_path(str(ROOT / "examples/ros2/follow_tissue.py"))["FollowTissue"]()
+
+
+def test_of_two_nodes_of_rclpy_each_follows_its_own_anchor(follow: Any) -> None:
+    """Both ask on one topic, and hear both answers."""
+    follow.pixel, follow.asking = SimpleNamespace(x=150.0, y=120.0), MagicMock()
+    answers = [({"u": 20.0, "v": 20.0}, 1), ({"u": 150.0, "v": 120.0}, 2)]
+    for args, number in answers:
+        said = {"request": "add_anchor_at_pixel", "args": args, "result": {"id": number}}
+        follow.answered(SimpleNamespace(data=json.dumps(said)))
+    assert follow.anchor == 2
+
+
+def test_the_node_of_rclpy_ends_with_the_node_that_it_follows(follow: Any) -> None:
     follow.anchor = 1
     columns = ("x", "y", "z", "id", "age", "confidence", "depth_confidence")
 

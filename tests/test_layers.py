@@ -35,12 +35,12 @@ LINES = {
     "sags_node/bags": 981,
     "sags_node/cli": 3556,
     "sags_node/clients": 1,
-    "sags_node/clients/bridge": 2545,
+    "sags_node/clients/bridge": 2550,
     "sags_node/clients/latency": 427,
-    "sags_node/clients/overlay": 3136,
-    "sags_node/clients/recording": 1467,
+    "sags_node/clients/overlay": 3154,
+    "sags_node/clients/recording": 1477,
     "sags_node/clients/registration": 526,
-    "sags_node/clients/viewer": 1525,
+    "sags_node/clients/viewer": 1528,
     "sags_node/config": 1431,
     "sags_node/detail": 897,
     "sags_node/engine": 4031,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1844,
     "sags_node/tools/importing": 1171,
     "sags_node/vision": 5420,
-    "tests": 49114,
+    "tests": 49213,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -42,7 +42,9 @@ class FollowTissue(Node):
 
     def answered(self, message: String) -> None:
         answer = json.loads(message.data)
-        if answer.get("request") != "add_anchor_at_pixel" or self.anchor is not None:
+        asked = {"u": self.pixel.x, "v": self.pixel.y}
+        is_ours = answer.get("request") == "add_anchor_at_pixel" and answer.get("args", asked) == asked
+        if not is_ours or self.anchor is not None:  # others ask, too, and all hear all answers
             return
         if "error" in answer:  # and it is asked again
             self.get_logger().warning(answer["error"])

@@ -158,6 +158,8 @@ def test_it_waits_for_a_node_that_is_started_later(run_dir: Path, request: pytes
         assert len(running.said) == 1 and "waiting (Ctrl-C ends)" in running.said[0]
         request.getfixturevalue("node")
         assert watcher.pictures(3, drawn=True, seconds=START_SECONDS)
+        session = json.loads(connection_path(run_dir, "sags").read_text())["session"]
+        until(lambda: watcher.status()["session"] == session)
 
 
 @pytest.mark.fault("node: ends before its first frame has reached an overlay")

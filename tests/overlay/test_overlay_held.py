@@ -334,12 +334,19 @@ def test_points_that_lie_on_the_file_in_other_axes_only_are_unsure(
 
 @pytest.mark.fault("file: an object that was registered in another session of the node")
 @pytest.mark.parametrize(
-    ("registration", "sure"), [({"session": "s"}, True), ({"session": "t"}, False), ({}, True), (None, True)]
-)
-def test_what_was_registered_in_another_session_is_unsure(registration: Any, sure: bool) -> None:
-    """`s` is the session of the frame."""
+    ("registration", "recorded_s", "sure"),
+    [
+        ({"session": "s"}, None, True), ({"session": "t"}, None, False), ({}, None, True), (None, None, True),
+        ({"session": "s", "epoch": 2}, None, True), ({"session": "s", "epoch": 1}, None, False),
+        ({"session": "s", "epoch": 1}, 3.0, True), ({"session": "t", "epoch": 2}, 3.0, False),
+    ],
+)  # fmt: skip
+def test_what_was_registered_in_another_session_is_unsure(
+    registration: Any, recorded_s: float | None, sure: bool
+) -> None:
+    """`s` is the session of the frame, 2 its epoch: of a recording, each turn has its own."""
     thing, frame = of_file(1e3 * LOCAL, 1e-3, at_units="file", registration=registration)
-    placed_at(thing, frame)
+    placed_at(thing, replace(frame, recorded_s=recorded_s))
     assert thing.is_sure == sure and thing.unsure == (None if sure else ELSEWHERE)
 
 

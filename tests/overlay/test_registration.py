@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +12,20 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from bridging import anchored_at, sockets
 from command_line import figures_of, refused
 from running_node import RunningNode
+from synthetic import stream
 from test_overlay import overlay
 from waiting import until
 
+from sags_node.clients.overlay.registering import frames_of
 from sags_node.clients.overlay.scene import read_scene
 from sags_node.clients.registration.register import Registration, register
 from sags_node.clients.registration.rigid import kabsch, nine_of_ten, of_pairs, picking_error, rigid_fit
 from sags_node.clients.registration.surfaces import MIRROR, Shape, Surface
 from sags_node.geometry import project, transform
+from sags_node.messaging.address import NodeAddress
 from sags_node.phantom import write_session
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.types import F64, I32, Camera
@@ -284,6 +290,22 @@ def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, 
             assert each["residual_mm"] <= each["residual_limit_mm"], each
         watcher.pictures(1, drawn=True)
     refused(2, "register", *given, said=(str(scene), "exists already", "--force"))
+
+
+@pytest.mark.live
+def test_frames_of_before_a_gap_are_not_used_with_those_after_it(tmp_path: Path) -> None:
+    """As where frames are held for a while: an organ may lie elsewhere since."""
+    seconds, gap = 1.0, 1.5
+    with sockets(tmp_path) as running, ThreadPoolExecutor(1) as pool:
+        with stream(running, anchored_at):
+            looking = pool.submit(frames_of, NodeAddress(run_dir=tmp_path), seconds)
+            until(lambda: running.wanted("tf"))
+            time.sleep(0.4)
+        time.sleep(gap)
+        assert not looking.done()
+        with stream(running, anchored_at):
+            stamps = [frame.stamp_ns * 1e-9 for frame in looking.result(60)]
+    assert len(stamps) > 5 and np.diff(stamps).max() < seconds
 
 
 @pytest.mark.live

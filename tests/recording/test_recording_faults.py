@@ -23,6 +23,7 @@ from sags_node.bags.bag import BagMessage
 from sags_node.bags.pictures import decode_picture
 from sags_node.cli.bag import recorded_table
 from sags_node.clients.recording import recorder as recorder_module
+from sags_node.clients.recording.backlog import Arrived, Ring
 from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
@@ -214,6 +215,21 @@ def test_a_ring_says_how_much_it_holds(tmp_path: Path) -> None:
     times = [arrived.log_ns for arrived in by_topic(Path(taken["snapshot"]))["status"]]
     assert taken["seconds"] == summary["kept_s"] == pytest.approx((times[-1] - times[0]) * 1e-9, abs=1e-3)
     assert summary["snapshot_seconds"] == 60
+
+
+@pytest.mark.parametrize("set_by", [3600, -3600])
+def test_a_ring_keeps_its_seconds_where_the_wall_clock_is_set(set_by: int) -> None:
+    """A message a second, 10 s of 30 are kept; and the camera_info of the beginning."""
+    now = 0.0
+    ring = Ring(10.0, 10**9, clock=lambda: now)
+    for second in range(31):
+        now = float(second)
+        wall_s = 10**9 + second + (set_by if second >= 25 else 0)
+        name = "left/camera_info" if second == 0 else "status"
+        message = message_of(name, cdr.string("x"), second + 1)
+        assert ring.add(Arrived(message, wall_s * 10**9), latched=second == 0) == []
+    assert ring.seconds == 10.0
+    assert [arrived.message.meta.seq for arrived in ring.content()] == [1, *range(21, 32)]
 
 
 @pytest.mark.fault("node: killed while it is recorded")

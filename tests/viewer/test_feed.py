@@ -88,3 +88,26 @@ def test_of_the_overlay_the_picture_of_exactly_that_frame_is_shown(tmp_path: Pat
             said = feed.says()
             feed.close()
     assert said is not None and said.objects[0].name == "vessel" and said.objects[0].unsure == "its anchors"
+
+
+def test_an_overlay_of_another_node_is_none_of_this_one(tmp_path: Path) -> None:
+    """Its anchors are other points: their names must not stand beside this node's."""
+    run_dir, session = tmp_path / "run", "another"
+    with node_sockets(run_dir) as running, making(running, plane_result()):
+        with OverlayStream("overlay", run_dir, (0, 0, 255)) as stream:
+
+            def send(_: int) -> None:
+                stream.serve()
+                stream.blank(session)  # a new reason is told at once
+                stream.tell({"session": session, "objects": []})
+                time.sleep(0.01)
+
+            with repeating(send):
+                feed, beside = Feed(NodeAddress(run_dir=run_dir)), OverlayFeed(run_dir)
+                until(lambda: beside.says() is not None and feed.now((LEFT,)).camera is not None)
+                time.sleep(0.2)
+                assert feed.now((LEFT,)).overlay is None
+                session = running.session
+                until(lambda: feed.now((LEFT,)).overlay is not None)
+                feed.close()
+                beside.close()

@@ -282,7 +282,7 @@ class Feed:
         self, topics: Iterable[str], sender: NodeAddress, max_age: float, wake: Callable[[], None]
     ) -> None:
         self._max_age, self._session = max_age, ""
-        rates = dict.fromkeys(topics, LEAST_HZ)
+        rates = dict.fromkeys((*topics, "status"), LEAST_HZ)
         self._subscriber = Subscriber.at(sender, rates, rates=rates, paused=True, may_be_absent=True)
         self._resources = ExitStack()
         self._resources.callback(self._subscriber.close)
@@ -301,7 +301,10 @@ class Feed:
     def problem(self, name: str) -> str | None:
         """Why the newest message of a topic must not be shown as new; None when it may be."""
         limit = SILENT_AFTER if name in EVERY_SECOND else self._max_age
-        return self._subscriber.problem(name, limit)
+        problem, topic = self._subscriber.problem(name, limit), topics.find(name)
+        if problem is not None or topic is None or topic.periodic or self.latest("status") is None:
+            return problem
+        return self._subscriber.problem("status", SILENT_AFTER)  # nothing else tells that its sender has gone
 
     def started_anew(self) -> bool:
         """Tell whether the sender is another one than when this was last asked."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from sags_node.clients.bridge.requests import ANSWER_TIME, Requests
@@ -78,14 +79,15 @@ class Inbox:
                 try:
                     args = ask.args(cdr.decode(data, ask.kind))
                 except SagsError as error:
-                    self._answer(name, None, str(error))
+                    self._answer({"request": name}, None, str(error))
                 else:
-                    self._requests.ask(ask.op, args, partial(self._answer, name), ask.seconds)
+                    about = {"request": name, "args": args}
+                    self._requests.ask(ask.op, args, partial(self._answer, about), ask.seconds)
 
-    def _answer(self, name: str, result: Args | None, words: str) -> None:
-        """From any thread."""
-        said = {"request": name, **({"error": words} if result is None else {"result": result})}
-        self._answers.write(cdr.string(json.dumps(said)).cdr(), time.time_ns())
+    def _answer(self, about: Args, result: Args | None, words: str) -> None:
+        """From any thread. All peers hear it: what was asked tells each which answer is its own."""
+        said = about | ({"error": words} if result is None else {"result": result})
+        self._answers.write(cdr.string(msgspec.json.encode(said).decode()).cdr(), time.time_ns())
 
 
 def _point(stamped: Any) -> Args:

@@ -29,7 +29,9 @@ LEAST_ANCHORS = 3  # for a rigid fit
 FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
 MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of ten are within half of it
 NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
-ELSEWHERE = "it was registered in another session of the node, whose world is another: register it again"
+ELSEWHERE = (
+    "it was registered in another session or epoch of the node, whose world may be another: register it again"
+)
 AGAIN = "it comes back once recognised; else pin it again, by four anchors or more"
 UNRECOGNISED = "its anchors were not recognised lately"
 GONE = f"the tissue at its anchors left the model; {AGAIN}"
@@ -268,8 +270,7 @@ class HeldObject:
         else:
             in_camera = self.spec.coordinates == "camera"
             self._model = np.asarray(transform(invert(T_world_cam), places)) if in_camera else places
-        stated = self.spec.registration
-        if stated is not None and stated.session not in (None, frame.session):
+        if self._is_of_another_world(frame):
             self._doubt = ELSEWHERE
         far = self._distance(self._model)
         if far > 0:
@@ -281,6 +282,15 @@ class HeldObject:
                         f"are the file's coordinates those of the {self.spec.coordinates}? If not, say `at`"
                     )
             self._refused = f"it lies {1e3 * far:.3g} mm from its anchors: {hint}"
+
+    def _is_of_another_world(self, frame: TissueFrame) -> bool:
+        """Tell whether it was registered before the node was started or began a new model: the scope may
+        have been elsewhere then. A recording comes to the same place with each turn, in a new epoch."""
+        stated, is_live = self.spec.registration, frame.recorded_s is None
+        if stated is None:
+            return False
+        is_anew = is_live and stated.epoch not in (None, frame.epoch)
+        return is_anew or stated.session not in (None, frame.session)
 
     def _misreadings(self) -> dict[float, str | None]:
         """What is wrong with its `at`, for either unit (m) that they may be in; asked before frames wait."""

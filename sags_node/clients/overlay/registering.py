@@ -52,7 +52,7 @@ def register_live(
     targets = scale * np.array(pairs.targets, np.float64).reshape(-1, 3)
     if not len(targets):
         targets = 0.5 * (vertices.min(0) + vertices.max(0))[None]
-    seen = _look(node, seconds)
+    seen = frames_of(node, seconds)
     places = np.array([_place(pair, number, seen) for number, pair in enumerate(pairs.pairs, 1)])
     surface = Surface.joined([frame.surface(frame.tissue) for frame in seen])
     at = scale * np.array([pair.at for pair in pairs.pairs], np.float64)
@@ -72,8 +72,12 @@ def register_live(
     return said, {"objects": [thing | {"anchors": anchors, "registration": said}]}
 
 
-def _look(node: NodeAddress, seconds: float) -> list[TissueFrame]:
-    """At most `FRAMES` that are spread over some seconds of one session of a node."""
+def frames_of(node: NodeAddress, seconds: float) -> list[TissueFrame]:
+    """At most `FRAMES` that are spread over some seconds of one session of a node, without a longer gap.
+
+    Raises:
+        SagsError: no frames, or no calibration.
+    """
     seen: list[TissueFrame] = []
     apart_ns, deadline, last = 1e9 * seconds / FRAMES, time.monotonic() + PATIENCE + seconds, None
     with Subscriber.at(node, [*NEEDED, CONFIDENCE]) as subscriber:
@@ -89,6 +93,8 @@ def _look(node: NodeAddress, seconds: float) -> list[TissueFrame]:
                 raise SagsError("the node has no calibration, so nothing has a length: see sags calib")
             if seen and (frame.session, frame.epoch) != (seen[0].session, seen[0].epoch):
                 seen.clear()  # places of before are of another world
+            if seen and frame.stamp_ns - seen[-1].stamp_ns > 1e9 * seconds:
+                seen.clear()  # the tissue may have moved since: frames were held, or the node was paused
             if not seen or frame.stamp_ns - seen[-1].stamp_ns >= apart_ns:
                 seen.append(frame)
         if not seen:

@@ -336,6 +336,7 @@ class _Overlay:
         return {
             **self._figures(RECENT),
             "max_age": self._options.max_age,
+            "session": None if self._source is None else self._source[0],
             "clock": None if self._clock is None else self._clock.status(),
             "no_right_eye": self._right or None,
             "warning_codes": self._warnings,

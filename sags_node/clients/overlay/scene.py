@@ -78,6 +78,7 @@ class Registered(BaseModel):
     residual_p90_mm: float | None = Field(None, ge=0)
     share: float = Field(1.0, gt=0, le=1)
     session: str | None = Field(None, description="of the node, in whose world its places are")
+    epoch: int | None = Field(None, ge=0, description="of that node")
 
 
 class ObjectSpec(Section):

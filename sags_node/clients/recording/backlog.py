@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
+from operator import itemgetter
 
 from sags_node.messaging.wire import Message
 
@@ -69,40 +73,46 @@ class Backlog:
 
 
 class Ring:
-    """Keeps messages of the last `seconds`, and of latched topics the last one however old it is."""
+    """Keeps messages of the last `seconds`, and of latched topics the last one however old it is.
 
-    def __init__(self, seconds: float, most_bytes: int) -> None:
-        self._span_ns = round(seconds * 1e9)
+    Args:
+        clock: s, that nobody sets: with the wall clock all that is kept would get old at once.
+    """
+
+    def __init__(self, seconds: float, most_bytes: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._span = seconds
         self._most_bytes = most_bytes
-        self._kept: deque[Arrived] = deque()
+        self._clock = clock
+        self._kept: deque[tuple[float, Arrived]] = deque()  # and when it came
         self._bytes = 0
-        self._latched: dict[str, Arrived] = {}
+        self._latched: dict[str, tuple[float, Arrived]] = {}
 
     def add(self, arrived: Arrived, latched: bool) -> list[Arrived]:
         """Keep a message; returns those that had to go for want of room, although they are young enough."""
-        self._kept.append(arrived)
+        came = self._clock()
+        self._kept.append((came, arrived))
         self._bytes += arrived.size
-        while self._kept[0].received_ns < arrived.received_ns - self._span_ns:
+        while self._kept[0][0] < came - self._span:
             self._pop()
         pushed_out = []
         while self._bytes > self._most_bytes:
             pushed_out.append(self._pop())
         if latched:
-            self._latched[arrived.message.topic] = arrived
+            self._latched[arrived.message.topic] = came, arrived
         return pushed_out
 
     @property
     def seconds(self) -> float:
         """From the oldest message that is kept to the newest; latched ones may be older."""
-        return (self._kept[-1].received_ns - self._kept[0].received_ns) * 1e-9 if self._kept else 0.0
+        return self._kept[-1][0] - self._kept[0][0] if self._kept else 0.0
 
     def content(self) -> list[Arrived]:
         """All that is kept, oldest first."""
-        since = self._kept[0].received_ns if self._kept else 2**63 - 1
-        older = [arrived for arrived in self._latched.values() if arrived.received_ns < since]
-        return sorted(older, key=lambda arrived: arrived.received_ns) + list(self._kept)
+        since = self._kept[0][0] if self._kept else inf
+        older = [latched for latched in self._latched.values() if latched[0] < since]
+        return [arrived for _, arrived in (*sorted(older, key=itemgetter(0)), *self._kept)]
 
     def _pop(self) -> Arrived:
-        arrived = self._kept.popleft()
+        _, arrived = self._kept.popleft()
         self._bytes -= arrived.size
         return arrived

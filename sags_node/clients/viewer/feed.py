@@ -145,6 +145,8 @@ class Feed:
 
     def _seen(self, subscriber: Subscriber, names: set[str], overlaid: tuple[str, ...]) -> Moment:
         status, overlay = _status_of(subscriber), self._overlay.says()
+        if overlay is not None and overlay.session not in (None, status.session):
+            overlay = None  # of another node on this machine: its anchors are other points
         problem = self._problem(subscriber, status)
         if problem is not None:
             return Moment(problem, status, overlay=overlay)

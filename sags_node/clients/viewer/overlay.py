@@ -34,6 +34,7 @@ class Overlay(msgspec.Struct, frozen=True):
     reason: str | None = None  # why it is blank
     latency_ms: dict[str, float | None] = {}
     objects: tuple[Thing, ...] = ()
+    session: str | None = None  # of the node that it draws for; None: not said
 
 
 class OverlayFeed:

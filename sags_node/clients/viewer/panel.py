@@ -386,7 +386,7 @@ def _line(text: str) -> str:
 def _overlay_table(overlay: Overlay | None) -> str:
     """Each object of the overlay, and how it does."""
     if overlay is None:
-        return _line("none runs here: sags overlay")
+        return _line("none of this node runs here: sags overlay")
     latency = overlay.latency_ms.get("p50")
     said = [f"blank: {overlay.reason}" if overlay.reason else f"{latency or 0:.0f} ms after the camera"]
     for thing in overlay.objects:
