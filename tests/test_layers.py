@@ -37,7 +37,7 @@ LINES = {
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2545,
     "sags_node/clients/latency": 427,
-    "sags_node/clients/overlay": 3136,
+    "sags_node/clients/overlay": 3137,
     "sags_node/clients/recording": 1467,
     "sags_node/clients/registration": 526,
     "sags_node/clients/viewer": 1525,
