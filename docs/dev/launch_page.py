@@ -56,10 +56,9 @@ mapping:
 - `sags new RECORDING -o my_launch.yaml` writes one.
 - `sags param set key:=value` changes keys of a running node. They say so below.
 - `key:=value` on the command line wins over the file. Keys are written with dots, as in the tables below.
-  Values are YAML, but without comments: `source.left:='/data/Case #3'` is that folder.
-  Values are YAML: `source.right:=null`, `'publish.data:=[tcp://*:5556]'`.
-- An unknown key is an error that names the nearest known one, or the key that replaced it. So is a wrong
-  value. The exit code is 2.
+  Values are YAML: `source.right:=null`, `'publish.data:=[tcp://*:5556]'`; but without comments:
+  `source.left:='/data/Case #3'` is that folder.
+- An unknown key is an error that names the nearest known one. So is a wrong value. The exit code is 2.
 - A missing key has its default.
 - Paths in a file are relative to the file. Paths on the command line are relative to the folder that you are
   in.
@@ -112,7 +111,7 @@ def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
     yield from _tables(RecordedSource, prefix, "Every recording")
     yield from _table(LiveSource, prefix, "Every live kind", list(LiveSource.model_fields))
     geometry = f"{prefix}geometry"
-    yield from _tables(GeometryConfig, f"{geometry}.", f"`{geometry}`: videos and every live kind")
+    yield from _tables(GeometryConfig, f"{geometry}.", f"`{geometry}`: videos, bags and every live kind")
     yield from _table(SentSource, prefix, "`ros2` and `push`", list(SentSource.__annotations__))
     yield from _table(RosGraph, prefix, "`ros2`", list(RosGraph.model_fields))
     yield from _table(Guarded, prefix, "`push`", list(Guarded.model_fields))

@@ -397,10 +397,10 @@ def test_the_default_place_is_the_middle_of_the_tissue() -> None:
 def test_after_a_new_start_it_is_lost_or_pinned_anew(how: str, repin: bool) -> None:
     place = on_plane(30, 40)
     thing = held([{"pixel": [30, 40]}], repin, pinner := FakePinner())
-    placed_at(thing, with_anchors([place]))
+    assert [thing.place(replace(with_anchors([place]), recorded_s=s)) for s in (1, 1, 1, 3)][-1] is not None
     after = {
         "model": with_anchors([np.full(3, np.nan)]),
-        "node": replace(with_anchors([place]), session="another"),
+        "node": replace(with_anchors([place]), session="another", recorded_s=2.0),
         "removed": with_anchors([None]),
     }[how]
     assert thing.place(after) is None and str(thing.reason).startswith("lost: ")

@@ -44,7 +44,7 @@ def measure_latency(
         As `Ledger.figures`.
 
     Raises:
-        SagsError: no node or overlay runs, or no code was seen before it was stopped.
+        SagsError: no code was seen before it was stopped; node and overlay may be started later.
     """
     ledger, reader = codes.ledger, Reader()
     newest: Received | None = None
@@ -52,8 +52,8 @@ def measure_latency(
     apart: str | None = None  # why an overlay that came has no picture
     leading, kept = ((node, PICTURE), KEPT) if overlay is None else ((overlay, OVERLAY), WAITING)
     with (
-        Subscriber.at(node, [PICTURE], kept=kept) as pictures,
-        Subscriber.at(leading[0], [leading[1]]) as subscriber,
+        Subscriber.at(node, [PICTURE], kept=kept, may_be_absent=True) as pictures,
+        Subscriber.at(leading[0], [leading[1]], may_be_absent=True) as subscriber,
     ):
         while not stop.is_set() and (now := time.monotonic()) < ends_at + LAST:
             due = codes.step(now < ends_at)

@@ -141,6 +141,7 @@ class HeldObject:
         if self._refused is not None:
             return self._refused
         if self._ids and frame.session != self._session:
+            self._begun_s = None  # it may play another recording, whose pixels show other tissue
             return self._lose("the node was started anew", self._pinner.forget)
         may_pin = self._lost is None or self._may_pin_again(frame)
         if not self._ids:
