@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import prange
 
 from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.engine.losses.pieces import LEVEL
+from sags_node.geometry import project
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.mapping.initialise import insert
 from sags_node.mapping.surface import surface_at
@@ -56,12 +58,12 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     return pixels[:count], depths[:count], errors[:count]
 
 
-def prune(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> int:
+def prune(model: GaussianModel, surface: F32, observation: Observation, limit: int) -> int:
     """Remove what `prune_mask` says and `prune_to_budget`; returns how many."""
-    remove = prune_mask(model, surface, depth_is_new, limit)
+    remove = prune_mask(model, surface, observation.depth_is_new, limit)
     removed = model.remove(remove)
     if model.count > limit:
-        removed += prune_to_budget(model, shown(model, surface[~remove]), limit)
+        removed += prune_to_budget(model, shown(model, surface[~remove], observation), limit)
     return removed
 
 
@@ -84,18 +86,36 @@ def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: in
     return remove
 
 
-def shown(model: GaussianModel, surface: F32) -> F32:
+def shown(model: GaussianModel, surface: F32, observation: Observation) -> F32:
     """How much each Gaussian shows, [N] px; infinite where nobody knows yet.
 
-    Of one that an instrument or other tissue hides it is the mean of all: it is seen again, and missed then.
+    Of one that an instrument or other tissue hides, and of one that an instrument begins to hide, it is at
+    least the mean of all: it is seen again, and missed then.
 
     Args:
         surface: [N, 3] of `surface_at`.
+        observation: of which that is.
     """
     z, measured = surface[:, 0], surface[:, 1]
     behind = z > (1 + FRONT_TOLERANCE) * measured  # also where nothing is measured
-    hidden = (z > 0) & behind & (model.contribution < IDLE)
-    return np.where(hidden, np.float32(mean_contribution(model.contribution[~hidden])), model.contribution)
+    hidden = (z > 0) & behind & (model.contribution < IDLE) | _beside_instrument(model.means, observation)
+    mean = np.float32(mean_contribution(model.contribution[~hidden]))
+    return np.where(hidden, np.maximum(model.contribution, mean), model.contribution)
+
+
+def _beside_instrument(means: F32, observation: Observation) -> Bool:
+    """[N] which of the Gaussians at `means` [N, 3] are no farther from an instrument, or behind it, than
+    Gaussians are from each other: it hides parts of them."""
+    height, width = observation.tissue.shape
+    apart = round(np.sqrt(width * height / max(len(means), 1)))
+    clear = cv2.erode(
+        observation.tissue.view(np.uint8), np.ones((2 * apart + 1, 2 * apart + 1), np.uint8),
+        borderType=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    pixels, _ = project(observation.camera, means)
+    inside = np.all((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5)), axis=1)
+    columns, rows = np.rint(np.where(inside[:, None], pixels, 0)).astype(np.intp).T
+    return np.asarray(inside & (clear[rows, columns] == 0))
 
 
 def prune_to_budget(model: GaussianModel, contribution: F32, limit: int) -> int:
@@ -147,7 +167,8 @@ def fill(
 
 def give_up(model: GaussianModel, observation: Observation, count: int) -> int:
     """Remove `least_shown`; returns how many."""
-    return model.remove(least_shown(shown(model, surface_at(model.means, observation)), count))
+    surface = surface_at(model.means, observation)
+    return model.remove(least_shown(shown(model, surface, observation), count))
 
 
 def least_shown(contribution: F32, count: int) -> Bool:

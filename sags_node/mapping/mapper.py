@@ -146,7 +146,7 @@ class Mapper:
         self.map.move_light(observation.camera)
         # 2. Prune: what floats in front of the tissue, and what the machine does not afford.
         limit = self._limit(budget)
-        removed = densify.prune(self.model, surface, observation.depth_is_new, limit)
+        removed = densify.prune(self.model, surface, observation, limit)
         if self._smoothing:
             narrow(self.model.smoothing, self.model.means, observation.camera)
 

@@ -230,7 +230,7 @@ class SagsMapper:
             # 2. Prune; draw, and let the colours follow a jump of the exposure; split, and fill holes.
             model, limit = self.model, self._limit(budget)
             surface = surface_at(model.means, observation)  # also if still: a broken row breaks all gradients
-            removed = densify.prune(model, surface, observation.depth_is_new, limit)
+            removed = densify.prune(model, surface, observation, limit)
             if removed or not still:
                 planes = self._exposed(frame)
                 if is_lost(planes, frame.drawn) and can_start(observation):

@@ -203,20 +203,26 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
 
 
 def test_where_the_machine_affords_fewer_hidden_tissue_stays_as_likely_as_what_is_seen() -> None:
-    """A third of the picture lies under an instrument: none of it shows, and each is as good as the mean."""
-    model, seen = model_of(grid_points()), observation()
+    """A third of the picture lies under an instrument: none of it shows, and each is as good as the mean. So
+    is what it begins to hide, of which little shows: with each step of the instrument that would be gone."""
+    points = grid_points()
+    model, seen, edge = model_of(points), observation(), WIDTH // 3
+    columns = points[:, 0] / DEPTH * FOCAL + (WIDTH - 1) / 2
+    begins = (edge - 0.5 < columns) & (columns < edge + 4)
     tissue = seen.tissue.copy()
-    tissue[:, : tissue.shape[1] // 3] = False
+    tissue[:, :edge] = False
     now = replace(seen, tissue=tissue, depth=np.where(tissue, seen.depth, np.float32(0)))
     surface = surface_at(model.means, now)
     hidden = (surface[:, 0] > 0) & (surface[:, 1] == 0)
-    assert 0.2 < hidden.mean() < 0.5
+    assert 0.2 < hidden.mean() < 0.5 and begins.any() and not (begins & hidden).any()
     model.contribution[:] = np.where(hidden, 0, np.random.default_rng(0).uniform(2, 20, model.count))
+    model.contribution[begins] = 1
+    hidden |= begins
     ids = model.ids.copy()
-    densify.prune(model, surface, False, model.count // 2)
+    densify.prune(model, surface, replace(now, depth_is_new=False), model.count // 2)
     gone = ~np.isin(ids, model.ids)
     assert gone.any() and not gone[hidden].any()
-    assert not densify.least_shown(densify.shown(model, surface_at(model.means, now)), 10)[
+    assert not densify.least_shown(densify.shown(model, surface_at(model.means, now), now), 10)[
         np.isin(model.ids, ids[hidden])
     ].any()
 
