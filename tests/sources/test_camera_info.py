@@ -17,7 +17,7 @@ from sags_node.errors import UsageError
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig, save_rig
 from sags_node.sources.pictures import read_picture
-from sags_node.sources.rectified import named_rectified
+from sags_node.sources.rectified import as_named, named_rectified
 from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.types import Eye, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
@@ -41,6 +41,25 @@ from sags_node.vision.rectify import Rectifier
 )  # fmt: skip
 def test_names_that_say_it(name: Path | str, rectified: bool) -> None:
     assert named_rectified(name) is rectified
+
+
+@pytest.mark.parametrize("says_P", [False, True])
+def test_a_calibration_that_does_not_say_P_is_told_of(
+    says_P: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Who rectified the pictures may have kept all of them, with another focal length."""
+    rig, file = load_rig(SESSION / "calib"), tmp_path / "stereo.yml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    T, size = rig.T_right_left, (rig.left.width, rig.left.height)
+    matrices = {"R": T[:3, :3], "T": T[:3, 3], "imageSize": np.array(size, np.float64)}
+    for number, eye in (("1", rig.left), ("2", rig.right)):
+        matrices |= {f"M{number}": eye.K, f"D{number}": eye.distortion}
+        matrices |= {f"R{number}": eye.R, f"P{number}": eye.P} if says_P else {}
+    for name, matrix in matrices.items():
+        storage.write(name, matrix)
+    storage.release()
+    as_named(load_rig(file), Path("left_rectified"), Path("right_rectified"))
+    assert ("does not say how pictures were rectified" in caplog.text) != says_P
 
 
 @pytest.fixture(scope="module")
