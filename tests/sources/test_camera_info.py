@@ -13,11 +13,13 @@ import pytest
 from bag_files import BASELINE, HEIGHT, MS, ROS2, START, WIDTH, Row, eye_of, picture, play
 from places import SESSION
 
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import UsageError
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig, save_rig
 from sags_node.sources.pictures import read_picture
 from sags_node.sources.rectified import as_named, named_rectified
+from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.types import Eye, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
@@ -239,6 +241,19 @@ def test_a_topic_of_both_eyes_is_split_as_a_live_one(tmp_path: Path) -> None:
             assert frame.right is not None and np.array_equal(frame.right, picture(number, 1))
     right_first = play(path, geometry={"layout": "side_by_side", "first": "right"})
     assert np.array_equal(right_first[0].left, picture(0, 1))
+
+
+def test_squeezed_eyes_of_a_topic_are_told_of_and_guessed_so(tmp_path: Path) -> None:
+    """Beside each other, each at half of its width, as a 3D mixer sends them."""
+    rows: list[Row] = []
+    for number in range(3):
+        eyes = (np.repeat(picture(number, eye), 2, axis=0) for eye in (0, 1))
+        rows.append(("/scope/image_raw", files.image(ROS2, np.hstack([*eyes]), START + number * MS), START))
+    bag, said = files.write_rosbag2(tmp_path / "bag", rows), ["source.geometry.layout:=side_by_side"]
+    config = load_launch(bag, said)
+    assert any("2 times as wide as high" in finding.what for finding in check_folder(bag, said))
+    K = guess_rig(config.source).left.K
+    assert K[1, 1] == 2 * K[0, 0]
 
 
 def clocks(folder: Path, count: int, ahead_ms: int) -> Path:
