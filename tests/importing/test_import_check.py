@@ -335,6 +335,14 @@ def test_eyes_are_told_by_names(tmp_path: Path) -> None:
         assert any(f"disparity {DISPARITY}" in each.what for each in found), found
 
 
+def test_a_link_that_leads_nowhere_is_a_picture_that_cannot_be_read(tmp_path: Path) -> None:
+    """As in a data set whose files were not all fetched."""
+    file = made(tmp_path) / "left/001.bmp"
+    file.unlink()
+    file.symlink_to("gone")
+    assert f"cannot read picture {file}" in str([each for each in odd(tmp_path) if each.level == "error"])
+
+
 def shown(left: U8, right: U8) -> dict[str, tuple[U8, str]]:
     """Both eyes in one picture, and how that is played."""
     rows = left.copy()
