@@ -101,6 +101,8 @@ class StereoRig:
     metric: bool = field(default=True, kw_only=True)
     # Its files do not say the unit of lengths; this one is usual of their form, and was taken.
     unit: str = field(default="m", kw_only=True)
+    # False: R and P stand in none of its files: `cv2.stereoRectify` made them.
+    says_P: bool = field(default=True, kw_only=True)
 
     @property
     def baseline(self) -> float:

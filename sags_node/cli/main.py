@@ -56,6 +56,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 OF_THE_NODE = frozenset("torch cv2 open3d onnxruntime numba PIL mcap lz4 zstandard av".split())
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
+CLOSED = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG)  # whatever looks for a file at a path meets them
 
 
 SECTIONS = {
@@ -117,9 +118,15 @@ class Sags(click.Group):
             if library is not None:
                 said = f"{library[1]} is missing on this system; sags doctor says which package has it"
         except OSError as error:
-            if error.errno not in NO_ROOM:
+            if error.errno in CLOSED and error.filename is not None:
+                said, code = (
+                    f"cannot open {error.filename}: {error.strerror}; check the path and your rights",
+                    2,
+                )
+            elif error.errno in NO_ROOM:
+                said, code = f"cannot write {error.filename or 'what was asked for'}: {error.strerror}", 1
+            else:
                 raise
-            said, code = f"cannot write {error.filename or 'what was asked for'}: {error.strerror}", 1
         if console.quiet:
             log.error("%s", said)
         console.print(f"[red]error:[/] {escape(said)}", soft_wrap=True)

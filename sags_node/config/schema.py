@@ -205,7 +205,24 @@ class GeometryConfig(Section):
                 raise ValueError(
                     f"{list(box)} is no box [x, y, width, height]: it needs a width and a height"
                 )
+        if self.layout == "panes" and self.first == "right":
+            raise ValueError(
+                "first: right says nothing of panes: leave it left, and exchange crop and crop_right"
+            )
         return self
+
+
+def _first_of_both(geometry: GeometryConfig) -> GeometryConfig:
+    if geometry.layout == "separate" and geometry.first == "right":
+        raise ValueError(
+            "first: right says nothing of eyes that come separately: leave it left, and exchange source.left "
+            "and source.right"
+        )
+    return geometry
+
+
+# Of a source that gives pictures of one kind: of both eyes, or of each.
+Geometry = Annotated[GeometryConfig, AfterValidator(_first_of_both)]
 
 
 class VideosSource(RecordedSource):
@@ -216,7 +233,7 @@ class VideosSource(RecordedSource):
     right: Path | None = Field(
         None, description="video of the right eye; null: one camera, with a monocular vision.onnx"
     )
-    geometry: GeometryConfig = GeometryConfig()
+    geometry: Geometry = GeometryConfig()
     tools: Box | None = Field(
         None, description="of source.geometry.layout panes: the left eye with the instruments painted green"
     )
@@ -285,7 +302,7 @@ class BagSource(RecordedSource):
         description="one: both eyes are stamped by one clock; two: by clocks that differ, and the right "
         "eye's is set by when its pictures were recorded",
     )
-    geometry: GeometryConfig = GeometryConfig()
+    geometry: Geometry = GeometryConfig()
 
     @model_validator(mode="after")
     def _one_topic_of_both(self) -> BagSource:
@@ -335,7 +352,7 @@ class LiveSource(Section):
     latency_ms: float = Field(
         0.0, ge=-1000, le=1000, description="from the exposure to the stamp; taken off every stamp"
     )
-    geometry: GeometryConfig = GeometryConfig()
+    geometry: Geometry = GeometryConfig()
 
 
 class V4l2Source(LiveSource):
@@ -478,6 +495,7 @@ class PushSource(SentSource, Guarded):
     """Pictures that another program hands in over ZeroMQ; docs/inputs.md says how."""
 
     kind: Literal["push"] = "push"
+    geometry: GeometryConfig = GeometryConfig()
     endpoint: str = Field("tcp://127.0.0.1:5558", description="ROUTER socket that the node binds")
 
 
@@ -694,6 +712,11 @@ class TissueConfig(Section):
 
     @model_validator(mode="after")
     def _source_is_described(self) -> TissueConfig:
+        for method, key in (("onnx", "path"), ("topic", "endpoint")):
+            if "method" not in self.model_fields_set and getattr(self, key) is not None:
+                raise ValueError(
+                    f"{key} is for method {method}, which is not set: set it, or leave {key} out"
+                )
         if self.method == "onnx" and (self.path is None or self.tissue_is is None):
             raise ValueError("onnx needs path (the .onnx file) and tissue_is (white, black or class numbers)")
         if self.method == "topic" and (self.endpoint is None or self.tissue_is not in ("white", "black")):

@@ -180,7 +180,7 @@ def _rig(
             f"{where} does not say the size of the pictures: give --size WxH; for a launch file "
             "convert it first (sags calib convert)"
         )
-    return rectify_eyes(name, size, K, (left, right), R, T)
+    return replace(rectify_eyes(name, size, K, (left, right), R, T), says_P=False)
 
 
 # ---- text ------------------------------------------------------------------------------------------------

@@ -115,6 +115,9 @@ class BagPairs(Pairs):
         self._size: tuple[int, int] | None = None
         self._messages: Iterator[BagMessage] | None = None
         self._index = -1  # of the pair that was read last
+        if self._layout.shows_both:
+            width, height = self._picture_size()
+            self.pixel_aspect = self._layout.pixel_aspect(width, height, 1.0)
 
     def at(self, index: int) -> RawPair | None:
         if index >= self.count:
@@ -134,6 +137,12 @@ class BagPairs(Pairs):
 
     def close(self) -> None:
         self._messages = None
+
+    def _picture_size(self) -> tuple[int, int]:
+        """Width and height of a picture as it was sent, px."""
+        self.at(0)
+        assert self._size is not None  # it was just read
+        return self._size
 
     def _picture(self, eye: int, key: Key) -> U8:
         message = self._find(eye, key)

@@ -15,6 +15,7 @@ from sags_node.config.schema import GstSource, V4l2Source
 from sags_node.errors import SagsError, UsageError
 from sags_node.sources.layout import Layout
 from sags_node.sources.pairing import Alternation, LivePairs, Picture, Shot
+from sags_node.sources.pictures import judge_pixels
 from sags_node.types import U8, Side
 from sags_node.workers import go_on
 
@@ -63,6 +64,9 @@ class Input(NamedTuple):
 class LiveStereo(LivePairs):
     """A `Source` of live stereo frames from devices.
 
+    Attributes:
+        pixel_aspect: width of a pixel over its height.
+
     Args:
         inputs: one that delivers both eyes, or one for each.
         config: how pictures become those of the eyes, and which are pairs.
@@ -79,6 +83,7 @@ class LiveStereo(LivePairs):
         super().__init__(config.pair_tolerance_ms, config.latency_ms)
         self._layout = Layout(config.geometry)
         self._size = size
+        self.pixel_aspect = 1.0
         self._alternation: Alternation | None = None
         self._readers: list[DeviceReader] = []
         try:
@@ -87,6 +92,8 @@ class LiveStereo(LivePairs):
         except SagsError:
             self.close()
             raise
+        for finding in judge_pixels(self.pixel_aspect):
+            log.warning("%s; %s", finding.what, finding.fix)
         self.rate = self._readers[0].rate
         if self._layout.is_sequential:
             self._alternation = Alternation(1e9 / self.rate)
@@ -114,6 +121,7 @@ class LiveStereo(LivePairs):
         device = one.open()
         try:
             size = self._layout.size(*device.size, one.name)
+            self.pixel_aspect = self._layout.pixel_aspect(*device.size, 1.0)
             if self._size is not None and self._size != size:
                 raise UsageError(
                     f"{one.name}: the pictures of an eye are {size[0]}x{size[1]} px but should be "

@@ -83,12 +83,8 @@ class Pairs:
     @property
     def findings(self) -> list[Finding]:
         """All that is to be said of it before it plays: `sags run` and `sags import --check` say the same."""
-        found = [*(parted("warning", each) for each in self.oddities), *self.judged]
-        if abs(self.pixel_aspect - 1) < NOT_SQUARE:
-            return found
-        what = f"pixels are {self.pixel_aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
-        fix = "calibrate pictures as they are played; a camera that is guessed has such pixels"
-        return [*found, Finding("warning", what, fix, {"pixel_aspect": self.pixel_aspect})]
+        said = (parted("warning", each) for each in self.oddities)
+        return [*said, *self.judged, *judge_pixels(self.pixel_aspect)]
 
     def at(self, index: int) -> RawPair | None:
         """The pair of this number, None behind the end. Those that follow each other are read fastest.
@@ -106,6 +102,15 @@ class Pairs:
 
     def close(self) -> None:
         """Release the files, where they stay open between pairs."""
+
+
+def judge_pixels(aspect: float) -> tuple[Finding, ...]:
+    """Return what is odd about pixels so many times as wide as high."""
+    if abs(aspect - 1) < NOT_SQUARE:
+        return ()
+    what = f"pixels are {aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
+    fix = "calibrate pictures as they are played; a camera that is guessed has such pixels"
+    return (Finding("warning", what, fix, {"pixel_aspect": aspect}),)
 
 
 class FolderPairs(Pairs):

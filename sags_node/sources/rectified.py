@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sags_node.config import schema as cfg
 from sags_node.rig import already_rectified, rectifies
+from sags_node.sources.pictures import say
 from sags_node.types import StereoRig
 
 RECTIFIED, RAW = {"rect", "rectified"}, {"raw", "unrectified"}
@@ -21,12 +22,23 @@ def as_pictures_come(rig: StereoRig, config: cfg.LaunchConfig) -> StereoRig:
     """
     if not come_rectified(config):
         return rig
-    return already_rectified(rig) if config.rig is None or rectifies(rig) else rig
+    return _rectified_with(rig) if config.rig is None or rectifies(rig) else rig
 
 
 def as_named(rig: StereoRig, *names: Path) -> StereoRig:
     """The same of pictures in files or folders, by their names."""
-    return already_rectified(rig) if named_rectified(*names) and rectifies(rig) else rig
+    return _rectified_with(rig) if named_rectified(*names) and rectifies(rig) else rig
+
+
+def _rectified_with(rig: StereoRig) -> StereoRig:
+    """The rig of pictures that were rectified with it, which is said where its files do not tell how."""
+    if not rig.says_P:
+        say(
+            f"{rig.path} does not say how pictures were rectified: P of cv2.stereoRectify with alpha=0 is "
+            "taken, and if theirs has another focal length, depth is wrong by as much; write R1 R2 P1 P2 of "
+            "their rectification into one OpenCV file with the rest"
+        )
+    return already_rectified(rig)
 
 
 def come_rectified(config: cfg.LaunchConfig) -> bool:

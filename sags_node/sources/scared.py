@@ -20,7 +20,7 @@ from sags_node.config.schema import GeometryConfig
 from sags_node.errors import SagsError, UsageError
 from sags_node.media.picture_file import decode
 from sags_node.media.video import Video
-from sags_node.rig import check_intrinsics, rectified_rig
+from sags_node.rig import accept_rig, check_intrinsics, rectified_rig
 from sags_node.rig.read import numbers_in, open_storage
 from sags_node.sources.layout import Layout
 from sags_node.sources.numbered import NumberedFiles, open_numbered
@@ -30,6 +30,7 @@ from sags_node.types import F32, F64, Eye, Reference, StereoRig
 
 log = logging.getLogger(__name__)
 
+FILE = "endoscope_calibration.yaml"
 METRES = 1e-3  # per unit of the files
 BASELINES = (1e-3, 50e-3)  # m: outside, the file is not in millimetres
 RECTIFIED_FOLDERS = (("left_rectified", "right_rectified"), ("data/left_finalpass", "data/right_finalpass"))
@@ -102,8 +103,9 @@ class ScaredPairs(Pairs):
         return np.where(rectified > 0, rectified, np.float32(0))
 
 
-def read_rig(folder: Path) -> StereoRig:
-    """The keyframe's calibration, for the pictures that are played: raw ones or rectified ones.
+def read_rig(folder: Path, judged: bool = True) -> StereoRig:
+    """The keyframe's calibration, for the pictures that are played: raw ones or rectified ones. If it is not
+    `judged`, what is odd about it is not said: pictures may have been resized since.
 
     Raises:
         UsageError: pictures or calibration are missing, damaged or implausible.
@@ -111,6 +113,8 @@ def read_rig(folder: Path) -> StereoRig:
     pictures, rectified = _open_pictures(folder)
     pictures.close()
     rig = read_calibration(folder, pictures.size)
+    if judged:
+        accept_rig(rig, folder / FILE)
     return rectified_rig(rig.name, *pictures.size, rig.left.P[:, :3], rig.baseline) if rectified else rig
 
 
@@ -123,7 +127,7 @@ def read_calibration(folder: Path, size: tuple[int, int]) -> StereoRig:
     Raises:
         UsageError: the file is missing, damaged or implausible.
     """
-    file = folder / "endoscope_calibration.yaml"
+    file = folder / FILE
     storage = open_storage(file)
     M1, M2, R = (_matrix(storage, file, key, (9,)).reshape(3, 3) for key in ("M1", "M2", "R"))
     D1, D2 = (_matrix(storage, file, key, (4, 5)) for key in ("D1", "D2"))

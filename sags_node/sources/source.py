@@ -95,7 +95,7 @@ def open_source(
 
 def recorded_rig(config: cfg.Source, judged: bool = True) -> StereoRig | None:
     """The calibration that comes with the pictures; None where the launch file must name one. If it is not
-    `judged`, a bag's may be implausible.
+    `judged`, a bag's may be implausible, and SCARED's of another size.
 
     Raises:
         UsageError: it is missing, damaged or implausible.
@@ -107,7 +107,7 @@ def recorded_rig(config: cfg.Source, judged: bool = True) -> StereoRig | None:
     if isinstance(config, cfg.ScaredSource):
         from sags_node.sources import scared
 
-        return scared.read_rig(config.folder)
+        return scared.read_rig(config.folder, judged)
     if isinstance(config, cfg.BagSource):
         from sags_node.sources import bags
 

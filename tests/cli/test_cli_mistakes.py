@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import RUN_HERE, refused, sags, start
@@ -144,6 +147,21 @@ def test_a_wrong_recording_or_calibration(
 ) -> None:
     refused(code, "run", *videos(user_files, **overrides), said=said)
     refused(code, "eval", "--pace", "step", *videos(user_files, **overrides), said=said)
+
+
+@pytest.mark.parametrize("command", [["run"], ["import", "--check"], ["calib", "check"]])
+def test_a_path_that_cannot_be_looked_up(command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    refused(2, *command, "x" * 300, said=("xxx: File name too long; check the path",))
+
+    usual = Path.stat
+
+    def private(path: Path, **how: Any) -> os.stat_result:
+        if "private" in path.parts:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return usual(path, **how)
+
+    monkeypatch.setattr(Path, "stat", private)
+    refused(2, *command, "/private/case", said=("cannot open /private/case", "Permission denied"))
 
 
 def test_a_video_is_no_picture(user_files: Path) -> None:

@@ -17,6 +17,7 @@ from sags_node.config.schema import (
     LaunchConfig,
     MappingConfig,
     PushRobot,
+    PushSource,
     Section,
     V4l2Source,
     VideosSource,
@@ -81,6 +82,13 @@ def test_a_word_that_is_a_path_elsewhere_is_none(tmp_path: Path) -> None:
     assert isinstance(found.source, V4l2Source) and found.source.left == "a"
 
 
+def test_a_key_that_a_sender_may_use_is_none_too_many() -> None:
+    """It sends each eye by itself, or both in one picture. Where a method is said, others' keys may stay."""
+    source = load_launch(None, ["source:={kind: push, geometry: {first: right}}"]).source
+    assert isinstance(source, PushSource) and source.geometry.first == "right"
+    load_launch(None, ["vision.tissue:={method: classical, path: net.onnx}"])
+
+
 def test_overrides_win_over_the_file() -> None:
     config = load_launch(
         ROOT / "launch/d4d_pull.yaml", ["mapping.budget_ms:=50", "source.tools:=[1, 2, 300, 200]"]
@@ -88,6 +96,9 @@ def test_overrides_win_over_the_file() -> None:
     assert config.mapping.budget_ms == 50
     assert isinstance(config.source, VideosSource)
     assert config.source.tools == (1, 2, 300, 200)
+
+
+PANES = "{layout: panes, first: right, crop: [0, 0, 8, 8], crop_right: [8, 0, 8, 8]}"
 
 
 @pytest.mark.parametrize(
@@ -104,6 +115,11 @@ def test_overrides_win_over_the_file() -> None:
         ("mapping.budget_ms:=yes", "mapping: Value error, budget_ms should be a number, not true or false"),
         ("engine.threads:=true", "engine: Value error, threads should be a number"),
         ("source:={kind: videos, left: a, geometry: {levels: [no, 1]}}", "levels should be a number"),
+        ("source:={kind: videos, left: a, right: b, geometry: {first: right}}", "exchange source.left and"),
+        ("source:={kind: v4l2, geometry: {first: right}}", "exchange source.left and source.right"),
+        (f"source:={{kind: videos, left: a, geometry: {PANES}}}", "exchange crop and crop_right"),
+        ("vision.tissue.path:=net.onnx", "path is for method onnx, which is not set"),
+        ("vision.tissue.endpoint:=tcp://127.0.0.1:5600", "endpoint is for method topic"),
         ("mapping.budget_ms", "key:=value"),
         ("mapping.budget_ms.x:=3", "mapping.budget_ms"),
     ],

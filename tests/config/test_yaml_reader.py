@@ -182,8 +182,8 @@ def test_a_section_of_a_launch_file_may_stand_in_two_places(
     monkeypatch.chdir(tmp_path)
     folder = Path("sub")
     folder.mkdir()
-    config: Any = as_launch("vision: {onnx: &n {path: net.onnx}, tissue: *n}\n", folder)
-    assert config.vision.onnx.path == config.vision.tissue.path == folder / "net.onnx"
+    config: Any = as_launch("source: &n {kind: push, key: a.key, allow: [b]}\nrobot: *n\n", folder)
+    assert config.source.key == config.robot.key == folder / "a.key"
 
 
 def test_a_value_of_any_size_is_shown_in_short(tmp_path: Path) -> None:

@@ -54,6 +54,16 @@ def test_both_eyes_in_one_picture_and_which_is_first(tmp_path: Path) -> None:
     assert said["source.geometry.layout"] == "over_under" and said["source.geometry.first"] == "right"
 
 
+def test_panes_that_are_exchanged_are_put_in_order(tmp_path: Path) -> None:
+    write_video(tmp_path / "both.mp4", [np.hstack(pair) for pair in zip(RIGHT, LEFT, strict=True)])
+    one, other = "[0, 0, 320, 256]", "[320, 0, 320, 256]"
+    keys = {"layout": "panes", "first": "left", "crop": one, "crop_right": other}
+    found = propose([tmp_path / "both.mp4"], [f"source.geometry.{key}:={said}" for key, said in keys.items()])
+    said = set_by(found.launch)
+    assert (said["source.geometry.crop"], said["source.geometry.crop_right"]) == (other, one)
+    assert said["source.geometry.first"] == "left" and "are exchanged" in str(found.findings)
+
+
 def test_black_borders_are_cut_off(tmp_path: Path) -> None:
     framed = [
         [cv2.copyMakeBorder(picture, 16, 16, 32, 32, cv2.BORDER_CONSTANT) for picture in eye]

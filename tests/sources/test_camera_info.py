@@ -13,11 +13,13 @@ import pytest
 from bag_files import BASELINE, HEIGHT, MS, ROS2, START, WIDTH, Row, eye_of, picture, play
 from places import SESSION
 
+from sags_node.config.launch_file import load_launch
 from sags_node.errors import UsageError
 from sags_node.pipeline.session import open_session
 from sags_node.rig import load_rig, save_rig
 from sags_node.sources.pictures import read_picture
-from sags_node.sources.rectified import named_rectified
+from sags_node.sources.rectified import as_named, named_rectified
+from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.types import Eye, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
@@ -41,6 +43,25 @@ from sags_node.vision.rectify import Rectifier
 )  # fmt: skip
 def test_names_that_say_it(name: Path | str, rectified: bool) -> None:
     assert named_rectified(name) is rectified
+
+
+@pytest.mark.parametrize("says_P", [False, True])
+def test_a_calibration_that_does_not_say_P_is_told_of(
+    says_P: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Who rectified the pictures may have kept all of them, with another focal length."""
+    rig, file = load_rig(SESSION / "calib"), tmp_path / "stereo.yml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    T, size = rig.T_right_left, (rig.left.width, rig.left.height)
+    matrices = {"R": T[:3, :3], "T": T[:3, 3], "imageSize": np.array(size, np.float64)}
+    for number, eye in (("1", rig.left), ("2", rig.right)):
+        matrices |= {f"M{number}": eye.K, f"D{number}": eye.distortion}
+        matrices |= {f"R{number}": eye.R, f"P{number}": eye.P} if says_P else {}
+    for name, matrix in matrices.items():
+        storage.write(name, matrix)
+    storage.release()
+    as_named(load_rig(file), Path("left_rectified"), Path("right_rectified"))
+    assert ("does not say how pictures were rectified" in caplog.text) != says_P
 
 
 @pytest.fixture(scope="module")
@@ -220,6 +241,19 @@ def test_a_topic_of_both_eyes_is_split_as_a_live_one(tmp_path: Path) -> None:
             assert frame.right is not None and np.array_equal(frame.right, picture(number, 1))
     right_first = play(path, geometry={"layout": "side_by_side", "first": "right"})
     assert np.array_equal(right_first[0].left, picture(0, 1))
+
+
+def test_squeezed_eyes_of_a_topic_are_told_of_and_guessed_so(tmp_path: Path) -> None:
+    """Beside each other, each at half of its width, as a 3D mixer sends them."""
+    rows: list[Row] = []
+    for number in range(3):
+        eyes = (np.repeat(picture(number, eye), 2, axis=0) for eye in (0, 1))
+        rows.append(("/scope/image_raw", files.image(ROS2, np.hstack([*eyes]), START + number * MS), START))
+    bag, said = files.write_rosbag2(tmp_path / "bag", rows), ["source.geometry.layout:=side_by_side"]
+    config = load_launch(bag, said)
+    assert any("2 times as wide as high" in finding.what for finding in check_folder(bag, said))
+    K = guess_rig(config.source).left.K
+    assert K[1, 1] == 2 * K[0, 0]
 
 
 def clocks(folder: Path, count: int, ahead_ms: int) -> Path:

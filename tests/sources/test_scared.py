@@ -276,6 +276,19 @@ def test_rectified_pictures_take_the_place_of_the_video(keyframe: Path) -> None:
         play(keyframe)
 
 
+@pytest.mark.parametrize("resized", [False, True])
+def test_pictures_that_were_resized_are_told_of(
+    keyframe: Path, resized: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The files do not say their size: of half of it all depth would be twice as far."""
+    if resized:
+        halves = [cv2.resize(np.vstack(pictures(number)), None, fx=0.5, fy=0.5) for number in range(FRAMES)]
+        write_video(keyframe / "data/rgb.mp4", halves, codec="mp4v")
+    open_session(keyframe)
+    said = "endoscope_calibration.yaml: both principal points lie at 2 of the middle"
+    assert (said in caplog.text) == resized
+
+
 def test_a_test_keyframe_without_poses_and_points_plays_with_a_still_camera(
     keyframe: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

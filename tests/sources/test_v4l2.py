@@ -188,6 +188,16 @@ def test_one_camera_shows_both_eyes(plugs: Plugs, first: str, value: int) -> Non
     assert frame.t_capture_ns == frame.t_capture_right_ns == 7 * MS and source.dropped == 0
 
 
+@pytest.mark.parametrize(("width", "aspect"), [(4, 2.0), (16, 1.0)])
+def test_eyes_that_a_camera_squeezes_are_told_of(
+    width: int, aspect: float, plugs: Plugs, caplog: pytest.LogCaptureFixture
+) -> None:
+    said = {"geometry": GeometryConfig(layout="side_by_side"), "right": None, "width": width}
+    with open_cameras(CONFIG.model_copy(update=said), open_device=plugs) as source:
+        assert source.pixel_aspect == aspect
+    assert ("2 times as wide as high" in caplog.text) == (aspect == 2)
+
+
 def test_mistakes_at_opening(plugs: Plugs) -> None:
     halves = {"geometry": GeometryConfig(layout="side_by_side"), "width": 9}
     for said, words in (

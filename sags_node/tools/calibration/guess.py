@@ -66,7 +66,8 @@ def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int]
         source = source.model_copy(update={"pace": "step", "loop": False, "warm_up": 0})
     size, pairs = None, list[Pair]()
     with open_source(source, references=False, quiet=True) as opened:
-        pixel_aspect = opened.pairs.pixel_aspect if isinstance(opened, Replay) else 1.0
+        reader = opened.pairs if isinstance(opened, Replay) else opened
+        pixel_aspect = float(getattr(reader, "pixel_aspect", 1.0))
         for index, frame in enumerate(opened):
             size = size or (frame.left.shape[1], frame.left.shape[0])
             if frame.right is not None and index % EVERY == 0:

@@ -36,7 +36,9 @@ def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path
         SagsError: one cannot be read.
     """
     chosen = set(files[:: max(1, -(-len(files) // LOOKED_AT))])
-    suspects = {files[-1], min(files, key=lambda file: file.stat().st_size)} - chosen
+    # A link may lead nowhere, as in a data set that was not fetched whole: that file cannot be read, either.
+    smallest = min(files, key=lambda file: file.stat().st_size if file.exists() else -1)
+    suspects = {files[-1], smallest} - chosen
     for file in suspects:
         read_picture(file, flags)
     return {file: read_picture(file, flags) for file in files if file in chosen}

@@ -24,6 +24,7 @@ from sags_node.tools.importing.folder import is_video, override
 
 DEVICES = Path("/dev")
 EYES = ("left", "right")
+EACH_EYE = (("source.left", "source.right"), ("source.geometry.crop", "source.geometry.crop_right"))
 SECONDS = 2.0  # that a camera is watched
 WHOLE = "source.geometry.layout:=over_under"  # takes any picture apart so that it can be put together again
 
@@ -140,9 +141,13 @@ def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str,
     """The launch with its fixes, and in words what each of them did."""
     keys = dict(each.split(":=", 1) for each in launch)
     done = {fix: f"{fix} is set" for fix in fixes}
-    apart = keys.get("source.right") not in (None, "null")
-    if pictures.RIGHT_FIRST in done and apart:  # no geometry says which of two files is whose
-        keys["source.left"], keys["source.right"] = keys["source.right"], keys["source.left"]
+    each_eye = [
+        (one, other) for one, other in EACH_EYE if keys.get(other) not in (None, "null") and one in keys
+    ]
+    apart = keys.get(videos.LAYOUT.removesuffix(":="), "separate") in ("separate", "panes")
+    if pictures.RIGHT_FIRST in done and apart and each_eye:  # no `first` says which of these is whose
+        for one, other in each_eye:
+            keys[one], keys[other] = keys[other], keys[one]
         done[pictures.RIGHT_FIRST] = "left and right are exchanged"
         fixes = [fix for fix in fixes if fix != pictures.RIGHT_FIRST]
     return [*(f"{key}:={value}" for key, value in keys.items()), *fixes], done

@@ -42,7 +42,7 @@ class Way(NamedTuple):
     what: str
     layout: str
     eyes: Callable[[U8], tuple[U8, U8]]
-    right: tuple[int, int] | None = None  # x, y of the right pane, px
+    right: tuple[int, int] | None = None  # x, y of the second pane, px; None: the layout tells it
 
 
 def _halves(picture: U8, axis: int = 1) -> tuple[U8, U8]:
@@ -133,13 +133,15 @@ def way_of(shown: Sequence[U8]) -> Way | None:
 
 def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
     """`key:=value` that take these pictures apart, the left eye first."""
-    if way.right is not None:
-        (x, y), (height, width) = way.right, way.eyes(shown[0])[0].shape[:2]
-        crops = f"crop:=[0,0,{width},{height}]", f"crop_right:=[{x},{y},{width},{height}]"
-        return f"{LAYOUT}panes", *(f"source.geometry.{crop}" for crop in crops)
     eyes = zip(*map(way.eyes, shown), strict=True)
     fixes = [fix for finding in pictures.check_eyes(*eyes) for fix in finding.launch]
-    return f"{LAYOUT}{way.layout}", *fixes
+    if way.right is None:
+        return f"{LAYOUT}{way.layout}", *fixes
+    height, width = way.eyes(shown[0])[0].shape[:2]
+    boxes = [f"[{x},{y},{width},{height}]" for x, y in ((0, 0), way.right)]
+    if pictures.RIGHT_FIRST in fixes:
+        boxes.reverse()
+    return f"{LAYOUT}panes", f"source.geometry.crop:={boxes[0]}", f"source.geometry.crop_right:={boxes[1]}"
 
 
 def _file(file: Path) -> list[Finding]:
@@ -200,10 +202,9 @@ def _one(file: Path, shown: list[U8]) -> list[Finding]:
     looked = pictures.check_both(*zip(*map(way.eyes, shown), strict=True))
     if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
-    if way.right is None:  # then `layout_of` exchanges them
-        said = "points lie farther to the right in the second picture, which is taken for the left eye's"
-        turned = Finding("ok", said)
-        looked = [turned if pictures.RIGHT_FIRST in each.launch else each for each in looked]
+    # `layout_of` exchanges them.
+    said = "points lie farther to the right in the second picture, which is taken for the left eye's"
+    looked = [Finding("ok", said) if pictures.RIGHT_FIRST in each.launch else each for each in looked]
     return [Finding("ok", f"{size} px show both eyes: {way.what}"), *looked]
 
 
