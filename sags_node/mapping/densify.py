@@ -89,8 +89,8 @@ def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: in
 def shown(model: GaussianModel, surface: F32, observation: Observation) -> F32:
     """How much each Gaussian shows, [N] px; infinite where nobody knows yet.
 
-    Of one that an instrument or other tissue hides, and of one that an instrument begins to hide, it is at
-    least the mean of all: it is seen again, and missed then.
+    Of one that an instrument or other tissue hides, or that an instrument begins to hide, it is at least the
+    mean of all: it is seen again, and missed then.
 
     Args:
         surface: [N, 3] of `surface_at`.
@@ -98,20 +98,22 @@ def shown(model: GaussianModel, surface: F32, observation: Observation) -> F32:
     """
     z, measured = surface[:, 0], surface[:, 1]
     behind = z > (1 + FRONT_TOLERANCE) * measured  # also where nothing is measured
-    hidden = (z > 0) & behind & (model.contribution < IDLE) | _beside_instrument(model.means, observation)
+    hidden = (z > 0) & behind & (model.contribution < IDLE)
     mean = np.float32(mean_contribution(model.contribution[~hidden]))
-    return np.where(hidden, np.maximum(model.contribution, mean), model.contribution)
-
-
-def _beside_instrument(means: F32, observation: Observation) -> Bool:
-    """[N] which of the Gaussians at `means` [N, 3] are no farther from an instrument, or behind it, than
-    Gaussians are from each other: it hides parts of them."""
+    counted = np.where(hidden, mean, model.contribution)
+    little = np.flatnonzero(counted < mean)
     height, width = observation.tissue.shape
-    apart = round(np.sqrt(width * height / max(len(means), 1)))
-    clear = cv2.erode(
-        observation.tissue.view(np.uint8), np.ones((2 * apart + 1, 2 * apart + 1), np.uint8),
-        borderType=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
+    apart = np.sqrt(width * height / max(model.count, 1))  # px from one Gaussian to the next
+    counted[little[_beside_instrument(model.means[little], observation, round(apart))]] = mean
+    return counted
+
+
+def _beside_instrument(means: F32, observation: Observation, reach: int) -> Bool:
+    """[N] which of the Gaussians at `means` [N, 3] lie behind an instrument, or at most `reach` px beside
+    it."""
+    height, width = observation.tissue.shape
+    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    clear = cv2.erode(observation.tissue.view(np.uint8), around, borderType=cv2.BORDER_REPLICATE)
     pixels, _ = project(observation.camera, means)
     inside = np.all((pixels > -0.5) & (pixels < (width - 0.5, height - 0.5)), axis=1)
     columns, rows = np.rint(np.where(inside[:, None], pixels, 0)).astype(np.intp).T
