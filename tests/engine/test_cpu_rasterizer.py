@@ -113,7 +113,7 @@ def test_view_is_normalised_by_coverage() -> None:
     view = camera(width=4, height=3)
     planes = np.zeros((5, 3, 4), np.float32)
     planes[:, 0, 0] = [0.3, 0.15, 0.9, 0.03, 0.6]
-    planes[:, 1, 1] = [0.1, 0.1, 0.1, 0.01, 0.4]  # too thin for a depth
+    planes[:, 1, 1] = [0.075, 0.075, 0.075, 0.01, 0.3]  # too thin for a depth
     planes[:, 2, 2] = [1e-5, 1e-5, 1e-5, 1e-6, 1e-4]  # nothing there
     drawn = to_view(planes, view, 5, 6)
     assert drawn.rgb[0, 0].tolist() == [128, 64, 255]

@@ -15,13 +15,13 @@ f4 = np.float32
 u8 = np.uint64
 ZERO, ONE = f4(0.0), f4(1.0)
 FAINT = f4(1e-3)  # below this coverage a colour means nothing
-SOLID = f4(0.5)  # coverage from which on a depth is stated
+SOLID = f4(0.4)  # coverage from which on a depth is stated: below it `densify` sees a hole
 
 
 def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> RenderedView:
     """The picture that `planes` [5, h, w] of `Rasterizer.forward` show, in fresh arrays of the camera's size.
 
-    rgb = C / alpha held in 0..1, 0 where alpha < 0.001; depth = D / alpha (m) where alpha >= 0.5, or where it
+    rgb = C / alpha held in 0..1, 0 where alpha < 0.001; depth = D / alpha (m) where alpha >= 0.4, or where it
     is at all and all four pixels beside it have that, else 0.
     Planes of another size than the camera's are interpolated: depths, before they are divided, by straight
     lines, which invent no depth beyond those around; colours as bytes, when somebody asks for them.
