@@ -32,7 +32,7 @@ LINES = {
     "benchmarks": 10031,
     "sags_lab": 5013,
     "sags_node": 1271,
-    "sags_node/bags": 981,
+    "sags_node/bags": 991,
     "sags_node/cli": 3563,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2550,
@@ -41,7 +41,7 @@ LINES = {
     "sags_node/clients/recording": 1477,
     "sags_node/clients/registration": 526,
     "sags_node/clients/viewer": 1528,
-    "sags_node/config": 1478,
+    "sags_node/config": 1491,
     "sags_node/detail": 897,
     "sags_node/engine": 4031,
     "sags_node/instruments": 820,
@@ -57,7 +57,7 @@ LINES = {
     "sags_node/quality": 267,
     "sags_node/rig": 1176,
     "sags_node/ros": 322,
-    "sags_node/sources": 5913,
+    "sags_node/sources": 5934,
     "sags_node/terminal": 397,
     "sags_node/tools": 573,
     "sags_node/tools/calibration": 1884,
@@ -65,8 +65,8 @@ LINES = {
     "sags_node/tools/export": 955,
     "sags_node/tools/fitting": 1844,
     "sags_node/tools/importing": 1179,
-    "sags_node/vision": 5420,
-    "tests": 49357,
+    "sags_node/vision": 5426,
+    "tests": 49413,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -7,7 +7,7 @@ false length nor an index that lies can take memory; db3 and ROS 1 files are rea
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +31,8 @@ RECORDED = "sags"  # metadata of a bag that says which node was recorded from he
 RELATIVE = {"sags_units": "relative"}  # metadata of a channel whose lengths have no unit
 AHEAD = "sags_ahead_ms"  # metadata of a channel whose content is predicted: how far ahead of the stamp
 
+Wanted = Callable[[str, str], bool]  # by topic and type
+
 
 @dataclass(frozen=True, slots=True)
 class BagMessage:
@@ -47,13 +49,18 @@ class BagMessage:
 
 
 def read_messages(
-    path: Path, topics: Collection[str] | None = None, start_ns: int = 0
+    path: Path,
+    topics: Collection[str] | None = None,
+    start_ns: int = 0,
+    wanted: Wanted | None = None,
 ) -> Iterator[BagMessage]:
     """The messages of a bag in the order of the file.
 
     Args:
         topics: only these; None: all.
         start_ns: leave out what was recorded before.
+        wanted: by topic and type, whose data is used; None: all. Of a ROS 1 bag other data stays as it is:
+            its type may have another form in ROS 2, as `Marker` has.
 
     Raises:
         UsageError: there is no bag at `path`, or it is of a form that is not read.
@@ -65,7 +72,7 @@ def read_messages(
             if file.suffix == ".mcap":
                 found = _read_mcap(file, topics, start_ns)
             else:
-                found = _read_with_rosbags(file, topics, start_ns)
+                found = _read_with_rosbags(file, topics, start_ns, wanted)
             for message in found:
                 yield _unpacked(message) if unpack else message
 
@@ -324,7 +331,9 @@ class Channels:
 # ---- db3 and ROS 1 ---------------------------------------------------------------------------------------
 
 
-def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
+def _read_with_rosbags(
+    file: Path, topics: Collection[str] | None, start_ns: int, wanted: Wanted | None
+) -> Iterator[BagMessage]:
     from rosbags import rosbag1, rosbag2
 
     ros1, log = file.suffix == ".bag", Path(f"{file}-wal")
@@ -339,13 +348,14 @@ def _read_with_rosbags(file: Path, topics: Collection[str] | None, start_ns: int
     with _damage_as_one_error(), reader:
         if ros1 and not {info.pos for info in reader.chunk_infos} <= positions:
             raise DamagedError(0, "its index points to places where no chunk is")
-        wanted = [c for c in reader.connections if topics is None or c.topic in topics]
-        if not wanted:
+        read = [c for c in reader.connections if topics is None or c.topic in topics]
+        if not read:
             return
-        for connection, log_ns, raw in reader.messages(connections=wanted, start=start_ns):
+        for connection, log_ns, raw in reader.messages(connections=read, start=start_ns):
             if len(raw) > MAX_RECORD_BYTES:
                 raise DamagedError(0, f"a message of {len(raw)} bytes on {connection.topic}")
-            data = cdr.from_ros1(raw, connection.msgtype) if ros1 else raw
+            turned = ros1 and (wanted is None or wanted(connection.topic, connection.msgtype))
+            data = cdr.from_ros1(raw, connection.msgtype) if turned else raw
             yield BagMessage(connection.topic, connection.msgtype, log_ns, log_ns, 0, data)
 
 

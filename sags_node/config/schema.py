@@ -38,6 +38,9 @@ Share = Annotated[float, Ge(0), Le(1)]
 Finite = Annotated[float, Ge(-1_000_000), Le(1_000_000)]
 Positive = Annotated[float, Ge(1e-6), Le(1_000_000)]
 Side = Annotated[int, Ge(16), Le(4096)]  # px
+Name = Annotated[  # also of digits alone, as PyTorch gives them: YAML reads those as a number
+    str, BeforeValidator(lambda said: str(said) if type(said) in (int, float) else said)
+]
 
 
 def _possible_levels(levels: tuple[float, float]) -> tuple[float, float]:
@@ -54,6 +57,12 @@ def _values_of_masks(said: object) -> object:
     if said not in ("white", "black") and not (known and all(known)):
         raise ValueError('should be white, black, or a list of values: 0 to 255, or colours as "#00ff00"')
     return said
+
+
+def _not_zero(scale: float) -> float:
+    if scale == 0:
+        raise ValueError("should not be 0: nothing would be left of the output")
+    return scale
 
 
 Levels = Annotated[
@@ -87,6 +96,8 @@ NAMESPACE = r"^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$"
 def _taken_for_a_number(said: object, value: object) -> bool:
     if isinstance(said, list | tuple) and isinstance(value, list | tuple):
         return any(map(_taken_for_a_number, said, value))
+    if isinstance(said, dict) and isinstance(value, dict):
+        return any(_taken_for_a_number(each, value.get(key)) for key, each in said.items())
     return isinstance(said, bool) and type(value) in (int, float)
 
 
@@ -636,7 +647,7 @@ def _by_name(said: object) -> object:
 class NetworkFormat(Section):
     """How a depth network takes pictures and what it gives: what its file does not say must be set."""
 
-    inputs: tuple[str, ...] | None = Field(
+    inputs: tuple[Name, ...] | None = Field(
         None, description="names: left eye, right eye; default: the only one"
     )
     layout: Literal["nchw", "nhwc"] | None = Field(
@@ -657,11 +668,11 @@ class NetworkFormat(Section):
         le=512,
         description="px; width and height are padded to multiples of it, for a network that takes any",
     )
-    output: str | None = Field(None, description="name of the output to use; default: the only one")
+    output: Name | None = Field(None, description="name of the output to use; default: the only one")
     meaning: Literal["disparity", "depth", "inverse_depth"] | None = Field(
         None, description="of the output's numbers; to be set"
     )
-    scale: Finite | None = Field(
+    scale: Annotated[Finite, AfterValidator(_not_zero)] | None = Field(
         None,
         description="the output's numbers times this are px of the picture that the network gets, or m; -1: "
         "disparities are negative; default: 1",
@@ -914,6 +925,8 @@ class LaunchConfig(Section):
     def _one_pose(self) -> Self:
         if self.robot is not None and self.vision.pose not in ("session", "refine"):
             raise ValueError(f"robot says where the scope is, vision.pose {self.vision.pose} too: choose one")
+        if self.robot is not None and getattr(self.source, "poses", None) is not None:
+            raise ValueError("robot says where the scope is, source.poses too: leave one of them out")
         return self
 
     @model_validator(mode="after")

@@ -221,7 +221,7 @@ def _side(tree: dict[str, Any], key: str, file: str) -> int:
 
 def _distortion(tree: dict[str, Any], file: str) -> F64:
     model = tree.get("distortion_model", "plumb_bob")
-    if model not in MODELS:
+    if not isinstance(model, str) or model not in MODELS:
         fix = "calibrate with 'plumb_bob' or 'rational_polynomial'"
         raise UsageError(f"{file}: distortion_model: {brief(model)} is not supported; {fix}")
     coefficients = _numbers(tree, "distortion_coefficients", file)
@@ -249,7 +249,7 @@ def _numbers(tree: dict[str, Any], key: str, file: str) -> F64:
         data = data[0].split()  # without commas, as Kinetic wrote it
     try:
         numbers = np.array(data, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # the last: a whole number of hundreds of digits
         numbers = np.zeros(())
     if not isinstance(data, list) or numbers.ndim != 1 or bool in map(type, data):
         raise UsageError(f"{file}: {key}.data: {brief(data)} is not a list of numbers")

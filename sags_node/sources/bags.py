@@ -23,7 +23,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.rig import accept_rig
 from sags_node.sources.bag_stamps import DIFFER_FIX, Key, judge_stamps, pair_messages
-from sags_node.sources.layout import Layout
+from sags_node.sources.layout import Layout, refuse_turned
 from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64, U8, Eye, StereoRig
 
@@ -68,7 +68,8 @@ def _read_contents(path: Path, changed: int) -> Contents:
     pictures: dict[str, list[Key]] = {}
     infos: dict[str, list[tuple[int, bytes]]] = {}
     newest: dict[str, bytes] = {}
-    for message in read_messages(path):
+    used = *IMAGE_TYPES, CAMERA_INFO
+    for message in read_messages(path, wanted=lambda topic, kind: kind in used):
         types.setdefault(message.topic, message.type)
         if message.type in IMAGE_TYPES:
             pictures.setdefault(message.topic, []).append((message.log_ns, _stamp(path, message)))
@@ -263,7 +264,8 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
     """The calibration in the bag's camera_info topics; None where both are missing or say nothing.
 
     Raises:
-        UsageError: a named topic is missing, only one eye is calibrated, or the calibration is implausible.
+        UsageError: a named topic is missing, only one eye is calibrated, the pictures are turned, or the
+            calibration is implausible.
         SagsError: the bag is damaged.
     """
     contents = read_contents(config.path)
@@ -282,6 +284,7 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
     if left is None or right is None:
         side = "left" if left is None else "right"
         raise UsageError(f"{config.path} calibrates one eye only, the {side} one is missing; set rig")
+    refuse_turned(config.geometry, config.path)
     rig = StereoRig(config.path.stem, left, right, path=config.path)
     return accept_rig(rig, config.path) if judged else rig
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 
@@ -132,6 +134,19 @@ class Layout:
         from sags_node.sources.pixels import spread  # a kernel: other pictures need no place for one
 
         return spread(picture, self._config.levels)
+
+
+def refuse_turned(geometry: GeometryConfig, where: Path | str) -> None:
+    """Refuse a calibration that comes with the pictures where these are turned: it is of them as they come.
+
+    Raises:
+        UsageError: they are; `where` the calibration is said.
+    """
+    if geometry.flip != "none":
+        raise UsageError(
+            f"{where}: camera_info is of pictures as they come, and source.geometry.flip: {geometry.flip} "
+            "turns them: leave flip out, or calibrate with the turned pictures and set rig"
+        )
 
 
 def _cropped(width: int, height: int, crop: Box | None, name: str) -> tuple[int, int]:

@@ -79,7 +79,7 @@ class _BagPoses(Robot):
         wanted = {absolute(config.topic), *self.tools}
         seen: dict[str, str] = {}
         wrong, first_wrong = 0, ""  # messages that are no pose: at their time there is none, as in tf2
-        for message in read_messages(source.path):
+        for message in read_messages(source.path, wanted=lambda topic, kind: kind in POSE_TYPES):
             topic = absolute(message.topic)
             seen[topic] = message.type
             if topic in {*wanted, STATIC} and message.type in POSE_TYPES:

@@ -16,6 +16,7 @@ from sags_node.messaging.security import RateLimitedLog
 from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.rig import accept_rig, already_rectified
 from sags_node.ros.graph import Graph, Reader, receive_buffer
+from sags_node.sources.layout import refuse_turned
 from sags_node.sources.sent import SentPictures
 from sags_node.types import Eye as Calibrated
 from sags_node.types import Finding, Side, StereoRig
@@ -180,7 +181,8 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
     """The calibration that the cameras publish; None where they publish an empty one.
 
     Raises:
-        UsageError: no camera_info comes within `seconds`, one eye's is empty, or they are implausible.
+        UsageError: no camera_info comes within `seconds`, one eye's is empty, the pictures are turned, or
+            they are implausible.
         SagsError: a message is damaged.
     """
     graph = Graph(config)
@@ -209,6 +211,7 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
         return None
     for eye in infos.names.keys() - found.keys():
         raise UsageError(f"{infos.names[eye]} says that its eye is not calibrated; set rig")
+    refuse_turned(config.geometry, graph.where())
     return accept_rig(StereoRig("ros2", found["left"], found["right"]), graph.where())
 
 

@@ -211,7 +211,7 @@ def _read_poses(folder: Path, count: int, left: Eye) -> F64 | None:
 def _read_pose(text: bytes, name: str) -> F64:
     try:
         pose = np.array(json.loads(text)["camera-pose"], np.float64)
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, OverflowError):
         raise UsageError(f"{name}: no JSON with a camera-pose of numbers; unpack it again") from None
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or not geometry.is_rotation(pose[:3, :3]):
         raise UsageError(f"{name}: camera-pose is not a rotation and a translation [4, 4]; unpack it again")

@@ -264,7 +264,7 @@ def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tupl
         name: of the file, for messages.
 
     Raises:
-        UsageError: these are not the inputs of a depth network.
+        UsageError: these are not the inputs of a depth network, or not of the size that is said.
     """
     if len(tensors) not in (1, 2, 4):
         raise UsageError(
@@ -287,6 +287,12 @@ def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tupl
         if said.size is not None:
             width, height = width or said.size[0], height or said.size[1]
         found.append(Input(tensor.name, seen, one, first, tensor.dtype, width, height))
+    if said.size is not None and said.size not in ((one.width, one.height) for one in found):
+        sizes = " and ".join(dict.fromkeys(f"{one.width}x{one.height}" for one in found))
+        raise UsageError(
+            f"{name}: size: {said.size[0]}x{said.size[1]} px, but its file takes {sizes} alone: set that, or "
+            "leave size out"
+        )
     return tuple(found)
 
 

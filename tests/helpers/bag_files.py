@@ -78,6 +78,16 @@ def camera_info(
     return store.types[INFO](*head, *numbers, *binning, region)
 
 
+def marker(stamp_ns: int) -> Any:
+    """A message of ROS 1 whose type has more fields in ROS 2."""
+    types = ROS1.types
+    point, unit = types["geometry_msgs/msg/Point"](0, 0, 0), types["geometry_msgs/msg/Vector3"](1, 1, 1)
+    pose = types["geometry_msgs/msg/Pose"](point, types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1))
+    color, time = types["std_msgs/msg/ColorRGBA"](1, 0, 0, 1), types["builtin_interfaces/msg/Duration"](0, 0)
+    shown = "tool", 1, 0, 0, pose, unit, color, time, False, [point], [color], "", "", False
+    return types["visualization_msgs/msg/Marker"](header(ROS1, stamp_ns), *shown)
+
+
 def stereo_rows(
     store: Any,
     count: int = 10,

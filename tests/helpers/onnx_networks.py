@@ -90,7 +90,7 @@ def save_matcher(
         expects: the normalisation it undoes.
         names: of the inputs, left first; the file holds them in alphabetical order.
         guided: it also takes the pair at half its size, first, and fails without.
-        output: full, half (of its size) or several.
+        output: full, half (of its size), 6187 (its name) or several.
         factor: of the disparity, in the output.
         depth_of: focal length times baseline (px m), for depth in metres instead of disparity.
         fault: nan or error, where the left picture is nearly black.
@@ -130,7 +130,8 @@ def save_matcher(
     if fault:
         disparity = _faulty(g, left, disparity, fault)
     half = g("AveragePool", disparity, kernel_shape=[2, 2], strides=[2, 2], ceil_mode=1)
-    outputs = {"full": {"disparity": disparity}, "half": {"disparity": half}}.get(output)
+    maps = {"full": {"disparity": disparity}, "half": {"disparity": half}, "6187": {"6187": disparity}}
+    outputs = maps.get(output)
     if outputs is None:  # a certainty, a coarse guess, the disparity itself
         certainty = g("Exp", g("Neg", g("ReduceMin", cost, axes=[1], keepdims=1)))
         guess = g("AveragePool", g("AveragePool", half, kernel_shape=[2, 2], strides=[2, 2], ceil_mode=1),

@@ -85,6 +85,16 @@ def test_what_a_killed_recorder_leaves(tmp_path: Path) -> None:
         assert any("rosbag reindex" in finding.fix for finding in check_folder(path))
 
 
+def test_a_ros1_message_of_another_form_than_in_ros2_keeps_no_pictures_back(tmp_path: Path) -> None:
+    """Nobody asked for it; whoever does is told."""
+    rows = [*files.stereo_rows(ROS1), ("/tool", files.marker(START), START)]
+    path = files.write_rosbag1(tmp_path / "a.bag", rows)
+    assert_frames(play(path), list(range(COUNT)))
+    assert "/tool" in {row["topic"] for row in bag_info(path)["topics"]}
+    with pytest.raises(SagsError, match="damaged visualization_msgs/msg/Marker"):
+        list(read_messages(path))
+
+
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])
 @pytest.mark.parametrize("padding", [0, 5])
 def test_raw_encodings(encoding: str, padding: int, tmp_path: Path) -> None:

@@ -223,6 +223,15 @@ def test_other_models_are_refused(model: str, tmp_path: Path) -> None:
         open_session(said_bag(tmp_path, [eyes(80.0)], model=model))
 
 
+def test_turned_pictures_need_a_calibration_of_their_own(tmp_path: Path) -> None:
+    """As pictures that are cut need one: camera_info is of what the cameras send."""
+    path, turned = said_bag(tmp_path, [eyes(80.0)]), "source.geometry.flip:=both"
+    with pytest.raises(UsageError, match=r"camera_info is of .*flip: both turns .*leave flip out.*set rig"):
+        open_session(path, [turned])
+    save_rig(open_session(path).rig, tmp_path / "rig")
+    assert open_session(path, [turned, f"rig:={tmp_path / 'rig'}"]).rig.left.K[0, 0] == 80
+
+
 # ---- topics and clocks -----------------------------------------------------------------------------------
 
 

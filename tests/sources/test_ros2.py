@@ -42,6 +42,9 @@ def test_the_calibration_and_the_tf_of_a_graph_are_taken() -> None:
     try:
         with sending(stereo_sender("dds", DOMAIN, "size=640x512")):
             rig = read_rig(config(), seconds=60)
+            turned = config().model_copy(update={"geometry": GeometryConfig(flip="horizontal")})
+            with pytest.raises(UsageError, match=r"flip: horizontal turns them: .* set rig"):
+                read_rig(turned, seconds=60)
             stamp = until(lambda: robot.track.newest_ns)
             assert robot.track.at(stamp)[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
     finally:

@@ -424,6 +424,7 @@ SHEARED = np.eye(4) + np.eye(4, k=1)
         ),
         (replaced(POSE, b"{"), "data/frame_data 1: no JSON with a camera-pose of numbers"),
         (replaced(POSE, b'{"camera-pose": "here"}'), "data/frame_data 1: no JSON with a camera-pose"),
+        (replaced(POSE, b'{"camera-pose": [1%s]}' % (400 * b"0")), "data/frame_data 1: no JSON with a cam"),
         (replaced(POSE, b'{"camera-pose": [[1, 0], [0, 1]]}'), "data/frame_data 1: camera-pose is not a rot"),
         (
             replaced(POSE, json.dumps({"camera-pose": SHEARED.tolist()}).encode()),

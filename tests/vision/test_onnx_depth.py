@@ -118,7 +118,7 @@ FIXED = (WIDTH, HEIGHT)
             PAIR | {"inputs": ("init_left", "init_right", "first", "second")},
         ),
         ({"size": (300, "h")}, OPEN),
-        ({"size": (300, "h")}, PAIR | {"size": (400, 240)}),  # the height alone is open
+        ({"size": (300, "h")}, PAIR | {"size": (300, 240)}),  # the height alone is open
         ({"names": ("left", "a_right")}, OPEN | {"inputs": ("left", "a_right")}),  # the right one is first
         ({"factor": -1.0}, OPEN | {"scale": -1}),  # RAFT-Stereo's
         ({"factor": 1 / 320}, OPEN | {"scale": 320}),  # widths of the picture
@@ -162,6 +162,19 @@ def test_metadata_sidecar_and_launch_file_say_more_in_this_order(scene: Scene, t
     assert error(load(path, scene, scale=-1.0), scene) > 5
 
 
+def test_a_name_of_digits_is_a_name(scene: Scene, tmp_path: Path) -> None:
+    """PyTorch gives such names; in YAML they are numbers."""
+    said = {"inputs": "[10, 11]", "output": "6187"}
+    path = save_matcher(tmp_path / "network.onnx", names=("10", "11"), output="6187", metadata=said)
+    more = {key: value for key, value in OPEN.items() if key != "inputs"}
+    assert error(load(path, scene, **more), scene) < 0.6
+    path = save_matcher(path, names=("10", "11"), output="6187")
+    path.with_suffix(".yaml").write_text("inputs: [10, 11]\noutput: 6187\n")
+    assert error(load(path, scene, **more), scene) < 0.6
+    vision = load_launch(None, ["vision.onnx.inputs:=[10, 11]", "vision.onnx.output:=6187"]).vision
+    assert (vision.onnx.inputs, vision.onnx.output) == (("10", "11"), "6187")
+
+
 @pytest.mark.parametrize("key", ["inputs", "normalization", "multiple", "output", "meaning"])
 def test_what_is_missing_is_named_with_what_the_file_says(key: str, scene: Scene, tmp_path: Path) -> None:
     path = save_matcher(tmp_path / "network.onnx", output="several")
@@ -197,6 +210,9 @@ AS_ODD = {"normalization": "unit", "multiple": 1, "meaning": "disparity"}
         (MATCHER, "", "meaning: inverse_depth", "meaning: a stereo network gives disparity or depth"),
         (MATCHER, "", "inputs: [left, right]", "inputs: its inputs are first, second"),
         (MATCHER, "", "output: depth", "output: its outputs are disparity"),
+        (MATCHER, "", "scale: 0", "network.yaml: scale: .*should not be 0"),
+        ({"x": [1, 3, 64, 96]}, "same", "size: [128, 96]", "size: 128x96 px, but its file takes 96x64 alone"),
+        ({"x": [1, 3, "h", 96]}, "same", "size: [128, 96]", "size: 128x96 px, but its file takes 96x96 alo"),
         ({"x": [1, 10]}, "same", "", "network.onnx: input x is 1x10; a picture is"),
         ({"x": [4, 3, "h", "w"]}, "same", "", "network.onnx: .*batch size 1"),
         ({"a": PICTURE, "b": PICTURE, "c": PICTURE}, "same", "", r"network.onnx takes 3 inputs \(a, b, c\)"),

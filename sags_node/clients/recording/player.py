@@ -166,12 +166,12 @@ class Player:
         first_ns, began_ns, first_epoch = 0, 0, self._epoch
         self._frames.clear()
         clock = PlayClock(0, options.rate, self._wall_ns)
-        for message in read_messages(self._path):
+        for message in read_messages(self._path, wanted=self._is_wanted):
             if not first_ns:
                 first_ns = message.log_ns + round(options.start_offset * 1e9)
                 clock = PlayClock(first_ns, options.rate, self._wall_ns)
             after = (message.log_ns - first_ns) * 1e-9
-            if after < 0 or not self._is_wanted(message):
+            if after < 0 or not self._is_wanted(message.topic, message.type):
                 continue
             if options.playback_duration is not None and after > options.playback_duration:
                 return
@@ -242,10 +242,10 @@ class Player:
                 f"{', '.join(sorted(there))}"
             )
 
-    def _is_wanted(self, message: BagMessage) -> bool:
-        name = self._name(message.topic)
+    def _is_wanted(self, topic: str, kind: str) -> bool:
+        name = self._name(topic)
         options = self._options
-        if not cdr.knows(message.type):
+        if not cdr.knows(kind):
             return False  # it could not be described to anybody
         if options.clock_hz is not None and name == CLOCK_TOPIC:
             return False  # there is one clock
