@@ -47,7 +47,7 @@ LINES = {
     "sags_node/instruments": 820,
     "sags_node/field": 1747,
     "sags_node/kernels": 1231,
-    "sags_node/mapping": 5587,
+    "sags_node/mapping": 5588,
     "sags_node/media": 896,
     "sags_node/messaging": 5366,
     "sags_node/model": 1094,

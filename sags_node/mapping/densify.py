@@ -11,6 +11,7 @@ from numba import prange
 
 from sags_node.engine.interface import BEHIND_SURFACE
 from sags_node.engine.losses.pieces import LEVEL
+from sags_node.engine.rasterizer.views import SOLID
 from sags_node.geometry import project
 from sags_node.kernels.jit import PIECE, inlined, kernel, parallel_kernel
 from sags_node.mapping.initialise import insert
@@ -20,7 +21,7 @@ from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I32, U8, Bool, Observation
 from sags_node.vision.depth_grid import depth_at, grid_of
 
-HOLE_ALPHA = 0.4  # below this a tissue pixel is a hole; 0.8 would count the gaps between small Gaussians
+HOLE_ALPHA = float(SOLID)  # below this a tissue pixel is a hole; 0.8 would count gaps of small Gaussians
 RESIDUAL_NEW_SURFACE = 0.2  # RGB residual, summed: above it a pixel nearer than the model is new surface
 RESIDUAL_DETAIL = 0.45  # summed over RGB: with the right depth, detail is missing
 GRID = 4  # px between candidates

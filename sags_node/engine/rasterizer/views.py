@@ -15,7 +15,7 @@ f4 = np.float32
 u8 = np.uint64
 ZERO, ONE = f4(0.0), f4(1.0)
 FAINT = f4(1e-3)  # below this coverage a colour means nothing
-SOLID = f4(0.4)  # coverage from which on a depth is stated: below it `densify` sees a hole
+SOLID = f4(0.4)  # coverage from which on a depth is stated; below it a pixel of tissue is a hole
 
 
 def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> RenderedView:
