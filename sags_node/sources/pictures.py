@@ -59,6 +59,7 @@ class Pairs:
         count: pairs as announced; a video may end earlier.
         rate: the recording's own; None: it does not know it.
         stamps: [count, 2] ns, of the left and the right picture; None: they are even.
+        later: how much later the right picture of an even pair was taken, periods.
         pixel_aspect: width of a pixel over its height, as far as the recording says it.
         oddities: what is to be said of its files, each with a remedy after a semicolon.
         cut_off: why pairs are missing at its end, with a remedy after a semicolon; "": none are.
@@ -73,6 +74,7 @@ class Pairs:
     left_numbers: I64 | None = None
     rate: float | None = None
     stamps: I64 | None = None
+    later = 0.0
     pixel_aspect = 1.0
     oddities: Sequence[str] = ()
     cut_off = ""

@@ -258,7 +258,9 @@ class Replay:
 
     def _skew(self, index: int) -> int:
         """How much later the right picture was taken, ns."""
-        return 0 if self._stamps is None else int(self._stamps[index, 1] - self._stamps[index, 0])
+        if self._stamps is None:
+            return round(self.pairs.later * 1e9 / (self.rate * self._config.stride))
+        return int(self._stamps[index, 1] - self._stamps[index, 0])
 
     def _is_too_late(self, frame_id: int) -> bool:
         """Tell whether to leave this frame out.

@@ -207,6 +207,7 @@ class OneVideoPairs(Pairs):
         left = 0
         if layout.is_sequential:
             turns, left = _turns(video), layout.order.index("left")
+            self.later = 0.5 - left
             seconds = 1 + np.flatnonzero((turns[1:] % 2 == 1) & (np.diff(turns) == 1))
             self._numbers = np.stack([seconds - 1, seconds], axis=1)
             lefts = np.cumsum(turns % 2 == left)

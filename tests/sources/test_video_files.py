@@ -189,6 +189,18 @@ def test_a_lost_picture_exchanges_no_eyes(tmp_path: Path, first: str) -> None:
     assert numbers_of(frames) == [pair if first == "left" else pair[::-1] for pair in pairs]
 
 
+@pytest.mark.parametrize("lost", [(), (17,)], ids=["even", "a picture lost"])
+@pytest.mark.parametrize(("first", "later"), [("left", 1), ("right", -1)])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_eyes_in_turn_keep_the_time_between_them(
+    tmp_path: Path, lost: tuple[int, ...], first: str, later: int, stride: int
+) -> None:
+    scope = eye(tmp_path / "scope.mp4", without(*lost))
+    config = pair_of(tmp_path, scope, None, layout="frame_sequential", first=first)
+    for frame in played(config.model_copy(update={"stride": stride})):
+        assert abs(frame.t_capture_right_ns - frame.t_capture_ns - later * 1e9 / RATE) < 1e5
+
+
 def test_playing_begins_where_it_is_told_and_keeps_the_files_pace(tmp_path: Path) -> None:
     """A pause of 20 s: no picture is early, and `source.start` is a time of the file."""
     seconds = [n / RATE + (20 if n >= 15 else 0) for n in ALL]
