@@ -35,6 +35,7 @@ MATRICES = (
     "projection_matrix",
 )  # k d r p
 SIDES = ("left.yaml", "right.yaml")
+NOT_THEIRS = "projection_by: cv2.stereoRectify\n"  # R and P stood in no file: see `StereoRig.says_P`
 
 
 def content_of(file: Path, fix: str = "check the path") -> bytes:
@@ -56,8 +57,10 @@ def read_folder(folder: Path) -> StereoRig:
         UsageError: a file is missing or malformed.
     """
     fix = "a rig is a folder with left.yaml and right.yaml"
-    eyes = (_read_eye(content_of(file, fix), str(file)) for file in eye_files(folder))
-    return StereoRig(folder.resolve().name, *eyes)
+    contents = {str(file): content_of(file, fix) for file in eye_files(folder)}
+    eyes = (_read_eye(content, file) for file, content in contents.items())
+    says_P = not any(NOT_THEIRS.encode() in content for content in contents.values())
+    return StereoRig(folder.resolve().name, *eyes, says_P=says_P)
 
 
 def read_one(file: Path, baseline: float) -> StereoRig:
@@ -134,9 +137,10 @@ def save_rig(rig: StereoRig, folder: Path) -> None:
     """
     check_folder(folder)
     left_file, right_file = eye_files(folder)
+    said = "" if rig.says_P else NOT_THEIRS
     with whole(left_file) as left, whole(right_file) as right:
-        left.write_text(eye_text(rig.left, "left"), encoding="utf-8")
-        right.write_text(eye_text(rig.right, "right"), encoding="utf-8")
+        left.write_text(eye_text(rig.left, "left") + said, encoding="utf-8")
+        right.write_text(eye_text(rig.right, "right") + said, encoding="utf-8")
 
 
 def eye_text(eye: Eye, name: str) -> str:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from bag_files import BASELINE, HEIGHT, MS, ROS2, START, WIDTH, Row, eye_of, picture, play
+from command_line import ran
 from places import SESSION
 
 from sags_node.config.launch_file import load_launch
@@ -45,9 +46,10 @@ def test_names_that_say_it(name: Path | str, rectified: bool) -> None:
     assert named_rectified(name) is rectified
 
 
+@pytest.mark.parametrize("converted", [False, True])
 @pytest.mark.parametrize("says_P", [False, True])
 def test_a_calibration_that_does_not_say_P_is_told_of(
-    says_P: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    says_P: bool, converted: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Who rectified the pictures may have kept all of them, with another focal length."""
     rig, file = load_rig(SESSION / "calib"), tmp_path / "stereo.yml"
@@ -60,6 +62,10 @@ def test_a_calibration_that_does_not_say_P_is_told_of(
     for name, matrix in matrices.items():
         storage.write(name, matrix)
     storage.release()
+    if converted:
+        code, _, said = ran("calib", "convert", file, "-o", tmp_path / "converted", "--scale", "0.5")
+        assert code == 0, said
+        file = tmp_path / "converted"
     as_named(load_rig(file), Path("left_rectified"), Path("right_rectified"))
     assert ("does not say how pictures were rectified" in caplog.text) != says_P
 
