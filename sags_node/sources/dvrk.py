@@ -83,9 +83,9 @@ class DvrkPairs(OneVideoPairs):
         video = Video(file.parent / Path(sidecar.video_file).name)  # a name cannot lead out of the folder
         first = GeometryConfig(layout="side_by_side", first="left" if order == "LR" else "right")
         super().__init__(video, Layout(first))
-        self.pixel_aspect, self.oddities = 1.0, ()  # the sidecar knows better how the video was made
+        self.pixel_aspect = 1.0  # the sidecar knows better how the video was made
         try:
-            self.stamps = _stamps(file, sidecar, video)
+            self.stamps, self.oddities = _stamps(file, sidecar, video)
         except UsageError:
             self.close()
             raise
@@ -136,20 +136,30 @@ def read_sidecar(file: Path) -> Sidecar:
     return sidecar
 
 
-def _stamps(file: Path, sidecar: Sidecar, video: Video) -> I64:
-    stamps = np.array([frame.stamps() for frame in sidecar.frames], np.int64)
+def _stamps(file: Path, sidecar: Sidecar, video: Video) -> tuple[I64, list[str]]:
+    """Return the stamps [N, 2] of the video's frames, ns, and what is odd about them."""
+    stamps, oddities = np.array([frame.stamps() for frame in sidecar.frames], np.int64), []
     if len(stamps) != video.count:
-        stamps = stamps[_nearest_frames(file, sidecar, video)]
+        found, longer = _nearest_frames(file, sidecar, video)
+        stamps = stamps[found]
+        if longer:
+            lost, other = (video.path, file) if longer > 0 else (file, video.path)
+            oddities = [
+                f"{lost} is {abs(longer) * 1e-6:.0f} ms shorter than {other}, and both are taken to begin "
+                f"together: stamps are {'early' if longer > 0 else 'late'} by as much if it lacks the first "
+                "frames, not the last ones; see whether pictures and the robot's poses move together"
+            ]
     if (np.diff(stamps[:, 0]) < 0).any():
         turn = int(np.argmax(np.diff(stamps[:, 0]) < 0)) + 1
         raise UsageError(
             f"{file}: the stamp of frame {turn} lies before that of the frame before; play the MP4 {ALONE}"
         )
-    return stamps
+    return stamps, oddities
 
 
-def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> I64:
-    """Find for each frame of the video the one of the sidecar at the same presentation time."""
+def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> tuple[I64, int]:
+    """Find for each frame of the video the one of the sidecar at the same presentation time; and how much
+    longer than the video the sidecar is, ns, 0 if not by half a period."""
     pts = [frame.gst.pts_ns for frame in sidecar.frames]
     known = np.array([-1 if at is None else at for at in pts], np.int64)
     if (known < 0).any() or video.stamps is None or (np.diff(known) < 0).any():
@@ -157,4 +167,7 @@ def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> I64:
             f"{file} lists {len(known)} frames but {video.path} holds {video.count}, and there are no rising "
             f"presentation times to join them by; play the MP4 {ALONE}"
         )
-    return nearest(video.stamps - video.stamps[0], known - known[0])
+    shown, listed = video.stamps - video.stamps[0], known - known[0]
+    longer = int(listed[-1] - shown[-1])
+    half = 0.5 * float(np.median(np.diff(shown))) if len(shown) > 1 else 0.0
+    return nearest(shown, listed), longer if abs(longer) > half else 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -327,7 +328,23 @@ def test_a_dvrk_video_with_other_frames_than_its_sidecar(tmp_path: Path) -> None
     folder = write_session(tmp_path / "session", frames)
     with Replay(DvrkSource(path=folder, pace="step")) as source:
         stamps = [(frame.t_capture_ns - START) // MS for frame in source]
+        assert not source.pairs.oddities
     assert stamps == [0, 40, 80, 80, 200, 200, 240, 280]
+
+
+@pytest.mark.parametrize(
+    ("listed", "said"),
+    [
+        (10, r"stereo\.mp4 is 80 ms shorter than .*\.json, .* stamps are early by as much"),
+        (6, r"stereo\.json is 80 ms shorter than .*\.mp4, .* stamps are late by as much"),
+    ],
+)
+def test_a_dvrk_video_that_lacks_its_beginning_or_end_is_told_of(
+    listed: int, said: str, tmp_path: Path
+) -> None:
+    folder = write_session(tmp_path / "session", [frame_record(number) for number in range(listed)])
+    with Replay(DvrkSource(path=folder, pace="step")) as source:
+        assert re.search(said, source.pairs.findings[0].what)
 
 
 @pytest.mark.parametrize(
