@@ -62,7 +62,7 @@ class OnnxSession:
 
     Attributes:
         inputs: in the file's order.
-        outputs: their names.
+        outputs: names of those that are tensors.
         description: what the file says of both, for messages.
         metadata: what the file says of itself.
         processor: "cuda" or "cpu", where it runs.
@@ -101,8 +101,13 @@ class OnnxSession:
                 str(path), options, providers=wanted, enable_fallback=0
             )
             declared, given = self._session.get_inputs(), self._session.get_outputs()
-            self.outputs: tuple[str, ...] = tuple(output.name for output in given)
             self.description = f"inputs: {_in_words(declared)}; outputs: {_in_words(given)}"
+            tensors = (output.name for output in given if output.type.startswith("tensor("))
+            self.outputs: tuple[str, ...] = tuple(tensors)
+            if not self.outputs:
+                raise UsageError(
+                    f"{self.name} gives no tensor: outputs: {_in_words(given)}; export its map by itself"
+                )
             self.metadata: Mapping[str, str] = self._session.get_modelmeta().custom_metadata_map
             self.inputs = tuple(self._tensor(tensor) for tensor in declared)
         except UsageError:
@@ -123,8 +128,7 @@ class OnnxSession:
             values = self._session.run(self.outputs, dict(feeds))
         except Exception as error:  # as above
             raise DepthNetworkError(f"{self.name} failed: {_first_line(error)}") from None
-        named = zip(self.outputs, values, strict=True)
-        return {name: value for name, value in named if isinstance(value, np.ndarray)}
+        return dict(zip(self.outputs, values, strict=True))
 
     def _tensor(self, declared: Any) -> Tensor:
         if declared.type not in TYPES:
@@ -292,6 +296,12 @@ def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tupl
         raise UsageError(
             f"{name}: size: {said.size[0]}x{said.size[1]} px, but its file takes {sizes} alone: set that, or "
             "leave size out"
+        )
+    sides = [(one.width or 0, one.height or 0) for one in found]  # 0: open
+    if said.multiple is not None and all(map(all, sides)) and np.any(np.array(sides) % said.multiple):
+        raise UsageError(
+            f"{name}: multiple: {said.multiple} px, but file or size fix {sides[-1][0]}x{sides[-1][1]}: "
+            "leave multiple out, or change size where the file leaves sides open"
         )
     return tuple(found)
 

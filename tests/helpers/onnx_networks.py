@@ -53,7 +53,7 @@ class Graph:
             self.nodes,
             "network",
             [helper.make_tensor_value_info(name, kind, shape) for name, (kind, shape) in inputs.items()],
-            [helper.make_tensor_value_info(name, FLOAT, None) for name in outputs],
+            [helper.make_empty_tensor_value_info(name) for name in outputs],  # ONNX Runtime infers types
             self.constants,
         )
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
@@ -183,12 +183,13 @@ def save_table(
 
 
 def save_odd(path: Path, inputs: Mapping[str, Sequence[Any]], output: str) -> Path:
-    """No depth network: any inputs, and an output that is `same` or `small`."""
+    """No depth network: any inputs, and an output that is `same`, `small` or a `sequence`."""
     g = Graph()
     first = next(iter(inputs))
     made = {
         "same": lambda: g("Identity", first),
         "small": lambda: g("AveragePool", first, kernel_shape=[3, 3], strides=[3, 3]),
+        "sequence": lambda: g("SequenceConstruct", first),
     }[output]()
     g.named("out", made)
     return g.save(path, {name: (FLOAT, shape) for name, shape in inputs.items()}, ["out"])
