@@ -59,8 +59,8 @@ def read_messages(
     Args:
         topics: only these; None: all.
         start_ns: leave out what was recorded before.
-        wanted: by topic and type, whose data is used; None: all. Of a ROS 1 bag other data stays as it is:
-            its type may have another form in ROS 2, as `Marker` has.
+        wanted: by topic and type, whose data is used; None: all. Other data stays as it is: of ROS 1, where
+            types may have another form, as `Marker` has, or of another encoding than CDR, as JSON.
 
     Raises:
         UsageError: there is no bag at `path`, or it is of a form that is not read.
@@ -70,7 +70,7 @@ def read_messages(
     for file in files:
         with _explained(file):
             if file.suffix == ".mcap":
-                found = _read_mcap(file, topics, start_ns)
+                found = _read_mcap(file, topics, start_ns, wanted)
             else:
                 found = _read_with_rosbags(file, topics, start_ns, wanted)
             for message in found:
@@ -216,7 +216,9 @@ def _explained(file: Path) -> Iterator[None]:
 # ---- MCAP ------------------------------------------------------------------------------------------------
 
 
-def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Iterator[BagMessage]:
+def _read_mcap(
+    file: Path, topics: Collection[str] | None, start_ns: int, wanted: Wanted | None
+) -> Iterator[BagMessage]:
     size = file.stat().st_size
     channels, session, epoch = Channels(), "", 0
     with open_file(file) as opened:
@@ -237,7 +239,8 @@ def _read_mcap(file: Path, topics: Collection[str] | None, start_ns: int) -> Ite
                     channels.read_missed(opened)
                 channel, schema = channels.of(record, head.position)
                 if record.log_ns >= start_ns and (topics is None or channel.topic in topics):
-                    if channel.message_encoding != "cdr":
+                    used = wanted is None or wanted(channel.topic, schema.name)
+                    if used and channel.message_encoding != "cdr":
                         raise UsageError(
                             f"{file}: topic {channel.topic} is encoded as {channel.message_encoding!r}; only "
                             "ROS 2 messages (cdr) are read"
@@ -294,7 +297,7 @@ class Channels:
     def __init__(self) -> None:
         self.missed: list[Head] = []  # chunks that were passed over unread
         self._channels: dict[int, Channel] = {}
-        self._schemas: dict[int, Schema] = {}
+        self._schemas = {0: Schema(0, b"", "", "")}  # of a channel without one, as of JSON
 
     def add(self, record: Schema | Channel) -> None:
         if isinstance(record, Schema):

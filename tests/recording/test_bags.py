@@ -19,6 +19,7 @@ from sags_node.bags.bag import read_messages
 from sags_node.bags.pictures import decode_picture
 from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
+from sags_node.clients.recording.recover import recover
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import BagSource
 from sags_node.errors import SagsError, UsageError
@@ -93,6 +94,34 @@ def test_a_ros1_message_of_another_form_than_in_ros2_keeps_no_pictures_back(tmp_
     assert "/tool" in {row["topic"] for row in bag_info(path)["topics"]}
     with pytest.raises(SagsError, match="damaged visualization_msgs/msg/Marker"):
         list(read_messages(path))
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_topic_of_json_keeps_no_pictures_back(named: bool, tmp_path: Path) -> None:
+    """As Foxglove's programs write beside those of ROS, with a schema or without; recovered it stays JSON."""
+    file = tmp_path / "bag.mcap"
+    with file.open("wb") as opened:
+        writer = McapWriter(opened)
+        writer.start()
+        schema = writer.register_schema("Notes", "jsonschema", b"{}") if named else 0
+        notes = writer.register_channel("/notes", "json", schema)
+        writer.add_message(notes, START, b'{"said": 1}', START)
+        known: dict[str, int] = {}
+        for topic, message, stamp in files.stereo_rows(ROS2):
+            kind = message.__msgtype__
+            if topic not in known:
+                known[topic] = writer.register_channel(
+                    topic, "cdr", writer.register_schema(kind, "ros2msg", b"")
+                )
+            writer.add_message(known[topic], stamp, bytes(ROS2.serialize_cdr(message, kind)), stamp)
+        writer.finish()
+    recover(file, tmp_path / "recovered")
+    for path in (file, tmp_path / "recovered"):
+        assert_frames(play(path), list(range(COUNT)))
+        (row,) = (row for row in bag_info(path)["topics"] if row["topic"] == "/notes")
+        assert (row["type"], row["messages"]) == ("Notes" if named else "", 1)
+        with pytest.raises(UsageError, match=r"topic /notes is encoded as 'json'; only ROS 2 messages"):
+            list(read_messages(path, ["/notes"]))
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])

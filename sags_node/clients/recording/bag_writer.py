@@ -50,6 +50,7 @@ class _Topic:
     type: str  # ROS 2 name
     type_hash: str
     latched: bool  # late subscribers get the last message too
+    encoding: str
 
 
 @dataclass(slots=True)
@@ -98,6 +99,7 @@ class BagWriter:
         type_hash: str = "",
         latched: bool = False,
         marks: Mapping[str, str] | None = None,
+        encoding: str = "cdr",
     ) -> int:
         """Announce a topic; its number for `write`.
 
@@ -106,6 +108,7 @@ class BagWriter:
             schema: its definition; the number in it is not used.
             latched: late subscribers get the last message too (durability transient_local).
             marks: more metadata of its channel, see `bag.marks_of`.
+            encoding: of its messages.
         """
         key = (schema.name, schema.encoding, schema.data)
         if key not in self._schemas:
@@ -117,9 +120,9 @@ class BagWriter:
         }
         schema_id = self._schemas[key]
         channel: int = self._say_first(
-            lambda writer: writer.register_channel(name, "cdr", schema_id, metadata)
+            lambda writer: writer.register_channel(name, encoding, schema_id, metadata)
         )
-        self._topics[channel] = _Topic(name, kind, type_hash, latched)
+        self._topics[channel] = _Topic(name, kind, type_hash, latched, encoding)
         return channel
 
     def write(
@@ -243,7 +246,7 @@ def _described(parts: Sequence[_Part], topics: Mapping[int, _Topic]) -> dict[str
                 "topic_metadata": {
                     "name": topic.name,
                     "type": topic.type,
-                    "serialization_format": "cdr",
+                    "serialization_format": topic.encoding,
                     "offered_qos_profiles": _quality(topic.latched),
                     "type_description_hash": topic.type_hash,
                 },

@@ -81,7 +81,7 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
     except BaseException:
         bag.discard()
         raise
-    read_back = sum(1 for _ in read_messages(out))
+    read_back = sum(1 for _ in read_messages(out, wanted=lambda topic, kind: False))
     if read_back != done.messages:
         raise SagsError(f"{out} holds {read_back} of {done.messages} messages; is the disk sound?")
     return {"folder": str(out), **asdict(done), "lost": done.lost}
@@ -110,7 +110,8 @@ class _Writer:
 
     def write(self, entry: Entry, channel: Channel, schema: Schema) -> None:
         metadata, marks = channel.metadata, marks_of(channel)
-        key = (channel.topic, schema.name, schema.data, *marks.items())
+        encoding = channel.message_encoding
+        key = (channel.topic, encoding, schema.name, schema.data, *marks.items())
         if key not in self._known:
             latched = "transient_local" in metadata.get("offered_qos_profiles", "")
             self._known[key] = self._bag.add_topic(
@@ -120,6 +121,7 @@ class _Writer:
                 metadata.get("topic_type_hash", ""),
                 latched,
                 marks,
+                encoding,
             )
         self._bag.write(self._known[key], entry.log_ns, entry.publish_ns, entry.sequence, entry.data)
         self.done.messages += 1
