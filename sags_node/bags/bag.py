@@ -37,7 +37,7 @@ Wanted = Callable[[str, str], bool]  # by topic and type
 @dataclass(frozen=True, slots=True)
 class BagMessage:
     topic: str  # as written, usually with a leading slash
-    type: str  # ROS 2 name, e.g. sensor_msgs/msg/Image
+    type: str  # ROS 2 name, e.g. sensor_msgs/msg/Image; of `cdr.OTHER_IN_ROS1` that of ROS 1
     log_ns: int  # when it was recorded
     publish_ns: int
     sequence: int  # 0 where the format has none
@@ -59,8 +59,8 @@ def read_messages(
     Args:
         topics: only these; None: all.
         start_ns: leave out what was recorded before.
-        wanted: by topic and type, whose data is used; None: all. Other data stays as it is: of ROS 1, where
-            types may have another form, as `Marker` has, or of another encoding than CDR, as JSON.
+        wanted: by topic and type, whose data is used; None: all. Other data stays as it is, also of another
+            encoding than CDR, as JSON.
 
     Raises:
         UsageError: there is no bag at `path`, or it is of a form that is not read.
@@ -358,8 +358,10 @@ def _read_with_rosbags(
             if len(raw) > MAX_RECORD_BYTES:
                 raise DamagedError(0, f"a message of {len(raw)} bytes on {connection.topic}")
             turned = ros1 and (wanted is None or wanted(connection.topic, connection.msgtype))
-            data = cdr.from_ros1(raw, connection.msgtype) if turned else raw
-            yield BagMessage(connection.topic, connection.msgtype, log_ns, log_ns, 0, data)
+            data, kind = cdr.from_ros1(raw, connection.msgtype) if turned else raw, connection.msgtype
+            if ros1 and kind in cdr.OTHER_IN_ROS1:
+                kind = kind.replace("/msg/", "/")  # its name in ROS 1: that of ROS 2 says another form
+            yield BagMessage(connection.topic, kind, log_ns, log_ns, 0, data)
 
 
 @contextmanager

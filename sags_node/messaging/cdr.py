@@ -38,6 +38,11 @@ POSE = "geometry_msgs/msg/PoseStamped"
 NODES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 UINT32_FIELDS = ("id", "id_high")
 PACKED_FIELDS = (*UINT32_FIELDS, "rgb")  # 32-bit words that are no numbers on a scale
+OTHER_IN_ROS1 = {  # types of that name have other fields there
+    "sensor_msgs/msg/Range", "shape_msgs/msg/SolidPrimitive", "visualization_msgs/msg/Marker",
+    "visualization_msgs/msg/MarkerArray",
+    *(f"visualization_msgs/msg/InteractiveMarker{part}" for part in ("", "Control", "Init", "Update")),
+}  # fmt: skip
 _POINT_FIELD_UINT32, _POINT_FIELD_FLOAT32 = 6, 7
 
 _store = get_typestore(Stores.ROS2_JAZZY)
@@ -112,12 +117,12 @@ def decode(data: Buffer, type_name: str) -> Any:
 
 
 def from_ros1(raw: bytes, type_name: str) -> bytes:
-    """The CDR of a ROS 1 message; one of a type that is not stock stays as it is.
+    """The CDR of a ROS 1 message; one of a type that is not stock, or another one there, stays as it is.
 
     Raises:
         WireError: it is damaged.
     """
-    if not knows(type_name):
+    if not knows(type_name) or type_name in OTHER_IN_ROS1:
         return raw
     try:
         return bytes(_store.ros1_to_cdr(raw, type_name))

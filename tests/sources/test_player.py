@@ -133,6 +133,23 @@ def test_compressed_pictures_are_played_raw(tmp_path: Path) -> None:
     assert seen[names[2]].array.shape == (HEIGHT, WIDTH)
 
 
+def test_a_type_that_ros_2_has_not_is_left_out_and_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """ROS 1 has another `Marker`; what is beside it is played."""
+    rows = [
+        *bag_files.stereo_rows(bag_files.ROS1, 2),
+        ("/tool", bag_files.marker(bag_files.START), bag_files.START),
+    ]
+    path = bag_files.write_rosbag1(tmp_path / "a.bag", rows)
+    played = Player(path, PlayOptions(), served(tmp_path / "run")).play()
+    assert played["messages"] == len(rows) - 1
+    assert caplog.text.count("/tool is left out: its type visualization_msgs/Marker") == 1
+    caplog.clear()
+    Player(path, PlayOptions(exclude=("/tool",)), served(tmp_path / "run")).play()
+    assert "/tool" not in caplog.text
+
+
 COLOR = bag_files.picture(0, 0)
 GREY = np.ascontiguousarray(COLOR[..., 1])
 MOSAIC = cv2.cvtColor(GREY, cv2.COLOR_BayerRG2RGB)

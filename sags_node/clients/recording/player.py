@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 import threading
 import time
@@ -25,6 +26,8 @@ from sags_node.messaging.freshness import STALE_AFTER
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.wire import Buffer
 from sags_node.wall_clock import WallClock
+
+log = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.02  # how soon pause and stop are noticed
 STAMPS_KEPT = 1024
@@ -121,6 +124,7 @@ class Player:
         self._frame_count = 0
         self._same_clock: dict[str, bool] = {}  # by topic: the recorder's clock stamped its first message
         self._session = ""  # recorded one of the last message
+        self._unknown = set[str]()  # topics that were said to be left out
 
     def stop(self) -> None:
         self._stopping.set()
@@ -245,11 +249,16 @@ class Player:
     def _is_wanted(self, topic: str, kind: str) -> bool:
         name = self._name(topic)
         options = self._options
-        if not cdr.knows(kind):
-            return False  # it could not be described to anybody
         if options.clock_hz is not None and name == CLOCK_TOPIC:
             return False  # there is one clock
-        return (not options.topics or name in options.topics) and name not in options.exclude
+        if (options.topics and name not in options.topics) or name in options.exclude:
+            return False
+        if not cdr.knows(kind):  # it could not be described to anybody
+            if topic not in self._unknown:
+                log.warning("%s is left out: its type %s is not one of ROS 2's own", topic, kind or "-")
+                self._unknown.add(topic)
+            return False
+        return True
 
     def _name(self, topic: str) -> str:
         """The name under which a topic of the bag is published."""
