@@ -25,7 +25,7 @@ def follow(u: float, v: float, frames: int | None) -> None:
         if newest is None:
             raise SagsError(f"no frame came: {node.problem(ANCHORS)}")
         session = newest.meta.session  # of the node; in another one that number is another anchor's
-        pinned = control.request("add_anchor", {"u": u, "v": v})["id"]
+        pinned, came = control.request("add_anchor", {"u": u, "v": v})["id"], False
         try:
             while frames is None or frames > 0:
                 newest = node.wait(ANCHORS, timeout=1.0, after=newest)
@@ -35,9 +35,12 @@ def follow(u: float, v: float, frames: int | None) -> None:
                 if newest.meta.session != session:
                     raise SagsError("the node was started anew: its anchors are gone; start this again")
                 rows = newest.points[newest.points["id"] == pinned]
+                if came and not len(rows):
+                    session = ""  # there is nothing to remove
+                    raise SagsError("somebody else removed the point; start this again")
                 if not len(rows):
-                    continue  # pinned in a frame after this one; or the model was reset
-                (row,) = rows
+                    continue  # it was pinned in a frame after this one
+                (row,), came = rows, True
                 if row["confidence"] < SURE:
                     print("not recognised: show nothing")
                 elif row["depth_confidence"] < SURE or not newest.metric:

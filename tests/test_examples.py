@@ -8,6 +8,8 @@ import runpy
 import signal
 import subprocess
 import sys
+import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,12 +19,13 @@ import numpy as np
 import pytest
 from bridging import SEEN, anchored_at, sockets
 from places import ROOT, SESSION
-from synthetic import stream
+from synthetic import plane_result, stream
 from waiting import until
 
 from sags_node.errors import SagsError
 from sags_node.messaging.received import ReceivedCloud, ReceivedText
 from sags_node.messaging.subscriber import Subscriber
+from sags_node.types import FrameResult
 
 pytestmark = [pytest.mark.live, pytest.mark.alone]
 
@@ -104,6 +107,33 @@ def test_a_point_is_not_followed_into_another_session_of_the_node(tmp_path: Path
         with sockets(tmp_path / "sags", node(2)) as running, stream(running, anchored_at):
             _, errors = example.communicate(timeout=60)
     assert example.returncode == 1 and "started anew" in errors and asked == [(1, "add")]
+
+
+def test_a_point_that_was_removed_is_followed_no_more(tmp_path: Path) -> None:
+    asked: list[str] = []
+    handlers = {
+        "add_anchor": lambda args: asked.append("add") or {"id": SEEN},
+        "remove_anchor": lambda args: asked.append("remove"),
+    }
+    removed = threading.Event()
+
+    def frame(number: int) -> FrameResult:
+        result = anchored_at(number)
+        return replace(result, anchors=plane_result().anchors) if removed.is_set() else result
+
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, ROOT / "examples/follow_point.py", "20", "20"]
+    with (
+        subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as example,
+        sockets(tmp_path / "sags", handlers) as running,
+        stream(running, frame),
+    ):
+        assert "m" in example.stdout.readline()
+        removed.set()
+        _, errors = example.communicate(timeout=60)
+    assert example.returncode == 1 and "somebody else removed the point" in errors and asked == ["add"]
 
 
 @pytest.fixture
