@@ -39,7 +39,7 @@ public sealed class Message {
         var found = new List<Anchor>();
         for (int row = 0; row < Head.shape[0]; row++) {
             Func<string, int> at = name => row * names.Length + Array.IndexOf(names, name);
-            Func<string, float> of = name => FloatAt(at(name));
+            Func<string, float> of = name => names.Contains(name) ? FloatAt(at(name)) : 0; // an older node does not send it: not sure
             if (float.IsNaN(of("x"))) continue;
             found.Add(new Anchor { Id = BitConverter.ToUInt32(Data, 4 * at("id")), X = of("x"), Y = of("y"), Z = of("z"),
                 U = of("u"), V = of("v"), Visibility = of("visibility"), Confidence = of("confidence"), DepthConfidence = of("depth_confidence") });
@@ -63,6 +63,7 @@ public sealed class SagsClient : IDisposable {
     double Now { get { return watch.Elapsed.TotalMilliseconds; } }
     double asked = double.NegativeInfinity, answered = double.NegativeInfinity;
     bool waiting; // for an answer: `asked` is of that one
+    double heard; // when the last bytes came
     volatile string problem = "not connected";
 
     public SagsClient(string url, double maxAge, params string[] topics) {
@@ -92,14 +93,8 @@ public sealed class SagsClient : IDisposable {
                     await socket.ConnectAsync(new Uri(url), stop.Token);
                     waiting = false;
                     await Say(socket, "{\"subscribe\": [\"" + string.Join("\",\"", topics) + "\"]}");
-                    while (true) {
-                        if (!waiting && Now - asked > ClockEvery) {
-                            asked = Now;
-                            waiting = true;
-                            await Say(socket, "{\"id\": 1, \"op\": \"get_clock\"}");
-                        }
-                        await Receive(socket);
-                    }
+                    heard = Now;
+                    while (true) await Receive(socket);
                 }
             } catch (Exception error) { // no gateway, or something that is none
                 lock (newest) { newest.Clear(); ahead.Clear(); }
@@ -114,12 +109,23 @@ public sealed class SagsClient : IDisposable {
         return socket.SendAsync(new ArraySegment<byte>(System.Text.Encoding.UTF8.GetBytes(words)), WebSocketMessageType.Text, true, stop.Token);
     }
 
+    async Task AskClock(ClientWebSocket socket) {
+        if (Now - heard > ClockKnown) throw new IOException("the gateway is silent"); // not even its clock comes: connect anew
+        if (waiting || Now - asked < ClockEvery) return;
+        asked = Now;
+        waiting = true;
+        await Say(socket, "{\"id\": 1, \"op\": \"get_clock\"}");
+    }
+
     async Task Receive(ClientWebSocket socket) {
         int length = 0;
         WebSocketReceiveResult got;
         do {
             if (length == buffer.Length) Array.Resize(ref buffer, 2 * length);
-            got = await socket.ReceiveAsync(new ArraySegment<byte>(buffer, length, buffer.Length - length), stop.Token);
+            var coming = socket.ReceiveAsync(new ArraySegment<byte>(buffer, length, buffer.Length - length), stop.Token);
+            do await AskClock(socket); while (await Task.WhenAny(coming, Task.Delay(100)) != coming);
+            got = await coming;
+            heard = Now;
             length += got.Count;
             if (got.MessageType == WebSocketMessageType.Close || length > MaxMessage) throw new IOException("the connection was closed");
         } while (!got.EndOfMessage);

@@ -7,12 +7,14 @@ import re
 import shutil
 import struct
 import subprocess
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,9 +76,14 @@ def running(program: Path, port: int) -> AbstractContextManager[subprocess.Popen
 
 
 def until_line(process: subprocess.Popen[str], start: str) -> str:
-    while not (line := process.stdout.readline()).startswith(start):
-        assert line, "it ended"  # it is killed by the test's own time limit, at the latest
-    return line
+    guard = threading.Timer(60, process.kill)
+    guard.start()
+    try:
+        while not (line := process.stdout.readline()).startswith(start):
+            assert line, f"it ended, or waited in vain for {start}"
+        return line
+    finally:
+        guard.cancel()
 
 
 def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_path: Path) -> None:
@@ -101,6 +108,18 @@ def test_it_shows_depth_colour_and_anchors_and_nothing_old(program: Path, tmp_pa
     assert int(first[0]) == SEEN and float(first[1]) == pytest.approx(0.07) and len(anchors.split(";")) == 3
 
 
+@pytest.mark.fault("gateway: the node behind it is started anew")
+def test_it_shows_the_next_node_as_well(program: Path, tmp_path: Path) -> None:
+    with (
+        bridged(run_web, options_of(WebOptions, tmp_path, port=0)) as port,
+        running(program, port) as process,
+    ):
+        for _ in range(2):
+            with sockets(tmp_path) as node, stream(node, anchored_at):
+                until_line(process, "stamp_ns=")
+            until_line(process, "stale")
+
+
 def test_the_part_for_unity_compiles(program: Path, tmp_path: Path) -> None:
     """Against the signatures that Unity's manual names; Unity itself is not here."""
     (tmp_path / "Unity.cs").write_text(UNITY)
@@ -114,13 +133,14 @@ def message(topic: str, encoding: str, shape: list[int], data: bytes, **changes:
     return struct.pack("<I", len(text)) + text + data
 
 
-def frame(stamp: int, **said: object) -> list[bytes]:
+def frame(stamp: int, columns: str = "x,y,z,id", anchors: bytes = b"", **said: object) -> list[bytes]:
     """All that the program shows of one frame, of 2 x 2 pixels."""
+    width = columns.count(",") + 1
     pixels, metres = np.full((2, 2, 4), 9, np.uint8).tobytes(), np.full(4, 0.07, "<f4").tobytes()
     return [
         message("sags/left/render/image", "rgba8", [2, 2, 4], pixels, stamp_ns=stamp),
         message("sags/left/render/depth", "32FC1", [2, 2], metres, stamp_ns=stamp, **said),
-        message("sags/anchors", "x,y,z,id", [0, 4], b"", stamp_ns=stamp),
+        message("sags/anchors", columns, [len(anchors) // (4 * width), width], anchors, stamp_ns=stamp),
     ]
 
 
@@ -167,6 +187,49 @@ def test_a_false_gateway_does_not_end_it(program: Path) -> None:
     assert len(attempts) > len(broken)
 
 
+@contextmanager
+def frames_of(program: Path, **said: Any) -> Iterator[subprocess.Popen[str]]:
+    """The program at a gateway that sends `frame` each time it is asked for the clock."""
+
+    def attend(connection: ServerConnection) -> None:
+        while True:
+            asked = json.loads(connection.recv())
+            if "op" in asked:
+                connection.send(json.dumps(answer(asked)))
+            for each in frame(time.time_ns(), **said):
+                connection.send(each)
+
+    with gateway(program, attend) as process:
+        yield process
+
+
+def test_what_an_older_node_does_not_send_is_not_sure(program: Path) -> None:
+    """It is not what stands beside it: the last of the row before."""
+    columns, rows = "x,y,z,id,u,v,visibility,confidence", np.zeros((2, 8), "<f4")
+    rows[:, 3], rows[:, 6:] = np.array([3, 4], "<u4").view("<f4"), 1
+    with frames_of(program, columns=columns, anchors=rows.tobytes()) as process:
+        found = LINE.fullmatch(until_line(process, "stamp_ns="))
+    assert found is not None and found[6] == "3:0:1:0;4:0:1:0"
+
+
+@pytest.mark.fault("gateway: falls silent without closing, as when a cable is pulled")
+def test_a_gateway_that_fell_silent_is_connected_to_again(program: Path) -> None:
+    connections: list[int] = []
+
+    def attend(connection: ServerConnection) -> None:
+        connections.append(len(connections))
+        while True:
+            asked = json.loads(connection.recv())
+            if connections[-1] > 0:
+                if "op" in asked:
+                    connection.send(json.dumps(answer(asked)))
+                for each in frame(time.time_ns()):
+                    connection.send(each)
+
+    with gateway(program, attend) as process:
+        until_line(process, "stamp_ns=")
+
+
 @pytest.mark.fault("link: slow, to a client in C#")
 @pytest.mark.parametrize("late", [1.2, 2.2])
 def test_pictures_that_come_late_are_old_also_where_the_clock_s_answers_are_as_late(
@@ -197,13 +260,5 @@ def test_pictures_that_come_late_are_old_also_where_the_clock_s_answers_are_as_l
 
 
 def test_lengths_without_a_unit_are_not_said_to_be_millimetres(program: Path) -> None:
-    def attend(connection: ServerConnection) -> None:
-        while True:
-            asked = json.loads(connection.recv())
-            if "op" in asked:
-                connection.send(json.dumps(answer(asked)))
-            for each in frame(time.time_ns(), units="relative"):
-                connection.send(each)
-
-    with gateway(program, attend) as process:
+    with frames_of(program, units="relative") as process:
         assert " depth_no_unit=0.07 " in until_line(process, "stamp_ns=")

@@ -24,12 +24,13 @@ from browsers import new_page
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
 from thin_sender import making, node_sockets
-from waiting import until
+from waiting import beside, until
 
 pytest.importorskip("websockets", reason="no gateway without: pip install '.[bridges]'")
 
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.sync.server import ServerConnection, serve
 
 from sags_node.clients.bridge import web as gateway
 from sags_node.clients.bridge.relay import MAX_AGE
@@ -281,6 +282,25 @@ def test_a_browser_draws_what_comes_and_goes_blank(page: Any, tmp_path: Path) ->
     for color, (u, v) in zip(colors, result.anchors.pixels[[0, 1, 3]].astype(int), strict=True):
         ring = raw["marks"][v - 8 : v + 9, u - 8 : u + 8].reshape(-1, 4).astype(int)
         assert np.abs(ring[np.argmax(ring[:, 3])][:3] - color).max() < 20
+
+
+@pytest.mark.fault("gateway: falls silent without closing, as when a cable is pulled")
+def test_a_page_connects_again_to_a_gateway_that_fell_silent(page: Any, web: int) -> None:
+    """Which hears it and never answers, so that nothing is closed."""
+    connections: list[str] = []
+
+    def attend(connection: ServerConnection) -> None:
+        connections.append("one")
+        for _ in connection:
+            pass
+
+    with serve(attend, "127.0.0.1", 0) as silent, beside(silent.serve_forever, silent.shutdown):
+        page.goto(f"http://127.0.0.1:{web}/")
+        page.wait_for_function("() => window.sags")
+        port = silent.socket.getsockname()[1]
+        page.evaluate("(url) => { new window.sags.constructor(url); }", f"ws://127.0.0.1:{port}/ws")
+        until(lambda: len(connections) > 1)
+        page.goto("about:blank")
 
 
 def test_the_page_says_that_lengths_have_no_unit(page: Any, tmp_path: Path) -> None:

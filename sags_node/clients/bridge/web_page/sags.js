@@ -19,7 +19,10 @@ export class Sags {
     this.connect();
     const look = () => { this.look(); requestAnimationFrame(look); }; // before each time the page is painted
     look();
-    setInterval(() => this.askClock(), CLOCK_EVERY);
+    setInterval(() => {
+      if (performance.now() - this.heardAt > CLOCK_KNOWN) this.socket.onclose(); // not even its clock comes: connect anew
+      else this.askClock();
+    }, CLOCK_EVERY);
   }
 
   show(topic, canvas) {
@@ -57,9 +60,16 @@ export class Sags {
   connect() {
     this.socket = new WebSocket(this.url);
     this.socket.binaryType = "arraybuffer";
+    this.heardAt = performance.now();
     this.socket.onopen = () => { this.subscribe(); this.askClock(); };
-    this.socket.onmessage = ({ data }) => (typeof data === "string" ? this.heard(JSON.parse(data)) : this.came(data));
+    this.socket.onmessage = ({ data }) => {
+      this.heardAt = performance.now();
+      if (typeof data === "string") this.heard(JSON.parse(data)); else this.came(data);
+    };
     this.socket.onclose = () => {
+      Object.assign(this.socket, { onopen: null, onmessage: null, onclose: null }); // one that hangs may close much later
+      this.socket.close();
+      this.heardAt = Infinity; // until it is connected anew
       for (const topic of this.topics.keys()) this.takeBack(topic, "no gateway");
       for (const { reject } of this.waiting.values()) reject(new Error("the connection was closed"));
       this.waiting.clear();
