@@ -18,6 +18,7 @@ MIN_RATE = 0.9  # of what the sender sends, or of the declared rate
 ENOUGH = 6  # messages that tell the period
 UNKNOWN_PERIOD = 0.1  # s, at most, until so many have come: who begins slowly must not be believed for long
 SESSIONS = 8  # of nodes that another one followed; each start of a node has a new one
+TWO_NODES = "two nodes send under this name; stop one of them, or give it another ns"
 MAX_CLOCK_AHEAD = 1.0  # s; beyond it an age says nothing
 
 
@@ -67,6 +68,11 @@ class Freshness:
         return True
 
     @property
+    def is_mixed(self) -> bool:
+        """A node that another one had followed came back."""
+        return self._mixed > 0
+
+    @property
     def period(self) -> float:
         """Seconds between two messages of the sender: declared, or the median of the capture stamps."""
         if self._rate_hz is not None:
@@ -101,7 +107,7 @@ class Freshness:
         if self.last is None:
             return "nothing received yet"
         if self._mixed:
-            return "two nodes send under this name; stop one of them, or give it another ns"
+            return TWO_NODES
         return self._untimely(self.last, now_ns, max_age) if self._periodic else None
 
     def _untimely(self, last: Meta, now_ns: int, max_age: float | None) -> str | None:

@@ -156,6 +156,19 @@ def test_a_node_that_was_started_anew_is_played_as_such(limits: Limits, tmp_path
     assert all(of_session.setdefault(session, said[0]) == said[0] for (session, _), said in came.items())
 
 
+@pytest.mark.fault("network: two nodes send under one name while it is recorded")
+@pytest.mark.parametrize("sessions", ["aaabbb", "ababab"])
+def test_two_nodes_under_one_name_are_told_of(
+    sessions: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One that is started anew is not."""
+    with recorded(tmp_path) as (sender, recorder, _):
+        for seq, session in enumerate(sessions, 1):
+            sender.send(message_of("status", cdr.string(session), seq, session=session))
+        until(lambda: recorder.summary()["messages"] == len(sessions))
+    assert caplog.text.count("two nodes send under this name") == (sessions == "ababab")
+
+
 def test_a_prediction_stays_one_when_it_is_played(tmp_path: Path) -> None:
     picture, name = cdr.image(np.ones((4, 4), np.uint8), "mono8", 1), "view/a/image"
     with recorded(tmp_path) as (sender, recorder, _):

@@ -25,7 +25,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder
 from sags_node.messaging import cdr, topics
 from sags_node.messaging.address import THE_NODE, NodeAddress
-from sags_node.messaging.freshness import Freshness
+from sags_node.messaging.freshness import TWO_NODES, Freshness
 from sags_node.messaging.stream import listen_to
 
 log = logging.getLogger(__name__)
@@ -77,6 +77,7 @@ class Recorder:
         self._rejected = 0
         self._why_rejected: str | None = None  # the first one
         self._refused: set[str] = set()  # thin pictures that the node cannot make
+        self._is_mixed = False  # two nodes are recorded, and it was said
         self._bytes = 0
         self._free: int | None = None  # bytes of the disk
         self._kept_s = 0.0  # in the ring
@@ -170,6 +171,9 @@ class Recorder:
                     continue
                 topic = self._topics.setdefault(message.topic, _Topic())
                 if topic.fresh.accept(message.meta):  # a last value sent again is nothing new
+                    if topic.fresh.is_mixed and not self._is_mixed:
+                        log.warning("%s: %s; both are recorded", message.topic, TWO_NODES)
+                        self._is_mixed = True
                     yield Arrived(message, received_ns)
 
     def _refuse(self, topic: str, why: str) -> None:
