@@ -209,6 +209,7 @@ class _Child:
         self.has_begun = False
         self.progress: dict[str, Any] = {}  # once a second
         self.ended: str | None = None  # why, where nobody has asked for it
+        self._owes = False  # an answer
         self._errors = tempfile.TemporaryFile(
             "w+", errors="replace"
         )  # a pipe that is full would stop the child
@@ -225,9 +226,18 @@ class _Child:
         return self._process.poll() is None
 
     def ask(self, line: str) -> None:
-        """Send a line; answers to earlier ones that came too late are forgotten."""
+        """Send a line; an answer to the one before that came too late is forgotten.
+
+        Raises:
+            SagsError: that one has not come yet; it would be taken for the answer to this line.
+        """
         while not self._lines.empty() and self._next_line(0.0) is not None:
-            pass
+            self._owes = False
+        if self._owes and self.is_running:
+            raise SagsError(
+                f"the recorder of {self.folder} still writes the snapshot before; ask again later"
+            )
+        self._owes = True
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(f"{line}\n")
@@ -242,7 +252,9 @@ class _Child:
             SagsError: it has ended instead.
             TimeoutError: it says nothing.
         """
-        return self._said(self._next_line(seconds))
+        line = self._next_line(seconds)
+        self._owes = False
+        return self._said(line)
 
     def finish(self, seconds: float) -> Any:
         """Let it end; the last line it says.

@@ -128,6 +128,31 @@ def test_a_ring_takes_the_next_free_name_and_outlives_a_snapshot_that_fails(
     recorder.stop().result(ANSWER)
 
 
+@pytest.mark.fault("process: the recorder is late with a snapshot")
+def test_a_late_snapshot_is_not_taken_for_the_next_one(
+    recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder.start({"path": str(tmp_path / "ring"), "snapshot_seconds": 5}).result(ANSWER)
+    (process,) = recorders()
+    os.kill(process, signal.SIGSTOP)
+    with monkeypatch.context() as patched:
+        patched.setattr(child, "SNAPSHOT_SECONDS", 0.2)
+        with pytest.raises(SagsError, match="no snapshot came from the recorder"):
+            recorder.snapshot().result(ANSWER)
+    with pytest.raises(SagsError, match="still writes the snapshot before; ask later"):
+        recorder.snapshot().result(ANSWER)
+    os.kill(process, signal.SIGCONT)
+
+    def next_one() -> dict[str, object] | None:
+        try:
+            return recorder.snapshot().result(ANSWER)
+        except SagsError as error:
+            assert "still writes" in str(error)
+            return None
+
+    assert until(next_one)["snapshot"] == str(tmp_path / "ring/snapshot_001")
+
+
 @pytest.mark.fault("process: the recorder does not begin")
 def test_a_recorder_that_does_not_begin_is_ended(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
