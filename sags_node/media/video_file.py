@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import av
 import numpy as np
 
 from sags_node.types import U8
+
+log = logging.getLogger(__name__)
 
 TICKS = 90_000  # a second: usual rates are whole multiples of one
 LONGEST_STEP = 60 * TICKS  # between two pictures; a longer one is another recording
@@ -28,6 +31,7 @@ class VideoFile:
     """
 
     def __init__(self, path: Path, rate: float, size: tuple[int, int]) -> None:
+        self._name = path.name
         rate = min(max(rate, RATES[0]), RATES[1])
         self._file = av.open(f"file:{path}", "w", format="mp4", options={"movflags": "faststart"})
         self._stream = self._file.add_stream("libx264", Fraction(rate).limit_denominator(1000))
@@ -46,7 +50,7 @@ class VideoFile:
 
         Args:
             stamp_ns: when it was captured: as long after the one before it is shown. Where stamps begin anew
-                it follows the one before. None: at the rate.
+                it follows the one before; so it does after a minute, which is said. None: at the rate.
 
         Raises:
             OSError: it cannot be written.
@@ -56,6 +60,13 @@ class VideoFile:
             if self._first_ns is None:
                 self._first_ns = stamp_ns
             at = (stamp_ns - self._first_ns) * 1e-9 * TICKS + self._shift
+            if at >= self._at + LONGEST_STEP:
+                log.warning(
+                    "%s: a pause of %.0f s is left out at %.1f s",
+                    self._name,
+                    (at - self._at) / TICKS,
+                    self._at / TICKS,
+                )
             if not self._at < at < self._at + LONGEST_STEP:
                 self._shift += after - at
                 at = after

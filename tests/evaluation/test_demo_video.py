@@ -6,9 +6,11 @@ from pathlib import Path
 
 import av
 import numpy as np
+import pytest
 
 from sags_node.clients.overlay.draw import over
 from sags_node.clients.overlay.save import Layers, read_layers
+from sags_node.media.video import Video
 from sags_node.media.video_file import VideoFile
 from sags_node.tools.demo import Shown
 from sags_node.types import U8
@@ -63,6 +65,21 @@ def test_an_overlay_that_was_killed_leaves_what_it_had_written(tmp_path: Path) -
     for length in range(len(whole) // 2, len(whole), 101):
         file.write_bytes(whole[:length])
         assert set(read_layers(file)) == {4}
+
+
+@pytest.mark.parametrize(
+    ("pause", "length", "said"), [(59, 60, ""), (90, 2, "pause of 90 s is left out at 1.0 s")]
+)
+def test_a_long_pause_is_left_out_and_said(
+    pause: int, length: int, said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = VideoFile(tmp_path / "video.mp4", 1, (WIDTH, HEIGHT))
+    for second in (0, 1, 1 + pause):
+        file.add(np.zeros((HEIGHT, WIDTH, 3), np.uint8), 10**9 * second)
+    file.finish()
+    stamps = Video(tmp_path / "video.mp4").stamps
+    assert stamps is not None and stamps[-1] - stamps[0] == 10**9 * length
+    assert said in caplog.text and ("pause" in caplog.text) == bool(said)
 
 
 def test_its_file_is_what_browsers_play(tmp_path: Path) -> None:
