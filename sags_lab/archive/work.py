@@ -97,17 +97,20 @@ class Outcome:
     host: str
 
 
-def work(recording: Recording, plan: Plan, key: str, program: Sequence[str] = PROGRAM) -> Outcome:
+def work(
+    recording: Recording, plan: Plan, key: str, program: Sequence[str] = PROGRAM, here: str | None = None
+) -> Outcome:
     """Do one recording. Whatever is wrong with it is in the outcome; nothing is raised for that.
 
     Args:
         program: what the job's arguments are given to.
+        here: the revision of `program` on this machine; default: ours.
     """
     began, frames = time.monotonic(), 0
     state: State = "done"
     reason = ""
     try:
-        frames = _work(recording, plan, key, program)
+        frames = _work(recording, plan, key, program, here or revision())
     except _FailedError as error:
         state, reason = error.state, str(error)
     except UsageError as error:
@@ -126,10 +129,10 @@ class _FailedError(Exception):
         self.state = state
 
 
-def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str]) -> int:
+def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str], here: str) -> int:
     """`work`; the frames of the recording, where the job counts them."""
-    if revision() != plan.version:
-        raise SagsError(f"this machine has sags-node {revision()}, not {plan.version}; install that")
+    if here != plan.version:
+        raise SagsError(f"this machine has sags-node {here}, not {plan.version}; install that")
     began, store = time.monotonic(), Store(plan.out)
     with scratch() as stage, store.partial(recording.id) as out:
         place, rig = fetched(recording, stage, plan.limits.staged_gb)

@@ -12,9 +12,9 @@ from sags_lab.archive.store import RESULTS, Store
 from sags_lab.archive.work import Outcome, Plan, work
 from sags_node.config.schema import PhantomSource
 from sags_node.phantom import write_session
-from sags_node.tools.evaluation.provenance import revision
 
 TINY_FRAMES = 6
+QUICK = "quick"  # a revision: that of the checkout may change meanwhile
 
 
 def write_tiny_session(folder: Path, seed: int) -> None:
@@ -26,7 +26,7 @@ def write_tiny_session(folder: Path, seed: int) -> None:
 
 def quick_work(recording: Recording, plan: Plan, key: str) -> Outcome:
     """`work` with `quick_job` in place of `sags`."""
-    return work(recording, plan, key, (str(Path(__file__).with_name("quick_job.py")),))
+    return work(recording, plan, key, (str(Path(__file__).with_name("quick_job.py")),), QUICK)
 
 
 def write_quick_recordings(folder: Path, count: int, **said: Any) -> list[Recording]:
@@ -41,7 +41,7 @@ def write_quick_recordings(folder: Path, count: int, **said: Any) -> list[Record
 
 
 def quick_plan(out: Path, *overrides: str, **limits: Any) -> Plan:
-    return Plan("eval", overrides, (), str(out), revision(), Limits(**limits))
+    return Plan("eval", overrides, (), str(out), QUICK, Limits(**limits))
 
 
 def table(store: Store) -> list[dict[str, Any]]:
