@@ -1,7 +1,7 @@
 """The wall clock of another machine: how far it is ahead of this one's, and how sure that is.
 
 with NodeClock("tcp://node:5557") as clock, Subscriber(names, "tcp://node:5556", clock=clock) as subscriber:
-    subscriber.age("left/render/depth")  # by the node's clock
+    subscriber.ok("left/render/depth")  # it is new enough, by the node's clock
 """
 
 from __future__ import annotations
