@@ -432,7 +432,7 @@ def test_a_recording_of_the_same_name_is_another_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("changed", ["launch.yaml", "calib/left.yaml"])
 def test_what_the_frames_are_made_from_is_another_when_a_file_was_changed(
-    tmp_path: Path, changed: str
+    tmp_path: Path, changed: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     recording = tmp_path / "clip"
     write_tiny_session(recording, seed=0)
@@ -441,6 +441,7 @@ def test_what_the_frames_are_made_from_is_another_when_a_file_was_changed(
     assert sags(*command).exit_code == 0
     before = first.stat().st_mtime_ns, first.read_bytes()
     assert sags(*command).exit_code == 0  # the same again goes on
+    assert "2 of 2 frames were there and stayed; --force makes all anew" in caplog.text
     assert (first.stat().st_mtime_ns, first.read_bytes()) == before
     file = recording / changed
     if changed == "launch.yaml":
@@ -448,12 +449,14 @@ def test_what_the_frames_are_made_from_is_another_when_a_file_was_changed(
     else:
         rig = read_rig(recording / "calib")
         file.write_text(file.read_text().replace(f"{rig.left.P[0, 2]}", f"{rig.left.P[0, 2] + 8}"))
-    refused(2, *command, said=("another launch file, calibration or fit", "--force"))
+    refused(2, *command, said=("another launch file, calibration, fit or version", "--force"))
     assert sags(*command, "--force").exit_code == 0
     assert first.read_bytes() != before[1]
 
 
-def test_the_state_of_a_sequence_tells_one_fit_from_the_next(tmp_path: Path) -> None:
+def test_the_state_of_a_sequence_tells_one_fit_and_version_from_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_tiny_session(tmp_path / "clip", seed=0)
     session = open_session(tmp_path / "clip", ["source.pace:=step"])
     with pytest.raises(UsageError, match=r"there is no .*checkpoint\.npz"):
@@ -465,6 +468,8 @@ def test_the_state_of_a_sequence_tells_one_fit_from_the_next(tmp_path: Path) -> 
         (tmp_path / "checkpoint.npz").write_text(said)
         states.append(sequence.state_of(session, tmp_path))
     assert states[0] == states[1] != states[2]
+    monkeypatch.setattr(sequence, "__version__", "0.0.1")
+    assert sequence.state_of(session, tmp_path) != states[2]
     session.source.stop()
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 
+from sags_node import __version__
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder, whole, writing
@@ -34,12 +35,14 @@ QUALITY = 98  # of the pictures kept for the way back, JPEG
 
 
 def state_of(session: Session, fit: Path | None) -> dict[str, str | None]:
-    """Digests of what the frames are made from: a file whose path is the same may hold something else now.
+    """Digests of what the frames are made from, a file whose path is the same may hold something else now;
+    and the version that makes them.
 
     Raises:
         UsageError: `fit` is no folder of a finished `sags fit`.
     """
     return {
+        "version": __version__,
         "configuration": digest(session.config.model_dump_json().encode()),
         "calibration": rig_digest(session.rig),
         "checkpoint": None if fit is None else digest(files_of_fit(fit)[0].read_bytes()),
@@ -70,8 +73,8 @@ def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
             same = False
         if not same:
             raise UsageError(
-                f"{folder} holds another sequence, or one of another launch file, calibration or fit; choose "
-                "another folder, or add --force"
+                f"{folder} holds another sequence, or one of another launch file, calibration, fit or "
+                "version; choose another folder, or add --force"
             )
     elif any(folder.iterdir()):
         raise UsageError(f"{folder} is not empty; choose another folder, or add --force")
@@ -129,6 +132,8 @@ def write_sequence(
             stamps.append(scene.t_capture_ns)
         if camera is None:
             raise SagsError("no frame shows anything to make a model of")
+        if kept:
+            log.warning("%d of %d frames were there and stayed; --force makes all anew", kept, kept + written)
         if held:
             log.warning("%d frames are left out, since they were not taken in (%s)", len(held), held[-1])
         loop = folder / LOOP
