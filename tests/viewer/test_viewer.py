@@ -406,6 +406,7 @@ def test_a_page_that_hears_nothing_covers_itself_and_a_folded_one_does_not(
     try:
         page.wait_for_function("() => document.elementFromPoint(300, 250)?.id === 'sags-still'")
         assert "no word from sags view for" in cover.text_content()
+        assert "Start it again, or mend the link" in cover.text_content()
     finally:
         view.process.send_signal(signal.SIGCONT)
     page.wait_for_function("() => document.getElementById('sags-still') === null")

@@ -20,7 +20,8 @@ SCRIPT = """<script>
   setInterval(() => {
     const silent = since === null ? 0 : (performance.now() - since) / 1000;
     if (silent < SILENT_AFTER || ++looks < 2) return cover.remove();
-    cover.textContent = `no word from sags view for ${silent.toFixed(0)} s: what was here is old`;
+    cover.textContent = `no word from sags view for ${silent.toFixed(0)} s: what was here is old. `
+      + "Start it again, or mend the link to it: the page comes back by itself";
     if (!cover.isConnected) document.body.append(cover);
   }, 250);
 })();
