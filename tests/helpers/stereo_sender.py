@@ -99,9 +99,10 @@ def main() -> None:
     else:
         send, left_out = dds(int(where), compressed, width / 320), lambda: 0
     print("sending", flush=True)
-    begun = time.monotonic()
+    due = time.monotonic()
     for number in range(round(SECONDS * rate)):
-        time.sleep(max(0.0, begun + number / rate - time.monotonic()))
+        time.sleep(max(0.0, due - time.monotonic()))
+        due = max(due, time.monotonic()) + 1 / rate  # as a camera: what it was late with comes in no burst
         left, right = pairs[number % len(pairs)]
         stamp_ns = time.time_ns()
         painted = stamp_ns // 1_000_000 % 60_000 if "clock" in said else number

@@ -141,7 +141,8 @@ def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
         options = RecordOptions(tmp_path / "ring", snapshot_seconds=0.6, node=NodeAddress(run_dir=run_dir))
         with stream(running), recording(options) as (recorder, said):
             for number in range(2):
-                time.sleep(1.2)
+                time.sleep(1.2)  # twice as long as is kept
+                until(lambda: recorder.summary()["kept_s"] > 0.2)  # also where this process stood still
                 recorder.snapshot()
                 until(lambda: len(said) > 1 + number)  # noqa: B023, used at once
     summary = said.pop()
