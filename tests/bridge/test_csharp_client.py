@@ -212,7 +212,7 @@ def test_what_an_older_node_does_not_send_is_not_sure(program: Path) -> None:
     assert found is not None and found[6] == "3:0:1:0;4:0:1:0"
 
 
-@pytest.mark.fault("gateway: falls silent without closing, as when a cable is pulled")
+@pytest.mark.fault("gateway: falls silent without closing, to a client in C#")
 def test_a_gateway_that_fell_silent_is_connected_to_again(program: Path) -> None:
     connections: list[int] = []
 

@@ -284,7 +284,7 @@ def test_a_browser_draws_what_comes_and_goes_blank(page: Any, tmp_path: Path) ->
         assert np.abs(ring[np.argmax(ring[:, 3])][:3] - color).max() < 20
 
 
-@pytest.mark.fault("gateway: falls silent without closing, as when a cable is pulled")
+@pytest.mark.fault("gateway: falls silent without closing, to a page")
 def test_a_page_connects_again_to_a_gateway_that_fell_silent(page: Any, web: int) -> None:
     """Which hears it and never answers, so that nothing is closed."""
     connections: list[str] = []
