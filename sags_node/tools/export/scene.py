@@ -195,7 +195,7 @@ def _read_fit(folder: Path, session: Session, advance: Advance) -> tuple[Fit, li
         settings = msgspec.convert(about["settings"], FitSettings)
         trained = set(about["frames"])
         tested = json.loads(figures.read_text(encoding="utf-8"))["heldout"]["frames"]
-    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
         raise SagsError(f"the fit in {folder} cannot be read: {error}; fit the recording again") from None
     count = session.source.frame_count
     clip = read_clip(
