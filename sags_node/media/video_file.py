@@ -9,6 +9,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+from av.video.reformatter import Colorspace
 
 from sags_node.types import U8
 
@@ -39,6 +40,7 @@ class VideoFile:
         self._stream.pix_fmt = "yuv420p"
         codec = self._stream.codec_context
         codec.time_base, codec.thread_count = Fraction(1, TICKS), 1
+        codec.colorspace = Colorspace.ITU601  # said, as players take HD that says nothing for BT.709
         self._stream.options = {"preset": "ultrafast", "crf": "22"}  # beside a node that needs the cores
         self._period = TICKS / rate
         self._first_ns: int | None = None

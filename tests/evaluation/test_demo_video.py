@@ -7,7 +7,9 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from av.video.reformatter import Colorspace
 
+from sags_node.clients.bridge.h264 import Encoder
 from sags_node.clients.overlay.draw import over
 from sags_node.clients.overlay.save import Layers, read_layers
 from sags_node.media.video import Video
@@ -96,3 +98,19 @@ def test_its_file_is_what_browsers_play(tmp_path: Path) -> None:
     np.testing.assert_allclose(levels, range(0, 200, 10), atol=4)
     data = (tmp_path / "video.mp4").read_bytes()
     assert data.index(b"moov") < data.index(b"mdat")
+
+
+@pytest.mark.parametrize("size", [(640, 512), (1280, 720)])
+def test_it_says_how_its_colours_are_coded(tmp_path: Path, size: tuple[int, int]) -> None:
+    """Players take HD that says nothing for BT.709; we write BT.601, and red would be 12 of 255 brighter."""
+    red = np.array([200, 60, 40], np.uint8)
+    file = VideoFile(tmp_path / "video.mp4", RATE, size)
+    file.add(np.full((size[1], size[0], 3), red, np.uint8))
+    file.finish()
+    shown = Video(tmp_path / "video.mp4").read(0)
+    assert shown is not None
+    np.testing.assert_allclose(shown[::9, ::9], np.broadcast_to(red, shown[::9, ::9].shape), atol=2)
+    (coded,) = av.CodecContext.create("h264", "r").decode(
+        av.Packet(Encoder().encode(np.full((size[1], size[0], 3), red, np.uint8)))
+    )
+    assert coded.colorspace == Colorspace.ITU601

@@ -309,6 +309,28 @@ def test_papers_count_with_the_masks_as_they_were_given(frames: list[StereoFrame
         assert margined[group]["psnr"] != plain[group]["psnr"]
 
 
+def test_instruments_that_cover_the_first_frames_leave_the_rest_measured(frames: list[StereoFrame]) -> None:
+    """There is no model then: nothing lies between it and the next frame, and no depth calls itself sure."""
+    nothing = np.zeros((HEIGHT, WIDTH), bool)
+    with Run() as run:
+        for frame in (frames[0], *frames[2:6]):
+            seen = replace(frame, tissue=nothing) if frame.frame_id == 0 else frame
+            result = frame_result(seen, SPEED)
+            if frame.frame_id == 0:
+                empty = round_gaussians(np.zeros((0, 3), np.float32), 0.001, np.zeros((0, 3), np.float32))
+                snapshot = replace(result.snapshot, gaussians=empty, velocities=np.zeros((0, 3), np.float32))
+                views = {"left": rasterize(empty, CAMERA)}
+                result = replace(result, snapshot=snapshot, views=views)
+            run.add(result, 21.0, frame.t_capture_ns)
+        rectifier, receipt = Rectifier(rig(), WIDTH, HEIGHT), Receipt(rig(), (WIDTH, HEIGHT), None)
+        measurer = Measurer(run, rectifier, CONFIG, DEFAULTS, receipt)
+        measurer.run(frames[:6], lambda what, done: None)
+    summary = summary_of(measurer)
+    assert summary["between"] is None and summary["heldout"] is not None
+    assert summary["online"]["psnr"] > 60
+    assert summary["depth_confidence"] is None
+
+
 def test_what_was_not_known_is_null(frames: list[StereoFrame]) -> None:
     blind = [replace(frame, reference=None) for frame in frames[:4]]
     options = MeasureOptions(hold_out=0, paper_psnr=True)

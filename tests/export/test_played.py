@@ -39,7 +39,7 @@ from sags_node.rig import read_rig
 from sags_node.sources.source import open_source
 from sags_node.tools.export import sequence
 from sags_node.tools.export.played import DEPTH_UNIT, TRACKS
-from sags_node.tools.export.scene import Scene
+from sags_node.tools.export.scene import Scene, from_session
 from sags_node.types import Camera, Gaussians, RectifiedPair
 from sags_node.vision.rectify import Rectifier
 
@@ -471,6 +471,13 @@ def test_the_state_of_a_sequence_tells_one_fit_and_version_from_the_next(
     monkeypatch.setattr(sequence, "__version__", "0.0.1")
     assert sequence.state_of(session, tmp_path) != states[2]
     session.source.stop()
+
+
+def test_a_time_of_whole_milliseconds_is_that_of_its_frame(tmp_path: Path) -> None:
+    """0.067 s are 67000000.00000001 ns: the frame of that stamp lay before them."""
+    write_tiny_session(tmp_path / "clip", seed=0)
+    session = open_session(tmp_path / "clip", ["source.pace:=step", f"source.rate:={1000 / 67}"])
+    assert from_session(session, 0.067, lambda *said: None).t_capture_ns == 67_000_000
 
 
 def test_files_of_something_else_stay_unless_forced(tmp_path: Path) -> None:

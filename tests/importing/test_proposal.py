@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import cv2
@@ -124,6 +125,17 @@ def test_the_file_plays_from_wherever_it_lies(tmp_path: Path, monkeypatch: pytes
     with open_source(config.source.model_copy(update={"pace": "step"}), references=False) as source:
         assert len(list(source)) == FRAMES
     refused(2, "new", tmp_path / "case", "-o", tmp_path / "mine.yaml", said=("exists already", "--force"))
+
+
+def test_what_is_odd_is_said_once_however_often_it_is_opened(tmp_path: Path) -> None:
+    for side, pictures in zip(EYES, (LEFT, RIGHT), strict=True):
+        (tmp_path / "case" / side).mkdir(parents=True)
+        for number, picture in enumerate(pictures):
+            if (side, number) != ("left", 3):
+                cv2.imwrite(str(tmp_path / "case" / side / f"{number}.png"), picture)
+    shutil.copytree(SESSION / "calib", tmp_path / "case/calib")
+    said = [each.what for each in propose([tmp_path / "case"]).findings]
+    assert len(said) == len(set(said)) and sum("no partner" in each for each in said) == 1
 
 
 def test_what_cannot_be_played_gets_no_file(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 import yaml
 from command_line import sags
 from mcap.reader import make_reader
+from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from recorded_plane import by_topic, content, record_plane, recording
 from rosbags.highlevel import AnyReader
@@ -22,7 +23,7 @@ from waiting import until
 
 from sags_node.bags.bag import read_messages
 from sags_node.bags.pictures import decode_picture
-from sags_node.clients.recording.bag_writer import Limits
+from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
 from sags_node.clients.recording.recorder import RecordOptions
@@ -132,6 +133,27 @@ def test_played_topics_are_named_as_info_prints_them(tmp_path: Path) -> None:
         ):
             with pytest.raises(UsageError, match=r"asked for as left/dept; it has .*left/depth"):
                 Player(bag, PlayOptions(**options), config).play()
+
+
+def test_a_bag_that_is_not_in_the_order_of_time_is_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As converters write it, one topic after the other: the second one would come as a burst at the end."""
+    kind, config = "std_msgs/msg/String", PublishConfig(data=(), control=None, run_dir=tmp_path / "played")
+    schema = Schema(id=0, name=kind, encoding="ros2msg", data=cdr.definition(kind).encode())
+    text = b"\0\1\0\0" + b"\2\0\0\0a\0"
+    for name, topics in {"after": ("a", "b"), "beside": ("a",)}.items():
+        with BagWriter(tmp_path / name) as bag:
+            for topic in topics:
+                channel = bag.add_topic(topic, kind, schema)
+                for number in range(10):
+                    stamp_ns = 10**18 + number * 100_000_000
+                    bag.write(channel, stamp_ns, stamp_ns, number, text)
+        caplog.clear()
+        Player(tmp_path / name, PlayOptions(rate=50.0), config).play()
+        told = [record.getMessage() for record in caplog.records]
+        assert len(told) == (name == "after")
+        assert all("b lies 0.9 s behind" in said and "ros2 bag convert" in said for said in told)
 
 
 def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from fractions import Fraction
 import av
 import numpy as np
 from av.video.frame import PictureType
+from av.video.reformatter import Colorspace
 
 from sags_node.clients.bridge.compressed import over_black
 from sags_node.types import U8
@@ -48,6 +49,7 @@ class Encoder:
         codec.width, codec.height, codec.pix_fmt = width, height, "yuv420p"
         codec.time_base = Fraction(1, round(RATE))
         codec.thread_count = 1
+        codec.colorspace = Colorspace.ITU601  # said, as decoders take HD that says nothing for BT.709
         bits = round(BITS_PER_PIXEL * width * height * RATE)
         codec.options = {
             "preset": "ultrafast",

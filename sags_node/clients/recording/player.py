@@ -125,6 +125,7 @@ class Player:
         self._same_clock: dict[str, bool] = {}  # by topic: the recorder's clock stamped its first message
         self._session = ""  # recorded one of the last message
         self._unknown = set[str]()  # topics that were said to be left out
+        self._is_unsorted = False  # the file is not in the order of time, which was said
 
     def stop(self) -> None:
         self._stopping.set()
@@ -167,7 +168,7 @@ class Player:
 
     def _play_once(self, publisher: Publisher) -> None:
         options = self._options
-        first_ns, began_ns, first_epoch = 0, 0, self._epoch
+        first_ns, newest_ns, began_ns, first_epoch = 0, 0, 0, self._epoch
         self._frames.clear()
         clock = PlayClock(0, options.rate, self._wall_ns)
         for message in read_messages(self._path, wanted=self._is_wanted):
@@ -182,6 +183,13 @@ class Player:
             self._wait_for(message.log_ns, clock, publisher)
             if self._stopping.is_set():
                 return
+            if message.log_ns < newest_ns - SAME_CLOCK and not self._is_unsorted:
+                self._is_unsorted = True
+                behind = (
+                    f"{message.topic} lies {(newest_ns - message.log_ns) * 1e-9:.1f} s behind what is later"
+                )
+                log.warning("%s: %s, and comes late: sort it by time (ros2 bag convert)", self._path, behind)
+            newest_ns = max(newest_ns, message.log_ns)
             if message.session != self._session:
                 if self._session:  # the node was started anew; a session that comes back is a second node
                     publisher.start_anew(uuid.uuid4().hex)

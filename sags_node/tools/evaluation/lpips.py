@@ -40,7 +40,7 @@ class Lpips:
         try:
             with np.load(weights, allow_pickle=False) as arrays:
                 self._weights = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-        except (OSError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise UsageError(f"cannot read LPIPS weights {weights}: {error}") from None
         missing = [name for name in _expected_names() if name not in self._weights]
         if missing:

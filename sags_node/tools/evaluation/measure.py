@@ -260,8 +260,10 @@ class Measurer:
                 lambda camera: self._view(after, shown.snapshot.gaussians, camera, 0),
             )
         self._learn(after)
-        if self._held is not None and now.seconds > self._earlier[0].recorded.seconds:
-            self._held.row.figures["between"] = self._between(self._earlier[0], self._held, after)
+        if self._held is not None:
+            before = self._earlier[0]
+            if now.seconds > before.recorded.seconds and len(before.shown.snapshot.gaussians):
+                self._held.row.figures["between"] = self._between(before, self._held, after)
         self._held = None
         self._earlier.appendleft(after)
         return replace(row, track=track, poses=self._poses(now.frame, pair, shown))

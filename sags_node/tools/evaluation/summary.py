@@ -115,7 +115,7 @@ def _quality(rows: Sequence[FrameRow], options: MeasureOptions) -> dict[str, dic
                 for key in keys
                 if options.paper_psnr or not key.startswith("paper_")
             }
-    tallies = [row.calibration for row in rows if row.calibration is not None]
+    tallies = [counts for row in rows if (counts := row.calibration) is not None and counts.any()]
     groups["depth_confidence"] = calibration.figures(tallies) if tallies else None
     groups["track"] = _track(rows)
     groups["pose"] = _pose(rows)

@@ -109,7 +109,7 @@ def from_session(session: Session, at: float | None, advance: Advance) -> Scene:
         held = scene.held
         taken = taken if held else scene
         advance(done + 1, count, "playing")
-        if at is not None and last_ns - first_ns >= at * 1e9:
+        if at is not None and last_ns - first_ns >= round(at * 1e9):
             break
     if taken is None or len(taken.gaussians) == 0:
         why = f": {held}" if held else ""
@@ -162,7 +162,8 @@ def from_fit(folder: Path, session: Session, at: float | None, advance: Advance)
     fit, frames = _read_fit(folder, session, advance)
     first_ns, last_ns = frames[0].t_capture_ns, frames[-1].t_capture_ns
     _check_time(session, at, first_ns, last_ns)
-    frame = next((f for f in frames if at is not None and f.t_capture_ns - first_ns >= at * 1e9), frames[-1])
+    from_ns = last_ns if at is None else first_ns + round(at * 1e9)
+    frame = next((f for f in frames if f.t_capture_ns >= from_ns), frames[-1])
     return Scene(fit.gaussians(frame), frame.camera, frame.t_capture_ns)
 
 
@@ -195,7 +196,7 @@ def _read_fit(folder: Path, session: Session, advance: Advance) -> tuple[Fit, li
         settings = msgspec.convert(about["settings"], FitSettings)
         trained = set(about["frames"])
         tested = json.loads(figures.read_text(encoding="utf-8"))["heldout"]["frames"]
-    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
         raise SagsError(f"the fit in {folder} cannot be read: {error}; fit the recording again") from None
     count = session.source.frame_count
     clip = read_clip(

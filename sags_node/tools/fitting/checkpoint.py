@@ -65,7 +65,7 @@ def load(fit: Fit, path: Path) -> None:
         about = json.loads(str(arrays.pop("about")))
         version, settings = about["version"], about["settings"]
         frames, progress = about["frames"], about["progress"]
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
         raise SagsError(f"cannot resume from {path}: {error}; start without --resume") from None
     if version != VERSION:
         raise UsageError(f"{path} was made by another version of this software; start without --resume")

@@ -77,7 +77,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
         judged = [] if apart else calibrated(config, folder)
         return plays + (judged if is_wrong(plays) else as_warnings(judged))
 
-    found = _once(found + _tried("frames", look))
+    found = once(found + _tried("frames", look))
     if is_wrong(found):
         return [*found, Finding("ok", f"to play it: when that is fixed: sags run {_quoted(folder)}")]
     stands_for = f", which stands for {' '.join(map(_quoted, launch))}" if launch else ""
@@ -109,7 +109,7 @@ def overrides_of(path: Path) -> list[str]:
     return [*with_rig, RECTIFIED] if rectified_before(load_launch(path, with_rig)) else with_rig
 
 
-def _once(found: list[Finding]) -> list[Finding]:
+def once(found: list[Finding]) -> list[Finding]:
     """Return what is wrong is met by several who look; the first says it."""
     said: list[str] = []
     kept = []
@@ -170,7 +170,7 @@ def played(config: LaunchConfig) -> list[Finding]:
     if is_wrong(found):
         return found
     what = "calibration" if config.robot is None else "calibration or robot"
-    return found + _tried(what, lambda: _fits(config.model_copy(update={"source": source})))
+    return once(found + _tried(what, lambda: _fits(config.model_copy(update={"source": source}))))
 
 
 def _frames(source: Recording | PhantomSource) -> list[Finding]:

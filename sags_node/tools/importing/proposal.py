@@ -19,7 +19,7 @@ from sags_node.sources.source import recorded_rig
 from sags_node.tools.calibration.eyes import look
 from sags_node.tools.calibration.pictures import pairs_of_session
 from sags_node.tools.importing import pictures, videos
-from sags_node.tools.importing.check import calibrated, overrides_of, played
+from sags_node.tools.importing.check import calibrated, once, overrides_of, played
 from sags_node.tools.importing.folder import is_video, override
 
 DEVICES = Path("/dev")
@@ -65,7 +65,8 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
             if each.launch and each.launch[0] in done
         ]
         looked = _looked_at(load_launch(named[0], launch))
-    return Proposal(launch, [*found, *looked, *calibrated(load_launch(named[0], launch), named[0])])
+    found += [*looked, *calibrated(load_launch(named[0], launch), named[0])]
+    return Proposal(launch, once(found))
 
 
 def _launch_of(named: Sequence[Path], overrides: Sequence[str]) -> list[str]:
