@@ -39,6 +39,7 @@ TOOL_PROBLEMS = {  # why its pose is not known
     "pose_missing": "no pose of the picture's time has come",
     "pose_stopped": "its newest pose is older than the picture",
     "pose_jumped": "its pose jumped within the last second",
+    "pose_too_far": "it is over 10 m from its base: its lengths must be in metres",
 }
 
 
