@@ -128,12 +128,16 @@ class _Fixed(NamedTuple):
 class PoseTrack:
     """The poses that came so far. Any threads may add and ask.
 
+    Attributes:
+        frame: in which they are, as its sender or `base` says; empty: not known.
+
     Args:
         base, hand: frames between which the pose is asked for; None: of a topic that holds the pose.
         kept: samples of each frame that are kept.
     """
 
     def __init__(self, base: str | None = None, hand: str | None = None, kept: int = KEPT) -> None:
+        self.frame = _plain(base or "")
         self._base, self._hand = _plain(base or BASE), _plain(hand or HAND)
         self._kept = kept
         self._edges: dict[str, _Edge | _Fixed] = {}
@@ -152,6 +156,8 @@ class PoseTrack:
                 parent, child = BASE, HAND
                 if kind == topics.TF:
                     parent, child = _plain(one.header.frame_id), _plain(one.child_frame_id)
+                else:
+                    self.frame = _plain(one.header.frame_id)
                 there = one.pose if kind == cdr.POSE else one.transform
                 turn = there.orientation if kind == cdr.POSE else there.rotation
                 place = there.position if kind == cdr.POSE else there.translation
