@@ -42,6 +42,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "pose_missing": "pose",
     "pose_stopped": "pose",
     "pose_jumped": "pose",
+    "pose_too_far": "pose",
     "tool_pose_missing": "pose",
     "mask_missing": "mask",
     "network_failed": "network",

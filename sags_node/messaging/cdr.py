@@ -237,13 +237,13 @@ def point_cloud(
     return Content(topics.POINT_CLOUD, parts, ",".join(fields), columns.shape, "float32")
 
 
-def transform(T_world_cam: F64, stamp_ns: int) -> Content:
-    """`tf2_msgs/TFMessage` with the pose [4, 4] (m) of the left optical frame in the world."""
-    w, x, y, z = (float(q) for q in matrix_to_quat(T_world_cam[:3, :3]))
-    translation = _ros["geometry_msgs/msg/Vector3"](*(float(t) for t in T_world_cam[:3, 3]))
+def transform(T: F64, stamp_ns: int, parent: str = WORLD_FRAME, child: str = LEFT_FRAME) -> Content:
+    """`tf2_msgs/TFMessage` with the pose [4, 4] (m) of one frame in another."""
+    w, x, y, z = (float(q) for q in matrix_to_quat(T[:3, :3]))
+    translation = _ros["geometry_msgs/msg/Vector3"](*(float(t) for t in T[:3, 3]))
     rotation = _ros["geometry_msgs/msg/Quaternion"](x, y, z, w)
     pose = _ros["geometry_msgs/msg/Transform"](translation, rotation)
-    stamped = _ros["geometry_msgs/msg/TransformStamped"](_header(stamp_ns, WORLD_FRAME), LEFT_FRAME, pose)
+    stamped = _ros["geometry_msgs/msg/TransformStamped"](_header(stamp_ns, parent), child, pose)
     return Content(topics.TF, (_serialize(_ros[topics.TF]([stamped])),))
 
 

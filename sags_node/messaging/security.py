@@ -123,9 +123,16 @@ def read_allow_list(places: Sequence[Path], section: str = "publish") -> dict[by
     """The clients that may connect, by public key (Z85), from `.pub` files and folders of them.
 
     Raises:
-        UsageError: there is none, there are too many, or a file is no public key.
+        UsageError: there is none, there are too many, a file is no public key, or anybody may add one.
     """
     files = _files(places, section)
+    folders = [place / folder for place in places for folder in ("", *ROLES)]
+    for place in (*files, *filter(Path.is_dir, folders)):
+        if place.exists() and place.stat().st_mode & 0o002:
+            raise UsageError(
+                f"{section}.allow: anybody may write to {place}, and so let himself in; run: chmod o-w "
+                f"{shlex.quote(str(place))}"
+            )
     if not files:
         where = ", ".join(str(place) for place in places)
         raise UsageError(

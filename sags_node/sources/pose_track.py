@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 import time
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, bisect_right, insort
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ SMALLEST_JUMP = 0.002  # m, and 1 degree: below it fast samples only jitter
 SMALLEST_TURN = np.radians(1)
 LATE_NS = 1_000_000_000  # a stamp that is so much older was not overtaken: the robot was started anew
 JUMP_HELD_NS = 1_000_000_000  # so long a track must be smooth again after a jump
+FARTHEST = 10.0  # m: no robot reaches so far from its base, and in mm every scope seems to
 KEPT = 20_000  # samples of each frame, of a robot that goes on telling
 MOST_FRAMES = 1000  # of a tf tree
 
@@ -66,16 +68,15 @@ class _Edge:
     def add(self, stamp_ns: int, sample: Sample) -> None:
         if self._stamps and stamp_ns < self._stamps[-1] - LATE_NS:
             self._stamps, self._samples, self._jumps = [], [], []  # the robot was started anew
-        if self._stamps and stamp_ns <= self._stamps[-1]:  # overtaken on its way, or sent twice
-            at = bisect_left(self._stamps, stamp_ns)
-            if self._stamps[at] != stamp_ns:
-                self._stamps.insert(at, stamp_ns)
-                self._samples.insert(at, sample)
-            return
-        if self._stamps and _jumps(self._samples[-1], sample, stamp_ns - self._stamps[-1]):
-            self._jumps.append(stamp_ns)
-        self._stamps.append(stamp_ns)
-        self._samples.append(sample)
+        at = bisect_left(self._stamps, stamp_ns)  # not the end: it was overtaken on its way
+        if stamp_ns in self._stamps[at : at + 1]:
+            return  # sent twice
+        self._stamps.insert(at, stamp_ns)
+        self._samples.insert(at, sample)
+        for one, other in pairwise(range(max(0, at - 1), min(at + 2, len(self._stamps)))):
+            later = self._stamps[other]
+            if _jumps(self._samples[one], self._samples[other], later - self._stamps[one]):
+                insort(self._jumps, later)
         if len(self._stamps) > 2 * self._kept:
             del self._stamps[: -self._kept], self._samples[: -self._kept]
             self._jumps = [stamp for stamp in self._jumps if stamp >= self._stamps[0]]
@@ -127,12 +128,16 @@ class _Fixed(NamedTuple):
 class PoseTrack:
     """The poses that came so far. Any threads may add and ask.
 
+    Attributes:
+        frame: in which they are, as its sender or `base` says; empty: not known.
+
     Args:
         base, hand: frames between which the pose is asked for; None: of a topic that holds the pose.
         kept: samples of each frame that are kept.
     """
 
     def __init__(self, base: str | None = None, hand: str | None = None, kept: int = KEPT) -> None:
+        self.frame = _plain(base or "")
         self._base, self._hand = _plain(base or BASE), _plain(hand or HAND)
         self._kept = kept
         self._edges: dict[str, _Edge | _Fixed] = {}
@@ -151,6 +156,8 @@ class PoseTrack:
                 parent, child = BASE, HAND
                 if kind == topics.TF:
                     parent, child = _plain(one.header.frame_id), _plain(one.child_frame_id)
+                else:
+                    self.frame = _plain(one.header.frame_id)
                 there = one.pose if kind == cdr.POSE else one.transform
                 turn = there.orientation if kind == cdr.POSE else there.rotation
                 place = there.position if kind == cdr.POSE else there.translation
@@ -170,6 +177,8 @@ class PoseTrack:
             raise SagsError(
                 f"the pose of {child} holds numbers that are no pose (a quaternion of length {length:.3g})"
             )
+        if child == parent:
+            raise SagsError(f"the pose of {child} is in {child} itself: tf must be a tree")
         if child not in self._edges and len(self._edges) >= MOST_FRAMES:
             raise SagsError(f"tf holds more than {MOST_FRAMES} frames")
         sample = Sample(quat / length, position)
@@ -214,7 +223,14 @@ class PoseTrack:
                 f"no pose of '{self._hand}' in '{self._base}' came yet; frames: {there[:200]}; check "
                 "robot.topic, robot.base and robot.hand",
             )
-        return invert(self._in_root(base, t_ns)) @ self._in_root(hand, t_ns)
+        T = invert(self._in_root(base, t_ns)) @ self._in_root(hand, t_ns)
+        if (distance := float(np.linalg.norm(T[:3, 3]))) > FARTHEST:
+            raise NoPoseError(
+                "pose_too_far",
+                f"the robot says that '{self._hand}' is {distance:.3g} m from '{self._base}': its lengths "
+                "must be in metres",
+            )
+        return T
 
     def _chain(self, frame: str) -> list[str]:
         """A frame, its parent and so on, up to the root."""

@@ -39,6 +39,7 @@ TOOL_PROBLEMS = {  # why its pose is not known
     "pose_missing": "no pose of the picture's time has come",
     "pose_stopped": "its newest pose is older than the picture",
     "pose_jumped": "its pose jumped within the last second",
+    "pose_too_far": "it is over 10 m from its base: its lengths must be in metres",
 }
 
 
@@ -297,14 +298,22 @@ class Posed:
         """Where the tools are; poses that are on their way are waited for."""
         T_cam_base, told = invert(T_base_hand @ self._T_hand_cam), []
         for tool in self._tools:
+            track = self.robot.tools[absolute(tool.topic)]
             T = np.array(tool.T_base)
             T_cam = T_cam_base @ (T_base_hand @ T if tool.on_hand else T)
             T_cam_tool, problem = None, ""
             try:
                 left = max(0.0, deadline - time.monotonic())
-                T_cam_tool = T_cam @ self.robot.tools[absolute(tool.topic)].at(t_ns, left)
+                T_cam_tool = T_cam @ track.at(t_ns, left)
             except NoPoseError as error:
                 problem = f"{tool.topic}: {TOOL_PROBLEMS[error.finding.code]}"
+            frames = track.frame, self.robot.track.frame
+            if all(frames) and frames[0] != frames[1] and not tool.model_fields_set & {"T_base", "on_hand"}:
+                T_cam_tool = None
+                problem = (
+                    f"{tool.topic}: its poses are in '{frames[0]}', the scope's in '{frames[1]}', and "
+                    "nothing says how these lie: set T_base or on_hand"
+                )
             told.append(ToolPose(tool.topic, 1e-3 * tool.error_mm, T_cam_tool, problem))
         return tuple(told)
 

@@ -11,7 +11,7 @@ import numpy as np
 from sags_node.config.schema import NORMALIZATIONS, OnnxConfig, VisionConfig
 from sags_node.errors import UsageError
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
-from sags_node.vision.mono_depth import Measure, MonoDepth
+from sags_node.vision.mono_depth import FEWEST_SAMPLES, Measure, MonoDepth
 from sags_node.vision.onnx_session import (
     DepthNetworkError,
     Eye,
@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 MOST_FAILURES = 3  # in a row, after which the network is not tried any more
 MOST_CHANNELS = 4  # of an output that is maps; more are features
 FEWEST_FINITE = 0.5  # of the numbers
+ALIKE = 0.1  # of the depth: a wrong scale, sign or eye is off by more, what both measure by less
+FEWEST_ALIKE = 0.5  # of the places with a measured depth
 MEANINGS = {True: ("disparity", "depth"), False: ("inverse_depth", "depth")}  # of a stereo network's output?
 HELP = "docs/networks.md says what the keys mean"
 
@@ -181,6 +183,7 @@ class NetworkDepth:
         self._mono = MonoDepth(config.onnx.declared_depth, config.stereo)
         self._fallback = config.onnx.fallback
         self._failures = 0  # in a row
+        self._has_agreed = False  # a stereo network's depth with a measured one
         self.problem = ""
 
     @property
@@ -197,7 +200,8 @@ class NetworkDepth:
         """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1); None: `problem` says why.
 
         Args:
-            measure: for a monocular network, see `MonoDepth`.
+            measure: for a monocular network, see `MonoDepth`; a stereo network is compared with it until it
+                has agreed once.
 
         Raises:
             UsageError: the frames lack what this network needs.
@@ -214,6 +218,7 @@ class NetworkDepth:
             disparity = self._network(pair.left, pair.right)
             if self._network.is_stereo:
                 found = self._stereo.judge(pair, disparity, tissue)
+                self._compare(found[0], measure)
             else:
                 found = self._mono(disparity, tissue, measure)
         except DepthNetworkError as error:
@@ -223,6 +228,24 @@ class NetworkDepth:
             return None
         self._failures, self.problem = 0, ""
         return found
+
+    def _compare(self, depth: F32, measure: Measure) -> None:
+        """Tell a network that is described wrongly: elsewhere its disparities match by chance here and there.
+
+        Raises:
+            DepthNetworkError: its first depth [H, W] is not what is measured without it.
+        """
+        measured = None if self._has_agreed else measure()
+        if measured is None or np.count_nonzero(measured) < FEWEST_SAMPLES:
+            return
+        known = measured > 0
+        alike = float(np.mean(np.abs(depth - measured)[known] < ALIKE * measured[known]))
+        if alike < FEWEST_ALIKE:
+            raise DepthNetworkError(
+                f"{self._network.name}: its depth is the measured one at only {alike:.0%} of the places: "
+                "check vision.onnx: meaning, scale, inputs, normalization, color"
+            )
+        self._has_agreed = True
 
     def _failed(self, reason: str) -> None:
         self._failures += 1

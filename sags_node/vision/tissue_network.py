@@ -30,9 +30,9 @@ MULTIPLE = 32  # px, of sides that the network leaves open
 class TissueNetwork:
     """One picture in; out come scores of classes, one score, or class numbers, of the picture or coarser.
 
-    The highest of several scores is the class. One score is a probability while it lies within 0 and 1, else
-    a logit; where it is high is class 1. How pictures are fed is said as for depth networks, in the file's
-    metadata or a .yaml beside it; by default RGB as for ImageNet.
+    The highest of several scores is the class. Whole numbers are classes. One score is a probability while it
+    lies within 0 and 1, else a logit; where it is high is class 1. How pictures are fed is said as for depth
+    networks, in the file's metadata or a .yaml beside it; by default RGB as for ImageNet.
 
     Args:
         size: width and height of the pictures it will get, px.
@@ -87,7 +87,8 @@ class TissueNetwork:
                 raise DepthNetworkError(f"{self._session.name}: output {name} is not finite")
             if len(scores) > 1:
                 return np.asarray(scores.argmax(0))
-            if scores.dtype.kind in "iub":
+            is_whole = scores.min() >= 0 and np.array_equal(scores, np.rint(scores))
+            if scores.dtype.kind in "iub" or is_whole:  # exporters cast class numbers to floats
                 return np.asarray(scores[0], np.intp)
             self._is_logit |= bool(scores.min() < 0 or scores.max() > 1)
             return np.asarray(scores[0] > (0 if self._is_logit else 0.5), np.intp)

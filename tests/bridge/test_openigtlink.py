@@ -7,7 +7,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,9 +24,9 @@ pytest.importorskip("pyigtl", reason="no OpenIGTLink without: pip install '.[bri
 
 from pyigtl.messages import PointMessage
 
-from sags_node.clients.bridge import igtl
+from sags_node.clients.bridge import igtl, igtl_peers
 from sags_node.clients.bridge.igtl import MAX_BODY_BYTES
-from sags_node.clients.bridge.igtl_peers import Peers
+from sags_node.clients.bridge.igtl_peers import MOST_PEERS, Peers
 from sags_node.clients.bridge.openigtlink import IgtlOptions, request_of, run_openigtlink
 from sags_node.clients.bridge.pins import Pins
 from sags_node.clients.overlay.stream import OverlayStream
@@ -212,6 +212,20 @@ def test_a_slow_peer_holds_nobody_up(tmp_path: Path, program: Path) -> None:
         with Peer(program, port, "slow", 1000) as slow, Peer(program, port) as quick:
             until(lambda: len(slow.came) > 4)
             assert len(quick.came) > 3 * len(slow.came), "it is not slowed down by the other"
+
+
+@pytest.mark.fault("socket: peers of OpenIGTLink take every place and never read")
+def test_who_takes_nothing_gives_its_place_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(igtl_peers, "STUCK_MS", 300)
+    listener = socket.create_server(("127.0.0.1", 0))
+    peers = Peers(listener, lambda said: None, lambda: None)
+    peers.start()
+    with closing(peers), ExitStack() as connected:
+        for _ in range(MOST_PEERS):
+            connected.enter_context(socket.create_connection(listener.getsockname()))
+        until(lambda: len(peers) == MOST_PEERS)
+        peers.send("SagsPicture", bytes(64 << 20))  # more than a kernel holds
+        until(lambda: len(peers) == 0)
 
 
 def test_nothing_is_asked_of_the_node_while_nobody_is_connected(tmp_path: Path, program: Path) -> None:

@@ -109,6 +109,22 @@ def test_only_what_is_read_is_asked_of_the_node(tmp_path: Path) -> None:
         until(lambda: not running.wanted("anchors"))
 
 
+def test_tf_knows_the_frame_of_the_right_eye(tmp_path: Path) -> None:
+    """A stock tf2 listener reads `/tf_static` so, and cannot place right pictures without."""
+    info = ("/sags/right/camera_info", topics.CAMERA_INFO)
+    with (
+        plane_bridged(run_ros2, options(tmp_path)),
+        Listener(("/tf_static", TF, KEPT), info) as joined,
+    ):
+        until(lambda: joined.came["/tf_static"] and joined.came[info[0]])
+        (told,) = cdr.decode(joined.newest("/tf_static"), TF).transforms
+        right = cdr.decode(joined.newest(info[0]), topics.CAMERA_INFO)
+    assert told.header.frame_id == cdr.LEFT_FRAME and told.child_frame_id == right.header.frame_id
+    place, turn = told.transform.translation, told.transform.rotation
+    assert (place.x, place.y, place.z) == (pytest.approx(-right.p[3] / right.p[0]), 0, 0) and place.x > 0
+    assert (turn.w, turn.x, turn.y, turn.z) == (1, 0, 0, 0)
+
+
 def stale(joined: Listener) -> list[str]:
     """The reasons in the newest message that calls something stale."""
     arrays = [cdr.decode(data, ARRAY).status for data in reversed(joined.came["/diagnostics"])]

@@ -135,6 +135,28 @@ def test_a_motion_that_tells_nothing_is_said() -> None:
         solve_hand_eye(views, stamps, grid(), RIG, track.at)
 
 
+@pytest.mark.parametrize("unit", [1.05, 0.97])
+def test_lengths_that_are_not_the_robots_are_said(unit: float) -> None:
+    """A board that was printed to fit the page: the stereo calibration is wrong by as much."""
+    views, stamps = seen(RIG, PERIOD, 10, 0.1, 6.0)
+    with pytest.raises(SagsError, match=f"moved {1 / unit:.3f} times as far as the robot says"):
+        solve_hand_eye(views, stamps, grid(), RIG, tracked(0, PERIOD, 6.0, unit=unit).at)
+
+
+def test_a_scope_that_turns_about_one_point_is_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So it does in a trocar. Then lengths cannot be compared: a longer scope is seen alike."""
+
+    def pivoted(t: float, scale: float = 1.0) -> F64:
+        a = 2 * np.pi * t / PERIOD
+        turn = rigid((180 + 10 * np.sin(a), 12 * np.cos(a), 15 * np.sin(2 * a)), (0, 0, 0))
+        return turn @ rigid((0, 0, 0), (0, 0, 0.1)) @ X
+
+    monkeypatch.setitem(globals(), "camera_at", pivoted)
+    views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
+    place, _ = errors(solve_hand_eye(views, stamps, grid(), RIG, tracked(0, PERIOD).at).hand_eye.T_hand_cam)
+    assert place < 0.3
+
+
 def test_poses_of_another_time_are_said() -> None:
     views, stamps = seen(RIG, PERIOD, 10, 0.1, 1.0)
     late = [stamp + 60 * S for stamp in stamps]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -195,6 +196,32 @@ def test_a_pose_comes_through_base_and_hand_eye_and_one_that_stopped_is_not_used
         warned.append(by_code(pipeline.warnings).get("tool_pose_missing", ""))
     assert [len([s for s in each if s != BY_PICTURE]) for each in sources] == [2, 1]
     assert not warned[0] and "PSM2/cp: its newest pose is older" in warned[1]
+
+
+@pytest.mark.fault("robot: a tool's poses are in another frame than the scope's")
+@pytest.mark.parametrize(
+    ("keys", "frame", "taken"),
+    [
+        ({}, "ECM", False),
+        ({}, "/Cart", True),
+        ({}, "", True),
+        ({"on_hand": True}, "ECM", True),
+        ({"T_base": np.eye(4).tolist()}, "PSM1_base", True),  # who says that they are one place knows
+    ],
+)
+def test_a_tool_whose_frame_nobody_has_placed_is_not_taken(
+    tmp_path: Path, keys: dict[str, Any], frame: str, taken: bool
+) -> None:
+    scene = filmed()
+    config = LaunchConfig(robot=robot_of(tmp_path, RobotTool(topic="/PSM1/measured_cp", **keys)))
+    with Posed(Frames(replace(scene.frame, t_capture_ns=S)), config, scene.phantom.rig) as posed:
+        for number in range(80):
+            t_ns = S // 2 + number * S // 50
+            for track, name in ((posed.robot.track, "Cart"), (*posed.robot.tools.values(), frame)):
+                track.add(bytes(cdr.pose(np.eye(4), t_ns, name).parts[0]), cdr.POSE)
+        (tool,) = next(iter(posed)).tools
+    assert (tool.T_cam_tool is not None) == taken
+    assert taken or "its poses are in 'ECM', the scope's in 'Cart'" in tool.problem
 
 
 def test_a_bag_without_the_tools_topic_is_refused_and_says_what_there_is(tmp_path: Path) -> None:

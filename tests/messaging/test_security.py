@@ -95,6 +95,17 @@ def test_a_key_that_others_can_read_is_refused_with_the_fix(tmp_path: Path, keys
     read_key_pair(file)
 
 
+@pytest.mark.fault("keys: anybody may write to the allow list")
+@pytest.mark.parametrize("place", [".", "listen", "viewer.pub"])
+def test_an_allow_list_that_anybody_may_write_to_is_refused(tmp_path: Path, place: str) -> None:
+    write_key_pair(tmp_path, "viewer")
+    (tmp_path / "listen").mkdir()
+    assert len(read_allow_list([tmp_path])) == 1
+    (tmp_path / place).chmod(0o777)
+    with pytest.raises(UsageError, match=r"so let himself in; run: chmod o-w "):
+        read_allow_list([tmp_path])
+
+
 @pytest.mark.parametrize(
     "content",
     [

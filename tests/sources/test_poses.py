@@ -144,6 +144,24 @@ def test_a_jump_is_said_until_a_second_after_it() -> None:
     assert track.at(after)[0, 3] == pytest.approx(0.3)
 
 
+@pytest.mark.fault("robot: two programs tell its pose on one topic")
+def test_what_was_overtaken_jumps_too() -> None:
+    """The other one's poses lie 30 cm aside, and come 15 ms late: between those that are there already."""
+    track = PoseTrack()
+    for number in range(100):
+        told(track, shifted(0.1), S + 10 * number * MS)
+        told(track, shifted(0.4), S + (10 * number - 15) * MS)
+    assert problem(track, S + 500 * MS) == "pose_jumped"
+
+
+@pytest.mark.fault("robot: it tells millimetres")
+def test_poses_in_millimetres_are_told_also_at_rest() -> None:
+    track = PoseTrack()
+    for number in range(3):
+        told(track, shifted(120.0), S + 20 * number * MS)
+    assert problem(track, S + 10 * MS) == "pose_too_far"
+
+
 @pytest.mark.fault("robot: started anew, its clock begins at zero")
 def test_a_robot_that_was_started_anew_is_followed() -> None:
     track = moving(2.0, begun=100 * S)
@@ -169,6 +187,8 @@ def test_frames_of_tf_are_chained_also_across_branches() -> None:
     tell("world", "arm", 5.0, fixed=True)
     for number in range(3):
         tell("arm", "tip", 0.01 * number, False, number * 50 * MS)
+    with pytest.raises(SagsError, match="world is in world itself"):
+        tell("world", "world", 0.3, fixed=True)
     assert track.at(75 * MS)[0, 3] == pytest.approx(4.015)
 
 

@@ -373,6 +373,30 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     assert "3 times in a row: not tried again" in results[-1].skipped["network"]
 
 
+@pytest.mark.fault("network: its sign, scale or order of eyes is described wrongly")
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        ({"factor": -1.0}, ""),
+        ({"output": "half", "factor": 0.5}, ""),  # px of the smaller map
+        ({"factor": 1 / 320}, ""),  # widths of the picture
+        ({"names": ("second", "first")}, ""),  # the eyes are exchanged
+        ({}, "vision.onnx.scale:=1.2"),
+    ],
+    ids=str,
+)
+def test_a_network_that_is_described_wrongly_is_told_of_and_not_used(
+    made: dict[str, Any], said: str, phantom_session: Path, frames: list[StereoFrame], tmp_path: Path
+) -> None:
+    network = save_matcher(tmp_path / "matcher.onnx", **made)
+    pipeline = pipeline_with(phantom_session, network, *filter(None, [said]))
+    for result, frame in zip(play(pipeline, frames[:4]), frames, strict=False):
+        assert "check vision.onnx: meaning, scale" in result.skipped["network"]
+        off, share = depth_error(result, frame)
+        assert off < 0.02 and share > 0.6  # it is matched
+    assert "network_failed" in by_code(pipeline.warnings)
+
+
 # ---- one eye ---------------------------------------------------------------------------------------------
 
 

@@ -87,7 +87,8 @@ def save_segmenter(path: Path, answer: str, fault: bool = False) -> Path:
     """Redness R - G of a picture fed as for ImageNet: tissue where it is above 40 grey levels.
 
     Args:
-        answer: logit, probability, scores (of grey, nothing, tissue), labels, or half (the logit, coarser).
+        answer: logit, probability, scores (of grey, nothing, tissue), labels, or half (the logit, coarser);
+            numbers: of classes, 1 an instrument and 3 tissue, as floats.
         fault: not finite where the picture is nearly black.
     """
     g = Graph()
@@ -103,6 +104,9 @@ def save_segmenter(path: Path, answer: str, fault: bool = False) -> Path:
         "probability": lambda: g("Sigmoid", logit),
         "scores": lambda: g("Concat", g("Neg", logit), nothing, logit, axis=1),
         "labels": lambda: g("Mul", g("Cast", g("Greater", logit, floats(0)), to=FLOAT), floats(1)),
+        "numbers": lambda: g(
+            "Add", g("Mul", g("Cast", g("Greater", logit, floats(0)), to=FLOAT), floats(2)), floats(1)
+        ),
         "half": lambda: g("AveragePool", logit, kernel_shape=[2, 2], strides=[2, 2]),
     }[answer]()
     g.named("mask", made)
@@ -130,6 +134,7 @@ def instrument_frame() -> StereoFrame:
         *((answer, "white") for answer in ("logit", "probability", "labels", "half", "scores")),
         ("scores", (2,)),
         ("scores", (1, 2)),
+        ("numbers", (0, 3)),
     ],
 )
 def test_a_networks_mask(tmp_path: Path, answer: str, tissue_is: str | tuple[int, ...]) -> None:

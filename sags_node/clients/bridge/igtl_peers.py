@@ -19,6 +19,7 @@ from sags_node.messaging.security import RateLimitedLog
 
 MOST_PEERS = 8
 SEND_BUFFER = 1 << 18  # bytes in the kernel: less than a picture, so that nothing old waits there
+STUCK_MS = 15_000  # who takes nothing for so long is cut off: some of them would keep all others out
 LOOK = 0.05  # s between calls of `idle`
 
 log = logging.getLogger(__name__)
@@ -119,6 +120,7 @@ class Peers:
         accepted: socket.socket = writer.get_extra_info("socket")
         accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         accepted.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, STUCK_MS)
         writer.transport.set_write_buffer_limits(0)  # the next message begins when one is in the kernel
         peer = _Peer(writer)
         if self._greeting is not None:

@@ -24,12 +24,14 @@ from sags_node.clients.bridge.ros2_requests import ANSWER, Inbox
 from sags_node.config.schema import RosGraph
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr, content, topics
-from sags_node.messaging.received import Frame, Received, ReceivedCloud, ReceivedRos
+from sags_node.messaging.received import Frame, Received, ReceivedCameraInfo, ReceivedCloud, ReceivedRos
 from sags_node.messaging.topics import VIEW_NAME
 from sags_node.ros.graph import Delivery, Graph, kernel_buffer
 
 ALL_POINTS = "/all"
 GLOBAL = {"tf": "/tf", "diagnostics": "/diagnostics"}  # the names by which all of ROS knows them
+STATIC = "/tf_static"
+SHARED = (*GLOBAL.values(), STATIC)
 BEAT = 1.0  # s between two messages about the bridge itself
 ATTEND = 0.1  # s between looks at who reads
 STALE = 3  # of a diagnostic status
@@ -103,7 +105,12 @@ def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool
         return [thinned, offer(ALL_POINTS, topic.type, Received.cdr)]
     if topic.type == topics.DIAGNOSTICS:
         return [offer("", topic.type, partial(_named, ns=ns))]
-    return [offer("", topic.type, Received.ros)]
+    found = [offer("", topic.type, Received.ros)]
+    if (ns, topic.name) == (options.node.ns, "right/camera_info"):
+        output = Output(STATIC, (Source(ns, topic.name),), BEAT, optional=True, lengths=True)
+        kept = Delivery(reliable=True, kept=True, lifespan=options.max_age)
+        found.append(Offer(output, topics.TF, kept, _eyes))
+    return found
 
 
 def _delivery(topic: topics.Topic, max_age: float) -> Delivery:
@@ -245,11 +252,7 @@ class Ros2(Outlet):
 
     def _namesakes(self) -> list[str]:
         """Who else publishes what only this node should: readers would get both, one after the other."""
-        own = [
-            name
-            for name in self.graph.publications()
-            if name in self._writers and name not in GLOBAL.values()
-        ]
+        own = [name for name in self.graph.publications() if name in self._writers and name not in SHARED]
         if own and not self._namesake:
             log.warning("%s: %s", ", ".join(own[:3]), TWO)
         self._namesake = bool(own)
@@ -289,6 +292,14 @@ def _thinned(received: Received, most: int) -> bytes:
     fields = received.meta.encoding.split(",")
     kept = np.ascontiguousarray(received.points[::every]).view(np.float32).reshape(-1, len(fields))
     return cdr.point_cloud(kept, fields, received.stamp_ns).cdr()
+
+
+def _eyes(received: Received) -> bytes:
+    """Where the right eye is in the left one: all of its pictures are in its own frame."""
+    assert isinstance(received, ReceivedCameraInfo)
+    T = np.eye(4)
+    T[0, 3] = -received.P[0, 3] / received.P[0, 0]
+    return cdr.transform(T, received.stamp_ns, cdr.LEFT_FRAME, cdr.RIGHT_FRAME).cdr()
 
 
 def _named(received: Received, ns: str) -> bytes:

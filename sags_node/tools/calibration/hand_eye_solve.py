@@ -30,6 +30,9 @@ OFFSET_STEP_NS = 10_000_000
 MOST_PAIRS = 400  # of views, whose relative turns are compared
 # Of a numeric derivative: m and rad; and s, between two poses motion is straight.
 STEPS = np.array([1e-6] * 12 + [1e-3])
+SCALED = np.append(STEPS, 1e-4)  # and how many times longer the robot's ways are taken to be
+LARGEST_SCALE = 0.02  # robots are off by less, and a page that is printed to fit by more
+BETTER = 0.95  # of the residuals' spread: so much is not by chance
 ROUNDS = 30
 UNSURE = (0.005, np.radians(1.0))  # m, rad: beyond it the motion does not tell enough
 LEAST_TURN = np.radians(0.5)  # root mean square: a board's turn is seen to a tenth of it
@@ -75,7 +78,7 @@ def solve_hand_eye(
     X = _linear(hands, boards)
     Z = hands[0] @ X @ boards[0]
     residuals = _Residuals(views, stamps, points, rig, known_at, X, Z, offset)
-    parameters, covariance, spread = _least_squares(residuals)
+    parameters, covariance, spread = _least_squares(residuals, STEPS)
     X, _, offset = residuals.unpacked(parameters)
     corners = residuals(parameters).reshape(-1, 2)
     ends = np.cumsum([2 * len(view.ids) for view in views])
@@ -92,6 +95,7 @@ def solve_hand_eye(
             f"the motion does not tell where the camera sits (to {place * 1e3:.1f} mm, "
             f"{np.degrees(turn):.2f} degrees): {_TURN}"
         )
+    _check_scale(residuals, spread)
     names = [view.name for view in views]
     return HandEyeSolution(HandEye(X, offset), errors, names, float(place), float(turn), float(clock * 1e9))
 
@@ -120,6 +124,21 @@ def _turned_enough(turns: F64) -> None:
         raise SagsError(
             f"the scope is turned by {np.degrees(second):.2f} degrees about its second axis, which does not "
             f"tell where the camera sits: {_TURN}"
+        )
+
+
+def _check_scale(residuals: _Residuals, spread: float) -> None:
+    """
+    Raises:
+        SagsError: the robot's ways and those in the pictures differ in length: all fits better then. About
+            one point alone a scope turns alike at any length.
+    """
+    parameters, _, scaled = _least_squares(residuals, SCALED)
+    if abs(parameters[-1]) > LARGEST_SCALE and scaled < BETTER * spread:
+        raise SagsError(
+            f"by the pictures the scope moved {1 + parameters[-1]:.3f} times as far as the robot says: "
+            "measure the board's squares (--square-mm), also of the stereo calibration, and check the "
+            "robot's unit"
         )
 
 
@@ -208,7 +227,7 @@ class _Residuals:
     """How far all corners are from where the parameters put them, px, left eye and right eye.
 
     Parameters [13]: a small motion of the camera on the hand (turn, place), one of the board, and the
-    offset's difference from the first one, s.
+    offset's difference from the first one, s; [14]: also by how much longer the robot's ways are.
     """
 
     views: Sequence[StereoView]
@@ -231,7 +250,8 @@ class _Residuals:
             hand = self.pose_at(stamp + offset)
             if hand is None:  # the search has left what is known: no place for it
                 return np.full(sum(4 * len(view.ids) for view in self.views), 1e3)
-            left = eye_base @ invert(hand) @ Z
+            longer = parameters[len(STEPS) :].sum()
+            left = eye_base @ invert(rigid(hand[:3, :3], (1 + longer) * hand[:3, 3])) @ Z
             points = self.points[view.ids].astype(np.float64)
             for eye, T, seen in (
                 (self.rig.left, left, view.left),
@@ -242,13 +262,13 @@ class _Residuals:
         return np.concatenate(parts)
 
 
-def _least_squares(residuals: _Residuals) -> tuple[F64, F64, float]:
-    """Levenberg and Marquardt: parameters [13], their covariance for residuals of 1 px, residuals' spread."""
-    parameters, damping = np.zeros(len(STEPS)), 1e-3
+def _least_squares(residuals: _Residuals, steps: F64) -> tuple[F64, F64, float]:
+    """Levenberg and Marquardt: parameters [P], their covariance for residuals of 1 px, residuals' spread."""
+    parameters, damping = np.zeros(len(steps)), 1e-3
     now = residuals(parameters)
     for _ in range(ROUNDS):
         J = np.stack(
-            [(residuals(parameters + d) - residuals(parameters - d)) / (2 * d.sum()) for d in np.diag(STEPS)],
+            [(residuals(parameters + d) - residuals(parameters - d)) / (2 * d.sum()) for d in np.diag(steps)],
             1,
         )
         normal = J.T @ J
