@@ -65,6 +65,18 @@ def test_an_overlay_that_was_killed_leaves_what_it_had_written(tmp_path: Path) -
         assert set(read_layers(file)) == {4}
 
 
+def test_a_picture_of_another_size_is_shown_whole(tmp_path: Path) -> None:
+    """As after a restart of the node with another size."""
+    file, halves = VideoFile(tmp_path / "video.mp4", RATE, (64, 48)), np.repeat([200, 20], 48)
+    file.add(np.zeros((48, 64, 3), np.uint8))
+    file.add(np.broadcast_to(halves[:, None, None], (96, 128, 3)).astype(np.uint8))
+    file.finish()
+    with av.open(str(tmp_path / "video.mp4")) as video:
+        *_, last = (frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
+    assert last.shape == (48, 64, 3)
+    np.testing.assert_allclose(last[[8, 40]].mean((1, 2)), (200, 20), atol=4)
+
+
 def test_its_file_is_what_browsers_play(tmp_path: Path) -> None:
     """H.264 in yuv420p, whose sides are even; its index stands first."""
     file = VideoFile(tmp_path / "video.mp4", RATE, (WIDTH, HEIGHT))
