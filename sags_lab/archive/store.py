@@ -113,9 +113,10 @@ class Store:
         names = sorted(path.rstrip("/").rpartition("/")[2] for path in found)
         return [name for name in names if not name.startswith(".")]
 
-    def done(self) -> dict[str, str]:
-        """The key of each recording that is done, by its id."""
-        return {name.split(".")[0]: name.split(".")[1] for name in self.names(DONE)}
+    def done(self, settings: str = "") -> dict[str, str]:
+        """The key of each recording that is done with these settings (`settings_of`), or any; by its id."""
+        found = (name.split(".")[:2] for name in self.names(DONE))
+        return {id: key for id, key in found if key.startswith(settings)}
 
     @contextmanager
     def partial(self, name: str) -> Iterator[Path]:
