@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import suppress
 
 from sags_node.client import ControlClient, ReceivedCloud, SagsError, Subscriber, TopicName
 
@@ -25,7 +26,7 @@ def follow(u: float, v: float, frames: int | None) -> None:
         if newest is None:
             raise SagsError(f"no frame came: {node.problem(ANCHORS)}")
         session = newest.meta.session  # of the node; in another one that number is another anchor's
-        pinned = control.request("add_anchor", {"u": u, "v": v})["id"]
+        pinned, seen = control.request("add_anchor", {"u": u, "v": v})["id"], False
         try:
             while frames is None or frames > 0:
                 newest = node.wait(ANCHORS, timeout=1.0, after=newest)
@@ -35,9 +36,11 @@ def follow(u: float, v: float, frames: int | None) -> None:
                 if newest.meta.session != session:
                     raise SagsError("the node was started anew: its anchors are gone; start this again")
                 rows = newest.points[newest.points["id"] == pinned]
+                if not len(rows) and seen:
+                    raise SagsError("the point was removed, by another client; start this again")
                 if not len(rows):
-                    continue  # pinned in a frame after this one; or the model was reset
-                (row,) = rows
+                    continue  # pinned in a frame after this one
+                (row,), seen = rows, True
                 if row["confidence"] < SURE:
                     print("not recognised: show nothing")
                 elif row["depth_confidence"] < SURE or not newest.metric:
@@ -49,7 +52,8 @@ def follow(u: float, v: float, frames: int | None) -> None:
                 frames = None if frames is None else frames - 1
         finally:
             if node.latest(ANCHORS).meta.session == session:
-                control.request("remove_anchor", {"id": pinned})
+                with suppress(SagsError):  # it is removed already, or the node is gone
+                    control.request("remove_anchor", {"id": pinned})
 
 
 def main() -> None:

@@ -106,6 +106,23 @@ def test_a_point_is_not_followed_into_another_session_of_the_node(tmp_path: Path
     assert example.returncode == 1 and "started anew" in errors and asked == [(1, "add")]
 
 
+def test_a_point_that_another_client_removes_is_not_waited_for(tmp_path: Path) -> None:
+    handlers: dict[str, Any] = {"add_anchor": lambda args: {"id": SEEN}}
+    command = [sys.executable, ROOT / "examples/follow_point.py", "20", "20"]
+    with (
+        sockets(tmp_path / "sags", handlers) as running,
+        subprocess.Popen(
+            command, env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)}, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        ) as example,
+    ):  # fmt: skip
+        with stream(running, anchored_at):
+            assert "m" in example.stdout.readline()
+        with stream(running):  # the same node, without anchors
+            _, errors = example.communicate(timeout=60)
+    assert example.returncode == 1 and "removed, by another client" in errors
+
+
 @pytest.fixture
 def follow(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The node of rclpy, its own code beside stand-ins for ROS; tests/bridge/test_ros2_rclpy.py has ROS."""
