@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -70,8 +69,8 @@ def failed(store: Store) -> list[dict[str, Any]]:
     """The records of all recordings whose last attempt failed, with the settings of the newest run."""
     own = settings(store)
     names = [f"{FAILED}/{name}" for name in store.names(FAILED) if name.endswith(".json")]
-    records = (json.loads(data) for data in store.read_many(names) if data is not None)
-    return [record for record in records if record["key"].startswith(own)]
+    records = store.read_all_json(names)
+    return [record for record in records if record is not None and record["key"].startswith(own)]
 
 
 def of_one(store: Store, id: str) -> dict[str, Any]:
@@ -161,8 +160,9 @@ def _batches(
     for begin in range(0, len(ordered), BATCH):
         batch = ordered[begin : begin + BATCH]
         ids = [recording.id for recording in batch if recording.id in done]
-        data = store.read_many([f"{DONE}/{id}.{done[id]}.json" for id in ids])
-        figures = {id: json.loads(row) for id, row in zip(ids, data, strict=True) if row is not None}
+        figures = dict(
+            zip(ids, store.read_all_json([f"{DONE}/{id}.{done[id]}.json" for id in ids]), strict=True)
+        )
         yield [_row(each, figures.get(each.id), records.get(each.id)) for each in batch]
 
 

@@ -20,7 +20,7 @@ from sags_lab.archive.results import of_one, read_results, status, write_results
 from sags_lab.archive.run import about, describe
 from sags_lab.archive.store import Store
 from sags_lab.archive.work import Needs, needs, work
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 
 
 @pytest.fixture
@@ -163,6 +163,16 @@ def test_what_was_done_with_other_settings_is_missing_until_it_is_done_again(tmp
     assert [of_one(store, each.id)["state"] for each in recordings] == ["done", "missing"]
     describe(store, recordings, before, as_csv(recordings))  # what was not begun is not lost
     assert of_one(store, recordings[1].id)["state"] == "done"
+
+
+@pytest.mark.parametrize("name", ["done/{}.key.json", "failed/{}.json", "archive.json"])
+def test_what_is_damaged_is_named(name: str, tmp_path: Path) -> None:
+    recordings, plan = write_quick_recordings(tmp_path / "in", 1), quick_plan(tmp_path / "out")
+    store = Store(plan.out)
+    for each in ("done/{}.key.json", name):
+        store.write(each.format(recordings[0].id), b'{"id": ')
+    with pytest.raises(SagsError, match=rf"{name.format(recordings[0].id)} is damaged; remove it"):
+        write_results(store, recordings)
 
 
 def test_a_figure_of_several_kinds_is_text_in_large_archives_too(
