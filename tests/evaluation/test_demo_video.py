@@ -6,9 +6,12 @@ from pathlib import Path
 
 import av
 import numpy as np
+import pytest
+from small_disk import small_disk
 
 from sags_node.clients.overlay.draw import over
 from sags_node.clients.overlay.save import Layers, read_layers
+from sags_node.errors import SagsError
 from sags_node.media.video_file import VideoFile
 from sags_node.tools.demo import Shown
 from sags_node.types import U8
@@ -63,6 +66,16 @@ def test_an_overlay_that_was_killed_leaves_what_it_had_written(tmp_path: Path) -
     for length in range(len(whole) // 2, len(whole), 101):
         file.write_bytes(whole[:length])
         assert set(read_layers(file)) == {4}
+
+
+def test_a_full_disk_ends_the_layers_and_not_the_overlay(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 1 << 20) as disk:
+        layers = Layers(disk / "layers")
+        for frame_id in range(6):
+            layers.add(frame_id, np.full((300, 300, 4), 255, np.uint8))
+        with pytest.raises(SagsError, match=r"cannot write .*layers: No space left"):
+            layers.close()
+        assert [*read_layers(disk / "layers")] == [0, 1]
 
 
 def test_a_picture_of_another_size_is_shown_whole(tmp_path: Path) -> None:
