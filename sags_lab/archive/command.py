@@ -348,7 +348,7 @@ def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     sags archive dataset out/theatre3 out/dataset
     """
     check_installed()
-    from sags_lab.archive.results import listed
+    from sags_lab.archive.results import listed, settings
     from sags_lab.archive.store import RECORDINGS, Store
     from sags_lab.lerobot.dataset import merge
 
@@ -356,10 +356,12 @@ def dataset(out: str, folder: Path, lerobot_version: Version) -> None:
     if store.local is None:
         raise UsageError(f"{out} is no folder of this machine; copy it here first")
     about, recordings = listed(store)
-    done = store.done()
+    done = store.done(settings(store))
     if about["job"] != "lerobot" or not done:
         raise UsageError(f"{out} holds {len(done)} results of {about['job']}; run --job lerobot first")
     episodes = [each.id for each in recordings if each.id in done]
+    if rest := len(recordings) - len(episodes):
+        console.print(f"{rest} recordings are not done, and left out: sags archive status {escape(out)}")
     frames = merge([store.local / RECORDINGS / id / "lerobot" for id in episodes], folder, lerobot_version)
     console.print(
         f"{len(episodes)} episodes, {frames} frames: [bold]{escape(str(folder))}[/]", soft_wrap=True

@@ -26,8 +26,13 @@ _SCRATCH = "sags-archive-"
 _CHANGED = ("ETag", "etag", "md5Hash", "LastModified", "mtime")  # of fsspec's info, the surest first
 
 
+def settings_of(about: Mapping[str, Any]) -> str:
+    """The beginning of every key that is made with these settings: job, options, overrides and version."""
+    return _hash({name: about[name] for name in ("job", "options", "overrides", "version")})[:8]
+
+
 def key_of(recording: Recording, about: Mapping[str, Any]) -> str:
-    """A hash of a recording's files, of all that is done with them, and by which version.
+    """A hash of all that is done with a recording, and by which version, then one of its files.
 
     A file counts by its name, size and time of change (of a URL: the server's ETag, where it has one); what
     is in it is not read. The files are those of the recording, of its calibration, and all that its launch
@@ -37,8 +42,12 @@ def key_of(recording: Recording, about: Mapping[str, Any]) -> str:
         about: job, options, overrides and version.
     """
     stats = [_stats(place) for place in places(recording)]
-    said = {"files": stats, "own": recording.overrides, "rig": recording.rig_name, "about": about}
-    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+    said = {"files": stats, "own": recording.overrides, "rig": recording.rig_name}
+    return settings_of(about) + _hash(said)[:16]
+
+
+def _hash(said: Any) -> str:
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
 def places(recording: Recording) -> list[str]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from sags_lab.archive.inputs import settings_of
 from sags_lab.archive.manifest import Recording, parquet, read_manifest
 from sags_lab.archive.store import ABOUT, DONE, FAILED, MANIFEST, RESULTS, Store
 from sags_node.errors import UsageError
@@ -35,7 +35,7 @@ def status(store: Store) -> dict[str, Any]:
         UsageError: there was no run.
     """
     about, recordings = listed(store)
-    done = store.done()
+    done = store.done(settings(store))
     failures = [record for record in failed(store) if record["id"] not in done or record["quarantined"]]
     ids = {recording.id for recording in recordings}
     quarantined = [record for record in failures if record["quarantined"] and record["id"] in ids]
@@ -59,10 +59,18 @@ def status(store: Store) -> dict[str, Any]:
     }
 
 
+def settings(store: Store) -> str:
+    """Those of the newest run, as keys have them: what was done with others is to be done again."""
+    about = store.read_json(ABOUT)
+    return "" if about is None else settings_of(about)
+
+
 def failed(store: Store) -> list[dict[str, Any]]:
-    """The records of all recordings whose last attempt failed."""
+    """The records of all recordings whose last attempt failed, with the settings of the newest run."""
+    own = settings(store)
     names = [f"{FAILED}/{name}" for name in store.names(FAILED) if name.endswith(".json")]
-    return [json.loads(data) for data in store.read_many(names) if data is not None]
+    records = store.read_all_json(names)
+    return [record for record in records if record is not None and record["key"].startswith(own)]
 
 
 def of_one(store: Store, id: str) -> dict[str, Any]:
@@ -81,8 +89,10 @@ def of_one(store: Store, id: str) -> dict[str, Any]:
     if len(ids) != 1:
         there = ", ".join(ids[:5]) or "none"
         raise UsageError(f"{id}: one recording must be named so, there are: {there}; see results.parquet")
-    record = store.read_json(f"{FAILED}/{ids[0]}.json")
-    key = store.done().get(ids[0])
+    own = settings(store)
+    record, key = store.read_json(f"{FAILED}/{ids[0]}.json"), store.done(own).get(ids[0])
+    if record is not None and not record["key"].startswith(own):
+        record = None
     row = None if key is None else store.read_json(f"{DONE}/{ids[0]}.{key}.json")
     log = store.read(f"{FAILED}/{ids[0]}.log") or store.read(f"recordings/{ids[0]}/log.txt") or b""
     return {
@@ -118,6 +128,13 @@ def write_results(store: Store, recordings: Sequence[Recording]) -> int:
         count += sum(row["state"] == "done" for row in rows)
         columns = dict.fromkeys(key for row in rows for key in row)
         tables.append(pa.table({key: _column(pa, [row.get(key) for row in rows]) for key in columns}))
+    kinds: dict[str, set[str]] = {}
+    for field in (field for table in tables for field in table.schema):
+        kinds.setdefault(field.name, {"null"}).add(str(field.type))
+    mixed = {name for name, those in kinds.items() if len(those) > 2 and those != {"null", "int64", "double"}}
+    for number, table in enumerate(tables):  # as in one batch
+        texts = [field.with_type(pa.string()) if field.name in mixed else field for field in table.schema]
+        tables[number] = table.cast(pa.schema(texts))
     file = io.BytesIO()
     pq.write_table(pa.concat_tables(tables, promote_options="permissive"), file)
     store.write(RESULTS, file.getvalue())
@@ -138,13 +155,14 @@ def _batches(
     store: Store, recordings: Sequence[Recording], records: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[list[dict[str, Any]]]:
     """The rows of all, by id, so many at a time."""
-    done = store.done()
+    done = store.done(settings(store))
     ordered = sorted(recordings, key=lambda each: each.id)
     for begin in range(0, len(ordered), BATCH):
         batch = ordered[begin : begin + BATCH]
         ids = [recording.id for recording in batch if recording.id in done]
-        data = store.read_many([f"{DONE}/{id}.{done[id]}.json" for id in ids])
-        figures = {id: json.loads(row) for id, row in zip(ids, data, strict=True) if row is not None}
+        figures = dict(
+            zip(ids, store.read_all_json([f"{DONE}/{id}.{done[id]}.json" for id in ids]), strict=True)
+        )
         yield [_row(each, figures.get(each.id), records.get(each.id)) for each in batch]
 
 

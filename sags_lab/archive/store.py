@@ -73,8 +73,23 @@ class Store:
         return [data if isinstance(data := found.get(path), bytes) else None for path in paths]
 
     def read_json(self, name: str) -> Any:
-        data = self.read(name)
-        return None if data is None else json.loads(data)
+        """A file of JSON; see `read_all_json`."""
+        return self.read_all_json([name])[0]
+
+    def read_all_json(self, names: Sequence[str]) -> list[Any]:
+        """As `read_many`.
+
+        Raises:
+            SagsError: one is damaged.
+        """
+        found: list[Any] = []
+        for name, data in zip(names, self.read_many(names), strict=True):
+            try:
+                found.append(None if data is None else json.loads(data))
+            except ValueError:
+                what = f"{self.url}/{name} is damaged; remove it"
+                raise SagsError(f"{what}, then sags archive run does again what it told of") from None
+        return found
 
     def write(self, name: str, data: bytes) -> None:
         """A file, whole or not at all; an earlier one is replaced.
@@ -113,9 +128,10 @@ class Store:
         names = sorted(path.rstrip("/").rpartition("/")[2] for path in found)
         return [name for name in names if not name.startswith(".")]
 
-    def done(self) -> dict[str, str]:
-        """The key of each recording that is done, by its id."""
-        return {name.split(".")[0]: name.split(".")[1] for name in self.names(DONE)}
+    def done(self, settings: str = "") -> dict[str, str]:
+        """The key of each recording that is done with these settings (`settings_of`), or any; by its id."""
+        found = (name.split(".")[:2] for name in self.names(DONE))
+        return {id: key for id, key in found if key.startswith(settings)}
 
     @contextmanager
     def partial(self, name: str) -> Iterator[Path]:

@@ -44,7 +44,8 @@ class Sums:
 
 
 def merged(stats: Sequence[Stats]) -> Stats:
-    """Of several episodes, each weighed by its count."""
+    """Of several episodes, each weighed by its count; one in which nothing is known has no say."""
+    stats = [each for each in stats if each["count"] != [0]] or stats[:1]
     values = {name: np.array([each[name] for each in stats], np.float64) for name in stats[0]}
     counts = values["count"].reshape(-1, *[1] * (values["mean"].ndim - 1))
     share = counts / max(1.0, float(counts.sum()))

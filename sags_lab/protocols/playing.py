@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, RecordedSource
+from sags_node.errors import UsageError
 from sags_node.pipeline.warm_up import prepare
 
 STEP = ("source.loop:=false", "source.pace:=step")  # each frame in its turn
@@ -19,6 +20,20 @@ def configured(given: Sequence[str], overrides: Sequence[str]) -> LaunchConfig:
     config = load_launch(None, [*given, *STEP, *overrides])
     prepare(config)
     return config
+
+
+def check_default(config: LaunchConfig, *keys: str) -> None:
+    """To be asked where the truth is that of a recording's first frame, last frame, or each.
+
+    Raises:
+        UsageError: one of these keys of `source` is set, so another frame would be compared with it.
+    """
+    default = type(config.source).model_fields
+    for key in keys:
+        if getattr(config.source, key) != default[key].default:
+            raise UsageError(
+                f"source.{key}: points are marked in frames that would not be played; leave it out"
+            )
 
 
 def stride_of(config: LaunchConfig) -> int:

@@ -19,7 +19,7 @@ from sags_lab.protocols.layouts import (
     stereomis_sequence,
     stir_clips,
 )
-from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress, configured, stride_of
+from sags_lab.protocols.playing import AS_GIVEN, STEP, Progress, check_default, configured, stride_of
 from sags_lab.protocols.point_tracker import Followed, PointTracker, raw_pair
 from sags_lab.protocols.point_tracks import shares_within
 from sags_lab.protocols.stir_2026 import is_stir_2026, measure_stir_2026
@@ -105,7 +105,8 @@ def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> 
     deep, deep_unmoved = [], []
     for clip in stir_clips(folder):
         given = ["source.kind:=videos", f"source.left:={clip.left}", f"source.right:={clip.right}"]
-        tracks = _follow(configured(given, overrides), clip.rig, clip.starts, clip.name, progress)
+        check_default(config := configured(given, overrides), "start", "frames", "stride")
+        tracks = _follow(config, clip.rig, clip.starts, clip.name, progress)
         clips[clip.name] = arithmetic.nearest_distances(tracks.pixels, clip.ends)
         distances.append(clips[clip.name])
         unmoved.append(arithmetic.nearest_distances(clip.starts, clip.ends))

@@ -20,7 +20,7 @@ import numpy as np
 
 from sags_lab.protocols.arithmetic import stir_2026_figures
 from sags_lab.protocols.layouts import LARGEST_TEXT, as_stir_counts, stir_rig
-from sags_lab.protocols.playing import Progress, configured, stride_of
+from sags_lab.protocols.playing import Progress, check_default, configured, stride_of
 from sags_lab.protocols.point_tracker import Followed, PointTracker, raw_pair
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import read_file
@@ -167,7 +167,7 @@ def _play(
     """Judge one sequence; times of the frames whose latency counts, ms."""
     left, right = sequence.folder / "left.mp4", sequence.folder / "right.mp4"
     given = ["source.kind:=videos", f"source.left:={left}", f"source.right:={right}"]
-    config = configured(given, overrides)
+    check_default(config := configured(given, overrides), "start")
     stride = stride_of(config)
     tracker = PointTracker(config, sequence.rig)
     pixels, times = sequence.queries, list[float]()

@@ -19,7 +19,7 @@ import numpy as np
 
 from sags_lab.protocols import arithmetic
 from sags_lab.protocols.layouts import read_tum
-from sags_lab.protocols.playing import Progress, configured
+from sags_lab.protocols.playing import Progress, check_default, configured
 from sags_lab.protocols.point_tracker import Followed, PointTracker
 from sags_node import geometry
 from sags_node.config.schema import LaunchConfig, RecordedSource
@@ -145,6 +145,7 @@ def measure_tracked(folder: Path, overrides: Sequence[str], progress: Progress) 
     sequence = tracked_sequence(folder)
     eyes = [f"source.{eye}:={folder}" for eye in ("left", "right")]
     config = configured(["source.kind:=folders", *eyes, f"source.rate:={RATE}"], overrides)
+    check_default(config, "start", "stride")
     found = _followed(sequence, config, progress)
     size = sequence.rig.left.width, sequence.rig.left.height
     truth, visible = sequence.pixels[:, : found.shape[1]], sequence.visible[:, : found.shape[1]]

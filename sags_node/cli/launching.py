@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -14,7 +13,7 @@ import click
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal import text
-from sags_node.terminal.console import console, progress, show
+from sags_node.terminal.console import console, json_text, progress, show
 
 if TYPE_CHECKING:
     from sags_node.config.schema import Source
@@ -255,6 +254,6 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         from sags_node.tools.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
-        lines = json.dumps({"provenance": provenance()} | dict(rows), indent=1)
+        lines = json_text({"provenance": provenance()} | dict(rows), indent=1)
         with whole(file) as partial:
             partial.write_text(lines + "\n", encoding="utf-8")

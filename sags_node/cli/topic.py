@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,7 +10,7 @@ import click
 from sags_node.cli.launching import as_json, part_of, positive, shown
 from sags_node.cli.node_options import control_option, data_options
 from sags_node.terminal import text
-from sags_node.terminal.console import show, tell
+from sags_node.terminal.console import json_text, show, tell
 
 if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
@@ -88,7 +87,7 @@ def topic_echo(
     notices = Notices(tell)
     for message in tool.topic_echo(names, node, count=count, warned=notices.update):
         found: Any = part_of(message, field) if field else message
-        show(json.dumps(found) if json_out else text.echo_text(found))
+        show(json_text(found) if json_out else text.echo_text(found))
 
 
 def _measuring(name: Literal["hz", "bw", "delay"], doc: str, *more: Callable[..., Any]) -> None:

@@ -42,13 +42,14 @@ class VideoFile:
         codec.time_base, codec.thread_count = Fraction(1, TICKS), 1
         codec.colorspace = Colorspace.ITU601  # said, as players take HD that says nothing for BT.709
         self._stream.options = {"preset": "ultrafast", "crf": "22"}  # beside a node that needs the cores
+        self._shape = size[::-1]
         self._period = TICKS / rate
         self._first_ns: int | None = None
         self._shift = 0.0  # ticks that stamps are late, where they began anew
         self._at = -self._period  # ticks, of the newest picture
 
     def add(self, picture: U8, stamp_ns: int | None = None) -> None:
-        """One more picture, RGB [H, W, 3].
+        """One more picture, RGB [H, W, 3]; one of another size is scaled.
 
         Args:
             stamp_ns: when it was captured: as long after the one before it is shown. Where stamps begin anew
@@ -74,8 +75,11 @@ class VideoFile:
                 at = after
             after = at
         self._at = max(after, self._at + 1)
-        even = np.ascontiguousarray(picture[: self._stream.height, : self._stream.width])
-        frame = av.VideoFrame.from_ndarray(even, "rgb24").reformat(format="yuv420p", threads=1)
+        width, height = self._stream.width, self._stream.height
+        if picture.shape[:2] == self._shape:
+            picture = picture[:height, :width]
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), "rgb24")
+        frame = frame.reformat(width, height, "yuv420p", threads=1)
         frame.pts, frame.time_base = round(self._at), Fraction(1, TICKS)
         self._write(frame)
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Self
 import msgspec
 import zmq
 
-from sags_node.errors import SagsError, brief
+from sags_node.errors import SagsError, UsageError, brief
 from sags_node.messaging.address import Address, ClientKeys, NodeAddress, connect, found
 from sags_node.messaging.roles import Client, needed
 from sags_node.messaging.security import Gate, RateLimitedLog
@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 
 class Request(msgspec.Struct, frozen=True):
-    v: Annotated[str, msgspec.Meta(pattern=r"^1\.[0-9]{1,4}$")]
+    v: Annotated[str, msgspec.Meta(pattern=r"^1\.[0-9]{1,4}\Z")]
     id: Identifier
     op: Annotated[str, msgspec.Meta(max_length=64)]
     args: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -273,7 +273,7 @@ class ControlClient(Closes):
         Raises:
             SagsError: the node refused (its own words), refuses this client altogether, is another one before
                 it answered, or did not answer within `timeout` seconds.
-            UsageError: the node wants keys that are not given, or the other way round.
+            UsageError: it cannot be sent, or the node wants keys that are not given, or the other way round.
         """
         deadline, until_ns = time.monotonic() + timeout, time.time_ns() + round(timeout * 1e9)
         silence = f"no answer from {self.endpoint} in {timeout:g} s; is the node running?"
@@ -285,7 +285,14 @@ class ControlClient(Closes):
         self._last_id += 1
         is_here = self.endpoint.startswith(HERE)
         asked = Request(PROTOCOL, self._last_id, op, dict(args or {}), timeout, until_ns if is_here else None)
-        request = msgspec.msgpack.encode(asked)
+        try:
+            request = msgspec.msgpack.encode(asked)
+        except (
+            OverflowError,
+            TypeError,
+            UnicodeError,
+        ) as error:  # a number of more than 64 bits, half a letter
+            raise UsageError(f"{op}: what is asked cannot be sent: {error}") from None
         self._socket.send(request, zmq.NOBLOCK)
         while (left := deadline - time.monotonic()) > 0:
             if not self._socket.poll(min(int(left * 1000) + 1, LOOK_MS)):

@@ -19,10 +19,11 @@ MAX_VIEW_PIXELS = 1920 * 1200  # of each eye
 MAX_VIEW_HZ = 60.0
 MAX_AHEAD_MS = 1000.0
 MAX_MEASURED = 256  # anchors: the mapping thread does it
+LARGEST = 1e6  # px or m: float32 and its squares bear it
 MAX_DISTANCE = 10.0  # m from the world's origin or the left camera
 
 Row = tuple[float, ...]
-Name = Annotated[str, msgspec.Meta(pattern=f"^{VIEW_NAME.pattern}$")]
+Name = Annotated[str, msgspec.Meta(pattern=rf"^{VIEW_NAME.pattern}\Z")]  # $ lets a line break pass
 Side = Annotated[int, msgspec.Meta(ge=16, le=MAX_VIEW_SIDE)]
 R = TypeVar("R", bound=msgspec.Struct)
 
@@ -44,8 +45,8 @@ class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         given = {name for name in "uvxyz" if getattr(self, name) is not None}
         if given not in ({"u", "v"}, {"x", "y", "z"}):
             raise ValueError("give either a pixel {u, v} of the left picture or a point {x, y, z} in metres")
-        if not all(math.isfinite(getattr(self, name)) for name in given):
-            raise ValueError(f"{', '.join(sorted(given))} must be finite")
+        if not all(abs(getattr(self, name)) <= LARGEST for name in given):  # nor is NaN
+            raise ValueError(f"{', '.join(sorted(given))} must be finite, and no more than {LARGEST:g}")
 
 
 class AnchorName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -113,9 +114,11 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.K is None:
             return None
         K = _matrix(self.K, 3, "K")
-        plain = K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == K[1, 0] == 0 and tuple(K[2]) == (0, 0, 1)
+        plain = min(K[0, 0], K[1, 1]) >= 1 and K[0, 1] == K[1, 0] == 0 and tuple(K[2]) == (0, 0, 1)
         if not plain:
-            raise ValueError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with positive fx, fy")
+            raise ValueError(
+                "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx and fy of 1 or more"
+            )
         return K
 
 
@@ -141,6 +144,6 @@ def _matrix(rows: tuple[Row, ...], size: int, name: str) -> F64:
     if len(rows) != size or any(len(row) != size for row in rows):
         raise ValueError(f"{name} must be {size} rows of {size} numbers")
     matrix = np.array(rows, np.float64)
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{name} must be finite")
+    if not (np.abs(matrix) <= LARGEST).all():  # nor is NaN
+        raise ValueError(f"{name} must be finite, and no more than {LARGEST:g}")
     return matrix

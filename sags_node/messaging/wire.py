@@ -41,7 +41,7 @@ class WireError(SagsError):
 class Meta(msgspec.Struct, frozen=True, kw_only=True):
     """The second part of every message; unknown keys are ignored."""
 
-    v: Annotated[str, msgspec.Meta(pattern=r"^1\.[0-9]{1,4}$")] = PROTOCOL
+    v: Annotated[str, msgspec.Meta(pattern=r"^1\.[0-9]{1,4}\Z")] = PROTOCOL
     type: Text  # ROS 2 type of the joined parts
     type_hash: Text  # RIHS01
     seq: Count  # per topic and session; a gap is a lost message

@@ -139,7 +139,12 @@ def show(result: Table | str | dict[str, Any] | list[dict[str, Any]]) -> None:
     if isinstance(result, Table):
         click.echo(_drawn(result))
     else:
-        click.echo(visible(result) if isinstance(result, str) else json.dumps(result))
+        click.echo(visible(result) if isinstance(result, str) else json_text(result))
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """JSON, in a line without `indent`; a number that is not finite becomes null: others read no NaN."""
+    return json.dumps(json.loads(json.dumps(value), parse_constant=lambda name: None), indent=indent)
 
 
 def _drawn(table: Table) -> str:

@@ -19,7 +19,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
-from bridging import anchored, anchored_at, bridged, options_of, plane_bridged, sockets
+from bridging import (
+    HIDDEN,
+    LOST,
+    SEEN,
+    UNSURE,
+    anchored,
+    anchored_at,
+    bridged,
+    options_of,
+    plane_bridged,
+    sockets,
+)
 from browsers import new_page
 from places import ROOT
 from synthetic import HEIGHT, WIDTH, at_frame, plane_result, stream
@@ -324,5 +335,7 @@ def test_the_example_shows_the_model_in_a_page_of_its_own(page: Any, tmp_path: P
             with making(running, anchored()):
                 page.goto(f"{site}/?from=ws://127.0.0.1:{port}/ws")
                 until(lambda: pixels(page, "model").any())
-                until(lambda: " px" in str(page.text_content("#anchors")))
+                told = until(lambda: page.text_content("#anchors"))
+                seen = f"{SEEN}: 20 20 px, {HIDDEN}: 50 30 px"
+                assert told == f"{seen}, {LOST}: not recognised, {UNSURE}: not recognised"
         server.shutdown()

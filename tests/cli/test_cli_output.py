@@ -24,6 +24,7 @@ from places import ROOT
 from rich.markup import escape
 from user_files import videos
 
+from sags_node.cli.launching import write_json
 from sags_node.cli.main import main
 from sags_node.errors import SagsError
 from sags_node.files import check_file, check_results, whole
@@ -129,6 +130,16 @@ def test_no_command_overwrites_what_comes_while_it_works(
     assert [file.name for file in tmp_path.iterdir()] == [name] and Path(name).read_text() == "theirs"
     Path(name).unlink()
     assert sags(*said).exit_code == 0 and Path(name).read_bytes() != b"theirs"
+
+
+def test_what_is_not_known_is_null_in_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As the place of an anchor that is lost."""
+    row = {"id": 1, "x": float("nan"), "z": [float("inf"), 0.25]}
+    terminal.show([row])
+    write_json(tmp_path / "rows.json", [row])
+    told = [{"id": 1, "x": None, "z": [None, 0.25]}]
+    assert pure_json(capsys.readouterr().out) == told
+    assert pure_json((tmp_path / "rows.json").read_text())["rows"] == told
 
 
 def test_figures_and_results_of_before_are_replaced_also_when_they_come_late(tmp_path: Path) -> None:

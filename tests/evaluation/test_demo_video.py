@@ -8,10 +8,12 @@ import av
 import numpy as np
 import pytest
 from av.video.reformatter import Colorspace
+from small_disk import small_disk
 
 from sags_node.clients.bridge.h264 import Encoder
 from sags_node.clients.overlay.draw import over
 from sags_node.clients.overlay.save import Layers, read_layers
+from sags_node.errors import SagsError
 from sags_node.media.video import Video
 from sags_node.media.video_file import VideoFile
 from sags_node.tools.demo import Shown
@@ -82,6 +84,28 @@ def test_a_long_pause_is_left_out_and_said(
     stamps = Video(tmp_path / "video.mp4").stamps
     assert stamps is not None and stamps[-1] - stamps[0] == 10**9 * length
     assert said in caplog.text and ("pause" in caplog.text) == bool(said)
+
+
+def test_a_full_disk_ends_the_layers_and_not_the_overlay(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 1 << 20) as disk:
+        layers = Layers(disk / "layers")
+        for frame_id in range(6):
+            layers.add(frame_id, np.full((300, 300, 4), 255, np.uint8))
+        with pytest.raises(SagsError, match=r"cannot write .*layers: No space left"):
+            layers.close()
+        assert [*read_layers(disk / "layers")] == [0, 1]
+
+
+def test_a_picture_of_another_size_is_shown_whole(tmp_path: Path) -> None:
+    """As after a restart of the node with another size."""
+    file, halves = VideoFile(tmp_path / "video.mp4", RATE, (64, 48)), np.repeat([200, 20], 48)
+    file.add(np.zeros((48, 64, 3), np.uint8))
+    file.add(np.broadcast_to(halves[:, None, None], (96, 128, 3)).astype(np.uint8))
+    file.finish()
+    with av.open(str(tmp_path / "video.mp4")) as video:
+        *_, last = (frame.to_ndarray(format="rgb24") for frame in video.decode(video=0))
+    assert last.shape == (48, 64, 3)
+    np.testing.assert_allclose(last[[8, 40]].mean((1, 2)), (200, 20), atol=4)
 
 
 def test_its_file_is_what_browsers_play(tmp_path: Path) -> None:

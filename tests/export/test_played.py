@@ -220,8 +220,9 @@ def places_v21(out: Path) -> list[dict[str, dict[str, Any]]]:
 
 def test_statistics_of_several_episodes_are_those_of_all_their_numbers() -> None:
     random = np.random.default_rng(5)
-    parts = [random.normal(number, 1 + number, (20 + 10 * number, 3)) for number in range(3)]
+    parts = [random.normal(100 + number, 1 + number, (20 + 10 * number, 3)) for number in range(3)]
     parts[1][4] = np.nan  # a lost point
+    parts.append(np.full((9, 3), np.nan))  # nothing known in a whole episode
     stats = []
     for part in parts:
         sums = Sums()

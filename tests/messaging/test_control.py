@@ -18,7 +18,7 @@ from ports import free_port
 from synthetic import publisher
 from waiting import beside, repeating, until
 
-from sags_node.errors import SagsError
+from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.control import MAX_PENDING, ControlClient, Handler
 from sags_node.node.operations import Requests
 
@@ -56,6 +56,9 @@ def test_results_and_errors_come_back(tmp_path: Path) -> None:
             asker.request("unsendable")
         with pytest.raises(SagsError, match=r"unknown op 'doubel'.*double"):
             asker.request("doubel")
+        for unsendable in (2**70, "\udcff", object()):
+            with pytest.raises(UsageError, match="ping: what is asked cannot be sent"):
+                asker.request("ping", {"x": unsendable})
         assert asker.request("ping") == "pong"
 
 

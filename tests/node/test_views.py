@@ -280,11 +280,15 @@ def test_wrong_poses_and_cameras_are_refused() -> None:
         ({"K": skewed, "fov": 50}, "not both"),
         ({"T_world_cam": mirrored}, "rotation"), ({"T_left_cam": far}, "in metres"), ({"K": skewed}, "fx"),
         ({"T_left_cam": identity[:3]}, "4 rows of 4"), ({"K": [[float("nan")] * 3] * 3}, "finite"),
+        ({"K": np.diag([1e300, 1, 1]).tolist()}, "no more than"), ({"name": "a\n"}, "name"),
+        ({"K": np.diag([1e-300, 1, 1]).tolist()}, "of 1 or more"),
         ({"fov": 170}, "150"), ({"rate_hz": 0}, "> 0"), ({"width": 1920, "height": 1920}, "too large"),
     ):  # fmt: skip
         with pytest.raises(SagsError, match=message):
             parse(ViewRequest, {"name": "a", **args})
     assert parse(AnchorRequest, {"u": 3, "v": 4}).u == 3
+    with pytest.raises(SagsError, match="no more than"):
+        parse(AnchorRequest, {"x": 1e300, "y": 0, "z": 0})
 
 
 def test_a_relative_view_moves_with_the_left_camera() -> None:

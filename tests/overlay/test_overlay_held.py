@@ -150,6 +150,17 @@ def placed_at(thing: HeldObject, frame: TissueFrame) -> np.ndarray:
     raise AssertionError(thing.reason)
 
 
+def test_without_a_calibration_nothing_is_sure() -> None:
+    """Its size beside the tissue is a guess then."""
+    thing = held([{"pixel": [30, 40]}])
+    known = with_anchors([on_plane(30, 40)])
+    placed_at(thing, known)
+    for metric in (True, False):
+        put = thing.placed(replace(known, metric=metric))
+        assert put is not None and put.is_sure is thing.is_sure is metric
+    assert "calibrated" in str(thing.status()["unsure"])
+
+
 def test_one_anchor_carries_the_object_and_keeps_its_direction_while_hidden() -> None:
     thing = held([{"pixel": [30, 40]}], pinner=(pinner := FakePinner()))
     T = placed_at(thing, with_anchors([on_plane(30, 40)]))

@@ -130,6 +130,7 @@ BAD_FILES = {
     "nan.ply": (ply(body=CORNERS.replace("0.01", "nan", 1) + "3 0 1 2\n"), "1 of its 3 vertices"),
     "huge.xyz": (b"0 8 5" + b"1" * 40, "1 of its 1 vertices"),
     "far.ply": (ply(body=CORNERS.replace("0.01", "10") + "3 0 1 2\n"), "for millimetres set scale: 0.001"),
+    "tiny.ply": (ply(body=CORNERS.replace("0.01", "1e-5") + "3 0 1 2\n"), "for metres set scale: 1"),
     **{f"{face}.ply": (ply(body=f"{CORNERS}{face}\n"), "a face names a vertex that is not there")
        for face in ("3 0 1 3", "3 0 1 -1", "5 0 1 2 0 2147483647")},
     **{f"binary {corner}.ply": (binary_ply(0, 1, corner), "a face names a vertex that is not there")

@@ -459,6 +459,10 @@ def test_a_live_node_is_shown_obeys_and_disappears(
 
     page.get_by_role("button", name="Pause").click()
     until(lambda: "paused" in status(page) and contrast(page) < 2, page)
+    assert page.get_by_text("nothing new").count() == 1, "whether there are anchors is not known now"
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    assert "_1970" not in download.value.suggested_filename
     page.get_by_role("button", name="Resume").click()
     until(lambda: "running" in status(page) and contrast(page) > 15, page)
 

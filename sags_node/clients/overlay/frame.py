@@ -75,6 +75,7 @@ class TissueFrame:
     anchors: dict[int, Anchor]
     confidence: F32 | None = None  # [H, W] 0..1 of the depth; None: the node does not tell
     recorded_s: float | None = None  # its place in the recording that the node plays; None: not said
+    metric: bool = True  # False: nobody has calibrated the eyes, so lengths are right up to a factor
 
     def surface(self, where: Bool) -> Surface:
         """Some points of the surface that is measured where a picture [H, W] is true."""
@@ -120,4 +121,5 @@ def tissue_frame(
         },
         confidence=None if confidence is None else confidence.array,
         recorded_s=None if depth.meta.recorded_s is msgspec.UNSET else depth.meta.recorded_s,
+        metric=depth.metric,
     )

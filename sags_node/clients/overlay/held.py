@@ -34,6 +34,7 @@ ELSEWHERE = (
 )
 AGAIN = "it comes back once recognised; else pin it again, by four anchors or more"
 UNRECOGNISED = "its anchors were not recognised lately"
+NO_UNIT = "nobody has calibrated the eyes: its size beside the tissue is a guess"
 GONE = f"the tissue at its anchors left the model; {AGAIN}"
 
 log = logging.getLogger(__name__)
@@ -108,7 +109,7 @@ class HeldObject:
         T = self.place(frame)
         if T is None:
             return None
-        put, doubts = Placed(self._body, T), [self.unsure]
+        put, doubts = Placed(self._body, T), [None if frame.metric else NO_UNIT, self.unsure]
         if self._bend is not None:
             put = replace(put, vertices=self._bend.move(frame, T))
             doubts.append(self._bend.doubt and f"it is drawn rigid: {self._bend.doubt}")

@@ -25,6 +25,7 @@ MAX_FILE_BYTES = 64 << 20
 MAX_TRIANGLES = 200_000
 MAX_POINTS = 20_000
 LARGEST = 1.0  # m across: nothing in a body is larger
+SMALLEST = 5e-4  # m across: nobody sees what is smaller, and a zone so small warns of nothing
 HEADER_BYTES = 1 << 16
 GREEN = (60, 230, 120)  # RGB
 ROD = 0.0003  # m, the radius of a line
@@ -131,6 +132,11 @@ def _check_vertices(file: Path, vertices: F64) -> None:
         raise UsageError(
             f"{file} is {across:.3g} m across, {LARGEST:g} m at most makes sense; "
             "for millimetres set scale: 0.001"
+        )
+    if across < SMALLEST and len(vertices) > 1:
+        raise UsageError(
+            f"{file} is {1e3 * across:.3g} mm across, {1e3 * SMALLEST:g} mm at least make sense; "
+            "for metres set scale: 1"
         )
 
 

@@ -203,9 +203,11 @@ class _Overlay:
         self._stream.tell(self._facts())
         self._pinner.close()
         self._worker.shutdown(cancel_futures=True)
-        if self._layers is not None:
-            self._layers.close()
-        self._output.close()
+        try:
+            if self._layers is not None:
+                self._layers.close()
+        finally:
+            self._output.close()
 
     def summary(self) -> dict[str, Any]:
         """See `run_overlay`."""

@@ -35,22 +35,32 @@ class Layers:
     def __init__(self, file: Path, force: bool = False) -> None:
         check_file(file, force)
         self._path = file
+        self._failed: OSError | None = None
         with writing(file):
             self._file: BinaryIO = file.open("wb")
 
     def add(self, frame_id: int, rgba: U8 | None) -> None:
-        """Add one frame [H, W, 4]; None: it was blank."""
+        """Add one frame [H, W, 4]; None: it was blank. What cannot be written is said by `close`."""
+        if self._failed is not None:
+            return
         top = left = height = width = 0
         if rgba is not None and rgba[..., 3].any():
             left, top, width, height = cv2.boundingRect(rgba[..., 3])
-        with writing(self._path):
+        try:
             self._file.write(_LAYER.pack(frame_id, top, left, height, width))
             if rgba is not None:
                 self._file.write(np.ascontiguousarray(rgba[top : top + height, left : left + width]).data)
+        except OSError as error:
+            self._failed = error  # the overlay itself goes on
 
     def close(self) -> None:
+        """Raises:
+        SagsError: not all of it was written.
+        """
         with writing(self._path):
             self._file.close()
+            if self._failed is not None:
+                raise self._failed
 
 
 class Layer(NamedTuple):

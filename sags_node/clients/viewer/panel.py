@@ -261,8 +261,9 @@ class Panel:
         self._send(client, f"Export {kind}", f"_{kind}.ply", lambda: exported(moment, kind, self._exporter))
 
     def _send(self, client: viser.ClientHandle, title: str, ending: str, make: Callable[[], bytes]) -> None:
-        """A file of this moment, named by its time."""
-        name = time.strftime("sags_%Y%m%d_%H%M%S", time.localtime(self._moment.t_capture_ns * 1e-9)) + ending
+        """A file of this moment, named by its time; where nothing is shown, by now."""
+        stamp = 1e-9 * self._moment.t_capture_ns or time.time()
+        name = time.strftime("sags_%Y%m%d_%H%M%S", time.localtime(stamp)) + ending
         try:
             client.send_file_download(name, make(), save_immediately=True)
         except SagsError as error:
@@ -311,11 +312,11 @@ class Panel:
             choice.value = chosen  # type: ignore[misc]  # as above
 
     def _list_anchors(self, anchors: NDArray[Any] | None) -> None:
-        rows = [] if anchors is None else list(anchors)
-        self._anchor_rows.content = anchor_table(rows, self._unit)
         if anchors is None:  # nothing fresh came: what somebody has chosen stays
-            self._distance.content = ""
+            self._anchor_rows.content, self._distance.content = _line("nothing new"), ""
             return
+        rows = list(anchors)
+        self._anchor_rows.content = anchor_table(rows, self._unit)
         numbers = (NONE, *(str(int(row["id"])) for row in rows))
         for choice in (self._chosen, self._other):
             if choice.options != numbers:

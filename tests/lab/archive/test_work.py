@@ -11,15 +11,16 @@ import pytest
 from fsspec.core import url_to_fs
 from tiny_archive import quick_plan, quick_work, write_quick_recordings
 
+from sags_lab.archive import results
 from sags_lab.archive.inputs import fetched, key_of, scratch
 from sags_lab.archive.jobs import FIGURES, JOBS, LOG, command
-from sags_lab.archive.manifest import Recording
+from sags_lab.archive.manifest import Recording, as_csv
 from sags_lab.archive.process import Limits
-from sags_lab.archive.results import read_results, write_results
-from sags_lab.archive.run import about
+from sags_lab.archive.results import of_one, read_results, status, write_results
+from sags_lab.archive.run import about, describe
 from sags_lab.archive.store import Store
 from sags_lab.archive.work import Needs, needs, work
-from sags_node.errors import UsageError
+from sags_node.errors import SagsError, UsageError
 
 
 @pytest.fixture
@@ -146,6 +147,44 @@ def test_the_key_changes_with_all_that_decides_the_result(tiny_session: Path, tm
     picture.touch()
     assert len({key, before, key_of(named, about(plan)), *others}) == 6
     assert key_of(recording, about(plan)) != key
+
+
+def test_what_was_done_with_other_settings_is_missing_until_it_is_done_again(tmp_path: Path) -> None:
+    """As after a run with changed settings that was stopped."""
+    recordings = write_quick_recordings(tmp_path / "in", 2)
+    before, now = (quick_plan(tmp_path / "out", f"mapping.rung:={rung}") for rung in (0, 1))
+    store = Store(now.out)
+    for recording in recordings:
+        quick_work(recording, before, key_of(recording, about(before)))
+    describe(store, recordings, now, as_csv(recordings))
+    assert status(store)["missing"] == 2
+    quick_work(recordings[0], now, key_of(recordings[0], about(now)))
+    assert write_results(store, recordings) == 1 and status(store)["done"] == 1
+    assert [of_one(store, each.id)["state"] for each in recordings] == ["done", "missing"]
+    describe(store, recordings, before, as_csv(recordings))  # what was not begun is not lost
+    assert of_one(store, recordings[1].id)["state"] == "done"
+
+
+@pytest.mark.parametrize("name", ["done/{}.key.json", "failed/{}.json", "archive.json"])
+def test_what_is_damaged_is_named(name: str, tmp_path: Path) -> None:
+    recordings, plan = write_quick_recordings(tmp_path / "in", 1), quick_plan(tmp_path / "out")
+    store = Store(plan.out)
+    for each in ("done/{}.key.json", name):
+        store.write(each.format(recordings[0].id), b'{"id": ')
+    with pytest.raises(SagsError, match=rf"{name.format(recordings[0].id)} is damaged; remove it"):
+        write_results(store, recordings)
+
+
+def test_a_figure_of_several_kinds_is_text_in_large_archives_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(results, "BATCH", 1)
+    recordings = write_quick_recordings(tmp_path / "in", 3)
+    store = Store(str(tmp_path / "out"))
+    for recording, value in zip(recordings, (1.5, "auto", None), strict=True):
+        store.write_json(f"done/{recording.id}.key.json", {"id": recording.id, "said": value, "n": 1})
+    assert write_results(store, recordings) == 3
+    assert [(row["said"], row["n"]) for row in read_results(store)] == [("1.5", 1), ("auto", 1), (None, 1)]
 
 
 def test_what_killed_workers_left_is_removed(tmp_path: Path) -> None:

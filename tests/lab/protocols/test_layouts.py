@@ -153,6 +153,12 @@ def test_stir_end_to_end(stir: Path) -> None:
     assert found["unmoved_mm"]["within_32"] > 0
 
 
+@pytest.mark.parametrize("changed", ["source.frames:=3", "source.start:=0.2", "source.stride:=2"])
+def test_frames_without_the_marks_of_stir_are_not_compared_with_them(changed: str, stir: Path) -> None:
+    said = (changed.partition(":=")[0], "frames that would not be played", "leave it out")
+    refused(2, "eval", "--protocol", "stir", stir, changed, said=said)
+
+
 def test_pixels_go_to_the_working_picture_and_back(recorded: tuple[StereoRig, list[StereoFrame]]) -> None:
     rig, _ = recorded
     camera = Rectifier(rig, 160, 128).camera

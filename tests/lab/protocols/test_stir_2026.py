@@ -108,6 +108,15 @@ def test_stir_2026_end_to_end(stir: Path) -> None:
 def test_without_what_follows_the_first_frame_nothing_is_measured(stir: Path) -> None:
     said = ("no annotated frame after the first", "source.frames")
     refused(1, "eval", "--protocol", "stir", str(stir), "source.frames:=2", said=said)
+    refused(
+        2,
+        "eval",
+        "--protocol",
+        "stir",
+        str(stir),
+        "source.start:=0.2",
+        said=("source.start: points are marked",),
+    )
 
 
 def test_wrong_files_of_2026(stir: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from command_line import figures_of
+from command_line import figures_of, refused
 from places import SESSION
 
 from sags_lab.protocols.point_tracker import PointTracker, raw_pair, to_raw
@@ -150,6 +150,8 @@ def test_stereomis_tracking_end_to_end(tracked: Path, frames: list[StereoFrame],
     np.testing.assert_array_equal(sequence.visible, seen)
     assert sequence.rig.baseline == pytest.approx(rig.baseline)
     np.testing.assert_array_equal(sequence.poses, np.tile(np.eye(4), (FRAMES, 1, 1)))
+    for key in ("source.start:=0.1", "source.stride:=2"):
+        refused(2, "eval", "--protocol", "stereomis", tracked, key, said=("points are marked in frames",))
     found = figures_of("eval", "--protocol", "stereomis", tracked, "--iterations", "1", "--json")
     assert found["frames"] == FRAMES and found["points"] == len(pixels) and found["masks"] is True
     assert found["tracked"]["survival"] == 1 and found["tracked"]["delta"] >= found["unmoved"]["delta"] > 0
