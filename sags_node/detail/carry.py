@@ -4,23 +4,23 @@ A view's pixel at depth z is a point of tissue. Less its motion since the source
 camera, that point falls on a pixel of the source's picture. It counts where the source showed tissue, and
 where the surface that it showed was as deep. That place changes slowly over a view: it is worked out for
 every fourth pixel along both axes (`trace`), and lies on straight lines between. What the picture shows there
-is looked up for each pixel (`carry`).
+is looked up for each pixel that has none yet (`carry`): of a left view these are few.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.geometry import resized_camera, scale_intrinsics
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only
-from sags_node.types import F32, I32, U8, Camera
+from sags_node.types import F32, I64, U8, Camera
 
 EVERY = 4  # px of the view
 EVERYWHERE = np.ones((1, 1), np.uint8)
@@ -34,10 +34,12 @@ NOWHERE = -1e6  # px
 FINDINGS = 3  # of a ray's place in the source, each from where the last one met its surface
 CLOSE = 1e-3  # of the depth: nearer to that surface it is found
 LITTLE = 3.0  # px of motion from one frame to the next: depths at edges differ by more than SAME all the same
-MIDDLE = 128  # of the levels of a picture: for tints
 _STILL = np.zeros((4, 1, 1), np.float32)
 f4 = np.float32
 u8 = np.uint64
+ONE, BYTE = u8(1), u8(255)
+G, B = u8(32), u8(16)  # bits: their lanes
+LANES, HALVES = u8(0x00FF00FF00FF00FF), u8(0x0080008000800080)
 
 
 def coarse_camera(camera: Camera) -> Camera:
@@ -191,65 +193,133 @@ def carry(
         shown: [H, W, 3] RGB of the view; written.
         taken: [H, W] the share that each pixel got, 0..255; written. Pixels that have one already stay.
         lent: of `SeenFrame.lent`.
-        gain: [3] factor that brings the source's light to that of the view.
+        gain: [3] factor that brings the source's light to that of the view, at most 100.
         tint: [m, n, 3] for the coarse camera: added to the picture, in the place of colours 0..1.
     """
-    column, row, columns, rows = cv2.boundingRect(traced.share)
-    if not columns:
+    _, row, _, rows = cv2.boundingRect(traced.share)
+    if not rows:
         return
-    top, left = max(EVERY * (row - 2), 0), max(EVERY * (column - 2), 0)  # px that they reach
-    free = taken[top : EVERY * (row + rows), left : EVERY * (column + columns)]
-    by_pixel = partial(_by_pixel, top=top, left=left, size=free.shape)
-    found = cv2.remap(lent, by_pixel(traced.places), None, cv2.INTER_LINEAR)
+    planes: list[NDArray[Any]] = [traced.places, traced.share[..., None]]
     if tint is not None:
-        levels = np.rint(np.pad(tint, ((0, 0), (0, 0), (0, 1))) * f4(255)) + f4(MIDDLE)
-        more = cv2.copyMakeBorder(np.clip(levels, 0, 255).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
-        found = cv2.addWeighted(found, 1, by_pixel(more), 1, -MIDDLE)
-    tissue = cv2.compare(cv2.extractChannel(found, 3), 127, cv2.CMP_GT)
-    share = cv2.bitwise_and(by_pixel(traced.share), cv2.compare(free, 0, cv2.CMP_EQ), mask=tissue)
-    paste(cv2.cvtColor(found, cv2.COLOR_RGBA2RGB), share, shown[top:], left, gain)
-    cv2.max(free, share, dst=free)
-
-
-def _by_pixel(coarse: Any, top: int, left: int, size: tuple[int, int]) -> Any:
-    """A box of the view from a map [m + 2, n + 2, ...]: on straight lines between the pixels of its coarse
-    camera, and one more on each side.
-
-    Args:
-        top, left: px of the view, where a coarse pixel begins.
-        size: rows and columns, px.
-    """
-    (height, width), row, column = size, top // EVERY, left // EVERY
-    around = coarse[row : row - (-height // EVERY) + 2, column : column - (-width // EVERY) + 2]
-    fine = cv2.resize(around, None, fx=EVERY, fy=EVERY, interpolation=cv2.INTER_LINEAR)
-    return fine[EVERY : EVERY + height, EVERY : EVERY + width]
-
-
-def paste(picture: U8, share: U8, shown: U8, left: int = 0, gain: F32 = NO_GAIN) -> None:
-    """Blend the `share` [H, W] 0..255 of a picture [H, W, 3] into one that is as large or larger.
-
-    Args:
-        shown: written, in the first rows from column `left` on.
-        gain: [3] factor of the picture's colours, at most 100.
-    """
-    _paste(read_only(picture), read_only(share), shown, left, np.rint(256 * gain).astype(np.int32))
+        planes.append(f4(255) * np.pad(tint, ((1, 1), (1, 1), (0, 0)), mode="edge"))
+    coarse = np.concatenate(planes, axis=2, dtype=f4)
+    first, end = EVERY * (row - 1) - EVERY // 2, EVERY * (row + rows) - EVERY // 2  # that they reach
+    _carry(
+        shown, taken, read_only(coarse), read_only(lent).view(np.uint32)[..., 0],
+        np.rint(256 * gain).astype(np.int64), max(first, 0), min(end, len(shown)),
+    )  # fmt: skip
 
 
 @parallel_kernel
-def _paste(picture: U8, share: U8, shown: U8, left: Any, gain: I32) -> None:
-    for row in prange(len(picture)):
-        y = np.int64(row)
-        _paste_row(picture[y].reshape(-1), share[y], shown[y].reshape(-1)[3 * left :], gain)
+def _carry(shown: U8, taken: U8, coarse: F32, lent: Any, gain: I64, first: Any, end: Any) -> None:
+    for number in prange(end - first):
+        y = np.int64(first + number)
+        row = (y + EVERY // 2) // EVERY  # of the two that it lies between
+        down = (f4(y + EVERY // 2 - EVERY * row) + f4(0.5)) / f4(EVERY)
+        _carry_row(shown[y].reshape(-1), taken[y], coarse[row], coarse[row + 1], down, lent, gain)
 
 
 @kernel
-def _paste_row(picture: U8, share: U8, shown: U8, gain: I32) -> None:
+def _carry_row(shown: U8, taken: U8, above: F32, below: F32, down: Any, lent: Any, gain: I64) -> None:
+    """Each group of pixels lies between two coarse ones. From one pixel to the next all grows by the same, in
+    units of 2**-16: the place u, v, the share, and the tint."""
+    wide, high = u8((lent.shape[1] - 1) << 16), u8((lent.shape[0] - 1) << 16)
+    width, tinted, red, green, blue = u8(len(taken)), above.shape[1] > 3, gain[0], gain[1], gain[2]
+    lit = red != 256 or green != 256 or blue != 256
+    r = g = b = more_r = more_g = more_b = 0
+    for group in range(len(above) - 1):
+        c = u8(group)
+        if max(above[c, u8(2)], above[c + ONE, u8(2)], below[c, u8(2)], below[c + ONE, u8(2)]) == f4(0):
+            continue
+        u, more_u = _growing(above, below, c, u8(0), down)
+        v, more_v = _growing(above, below, c, u8(1), down)
+        share, more_share = _growing(above, below, c, u8(2), down)
+        if tinted:
+            r, more_r = _growing(above, below, c, u8(3), down)
+            g, more_g = _growing(above, below, c, u8(4), down)
+            b, more_b = _growing(above, below, c, u8(5), down)
+        u, v = u + 128, v + 128  # the nearest 256th
+        for x in range(EVERY * group - EVERY // 2, EVERY * group + EVERY // 2):
+            if u8(x) < width and taken[u8(x)] == 0 and u8(u) < wide and u8(v) < high:  # and not below 0
+                i, j, right, under = u8(v >> 16), u8(u >> 16), u8(u >> 8) & BYTE, u8(v >> 8) & BYTE
+                found = _mixed(
+                    _mixed(_lanes(lent[i, j]), _lanes(lent[i, j + ONE]), right),
+                    _mixed(_lanes(lent[i + ONE, j]), _lanes(lent[i + ONE, j + ONE]), right),
+                    under,
+                )
+                if found >> u8(55):  # more than half is tissue
+                    if tinted:
+                        found = _rgb(_tinted(found, r), _tinted(found >> G, g), _tinted(found >> B, b))
+                    if lit:
+                        found = _rgb(_lit(found, red), _lit(found >> G, green), _lit(found >> B, blue))
+                    part, at = u8(share + 32768) >> u8(16), u8(3 * x)
+                    taken[u8(x)] = np.uint8(part)
+                    was = _rgb(u8(shown[at]), u8(shown[at + ONE]), u8(shown[at + u8(2)]))
+                    found = _mixed(was, found, part + (part >> u8(7)))  # 255 of 255 is 256 of 256
+                    shown[at], shown[at + ONE] = np.uint8(found), np.uint8(found >> G)
+                    shown[at + u8(2)] = np.uint8(found >> B)
+            u, v, share = u + more_u, v + more_v, share + more_share
+            r, g, b = r + more_r, g + more_g, b + more_b
+
+
+@inlined
+def _growing(above: F32, below: F32, c: Any, plane: Any, down: Any) -> Any:
+    """What a plane of coarse pixels is at a group's first pixel, and by how much it grows to the next."""
+    before = above[c, plane] + down * (below[c, plane] - above[c, plane])
+    after = above[c + ONE, plane] + down * (below[c + ONE, plane] - above[c + ONE, plane])
+    step = (after - before) * f4(2**16 / EVERY)
+    return np.int64(before * f4(2**16) + f4(0.5) * step), np.int64(step)
+
+
+@inlined
+def _lanes(pixel: Any) -> Any:
+    """The four bytes of RGBA in lanes of 16 bits: R, B, G, A from the lowest on."""
+    bits = u8(pixel)
+    return (bits | bits << u8(24)) & LANES
+
+
+@inlined
+def _mixed(a: Any, b: Any, part: Any) -> Any:
+    """`a` with `part` of 256 of `b`, lane by lane."""
+    return ((a * (u8(256) - part) + b * part + HALVES) >> u8(8)) & LANES
+
+
+@inlined
+def _rgb(r: Any, g: Any, b: Any) -> Any:
+    return r | g << G | b << B
+
+
+@inlined
+def _tinted(lane: Any, tint: Any) -> Any:
+    """The lowest lane with a tint, in units of 2**-16."""
+    return u8(min(max(np.int64(lane & BYTE) + ((tint + 32768) >> 16), 0), 255))
+
+
+@inlined
+def _lit(lane: Any, gain: Any) -> Any:
+    """The lowest lane times a gain, in units of 2**-8."""
+    return u8(min((np.int64(lane & BYTE) * gain + 128) >> 8, 255))
+
+
+def paste(picture: U8, share: U8, shown: U8) -> None:
+    """Blend the `share` [H, W] 0..255 of a picture [H, W, 3] into `shown`, of that size, which is written."""
+    _paste(read_only(picture), read_only(share), shown)
+
+
+@parallel_kernel
+def _paste(picture: U8, share: U8, shown: U8) -> None:
+    for row in prange(len(picture)):
+        y = np.int64(row)
+        _paste_row(picture[y].reshape(-1), share[y], shown[y].reshape(-1))
+
+
+@kernel
+def _paste_row(picture: U8, share: U8, shown: U8) -> None:
     half, eight = np.int32(128), np.int32(8)
     for x in range(u8(len(share))):
         part = np.int32(share[x])
         part += part >> np.int32(7)  # 255 of 255 is 256 of 256
         for c in range(u8(3)):
             at = u8(3) * x + c
-            level = min((np.int32(picture[at]) * gain[c] + half) >> eight, np.int32(255))
             was = np.int32(shown[at])
-            shown[at] = np.uint8(was + (((level - was) * part + half) >> eight))
+            shown[at] = np.uint8(was + (((np.int32(picture[at]) - was) * part + half) >> eight))

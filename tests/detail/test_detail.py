@@ -111,9 +111,10 @@ def test_the_kernels_do_what_their_twin_does(aside: float, share: float) -> None
     shown, taken = carried(depth, camera, source, share=share)
     expected = twin(np.full_like(shown, 90), depth, camera, source, share)
     differs = np.abs(shown.astype(int) - expected).max(-1)
-    # Places in steps of 1/32 px along two axes, where a picture changes by up to 255 levels; three roundings
-    # to whole levels. Beside the step in depth there is one between two fourth pixels.
-    assert differs[:, 26:].max() <= share * 2 * 255 / 64 + 1.5 and differs[:, :14].max() == 0
+    # Places in steps of 1/256 px along two axes, where a picture changes by up to 255 levels; three roundings
+    # to whole levels, and a share in steps of 1/255. Beside the step in depth there is one between two fourth
+    # pixels.
+    assert differs[:, 26:].max() <= share * 2 * 255 / 512 + 2.5 and differs[:, :14].max() == 0
     assert not taken[:, :16].any() and (taken[:, 28:] > 0).mean() > 0.85
 
 
