@@ -163,8 +163,7 @@ def unknown_form(path: Path) -> str:
         what = f"no calibration: no {path / 'left.yaml'}; a rig is a folder with left.yaml and right.yaml"
         return f"{what}; {near(path)}"
     looked_for = "; ".join(form.value for form in Form)
-    others = "docs/calibration.md converts others"
-    return f"{path} is no calibration; looked for: {looked_for}; {others}"
+    return f"{path} is no calibration; looked for: {looked_for}; docs/calibration.md converts others"
 
 
 # ---- two cameras and how they stand to each other ---------------------------------------------------------
