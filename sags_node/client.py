@@ -6,7 +6,7 @@ or Open3D.
 """
 
 from sags_node.errors import SagsError
-from sags_node.messaging.address import ClientKeys
+from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.async_subscriber import AsyncSubscriber
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.freshness import StaleError
@@ -30,5 +30,5 @@ __all__ = [
     "MEASURING", "AsyncSubscriber", "ClientKeys", "ControlClient", "Frame", "FrameSender", "Measured",
     "NodeClock", "Offset", "PoseSender", "Received", "ReceivedCameraInfo", "ReceivedCloud",
     "ReceivedCompressed", "ReceivedImage", "ReceivedRos", "ReceivedText", "SagsError", "StaleError",
-    "Subscriber", "TopicName", "measure",
+    "Subscriber", "TopicName", "client_keys", "measure",
 ]  # fmt: skip

@@ -17,6 +17,7 @@ from sags_node.cli.launching import (
     force_option,
     group_of,
     launch_argument,
+    launched,
     path_option,
     positive,
     show_findings,
@@ -89,7 +90,7 @@ def calib() -> None:
 @calib.command()
 @path_argument
 @click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
-@path_option("--session", help="Launch file or session to compare with.")
+@path_option("--session", help="Launch file or recording to compare with.")
 @click.option(
     "--images",
     type=(click.Path(path_type=Path), click.Path(path_type=Path)),
@@ -129,7 +130,7 @@ def check(
     if stray is not None:
         raise UsageError(f"'{stray}': one calibration at a time; pictures come after --images or --session")
     with progress("comparing") as advance:
-        findings = check_calibration(path, session, images, overrides_only, size, metres, advance)
+        findings = check_calibration(path, session, images, overrides_only, size, metres, advance, launched)
     rows = [asdict(finding) for finding in findings]
     show_findings(rows, json_out, f"{path} cannot be used as it is")
 
@@ -157,7 +158,7 @@ def convert(
 
     if path.resolve() in (file.resolve() for file in (out, *eye_files(out))):
         raise UsageError(f"{out} is what is converted, and would be replaced; name another folder")
-    rig = resized_rig(read_calibration(path, size, metres), scale)
+    rig = resized_rig(read_calibration(path, size, metres, launched), scale)
     refuse_errors(check_rig(rig, metres), path)
     check_files(*eye_files(out), force=force)
     save_rig(rig, out)

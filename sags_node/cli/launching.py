@@ -16,7 +16,7 @@ from sags_node.terminal import text
 from sags_node.terminal.console import console, json_text, progress, show
 
 if TYPE_CHECKING:
-    from sags_node.config.schema import Source
+    from sags_node.config.schema import LaunchConfig, Source
     from sags_node.pipeline.session import Guess, Session
 
 
@@ -91,6 +91,13 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     from sags_node.tools.importing.check import overrides_of
 
     return path, [*overrides_of(Path(path)), *overrides]
+
+
+def launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
+    """The configuration of what `split` takes."""
+    from sags_node.config.launch_file import load_launch
+
+    return load_launch(*split([str(path), *overrides]))
 
 
 session_option = click.option("--session", metavar="RECORDING", help="The recording, named by an option.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from string import Template
@@ -289,8 +290,9 @@ def _explain(
             said = COMMAND_LINE if f"{where}.kind" in given else name
             lines.append(f"{said}: {where}.kind: should be one of {kinds} (got {brief(got)})")
         else:
-            what = _PLAIN.get(item["type"], item["msg"])
-            lines.append(f"{said}: {where or 'launch file'}: {what} (got {brief(item.get('input'))})")
+            what = _PLAIN.get(item["type"], item["msg"]).removeprefix("Value error, ")
+            got = "" if isinstance(item["input"], dict) else f" (got {brief(item['input'])})"
+            lines.append(f"{said}: {where or 'launch file'}: {what}{got}{_described(path, root)}")
     if len(mistakes) > MOST_MISTAKES:
         lines.append(f"{name}: and {len(mistakes) - MOST_MISTAKES} more")
     return "\n".join(lines)
@@ -304,22 +306,35 @@ _PLAIN = {  # where pydantic speaks of Python
 }
 
 
+def _described(path: Sequence[str], root: type[Section]) -> str:
+    """What the documents say of a key, and so its unit; "" of what is none."""
+    key = path[-1] if path else ""
+    fields = [one.model_fields[key] for one in _sections_at(path[:-1], root) if key in one.model_fields]
+    said = next((field.description for field in fields if field.description), None)
+    return "" if said is None else f"; docs/launch.md: {re.split('[.] |; default: ', said)[0]}"
+
+
 def _nearest(path: Sequence[str], root: type[Section]) -> str:
     """The known key that was probably meant: of this section, or one of that name in another."""
     known = _known_keys(path[:-1], root)
-    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.6)
     if not near:
         near = [f"{part}.{path[-1]}" for part in _SECTIONS if path[-1] in _known_keys([part], LaunchConfig)]
     return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(sorted(known))}"
 
 
 def _known_keys(path: Sequence[str], root: type[Section]) -> list[str]:
-    there = [root]  # sections that it may be
+    return list(dict.fromkeys(name for one in _sections_at(path, root) for name in one.model_fields))
+
+
+def _sections_at(path: Sequence[str], root: type[Section]) -> list[type[Section]]:
+    """What a section may be."""
+    there = [root]
     for part in path:  # a key, a kind, or a number in a list
         kinds = [one for one in there if (kind := one.model_fields.get("kind")) and kind.default == part]
         inner = [section for one in there for section in _sections_in(one, part)]
         there = kinds or inner or there
-    return list(dict.fromkeys(name for one in there for name in one.model_fields))
+    return there
 
 
 def _sections_in(section: type[Section] | None, key: str) -> list[type[Section]]:

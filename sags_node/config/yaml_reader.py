@@ -155,6 +155,18 @@ def _unfolded(value: Any) -> Any:
 def _in_words(error: yaml.YAMLError) -> str:
     """One line of what PyYAML says in several."""
     if isinstance(error, yaml.MarkedYAMLError):
-        line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
-        return line + (error.problem or error.context or "it cannot be read")[:LONGEST]
+        problem = error.problem or error.context or "it cannot be read"
+        begun = error.context_mark if error.context == "while scanning a simple key" else None
+        mark = begun or error.problem_mark  # what is missing is missed later
+        line = "" if mark is None else f"line {mark.line + 1}: "
+        fix = next((fix for said, fix in _FIXES.items() if problem.startswith(said)), "")
+        return line + problem[:LONGEST] + fix
     return " ".join(str(error).split())[:LONGEST]
+
+
+_FIXES = {  # of the beginning of what PyYAML says
+    "found character '\\t'": "; indent with spaces, not with tabs",
+    "mapping values": "; give keys of one section the same indent, and put a text with ': ' in quotes",
+    "expected <block end>": "; give keys of one section the same indent",
+    "could not find expected ':'": "; write 'key: value'",
+}

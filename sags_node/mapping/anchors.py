@@ -159,7 +159,10 @@ class Anchors:
         carriers = _carriers(point, snapshot.gaussians)
         if len(carriers[0]) == 0:
             place = ", ".join(f"{x:.4f}" for x in point)
-            raise SagsError(f"the model has no tissue within {REACH * 1e3:g} mm of ({place}) m, world")
+            raise SagsError(
+                f"the model has no tissue within {REACH * 1e3:g} mm of ({place}) m, world; choose another "
+                "place, or wait until it was in sight for a second"
+            )
         anchor_id = self._next_id
         row = _row(anchor_id, point, carriers)
         _carry(row, snapshot.gaussians)

@@ -91,6 +91,8 @@ class Video:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        if path.is_dir():
+            raise UsageError(f"video {path} is a folder; of pictures: source.kind:=folders")
         if not path.is_file():
             raise UsageError(f"video {path} does not exist; check the path, or SAGS_DATA if it is used")
         seen = path.stat()

@@ -32,8 +32,8 @@ class ClientKeys:
     node: bytes | None = None
 
 
-def client_keys(key: Path | None, node_key: str | None) -> ClientKeys | None:
-    """The keys named on the command line: a `.key` file, and the node's public key or `.pub` file.
+def client_keys(key: Path | str | None, node_key: str | None) -> ClientKeys | None:
+    """The keys that are named: an own `.key` file, and the node's public key or `.pub` file.
 
     Raises:
         UsageError: a file is not what it should be, or the node's key is given without an own one.
@@ -42,7 +42,7 @@ def client_keys(key: Path | None, node_key: str | None) -> ClientKeys | None:
         if node_key is not None:
             raise UsageError(f"--server-key needs --key: {_HOW}")
         return None
-    return ClientKeys(read_key_pair(key), None if node_key is None else public_key(node_key))
+    return ClientKeys(read_key_pair(Path(key)), None if node_key is None else public_key(node_key))
 
 
 @dataclass(frozen=True, slots=True)

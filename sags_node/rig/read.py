@@ -68,7 +68,7 @@ class Form(Enum):
     ROS_FOLDER = "ROS camera_info files left.yaml and right.yaml"
     ROS_ARCHIVE = "calibrationdata.tar.gz of ROS camera_calibration"
     OPENCV_PAIR = "intrinsics and extrinsics files of OpenCV's stereo_calib"
-    OPENCV_FILE = "one OpenCV file with all matrices"
+    OPENCV_FILE = "one OpenCV file (.yml, .yaml, .xml) with all matrices, by its name"
     TEXT_FOLDER = "text matrices of scikit-surgery"
 
 
@@ -163,7 +163,7 @@ def unknown_form(path: Path) -> str:
         what = f"no calibration: no {path / 'left.yaml'}; a rig is a folder with left.yaml and right.yaml"
         return f"{what}; {near(path)}"
     looked_for = "; ".join(form.value for form in Form)
-    return f"{path} is no calibration; looked for: {looked_for}"
+    return f"{path} is no calibration; looked for: {looked_for}; docs/calibration.md converts others"
 
 
 # ---- two cameras and how they stand to each other ---------------------------------------------------------

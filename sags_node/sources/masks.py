@@ -116,6 +116,10 @@ class Masks:
         if not listed:
             found, counts = np.unique(codes[_alike(codes)], return_counts=True)
             there = [f"#{code:06x}" for code in found[counts > SMALLEST_AREA * codes.size]]
+            if not there:
+                raise UsageError(
+                    f"{file} has no area of one colour, so it is no mask; name a folder of masks"
+                )
             if not (isinstance(self._instruments, str) and set(there) <= {*ENDOVIS, *ENDOVIS_TISSUE}):
                 raise _question(file, there, [name for name in there if name != "#000000"])
             listed = [*ENDOVIS]

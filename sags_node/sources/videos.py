@@ -105,10 +105,14 @@ class VideoPairs(Pairs):
         if left.rate is not None and right.rate is not None:
             apart = abs(left.rate - right.rate) / left.rate
             if apart > (0.01 if is_even else UNEVEN_RATES):
+                said = "they are not one stereo pair: record both at one rate, or bring one to it"
+                way = f"-i {shlex.quote(str(right.path))} -r {left.rate:g}"
+                if left.count == right.count:  # none may be added
+                    said = f"both have {left.count} pictures, so one rate is wrong; is it the right one's"
+                    way = f"-r {left.rate:g} -i {shlex.quote(str(right.path))}"
                 raise UsageError(
-                    f"{left.path} has {left.rate} frames/s but {right.path} has {right.rate}; they are not "
-                    "one stereo pair: record both at one rate, or bring one to it (ffmpeg -i "
-                    f"{shlex.quote(str(right.path))} -r {left.rate:g} NEW)"
+                    f"{left.path} has {left.rate:g} frames/s but {right.path} has {right.rate:g}; {said} "
+                    f"(ffmpeg {way} NEW)"
                 )
         if left.stamps is None or right.stamps is None or left.rate is None:
             return None

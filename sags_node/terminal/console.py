@@ -107,18 +107,19 @@ def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[C
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None, visible=False)
         said = began = now()
-        first, count = 0, 0  # where the count that runs began, and of how many it is
+        first, last, count = 0, 0, 0  # where the count that runs began and is, and of how many it is
 
         def advance(done: int, total: int | None = None, description: str | None = None) -> None:
-            nonlocal said, began, first, count
+            nonlocal said, began, first, last, count
             bar.update(
                 task, completed=done, total=total, description=visible(description or what), visible=True
             )
             if console.is_terminal:
                 return
             moment, of = now(), total or 0
-            if of != count or done < first:
+            if of != count or done < last:
                 began, first, count = moment, done, of
+            last = done
             if moment - said >= SAY_EVERY:
                 said = moment
                 rest = ""

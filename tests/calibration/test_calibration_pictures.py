@@ -469,6 +469,18 @@ def test_check_with_files_and_folders(phantom_session: Path) -> None:
         assert code == 0 and "rows agree" in out
 
 
+def test_a_recording_without_a_launch_file_is_a_session_too(phantom_session: Path, tmp_path: Path) -> None:
+    """As everywhere; where it brings no calibration, one is checked against it, else its own."""
+    for eye in ("left", "right"):
+        (tmp_path / eye).symlink_to(phantom_session / eye)
+    for own in (False, True):
+        if own:
+            (tmp_path / "calib").symlink_to(phantom_session / "calib")
+        said = [tmp_path] if own else [phantom_session / "calib", "--session", tmp_path]
+        code, out, _ = sags(*said)
+        assert code == 0 and "rows agree" in out
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

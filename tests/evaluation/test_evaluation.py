@@ -1,6 +1,7 @@
 """What is kept, the measuring of a run with known answers, golden comparison and the report."""
 
 import json
+import re
 import tempfile
 from collections import Counter
 from dataclasses import replace
@@ -442,6 +443,16 @@ def test_a_plot_is_valid_svg_with_a_gap_where_nothing_is_known() -> None:
     numbers = np.array(line.replace("M", "").replace("L", "").split(), float).reshape(-1, 2)
     assert numbers[1, 1] < numbers[0, 1]  # larger is higher
     assert line_plot("empty", [Series("one", "#123456", [])], {}) == ""
+
+
+def test_the_names_of_all_lines_of_a_report_lie_inside_it() -> None:
+    long = "the model alone, of a frame that it learnt from"
+    names = [long, "left render, mostly this picture", "the picture before, again", "kept back, never seen"]
+    svg = line_plot("", [Series(name, "#123456", [(0, 1.0), (1, 2.0)]) for name in names], {})
+    (width,) = re.findall(r'viewBox="0 0 ([0-9.]+)', svg)
+    for name in names:
+        (begin,) = re.findall(rf' x="([0-9.]+)"[^>]*>{name}<', svg)
+        assert float(begin) + 5 * len(name) < float(width)  # pt a letter of this size, at most
 
 
 def test_without_matplotlib_it_says_at_once_what_to_install(

@@ -22,9 +22,9 @@ from waiting import beside, until
 from zmq.auth import load_certificate
 
 from sags_node.cli.main import main
+from sags_node.client import ClientKeys, client_keys
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging.address import ClientKeys, client_keys
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS
 from sags_node.messaging.roles import Client
@@ -260,7 +260,8 @@ def test_missing_and_needless_keys_are_named_at_once(tmp_path: Path, keys: Path)
         Subscriber([TOPIC], endpoint="tcp://127.0.0.1:9", keys=viewer)
     with pytest.raises(UsageError, match="--server-key needs --key"):
         client_keys(None, str(keys / "node.pub"))
-    assert client_keys(keys / "stranger.key", str(keys / "node.pub")) == of(keys, "stranger")
+    for own in (keys / "stranger.key", str(keys / "stranger.key")):
+        assert client_keys(own, str(keys / "node.pub")) == of(keys, "stranger")
 
 
 def test_refusals_reach_the_log_but_do_not_fill_it(

@@ -145,6 +145,13 @@ def test_other_masks_are_asked_about_and_read_as_is_answered(name: str, tmp_path
         assert frame.tissue is not None and (frame.tissue == ~TOOL)[sure].all()
 
 
+def test_a_photograph_is_no_mask(tmp_path: Path) -> None:
+    """A wrong folder: it was taken for masks without an instrument."""
+    noise = np.random.default_rng(0).integers(0, 256, (*TOOL.shape, 3), np.uint8)
+    with pytest.raises(UsageError, match="no area of one colour, so it is no mask; name a folder of masks"):
+        open_source(with_masks(tmp_path, noise))
+
+
 def test_a_label_that_comes_late_is_asked_about_there(tmp_path: Path) -> None:
     config = with_masks(tmp_path, grey((SHAFT, 255)))
     cv2.imwrite(str(tmp_path / "masks/5.png"), grey((SHAFT, 255), (TIP, 85)))

@@ -43,6 +43,7 @@ FEWEST_KNOWN = 0.1  # of the patches
 FOUND_BACK = 0.7  # px
 
 Progress = Callable[[int, int], None]
+Launched = Callable[[Path, Sequence[str]], LaunchConfig]
 GOOD_ROWS = (0.7, 2.0)  # px of the full picture, median and 90 %
 FIRST_PAIRS = 2  # that tell whether pictures were rectified
 DISPARITY_MARGIN = 4.0  # px beyond those of matched points
@@ -56,22 +57,24 @@ def check_calibration(
     size: tuple[int, int] | None = None,
     metres: float | None = None,
     progress: Progress | None = None,
+    launched: Launched = load_launch,
 ) -> list[Finding]:
     """Look over a calibration, or the one a session uses, and compare it with pictures where there are some.
 
     Args:
         path: a calibration of any known form, or a session, which is then compared with its own pictures.
-        session: launch file or session folder whose pictures are used.
+        session: launch file or recording whose pictures are used.
         images: pairs of files or of folders.
         overrides: `key:=value` of the session.
         size, metres: as in `read_rig`.
+        launched: reads a session.
 
     Raises:
         UsageError: a path is wrong, or nothing known is there.
         SagsError: pictures cannot be read.
     """
-    own = None if find_form(path) is not None else _launched(path, overrides)
-    config = own if session is None else load_launch(session, overrides)
+    own = None if find_form(path) is not None else _launched(path, overrides, launched)
+    config = own if session is None else launched(session, overrides)
     pairs: list[Pair] = []
     depths: Sequence[F32 | None] = ()
     if images:
@@ -89,10 +92,12 @@ def check_calibration(
     return judge(rig, pairs, depths, metres)
 
 
-def read_calibration(path: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
+def read_calibration(
+    path: Path, size: tuple[int, int] | None, metres: float | None, launched: Launched = load_launch
+) -> StereoRig:
     """`read_rig`, also of the calibration that a session uses."""
     known = find_form(path) is not None
-    return read_rig(path, size, metres) if known else _rig_of(_launched(path, ()), size, metres)
+    return read_rig(path, size, metres) if known else _rig_of(_launched(path, (), launched), size, metres)
 
 
 def judge(
@@ -145,11 +150,11 @@ def rectified_before(config: LaunchConfig) -> bool:
     return bool(matches) and bool(judge_rectified(rig, np.concatenate(matches)))
 
 
-def _launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
+def _launched(path: Path, overrides: Sequence[str], launched: Launched) -> LaunchConfig:
     if not path.exists():
         raise UsageError(unknown_form(path))
     try:
-        return load_launch(path, overrides)
+        return launched(path, overrides)
     except UsageError as error:
         if (path / "launch.yaml").exists():
             raise

@@ -121,5 +121,5 @@ def line_plot(
         axes.set_xlabel(across)
         axes.set_ylabel(up)
         if len(series) > 1:
-            figure.legend(loc="outside lower left", ncols=len(series))
+            figure.legend(loc="outside lower left", ncols=len(series) if len(series) < 4 else 2)  # all fit
         return as_svg(figure)

@@ -157,7 +157,7 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
             spans,
         ),
         line_plot(
-            "How long a frame took: ms (grey: missed)",
+            "How long a frame took: ms (grey: missed or kept back)",
             [series("stamp to sending", BLUE, "latency_ms"), series("work", ORANGE, "frame_ms")],
             spans,
             gaps=missed,
