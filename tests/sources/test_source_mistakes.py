@@ -66,7 +66,7 @@ def beyond(folder: Path) -> Recording:
 # What is wrong, made in a folder of `recordings`; what is said.
 MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: folders_of(at, "nowhere"), "nowhere does not exist; check the path"),
-    (lambda at: cfg.VideosSource(left=at / "l", right=at / "r"), "l is a folder; of pictures: source.kind:=folders"),
+    (lambda at: cfg.VideosSource(left=at / "l", right=at / "r"), "l is a folder; of pictures: source.kind"),
     (lambda at: folders_of(at, "l/000.png"), "000.png is not a folder; check the path"),
     (lambda at: (at / "empty").mkdir() or folders_of(at, right="empty"), "empty holds no picture"),
     (lambda at: [(at / f"r/00{n}.png").unlink() for n in range(4)] and folders_of(at),
