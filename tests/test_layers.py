@@ -47,7 +47,7 @@ LINES = {
     "sags_node/instruments": 820,
     "sags_node/field": 1747,
     "sags_node/kernels": 1231,
-    "sags_node/mapping": 5591,
+    "sags_node/mapping": 5595,
     "sags_node/media": 915,
     "sags_node/messaging": 5394,
     "sags_node/model": 1094,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1844,
     "sags_node/tools/importing": 1180,
     "sags_node/vision": 5460,
-    "tests": 50095,
+    "tests": 50105,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -69,13 +69,14 @@ def affordable(config: LaunchConfig, width: int, height: int) -> int:
     # Where time is short, steps show more than Gaussians that share few pixels (`benchmarks/ladder.md`).
     each = PIXELS_PER_GAUSSIAN if config.mapping.iterations is None else LEAST_PIXELS
     most = max(100, width * height // each)
-    if config.mapping.iterations is None or config.mapping.rung is not None:
-        return min(most, max(rung.gaussians for rung in rungs_of(config)))
+    number = config.mapping.rung
+    if config.mapping.iterations is None or number is not None:
+        return min(most, rungs_of(config)[-1 if number is None else number].gaussians)
     return max(100, min(most, round(per_ms * config.mapping.frame_ms())))
 
 
 def rungs_of(config: LaunchConfig, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]:
-    """Those that the mapper may be on, from the cheapest to the best.
+    """The ladder's, from the cheapest to the best.
 
     Raises:
         UsageError: `mapping.rung` names none.
@@ -84,8 +85,6 @@ def rungs_of(config: LaunchConfig, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]
     rungs: tuple[Rung, ...] = RUNGS if device_of(config).kind == "cpu" else GPU_RUNGS
     if number is not None and number >= len(rungs):
         raise UsageError(f"mapping.rung {number}: the ladder's rungs are 0 to {len(rungs) - 1}")
-    if number is not None:
-        rungs = (rungs[number],)
     return rungs if skips.depth else tuple(replace(rung, depth_every=1) for rung in rungs)
 
 
@@ -102,13 +101,14 @@ def make_budget(
     """
     mapping = config.mapping
     if mapping.iterations is not None:
-        rung = EVERYTHING if mapping.rung is None else rungs_of(config, skips)[0]
+        rung = EVERYTHING if mapping.rung is None else rungs_of(config, skips)[mapping.rung]
         return StepBudget(mapping.iterations, rung)
     if speed is None:
         speed = _measured_speed(config)
     prices = ON_CPU if device_of(config).kind == "cpu" else ON_GPU
     seconds = 1e-3 * mapping.frame_ms(rate)
-    return TimeBudget(Ladder(rungs_of(config, skips), width * height, seconds, speed, prices))
+    rungs = rungs_of(config, skips)
+    return TimeBudget(Ladder(rungs, width * height, seconds, speed, prices, mapping.rung))
 
 
 def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None) -> LaunchConfig:

@@ -149,8 +149,9 @@ class Ladder:
     """
 
     def __init__(
-        self, rungs: Sequence[Rung], pixels: int, seconds: float, speed: float = 1.0, prices: Prices = ON_CPU
-    ) -> None:
+        self, rungs: Sequence[Rung], pixels: int, seconds: float, speed: float = 1.0,
+        prices: Prices = ON_CPU, fixed: int | None = None,
+    ) -> None:  # fmt: skip
         """
         Args:
             rungs: from the cheapest to the best.
@@ -158,8 +159,10 @@ class Ladder:
             seconds: that a frame may take.
             speed: how long the machine takes, in units of the prices' machine.
             prices: what frames cost there.
+            fixed: the rung that it stays on.
         """
         self._rungs = rungs
+        self._fixed = fixed
         self._prices = prices
         self._pixels = pixels
         self.speed = speed
@@ -171,8 +174,9 @@ class Ladder:
         self._patience = PATIENCE
         self._climbed = False  # whether the last change was up
         self.seconds = seconds
-        self.place = self._best(FIRST_AIM)
-        self.reason = "by the machine's speed"
+        self.place, self.reason = self._best(FIRST_AIM), "by the machine's speed"
+        if fixed is not None:
+            self.place, self.reason = fixed, "by mapping.rung"
 
     @property
     def rung(self) -> Rung:
@@ -235,7 +239,7 @@ class Ladder:
         return max((i for i in range(len(self._rungs)) if self._expected(i) <= most), default=0)
 
     def _go(self, place: int, reason: str) -> None:
-        if place == self.place:
+        if place == self.place or self._fixed is not None:
             return
         self._climbed = place > self.place
         self.place, self.reason = place, reason

@@ -174,11 +174,21 @@ def test_what_a_launch_pins_and_switches_off() -> None:
     def rungs(rung: int | None = None, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]:
         return rungs_of(LaunchConfig(device="cpu", mapping=MappingConfig(rung=rung)), skips)
 
-    assert rungs() == RUNGS
-    assert rungs(rung=3) == (RUNGS[3],)
+    assert rungs() == rungs(rung=3) == RUNGS
     assert {rung.depth_every for rung in rungs(skips=Skips(depth=False))} == {1}
     with pytest.raises(UsageError, match=r"mapping\.rung 99: the ladder's rungs are 0 to \d+"):
         rungs(rung=99)
+
+
+def test_a_pinned_rung_stays_and_says_its_number() -> None:
+    budget = make_budget(LaunchConfig(device="cpu", mapping=MappingConfig(rung=4)), 640, 512, speed=1.0)
+    for _ in range(3 * FIRST_FRAMES):
+        budget.start()
+        budget.step()
+        budget.finish(50_000)  # in no time
+    state = budget.start().state
+    assert state is not None and (state.number, state.of) == (4, len(RUNGS))
+    assert state.reason == "by mapping.rung" and state.gaussians == RUNGS[4].gaussians
 
 
 def test_how_many_gaussians_a_model_may_have() -> None:
