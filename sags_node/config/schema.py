@@ -816,7 +816,7 @@ class MappingConfig(Section):
     )
     budget_ms: float | None = Field(
         None,
-        gt=0,
+        ge=1,
         le=1000,
         description="wall time of one frame, all stages; default: nine tenths of the time until the next "
         "one comes, 100 at most; 33 where a recording is not played in real time",

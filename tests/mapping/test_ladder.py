@@ -202,7 +202,7 @@ def test_how_many_gaussians_a_model_may_have() -> None:
     assert most(max_gaussians=777) == 777
     assert most(rung=2) == RUNGS[2].gaussians
     assert most(iterations=1, budget_ms=20) == 22_000
-    assert most(iterations=1, budget_ms=0.01) == 100
+    assert most(20, 10, iterations=1, budget_ms=1) == 100
 
 
 def test_a_new_budget_goes_on_at_the_speed_of_the_one_before() -> None:
