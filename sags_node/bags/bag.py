@@ -7,7 +7,7 @@ false length nor an index that lies can take memory; db3 and ROS 1 files are rea
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from sags_node.messaging import cdr
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
+DATE = 6  # digits at least: a number of so many counts no files
 RECORDED = "sags"  # metadata of a bag that says which node was recorded from here on
 RELATIVE = {"sags_units": "relative"}  # metadata of a channel whose lengths have no unit
 AHEAD = "sags_ahead_ms"  # metadata of a channel whose content is predicted: how far ahead of the stamp
@@ -178,6 +179,14 @@ def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
     found = folder.glob(f"{SHOWN}{suffix}")
     return sorted(found, key=lambda file: (_whole(file.stem.rpartition("_")[2]), file.name))
+
+
+def missing_files(files: Sequence[Path]) -> int:
+    """Count the files of a recording that are missing before its last: they are numbered from 0, as case_0."""
+    parts = [file.stem.rpartition("_")[2] for file in files]
+    if not all(part.isdecimal() and len(part) < DATE for part in parts):
+        return 0
+    return max(map(int, parts), default=-1) + 1 - len(set(parts))
 
 
 def _stem(stem: str) -> str:

@@ -378,5 +378,6 @@ def recovered_text(done: Mapping[str, Any]) -> str:
         "messages without a topic": done["messages_lost"],
         "bytes that are no records": done["bytes_skipped"],
         "files cut off or never closed": done["unclosed_files"],
+        "files missing": done["files_missing"],
     }
     return f"{saved}; not whole: " + ", ".join(f"{what} {count}" for what, count in parts.items() if count)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import random
+import shutil
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -164,6 +165,19 @@ def test_two_recordings_are_not_joined(plane_bag: Path, tmp_path: Path) -> None:
         described.replace(f"  - {file.name}", "  - case1_0.mcap\n  - case2_0.mcap")
     )
     assert recover(both, out)["messages"] == 2 * bag_info(plane_bag)["messages"]
+
+
+@pytest.mark.parametrize(
+    ("names", "missing"),
+    [("case_0 case_2", 1), ("case_1", 1), ("case_0 case_1", 0), ("case_20260102", 0), ("case", 0)],
+)
+def test_a_file_that_is_missing_is_lost(names: str, missing: int, plane_bag: Path, tmp_path: Path) -> None:
+    (file,) = plane_bag.glob("*.mcap")
+    (tmp_path / "case").mkdir()
+    for name in names.split():
+        shutil.copy(file, tmp_path / "case" / f"{name}.mcap")
+    done = recover(tmp_path / "case", tmp_path / "saved")
+    assert (done["files_missing"], done["lost"]) == (missing, missing > 0)
 
 
 def test_recover_on_the_command_line(plane_bag: Path, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from sags_node.bags.bag import (
     check_one,
     files_in,
     marks_of,
+    missing_files,
     read_messages,
     records_of,
     storage_files,
@@ -41,10 +42,12 @@ class Recovery:
     messages_lost: int = 0  # known by number; a damaged chunk hides how many it held
     bytes_skipped: int = 0
     unclosed_files: int = 0
+    files_missing: int = 0  # by the numbers of those that are there
 
     @property
     def lost(self) -> bool:
-        return bool(self.chunks_damaged or self.messages_lost or self.bytes_skipped or self.unclosed_files)
+        parts = self.chunks_damaged, self.messages_lost, self.bytes_skipped, self.unclosed_files
+        return any(parts) or self.files_missing > 0
 
 
 def recover(path: Path, out: Path) -> dict[str, Any]:
@@ -66,7 +69,7 @@ def recover(path: Path, out: Path) -> dict[str, Any]:
         raise UsageError(
             f"{path}: only MCAP is recovered; for ROS 1 use rosbag reindex, for db3 sqlite3 .recover"
         )
-    done = Recovery()
+    done = Recovery(files_missing=missing_files(files) if path.is_dir() else 0)
     bag = BagWriter(out)
     try:
         with bag:
