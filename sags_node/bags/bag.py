@@ -182,7 +182,7 @@ def files_in(folder: Path, suffix: str) -> list[Path]:
 
 
 def missing_files(files: Sequence[Path]) -> int:
-    """Count the files of a recording that are missing before its last: their numbers begin with 0 (case_0)."""
+    """Count the files of a recording that are missing before its last; they are numbered from 0: case_0."""
     parts = [file.stem.rpartition("_")[2] for file in files]
     if not all(part.isdecimal() and len(part) < DATE for part in parts):
         return 0
