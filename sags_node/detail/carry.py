@@ -223,8 +223,8 @@ def _carry(shown: U8, taken: U8, coarse: F32, lent: Any, gain: I64, first: Any, 
 def _carry_row(shown: U8, taken: U8, above: F32, below: F32, down: Any, lent: Any, gain: I64) -> None:
     """Each group of pixels lies between two coarse ones. From one pixel to the next all grows by the same, in
     units of 2**-16: the place u, v, the share, and the tint."""
-    wide, high = u8((lent.shape[1] - 1) << 16), u8((lent.shape[0] - 1) << 16)
-    width, tinted, red, green, blue = u8(len(taken)), above.shape[1] > 3, gain[0], gain[1], gain[2]
+    wide, high = (lent.shape[1] - 1) << 16, (lent.shape[0] - 1) << 16
+    tinted, red, green, blue = above.shape[1] > 3, gain[0], gain[1], gain[2]
     lit = red != 256 or green != 256 or blue != 256
     r = g = b = more_r = more_g = more_b = 0
     for group in range(len(above) - 1):
@@ -240,7 +240,7 @@ def _carry_row(shown: U8, taken: U8, above: F32, below: F32, down: Any, lent: An
             b, more_b = _growing(above, below, c, u8(5), down)
         u, v = u + 128, v + 128  # the nearest 256th
         for x in range(EVERY * group - EVERY // 2, EVERY * group + EVERY // 2):
-            if u8(x) < width and taken[u8(x)] == 0 and u8(u) < wide and u8(v) < high:  # and not below 0
+            if 0 <= x < len(taken) and taken[u8(x)] == 0 and 0 <= u < wide and 0 <= v < high:
                 i, j, right, under = u8(v >> 16), u8(u >> 16), u8(u >> 8) & BYTE, u8(v >> 8) & BYTE
                 found = _mixed(
                     _mixed(_lanes(lent[i, j]), _lanes(lent[i, j + ONE]), right),

@@ -535,7 +535,7 @@ def moving(count: int, shift: int = 0) -> list[U8]:
 @pytest.mark.parametrize(
     ("right", "rate", "said"),
     [
-        (40, 30.0, ("25.0 frames/s", "30.0", "not one stereo pair")),
+        (40, 30.0, ("25 frames/s", "has 30", "one rate is wrong")),
         (25, 25.0, ("right.avi has 25 pictures, ", "left.avi 40", "source.frames:=25")),
     ],
     ids=["another rate", "too short"],
