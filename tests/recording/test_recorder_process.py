@@ -139,7 +139,7 @@ def test_a_late_snapshot_is_not_taken_for_the_next_one(
         patched.setattr(child, "SNAPSHOT_SECONDS", 0.2)
         with pytest.raises(SagsError, match="no snapshot came from the recorder"):
             recorder.snapshot().result(ANSWER)
-    with pytest.raises(SagsError, match="still writes the snapshot before; ask later"):
+    with pytest.raises(SagsError, match="still writes the snapshot before; ask again later"):
         recorder.snapshot().result(ANSWER)
     os.kill(process, signal.SIGCONT)
 
