@@ -48,7 +48,7 @@ LINES = {
     "sags_node/field": 1747,
     "sags_node/kernels": 1231,
     "sags_node/mapping": 5595,
-    "sags_node/media": 915,
+    "sags_node/media": 916,
     "sags_node/messaging": 5394,
     "sags_node/model": 1094,
     "sags_node/node": 1847,

@@ -201,6 +201,7 @@ class Video:
 
     def close(self) -> None:
         self._frame = None
+        self._frames: Iterator[av.VideoFrame] = iter(())  # else garbage collection ends it, in any thread
         self._container.close()
 
     def _find_rate(self) -> tuple[float | None, bool]:
