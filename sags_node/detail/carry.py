@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sags_node.detail.seen import SAME, SeenFrame
 from sags_node.geometry import resized_camera, scale_intrinsics
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only
-from sags_node.types import F32, I64, U8, Camera
+from sags_node.types import F32, I32, I64, U8, Camera
 
 EVERY = 4  # px of the view
 EVERYWHERE = np.ones((1, 1), np.uint8)
@@ -202,7 +202,7 @@ def carry(
     planes: list[NDArray[Any]] = [traced.places, traced.share[..., None]]
     if tint is not None:
         planes.append(f4(255) * np.pad(tint, ((1, 1), (1, 1), (0, 0)), mode="edge"))
-    coarse = np.concatenate(planes, axis=2, dtype=f4)
+    coarse = np.rint(256 * np.concatenate(planes, axis=2, dtype=f4)).astype(np.int32)
     first, end = EVERY * (row - 1) - EVERY // 2, EVERY * (row + rows) - EVERY // 2  # that they reach
     _carry(
         shown, taken, read_only(coarse), read_only(lent).view(np.uint32)[..., 0],
@@ -211,25 +211,25 @@ def carry(
 
 
 @parallel_kernel
-def _carry(shown: U8, taken: U8, coarse: F32, lent: Any, gain: I64, first: Any, end: Any) -> None:
+def _carry(shown: U8, taken: U8, coarse: I32, lent: Any, gain: I64, first: Any, end: Any) -> None:
     for number in prange(end - first):
         y = np.int64(first + number)
         row = (y + EVERY // 2) // EVERY  # of the two that it lies between
-        down = (f4(y + EVERY // 2 - EVERY * row) + f4(0.5)) / f4(EVERY)
+        down = 2 * (y + EVERY // 2 - EVERY * row) + 1  # eighths of the way from one to the other
         _carry_row(shown[y].reshape(-1), taken[y], coarse[row], coarse[row + 1], down, lent, gain)
 
 
 @kernel
-def _carry_row(shown: U8, taken: U8, above: F32, below: F32, down: Any, lent: Any, gain: I64) -> None:
+def _carry_row(shown: U8, taken: U8, above: I32, below: I32, down: Any, lent: Any, gain: I64) -> None:
     """Each group of pixels lies between two coarse ones. From one pixel to the next all grows by the same, in
-    units of 2**-16: the place u, v, the share, and the tint."""
-    wide, high = (lent.shape[1] - 1) << 16, (lent.shape[0] - 1) << 16
+    units of 2**-14: the place u, v, the share, and the tint. All are whole numbers, for any machine alike."""
+    wide, high = (lent.shape[1] - 1) << 14, (lent.shape[0] - 1) << 14
     tinted, red, green, blue = above.shape[1] > 3, gain[0], gain[1], gain[2]
     lit = red != 256 or green != 256 or blue != 256
     r = g = b = more_r = more_g = more_b = 0
     for group in range(len(above) - 1):
         c = u8(group)
-        if max(above[c, u8(2)], above[c + ONE, u8(2)], below[c, u8(2)], below[c + ONE, u8(2)]) == f4(0):
+        if max(above[c, u8(2)], above[c + ONE, u8(2)], below[c, u8(2)], below[c + ONE, u8(2)]) == 0:
             continue
         u, more_u = _growing(above, below, c, u8(0), down)
         v, more_v = _growing(above, below, c, u8(1), down)
@@ -238,10 +238,10 @@ def _carry_row(shown: U8, taken: U8, above: F32, below: F32, down: Any, lent: An
             r, more_r = _growing(above, below, c, u8(3), down)
             g, more_g = _growing(above, below, c, u8(4), down)
             b, more_b = _growing(above, below, c, u8(5), down)
-        u, v = u + 128, v + 128  # the nearest 256th
+        u, v = u + 32, v + 32  # the nearest 256th
         for x in range(EVERY * group - EVERY // 2, EVERY * group + EVERY // 2):
             if 0 <= x < len(taken) and taken[u8(x)] == 0 and 0 <= u < wide and 0 <= v < high:
-                i, j, right, under = u8(v >> 16), u8(u >> 16), u8(u >> 8) & BYTE, u8(v >> 8) & BYTE
+                i, j, right, under = u8(v >> 14), u8(u >> 14), u8(u >> 6) & BYTE, u8(v >> 6) & BYTE
                 found = _mixed(
                     _mixed(_lanes(lent[i, j]), _lanes(lent[i, j + ONE]), right),
                     _mixed(_lanes(lent[i + ONE, j]), _lanes(lent[i + ONE, j + ONE]), right),
@@ -252,7 +252,7 @@ def _carry_row(shown: U8, taken: U8, above: F32, below: F32, down: Any, lent: An
                         found = _rgb(_tinted(found, r), _tinted(found >> G, g), _tinted(found >> B, b))
                     if lit:
                         found = _rgb(_lit(found, red), _lit(found >> G, green), _lit(found >> B, blue))
-                    part, at = u8(share + 32768) >> u8(16), u8(3 * x)
+                    part, at = u8((share + 8192) >> 14), u8(3 * x)
                     taken[u8(x)] = np.uint8(part)
                     was = _rgb(u8(shown[at]), u8(shown[at + ONE]), u8(shown[at + u8(2)]))
                     found = _mixed(was, found, part + (part >> u8(7)))  # 255 of 255 is 256 of 256
@@ -263,12 +263,11 @@ def _carry_row(shown: U8, taken: U8, above: F32, below: F32, down: Any, lent: An
 
 
 @inlined
-def _growing(above: F32, below: F32, c: Any, plane: Any, down: Any) -> Any:
+def _growing(above: I32, below: I32, c: Any, plane: Any, down: Any) -> Any:
     """What a plane of coarse pixels is at a group's first pixel, and by how much it grows to the next."""
-    before = above[c, plane] + down * (below[c, plane] - above[c, plane])
-    after = above[c + ONE, plane] + down * (below[c + ONE, plane] - above[c + ONE, plane])
-    step = (after - before) * f4(2**16 / EVERY)
-    return np.int64(before * f4(2**16) + f4(0.5) * step), np.int64(step)
+    before = np.int64(above[c, plane]) * (8 - down) + np.int64(below[c, plane]) * down
+    after = np.int64(above[c + ONE, plane]) * (8 - down) + np.int64(below[c + ONE, plane]) * down
+    return 7 * before + after, 2 * (after - before)
 
 
 @inlined
@@ -291,8 +290,8 @@ def _rgb(r: Any, g: Any, b: Any) -> Any:
 
 @inlined
 def _tinted(lane: Any, tint: Any) -> Any:
-    """The lowest lane with a tint, in units of 2**-16."""
-    return u8(min(max(np.int64(lane & BYTE) + ((tint + 32768) >> 16), 0), 255))
+    """The lowest lane with a tint, in units of 2**-14."""
+    return u8(min(max(np.int64(lane & BYTE) + ((tint + 8192) >> 14), 0), 255))
 
 
 @inlined

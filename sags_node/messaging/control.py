@@ -287,11 +287,7 @@ class ControlClient(Closes):
         asked = Request(PROTOCOL, self._last_id, op, dict(args or {}), timeout, until_ns if is_here else None)
         try:
             request = msgspec.msgpack.encode(asked)
-        except (
-            OverflowError,
-            TypeError,
-            UnicodeError,
-        ) as error:  # a number of more than 64 bits, half a letter
+        except (OverflowError, TypeError, UnicodeError) as error:  # more than 64 bits, half a letter
             raise UsageError(f"{op}: what is asked cannot be sent: {error}") from None
         self._socket.send(request, zmq.NOBLOCK)
         while (left := deadline - time.monotonic()) > 0:
