@@ -347,9 +347,9 @@ def numbers_in(node: cv2.FileNode) -> F64 | None:
         return np.array([node.at(index).real() for index in range(min(node.size(), LARGEST_MATRIX))])
     if not node.isMap():
         return None
-    sizes = node.getNode("sizes")  # of one dimension, since OpenCV 5
-    of_one = sizes.at(0).real() if sizes.isSeq() and sizes.size() == 1 else 0.0
-    claimed = of_one or node.getNode("rows").real() * node.getNode("cols").real()
+    sizes = node.getNode("sizes")  # of one dimension, since OpenCV 5; in XML no list, but the number
+    size = sizes.at(0) if sizes.isSeq() and sizes.size() == 1 else sizes
+    claimed = size.real() if size.isInt() else node.getNode("rows").real() * node.getNode("cols").real()
     if not 0 < claimed <= LARGEST_MATRIX:  # what is claimed is what OpenCV makes room for
         return None
     try:
