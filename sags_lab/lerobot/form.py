@@ -67,8 +67,8 @@ def _places(episode: int) -> dict[str, int]:
 
 
 def features_of(size: tuple[int, int], eyes: Sequence[str], fps: int) -> dict[str, Any]:
-    """As info.json says them, of pictures with this width and height."""
-    width, height = size
+    """As info.json says them, of pictures with this width and height; a video has even ones."""
+    width, height = (side - side % 2 for side in size)
     coarse = [height // COARSE, width // COARSE]
     video = {
         "dtype": "video",
@@ -76,7 +76,7 @@ def features_of(size: tuple[int, int], eyes: Sequence[str], fps: int) -> dict[st
         "names": ["height", "width", "channels"],
         "info": {
             "video.fps": fps, "video.height": height, "video.width": width, "video.channels": 3,
-            "video.codec": "mpeg4", "video.pix_fmt": "yuv420p", "video.is_depth_map": False,
+            "video.codec": "h264", "video.pix_fmt": "yuv420p", "video.is_depth_map": False,
             "has_audio": False,
         },
     }  # fmt: skip

@@ -275,6 +275,22 @@ def test_a_pose_that_the_robot_does_not_tell_is_not_the_last_one(tmp_path: Path)
     assert np.array_equal(first, np.float32(told.pair.camera.T_world_cam)) and np.isnan(second).all()
 
 
+def test_a_data_set_says_what_its_videos_are(tmp_path: Path) -> None:
+    told = plane_result(stamp_ns=0)
+    camera = replace(told.pair.camera, width=told.pair.camera.width - 1, height=told.pair.camera.height - 1)
+    odd = replace(told.pair, camera=camera, left=told.pair.left[:-1, :-1], right=None)
+    episode = LeRobot(tmp_path / "out", 10.0, "v3.0")
+    episode.add(0, replace(told, pair=odd), told.anchors)
+    episode.finish()
+    info = json.loads((tmp_path / "out/meta/info.json").read_text())["features"][LEFT]
+    (video,) = (tmp_path / "out/videos").rglob("*.mp4")
+    with av.open(str(video)) as opened:
+        stream = opened.streams.video[0]
+        assert info["shape"] == [stream.height, stream.width, 3]
+        assert info["info"]["video.codec"] == stream.codec_context.name
+        assert info["info"]["video.pix_fmt"] == stream.pix_fmt
+
+
 def test_the_model_is_exported_of_frames_that_were_taken_in(
     darkened: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
