@@ -22,6 +22,7 @@ from typing import Any, Literal
 import msgspec
 
 from sags_node.errors import SagsError
+from sags_node.files import check_name
 from sags_node.processes import KILL_SECONDS, end
 from sags_node.types import Finding
 
@@ -123,7 +124,7 @@ class RecorderProcess:
             request = msgspec.convert(dict(args), _Request)
         except msgspec.ValidationError as error:
             raise SagsError(f"{error}; start_recording takes path and what sags bag record takes") from None
-        folder = Path(request.path).absolute()
+        check_name(folder := Path(request.path).absolute())
         command = [sys.executable, "-m", "sags_node", "bag", "record", "--stdin", "--json"]
         command += ["--endpoint", self._endpoint, "--ns", self._ns, "--compression", request.compression]
         command += ["-o", str(folder)]

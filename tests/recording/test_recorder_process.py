@@ -50,6 +50,19 @@ def test_a_zero_character_is_refused(recorder: RecorderProcess, args: dict[str, 
         recorder.start(args).result(ANSWER)
 
 
+@pytest.mark.fault("node: it runs in a folder whose name is no text, and is to record into it")
+def test_a_folder_that_nobody_can_be_told_of_is_refused(
+    recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = Path(os.fsdecode(os.fsencode(tmp_path / "caf") + b"\xe9"))
+    here.mkdir()
+    monkeypatch.chdir(here)
+    with pytest.raises(SagsError, match=r"no UTF-8 text.*rename it") as refused:
+        recorder.start({"path": "case1"}).result(ANSWER)
+    str(refused.value).encode()  # it can be sent
+    assert recorder.status() is None
+
+
 @pytest.mark.fault("process: the recorder hangs")
 def test_a_recorder_that_does_not_answer_is_ended(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
