@@ -111,6 +111,9 @@ def test_a_recording_that_has_ended_by_itself_is_told(recorder: RecorderProcess,
     assert f"sags bag recover {tmp_path / 'bag'}" in told.text
     health = NodeHealth("running", 30.0, {}, {}, {}, {}, 1, 1.0, {}, warnings=by_stage([told]))
     assert health_answer(health) == {"healthy": False, "state": "running", "warnings": ["recording_ended"]}
+    with pytest.raises(SagsError):
+        recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)  # it is there already
+    assert ended(recorder) == [told]  # still nothing is recorded
     with pytest.raises(SagsError, match="the recorder was ended; save what it wrote"):
         recorder.stop().result(ANSWER)
     recorder.start({"path": str(tmp_path / "next")}).result(ANSWER)
