@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import SagsError, UsageError, brief
 
 SHOWN = "[!.]*"  # no hidden files: macOS puts `._NAME` beside each on foreign disks
 NO_TEXT = "holds bytes that are no UTF-8 text, so no other program can be told of it: rename it"
@@ -37,13 +37,13 @@ def is_text(name: str) -> bool:
 
 
 def check_name(path: Path) -> None:
-    """Refuse a recording whose name could not be published.
+    """Refuse a file whose name could not be published.
 
     Raises:
         UsageError: the name is no text.
     """
     if not is_text(str(path)):
-        raise UsageError(f"{path} {NO_TEXT}")
+        raise UsageError(f"{brief(str(path))} {NO_TEXT}")
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -119,8 +119,8 @@ def whole(path: Path, new: bool = False) -> Iterator[Path]:
     Raises:
         SagsError: it cannot be written, or another file is there.
     """
-    target = path.resolve()  # through a link, not over it
-    if new and target.exists():
+    target = Path(os.path.realpath(path))  # through a link, not over it
+    if new and os.path.lexists(target):
         raise SagsError(f"{path} exists already; choose another name")
     with writing(path), tempfile.TemporaryDirectory(prefix=".sags-", dir=target.parent) as passing:
         partial = Path(passing) / path.name

@@ -151,9 +151,14 @@ class Peers:
         if event == zmq.EVENT_ACCEPTED:
             self._count["accepted"] += 1
             try:
-                peer = _Peer(sockets.socket(fileno=os.dup(value)), time.monotonic())
+                copy = os.dup(value)
             except OSError:
                 return  # it has gone already
+            try:
+                peer = _Peer(sockets.socket(fileno=copy), time.monotonic())
+            except OSError:
+                os.close(copy)  # it has gone, and its number is that of another file
+                return
             self._open[value] = peer
             closed = peer.since < self._closed_until and not peer.is_local
             if closed or len(self._open) > MAX_PEERS:

@@ -15,6 +15,7 @@ import numpy as np
 from sags_node.config.launch_file import with_parameters
 from sags_node.config.schema import LIVE_PARAMETERS, LaunchConfig
 from sags_node.errors import SagsError
+from sags_node.files import check_name
 from sags_node.mapping.budget import Budget
 from sags_node.messaging import content, published
 from sags_node.messaging.measure import measured
@@ -189,12 +190,13 @@ class Operations:
             raise SagsError("save_model needs a path that ends in .ply")
         if "\0" in path:
             raise SagsError("a path cannot hold a zero character")
+        check_name(file := Path(path).absolute())
         newest = self._state.pipeline.newest
         if newest is None or len(newest.snapshot.gaussians) == 0:
             raise SagsError("there is no model yet; wait for the first frame")
         metric = self._state.pipeline.metric
         newest = newest if self._state.pipeline.may_be_sure else unsure(newest)
-        file, gaussians = Path(path).absolute(), newest.snapshot.gaussians  # never changed any more
+        gaussians = newest.snapshot.gaussians  # never changed any more
 
         def write() -> dict[str, Any]:
             write_ply(file, gaussians, metric=metric)

@@ -22,6 +22,7 @@ from typing import Any, Literal
 import msgspec
 
 from sags_node.errors import SagsError
+from sags_node.files import check_name
 from sags_node.processes import KILL_SECONDS, end
 from sags_node.types import Finding
 
@@ -60,6 +61,7 @@ class RecorderProcess:
         self._ns = ns
         self._endpoint = endpoint
         self._child: _Child | None = None
+        self._begun: _Child | None = None  # whose recording is told of
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
 
     def start(self, args: Mapping[str, Any]) -> Future[Any]:
@@ -77,8 +79,8 @@ class RecorderProcess:
     def status(self) -> dict[str, Any] | None:
         """How the recording goes, as the recorder said it last, and under `ended` why it has ended by itself.
         None: nothing is being recorded. Any thread may call this."""
-        child = self._child
-        if child is None or not child.has_begun:
+        child = self._begun
+        if child is None:
             return None
         return {"folder": str(child.folder), **child.progress, "ended": child.ended}
 
@@ -123,7 +125,7 @@ class RecorderProcess:
             request = msgspec.convert(dict(args), _Request)
         except msgspec.ValidationError as error:
             raise SagsError(f"{error}; start_recording takes path and what sags bag record takes") from None
-        folder = Path(request.path).absolute()
+        check_name(folder := Path(request.path).absolute())
         command = [sys.executable, "-m", "sags_node", "bag", "record", "--stdin", "--json"]
         command += ["--endpoint", self._endpoint, "--ns", self._ns, "--compression", request.compression]
         command += ["-o", str(folder)]
@@ -140,11 +142,11 @@ class RecorderProcess:
         self._child = _Child(command, folder, has_ring=request.snapshot_seconds is not None)
         try:
             answer = self._child.answer(START_SECONDS)
-            self._child.has_begun = True
+            self._begun = self._child
             return answer
         except SagsError:  # it has said why, and ends
             self._child.kill()
-            self._child = None
+            self._child = self._begun  # one that has ended is told of until another begins
             raise
         except TimeoutError:
             self._child.kill()
@@ -170,7 +172,7 @@ class RecorderProcess:
 
     def _stop(self) -> Any:
         child = self._running()
-        self._child = None
+        self._child = self._begun = None
         try:
             return child.finish(FINISH_SECONDS)
         except TimeoutError:
@@ -206,7 +208,6 @@ class _Child:
             raise SagsError("path and topics cannot hold a zero character")
         self.folder = folder
         self.has_ring = has_ring
-        self.has_begun = False
         self.progress: dict[str, Any] = {}  # once a second
         self.ended: str | None = None  # why, where nobody has asked for it
         self._owes = False  # an answer

@@ -161,7 +161,8 @@ class Views:
                 view.failure = f"it cannot be drawn: {str(error) or type(error).__name__}"
                 if view.failure != view.logged:
                     view.logged = view.failure
-                    log.exception("view '%s' cannot be drawn", name)
+                    unforeseen = not isinstance(error, SagsError)
+                    log.warning("view '%s': %s", name, view.failure, exc_info=unforeseen)
             else:
                 yield name, drawn
         self._note()

@@ -6,6 +6,8 @@ import json
 import logging
 import os
 import stat
+import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import hostile
@@ -26,7 +28,7 @@ from sags_node.client import ClientKeys, client_keys
 from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.control import ControlClient
-from sags_node.messaging.peers import MAX_PEERS
+from sags_node.messaging.peers import MAX_PEERS, Peers
 from sags_node.messaging.roles import Client
 from sags_node.messaging.security import read_allow_list, read_key_pair, write_key_pair
 from sags_node.messaging.subscriber import Subscriber
@@ -331,6 +333,36 @@ def test_peers_are_capped_and_those_who_are_in_stay_in(tmp_path: Path) -> None:
                 connection.close()
             with attacked.subscriber() as late:
                 assert late.wait(TOPIC, 30) is not None
+
+
+@pytest.mark.fault("socket: a peer vanishes at once, and its descriptor is that of a file when it is noticed")
+def test_the_descriptor_of_who_has_gone_is_no_peer() -> None:
+    may_look, looks = threading.Event(), threading.Event()
+
+    def revocations() -> int:  # asked by the thread that watches the peers, after each look
+        if threading.current_thread() is not threading.main_thread():
+            looks.set()
+            assert may_look.wait(60)
+        return 0
+
+    with zmq_socket(zmq.XPUB, "tcp://127.0.0.1:*", bind=True) as socket:
+        peers = Peers(socket, "data", 1000, revocations)
+        endpoint = socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        assert looks.wait(60)
+        before = _descriptors()
+        visitors = [hostile.raw(endpoint) for _ in range(20)]
+        until(lambda: _descriptors() >= before + 40)  # both ends are open
+        for visitor in visitors:
+            visitor.close()
+        until(lambda: _descriptors() <= before)
+        with ExitStack() as files:
+            for _ in range(40):
+                files.enter_context(open(os.devnull, "rb"))
+            may_look.set()
+            until(lambda: peers.counts()["refused"] == 20)
+            until(lambda: _descriptors() <= before + 40)
+            assert peers.counts()["open"] == 0
+        peers.close()
 
 
 SUBSCRIPTIONS = b"".join(b"\x00\xc9\x01" + np.random.default_rng(i).bytes(200) for i in range(2000))

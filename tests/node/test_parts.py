@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -275,6 +276,19 @@ def test_a_model_without_a_calibration_says_so_and_is_nowhere_sure(tmp_path: Pat
         assert (b"comment units relative" in head) == (not metric)
         most[metric] = np.frombuffer(body, "<f4").reshape(-1, head.count(b"property"))[:, -1].max()
     assert most[True] > SURE > most[False]
+
+
+@pytest.mark.fault("file: a model is to be saved under a name that nobody can write, or nobody can be told")
+def test_a_name_that_cannot_be_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save = operations(plane_result()).handlers()["save_model"]
+    with pytest.raises(SagsError, match=r"cannot write .*name too long; name another place"):
+        save({"path": f"{tmp_path / ('n' * 300)}.ply"}).result(30)
+    here = Path(os.fsdecode(os.fsencode(tmp_path / "caf") + b"\xe9"))  # as an old disk or archive has names
+    here.mkdir()
+    monkeypatch.chdir(here)
+    with pytest.raises(SagsError, match=r"no UTF-8 text.*rename it") as refused:
+        save({"path": "model.ply"})
+    str(refused.value).encode()  # it can be sent
 
 
 def test_before_the_first_frame_there_is_nothing_to_save(tmp_path: Path) -> None:

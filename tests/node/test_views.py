@@ -417,12 +417,23 @@ def test_what_cannot_be_drawn_costs_its_view_alone(
     views.open(parse(ViewRequest, {"name": "a", "width": 48, "height": 32}), plane_result())
     assert set(run(views, clocks, 2, {"a", "b"})) == {"b"}
     assert views.status["a"].limited_by == "it cannot be drawn: MemoryError"
-    assert [record.message for record in caplog.records] == ["view 'a' cannot be drawn"]
+    (record,) = caplog.records
+    assert record.message == "view 'a': it cannot be drawn: MemoryError" and record.exc_info
     with pytest.raises(MemoryError):
         views.open(parse(ViewRequest, {"name": "c", "width": 64, "height": 32}), plane_result())
     assert set(views.status) == {"a", "b"}
     full = False
     assert "a" in run(views, clocks, 0.2, {"a", "b"}) and views.status["a"].limited_by == ""
+
+
+def test_a_view_of_strain_that_nobody_measures_is_one_line_in_the_log(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    views, clocks = opened(0.005)
+    views.open(parse(ViewRequest, {"name": "a", "show": "strain"}), None)  # it waits for a frame
+    assert not run(views, clocks, 2, {"a"})
+    (record,) = caplog.records
+    assert "send start_strain first" in record.message and not record.exc_info
 
 
 @pytest.mark.parametrize(("missed", "share"), [(False, SHARE), (True, LEAST_SHARE)])

@@ -50,6 +50,19 @@ def test_a_zero_character_is_refused(recorder: RecorderProcess, args: dict[str, 
         recorder.start(args).result(ANSWER)
 
 
+@pytest.mark.fault("node: it runs in a folder whose name is no text, and is to record into it")
+def test_a_folder_that_nobody_can_be_told_of_is_refused(
+    recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = Path(os.fsdecode(os.fsencode(tmp_path / "caf") + b"\xe9"))
+    here.mkdir()
+    monkeypatch.chdir(here)
+    with pytest.raises(SagsError, match=r"no UTF-8 text.*rename it") as refused:
+        recorder.start({"path": "case1"}).result(ANSWER)
+    str(refused.value).encode()  # it can be sent
+    assert recorder.status() is None
+
+
 @pytest.mark.fault("process: the recorder hangs")
 def test_a_recorder_that_does_not_answer_is_ended(
     recorder: RecorderProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -98,6 +111,9 @@ def test_a_recording_that_has_ended_by_itself_is_told(recorder: RecorderProcess,
     assert f"sags bag recover {tmp_path / 'bag'}" in told.text
     health = NodeHealth("running", 30.0, {}, {}, {}, {}, 1, 1.0, {}, warnings=by_stage([told]))
     assert health_answer(health) == {"healthy": False, "state": "running", "warnings": ["recording_ended"]}
+    with pytest.raises(SagsError):
+        recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)  # it is there already
+    assert ended(recorder) == [told]  # still nothing is recorded
     with pytest.raises(SagsError, match="the recorder was ended; save what it wrote"):
         recorder.stop().result(ANSWER)
     recorder.start({"path": str(tmp_path / "next")}).result(ANSWER)
