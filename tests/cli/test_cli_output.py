@@ -438,8 +438,9 @@ def test_run_prints_nothing_but_json(user_files: Path) -> None:
     result = sags("run", *videos(user_files), "source.frames:=3", "--json")
     assert result.exit_code == 0 and pure_json(result.stdout)["gaussians"] > 100
     assert re.search(r"source: videos .*\n.* \d+x\d+ px at 10 frames/s, .* calibration \S+\n", result.stderr)
-    ended = sags("run", *videos(user_files), "source.frames:=3", "source.pace:=fast").stdout
+    ended = sags("run", *videos(user_files), "source.frames:=3", "source.pace:=step").stdout
     assert re.search(r"^state +ended, 3 of 3 frames published$", ended, re.MULTILINE)
+    assert re.search(r"^latency p50 / p99 +–$", ended, re.MULTILINE), "stamps are no times of day"
     looped = sags("run", *videos(user_files), "source.loop:=true", "--seconds", "0.3").stdout
     assert re.search(r"^state +ended, \d+ frames published$", looped, re.MULTILINE)
 
