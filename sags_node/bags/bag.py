@@ -6,10 +6,12 @@ false length nor an index that lies can take memory; db3 and ROS 1 files are rea
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,6 +26,8 @@ from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import SHOWN, open_file
 from sags_node.messaging import cdr
+
+log = logging.getLogger(__name__)
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
@@ -146,6 +150,8 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
             raise UsageError(
                 f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
             )
+        if lacking := missing_files(files):
+            _tell(f"{path} lacks {lacking} of its files, and what was in them")
         return files, False
     information = _metadata(path / METADATA)
     mode = str(information.get("compression_mode") or "").lower()
@@ -159,6 +165,11 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
         if not file.is_file() or file.suffix not in (".mcap", ".db3"):
             raise UsageError(f"{path / METADATA} names {file.name}, which is not a .mcap or .db3 file there")
     return files, mode == "message"
+
+
+@cache  # said once: a bag is looked at several times
+def _tell(said: str) -> None:
+    log.warning("%s", said)
 
 
 def check_one(folder: Path) -> None:
