@@ -143,7 +143,7 @@ def test_numbers_out_of_range(arguments: list[str]) -> None:
         (2, {"rig": "one_eyed"}, ("one_eyed/right.yaml", "No such file")),
         (2, {"rig": "millimetres"}, ("millimetres", "projection_matrix[3]", "by 1000")),
         (2, {"rig": "positive"}, ("projection_matrix[3]", "negative")),
-        (1, {"rig": "double"}, ("320x256", "640x512")),
+        (2, {"rig": "double"}, ("320x256", "640x512")),
     ],
 )
 def test_a_wrong_recording_or_calibration(
