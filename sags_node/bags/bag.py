@@ -27,7 +27,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.files import SHOWN, open_file
 from sags_node.messaging import cdr
 
-log = logging.getLogger(__name__)
+_warn = cache(logging.getLogger(__name__).warning)  # once: a bag is looked at several times
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
@@ -151,7 +151,7 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
                 f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
             )
         if lacking := missing_files(files):
-            _tell(f"{path} lacks {lacking} of its files, and what was in them")
+            _warn("%s lacks %d of its files, and what was in them", path, lacking)
         return files, False
     information = _metadata(path / METADATA)
     mode = str(information.get("compression_mode") or "").lower()
@@ -165,11 +165,6 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
         if not file.is_file() or file.suffix not in (".mcap", ".db3"):
             raise UsageError(f"{path / METADATA} names {file.name}, which is not a .mcap or .db3 file there")
     return files, mode == "message"
-
-
-@cache  # said once: a bag is looked at several times
-def _tell(said: str) -> None:
-    log.warning("%s", said)
 
 
 def check_one(folder: Path) -> None:

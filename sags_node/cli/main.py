@@ -112,8 +112,7 @@ class Sags(click.Group):
 def _one_message(ctx: click.Context) -> Iterator[None]:
     """An expected error becomes one message and an exit code."""
     try:
-        yield
-        return
+        return (yield)
     except click.UsageError as error:
         if (said := visible(error.format_message())) == error.format_message():
             raise

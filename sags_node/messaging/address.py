@@ -21,10 +21,7 @@ HANDSHAKE_MS = 5000
 LOOK_S = 0.1  # between looks for a node that is not there
 RETRIES = 3  # failed handshakes in a row, where one alone may be a node that is just starting anew
 
-_HOW = (
-    "make a key pair with sags keygen, have its .pub put into the node's publish.allow, and give --key "
-    "(in Python: keys=client_keys(...))"
-)
+_HOW = "make a key pair with sags keygen, have its .pub put into publish.allow, give --key (client_keys)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +146,7 @@ def _given(endpoint: str, keys: ClientKeys | None) -> Address:
         return Address(endpoint)
     if keys.node is None:
         raise UsageError(
-            f"{endpoint}: --key needs --server-key (client_keys: node_key), the .pub file of the node"
+            f"{endpoint}: --key needs --server-key (client_keys: node_key), the .pub of the node"
         )
     return Address(endpoint, keys)
 

@@ -115,8 +115,7 @@ class Rectifier:
         """Rectify the pictures of one frame, and make its gray ones. Any thread may do it ahead.
 
         Raises:
-            UsageError: the pictures do not have the calibration's size.
-            SagsError: the eyes' pictures differ in size.
+            UsageError, SagsError: the pictures do not have the calibration's size, or that of each other.
         """
         started = time.perf_counter()
         height, width = frame.left.shape[:2]
