@@ -10,14 +10,16 @@ What must come out is printed: how the camera sits on the robot, and that the ro
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.typesys import Stores, get_typestore
 
+from sags_node.errors import SagsError
 from sags_node.geometry import invert
 from sags_node.messaging import cdr
 from sags_node.messaging.topics import IMAGE
@@ -81,7 +83,10 @@ def main() -> None:
     )
     parser.add_argument("folder", type=Path, help="new; gets bag/ and rig/")
     folder = parser.parse_args().folder
-    record(folder)
+    try:
+        record(folder)
+    except (SagsError, WriterError) as error:
+        sys.exit(f"error: {error}")
     place = " ".join(f"{1e3 * part:.2f}" for part in T_HAND_CAMERA[:3, 3])
     print(f"camera on the hand: {place} mm; robot - pictures: {1e3 * AHEAD_S:.0f} ms")
 

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.client import FrameSender, PoseSender
+from sags_node.client import FrameSender, PoseSender, SagsError
 from sags_node.config.schema import PhantomSource
 from sags_node.messaging import cdr
 from sags_node.phantom import cached_session
@@ -92,6 +92,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="default: until Ctrl-C")
     parser.add_argument("--rig", type=Path, help="write the calibration here, for the node, and end")
     said = parser.parse_args()
+    if said.rate <= 0:
+        parser.error("--rate must be above 0")
     print("rendering the phantom (once)", flush=True)
     config = PhantomSource(width=said.size[0], height=said.size[1], camera_motion="sway", seconds=2.0)
     folder = cached_session(config)
@@ -124,5 +126,7 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
+    except (SagsError, ValueError) as error:  # ValueError: a size or a domain that there is not
+        sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit(130)  # as sags

@@ -5,12 +5,13 @@ python -m sags_node run vision.tissue.method:=topic vision.tissue.tissue_is:=whi
 python examples/tissue_masks.py tcp://127.0.0.1:5600
 """
 
+import argparse
 import sys
 import uuid
 
 import numpy as np
 
-from sags_node.client import ReceivedImage, Subscriber, TopicName
+from sags_node.client import ReceivedImage, SagsError, Subscriber, TopicName
 from sags_node.config.schema import PublishConfig
 from sags_node.messaging import cdr
 from sags_node.messaging.publisher import Publisher
@@ -39,7 +40,13 @@ def main(endpoint: str) -> None:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("endpoint", help="where the masks are published")
     try:
-        main(sys.argv[1])
+        main(parser.parse_args().endpoint)
+    except SagsError as error:
+        sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         pass

@@ -1,15 +1,35 @@
 """The `sags` command, also as `python -m sags_node`, from its first moment on: loading it takes a while."""
 
 import atexit
+import errno
+import io
 import os
 import signal
 import sys
 import threading
+from typing import Any
+
+
+class _Messages(io.FileIO):
+    """What stderr leads to. A full disk or a terminal that is gone swallows messages, and ends no work."""
+
+    def write(self, said: Any) -> int:
+        try:
+            return super().write(said)
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+                raise
+            return len(said)
 
 
 def main() -> None:
     """Run the command. A Ctrl-C while it is being loaded ends it at once: nothing has begun yet."""
     code: object = 1  # of an error that Python prints
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed: else the next file that is opened gets what libraries print
+            setattr(sys, name, open(os.open(os.devnull, os.O_RDWR), mode, closefd=False))
+    messages: Any = _Messages(2, "w", closefd=False)  # which has what TextIOWrapper needs
+    sys.stderr = io.TextIOWrapper(messages, sys.stderr.encoding, "backslashreplace", write_through=True)
 
     def end() -> None:
         """Python itself would break a daemon thread off inside OpenCV, whose code answers with SIGABRT."""

@@ -76,12 +76,12 @@ def read_file(path: Path, largest: int) -> bytes:
 
 
 def near(path: Path) -> str:
-    """The remedy for a path that cannot be read: what beside it is named alike."""
+    """The remedy for a path that cannot be read: if nothing is there, what beside it is named alike."""
     try:
-        beside = [each.name for each in path.absolute().parent.iterdir()]
+        beside = [] if path.exists() else [each.name for each in path.absolute().parent.iterdir()]
     except OSError:
         return "check the path"
-    names = difflib.get_close_matches(path.name, [each for each in beside if each != path.name], n=1)
+    names = difflib.get_close_matches(path.name, beside, n=1)
     return f"did you mean {path.parent / names[0]}?" if names else "check the path"
 
 

@@ -136,6 +136,27 @@ def test_a_point_that_was_removed_is_followed_no_more(tmp_path: Path) -> None:
     assert example.returncode == 1 and "somebody else removed the point" in errors and asked == ["add"]
 
 
+@pytest.mark.parametrize(
+    ("example", "said"),
+    [
+        ("follow_point.py x 20", "invalid float value"),
+        ("tissue_masks.py", "required: endpoint"),
+        ("tissue_masks.py nonsense", "error: 'nonsense' is no endpoint"),
+        ("record_board.py FILE", "error: cannot write"),
+        ("record_board.py FULL", "exists already"),
+        ("send_phantom.py push --rate 0", "must be above 0"),
+        ("send_phantom.py push --endpoint nonsense", "error: cannot connect to nonsense"),
+    ],
+)
+def test_wrong_use_of_an_example_is_one_message(tmp_path: Path, example: str, said: str) -> None:
+    (tmp_path / "full/bag").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    name, *words = (word.lower() if word.isupper() else word for word in example.split())
+    command = [sys.executable, ROOT / "examples" / name, *words]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode in (1, 2) and said in ended.stderr and "Traceback" not in ended.stderr
+
+
 @pytest.fixture
 def follow(monkeypatch: pytest.MonkeyPatch) -> Any:
     """The node of rclpy, its own code beside stand-ins for ROS; tests/bridge/test_ros2_rclpy.py has ROS."""
@@ -185,4 +206,8 @@ def test_the_node_of_rclpy_ends_with_the_node_that_it_follows(follow: Any) -> No
     assert len(follow.sent) == 6
     with pytest.raises(SystemExit, match="started anew"):
         follow.came(cloud(now + 200000.0, 100000.0))  # older than ours was, and pinned since
+    nothing = cloud(now, 1.0)
+    nothing.data = b""
+    with pytest.raises(SystemExit, match="the point was removed"):
+        follow.came(nothing)
     assert len(follow.sent) == 6

@@ -61,7 +61,7 @@ mapping:
 - An unknown key is an error that names the nearest known one. So is a wrong value. The exit code is 2.
 - A missing key has its default.
 - Paths in a file are relative to the file. Paths on the command line are relative to the folder that you are
-  in.
+  in. `~/` is your home in both.
 - `$NAME` in a file is an environment variable, `$$` is a dollar. `$SAGS_DATA` need not be set. It is then
   `../shared/data`, seen from the folder above the launch file's.
 - The topic `parameters` shows the configuration of a running node.

@@ -59,7 +59,10 @@ class FollowTissue(Node):
         columns = {field.name: field.offset // 4 for field in cloud.fields}
         numbers = np.frombuffer(cloud.data, "<f4").reshape(-1, cloud.point_step // 4)
         ids = numbers[:, columns["id"]].view("<u4") if len(numbers) else np.zeros(0, "<u4")
-        for row in numbers[ids == self.anchor]:
+        rows = numbers[ids == self.anchor]
+        if not len(rows) and np.isfinite(self.pinned):  # else it was pinned in a frame after this one
+            sys.exit("the point was removed, or the node was started anew; start this again")
+        for row in rows:
             pinned = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec - float(row[columns["age"]])
             if pinned > self.pinned + EXACT:  # another anchor: numbers begin again with a new node
                 sys.exit("the node was started anew: its anchors are gone; start this again")

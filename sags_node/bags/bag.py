@@ -6,10 +6,12 @@ false length nor an index that lies can take memory; db3 and ROS 1 files are rea
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,6 +26,8 @@ from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import SHOWN, open_file
 from sags_node.messaging import cdr
+
+_warn = cache(logging.getLogger(__name__).warning)  # once: a bag is looked at several times
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
@@ -146,6 +150,8 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
             raise UsageError(
                 f"{path} holds neither {METADATA} nor a .mcap or .db3 file; it is not a rosbag2 folder"
             )
+        if lacking := missing_files(files):
+            _warn("%s lacks %d of its files, and what was in them", path, lacking)
         return files, False
     information = _metadata(path / METADATA)
     mode = str(information.get("compression_mode") or "").lower()

@@ -81,10 +81,10 @@ def ended_text(sent: int, count: int | None) -> str:
 def health_table(health: NodeHealth, state: str | None = None) -> Table:
     """One screen of what a person wants to know; `state`: in the place of what the node says."""
     table = text.table()
-    latency = health.latency_ms
     table.add_row("state", state or health.state)
     table.add_row("published", f"{health.rate_hz:.1f} Hz")
-    table.add_row("latency p50 / p99", f"{latency['p50']:.0f} / {latency['p99']:.0f} ms")
+    p50, p99 = health.latency_ms["p50"], health.latency_ms["p99"]
+    table.add_row("latency p50 / p99", f"{p50:.0f} / {p99:.0f} ms" if p50 else "–")
     table.add_row("Gaussians", f"{health.gaussians:,}")
     if health.rung is not None:
         table.add_row("quality", text.rung_text(health.rung))

@@ -10,7 +10,8 @@ import shlex
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,7 +70,7 @@ SECTIONS = {
 
 
 class Sags(click.Group):
-    """Turns expected errors into one message and an exit code; its help has the commands in sections."""
+    """Turns expected errors into `_one_message`; its help has the commands in sections."""
 
     sections: Mapping[str, str] = {}
 
@@ -87,9 +88,14 @@ class Sags(click.Group):
             with formatter.section("Which node, for commands that look for one"):
                 formatter.write_dl(list(WHICH_NODE.items()))
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        with _one_message(ctx):
+            return super().parse_args(ctx, args)
+
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return self._invoke(ctx)
+            with _one_message(ctx):
+                return super().invoke(ctx)
         except (KeyboardInterrupt, SystemError) as error:
             # A Ctrl-C becomes a SystemError in C code that calls Python, and one more in C code around that:
             # loading a kernel.
@@ -101,36 +107,36 @@ class Sags(click.Group):
             console.print("stopped")
             ctx.exit(130)
 
-    def _invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except click.UsageError as error:
-            if (said := visible(error.format_message())) == error.format_message():
-                raise
-            raise click.UsageError(said, error.ctx) from None
-        except SagsError as error:
-            said, code = str(error), error.exit_code
-        except ImportError as error:
-            library, code = re.match(r"(lib\S+\.so\S*): cannot open", str(error)), 2
-            if library is None and str(error.name).partition(".")[0] not in OF_THE_NODE:
-                raise
-            said = f"{error.name} is not installed: this is for a client; for all of it {install('node')}"
-            if library is not None:
-                said = f"{library[1]} is missing on this system; sags doctor says which package has it"
-        except OSError as error:
-            if error.errno in CLOSED and error.filename is not None:
-                said, code = (
-                    f"cannot open {error.filename}: {error.strerror}; check the path and your rights",
-                    2,
-                )
-            elif error.errno in NO_ROOM:
-                said, code = f"cannot write {error.filename or 'what was asked for'}: {error.strerror}", 1
-            else:
-                raise
-        if console.quiet:
-            log.error("%s", said)
-        console.print(f"[red]error:[/] {escape(said)}", soft_wrap=True)
-        ctx.exit(code)
+
+@contextmanager
+def _one_message(ctx: click.Context) -> Iterator[None]:
+    """An expected error becomes one message and an exit code."""
+    try:
+        return (yield)
+    except click.UsageError as error:
+        if (said := visible(error.format_message())) == error.format_message():
+            raise
+        raise click.UsageError(said, error.ctx) from None
+    except SagsError as error:
+        said, code = str(error), error.exit_code
+    except ImportError as error:
+        library, code = re.match(r"(lib\S+\.so\S*): cannot open", str(error)), 2
+        if library is None and str(error.name).partition(".")[0] not in OF_THE_NODE:
+            raise
+        said = f"{error.name} is not installed: this is for a client; for all of it {install('node')}"
+        if library is not None:
+            said = f"{library[1]} is missing on this system; sags doctor says which package has it"
+    except OSError as error:
+        if error.errno in CLOSED and error.filename is not None:
+            said, code = f"cannot open {error.filename}: {error.strerror}; check the path and your rights", 2
+        elif error.errno in NO_ROOM:
+            said, code = f"cannot write {error.filename or 'what was asked for'}: {error.strerror}", 1
+        else:
+            raise
+    if console.quiet:
+        log.error("%s", said)
+    console.print(f"[red]error:[/] {escape(said)}", soft_wrap=True)
+    ctx.exit(code)
 
 
 def sags_group(function: Callable[..., None]) -> Sags:

@@ -66,6 +66,7 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
             tree = _resolved(_read_yaml(file), file.parent)
     for override in overrides:
         _apply_override(tree, override)
+    tree = _with_texts(tree, lambda key, text, is_path: os.path.expanduser(text) if is_path else text)
     try:
         config = LaunchConfig.model_validate(tree)
     except ValidationError as error:
@@ -242,7 +243,7 @@ def _resolved(tree: Mapping[str, Any], folder: Path) -> dict[str, Any]:
                 "a name has a $"
             )
         expanded = template.safe_substitute(variables)
-        return str(folder / expanded) if is_path else expanded
+        return str(folder / os.path.expanduser(expanded)) if is_path else expanded
 
     return _with_texts(tree, resolved)
 

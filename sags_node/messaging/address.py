@@ -21,7 +21,7 @@ HANDSHAKE_MS = 5000
 LOOK_S = 0.1  # between looks for a node that is not there
 RETRIES = 3  # failed handshakes in a row, where one alone may be a node that is just starting anew
 
-_HOW = "make a key pair with sags keygen, have its .pub put into the node's publish.allow, and give --key"
+_HOW = "make a key pair with sags keygen, have its .pub put into publish.allow, give --key (client_keys)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def client_keys(key: Path | str | None, node_key: str | None) -> ClientKeys | No
     """
     if key is None:
         if node_key is not None:
-            raise UsageError(f"--server-key needs --key: {_HOW}")
+            raise UsageError(f"--server-key (node_key) needs --key: {_HOW}")
         return None
     return ClientKeys(read_key_pair(Path(key)), None if node_key is None else public_key(node_key))
 
@@ -145,7 +145,9 @@ def _given(endpoint: str, keys: ClientKeys | None) -> Address:
     if endpoint.startswith("ipc:") or keys is None:
         return Address(endpoint)
     if keys.node is None:
-        raise UsageError(f"{endpoint}: --key needs --server-key, the .pub file of the node")
+        raise UsageError(
+            f"{endpoint}: --key needs --server-key (client_keys: node_key), the .pub of the node"
+        )
     return Address(endpoint, keys)
 
 
@@ -220,5 +222,5 @@ class HandshakeWatch:
             return f"{endpoint} breaks off the connection; it probably wants a key: {_HOW}, and --server-key"
         return (
             f"{endpoint} breaks off the connection; is it encrypted at all, and "
-            "is --server-key the public key of this very node?"
+            "is --server-key (node_key) the public key of this very node?"
         )

@@ -62,6 +62,7 @@ class Statistics:
         self._drawn = inf  # when one was that shows the model; inf: none is expected yet
         self._lacks = ""  # why the last one that was taken in does not
         self._latency: deque[float] = deque(maxlen=WINDOW)
+        self._stamped_now = not (isinstance(source, RecordedSource) and source.pace == "step")
         self._worked: deque[float] = deque(maxlen=WINDOW)  # ms on each
         self._stages: dict[str, deque[float]] = {}
         self._skipped: dict[str, int] = {}
@@ -91,8 +92,9 @@ class Statistics:
                 self._lacks = _lacks(result)
             if result.held or not self._lacks or waited:
                 self._drawn = self._published[-1]
-            self._latency.append(latency_ms)
-            self.latency_s = 1e-3 * median(self._latency)
+            if self._stamped_now:  # else stamps are no times of day
+                self._latency.append(latency_ms)
+                self.latency_s = 1e-3 * median(self._latency)
             self._worked.append(sum(result.timings_ms.values()))
             for stage, ms in result.timings_ms.items():
                 self._stages.setdefault(stage, deque(maxlen=WINDOW)).append(ms)

@@ -115,12 +115,12 @@ class Rectifier:
         """Rectify the pictures of one frame, and make its gray ones. Any thread may do it ahead.
 
         Raises:
-            SagsError: the pictures do not have the calibration's size.
+            UsageError, SagsError: the pictures do not have the calibration's size, or that of each other.
         """
         started = time.perf_counter()
         height, width = frame.left.shape[:2]
         if wrong := wrong_size(self.path, self.raw_size, (width, height)):
-            raise SagsError(f"{wrong.what}; {wrong.fix}")
+            raise UsageError(f"{wrong.what}; {wrong.fix}")
         if frame.right is not None:
             self._check(frame.right, "right picture")
         left = self._left.image(frame.left)

@@ -45,6 +45,10 @@ def test_a_wrong_launch(command: str, arguments: list[str], said: tuple[str, ...
     refused(2, command, *arguments, said=said)
 
 
+def test_what_is_there_and_no_file_is_not_taken_for_a_slip_of_the_pen() -> None:
+    refused(2, "run", "/dev/null", said=("/dev/null: it is a device, no file; check the path",))
+
+
 @pytest.mark.parametrize("content", ["", "# source: {kind: videos}\n", "{}"])
 def test_a_launch_file_that_says_nothing_is_not_taken_for_the_phantom(tmp_path: Path, content: str) -> None:
     (tmp_path / "mine.yaml").write_text(content)
@@ -139,7 +143,7 @@ def test_numbers_out_of_range(arguments: list[str]) -> None:
         (2, {"rig": "one_eyed"}, ("one_eyed/right.yaml", "No such file")),
         (2, {"rig": "millimetres"}, ("millimetres", "projection_matrix[3]", "by 1000")),
         (2, {"rig": "positive"}, ("projection_matrix[3]", "negative")),
-        (1, {"rig": "double"}, ("320x256", "640x512")),
+        (2, {"rig": "double"}, ("320x256", "640x512")),
     ],
 )
 def test_a_wrong_recording_or_calibration(

@@ -378,6 +378,28 @@ def test_where_no_terminal_is_progress_is_a_line_now_and_then(capsys: pytest.Cap
     ]
 
 
+@pytest.mark.fault("process: stdin, stdout or stderr is closed, or on a full disk")
+@pytest.mark.parametrize("where", ["2>/dev/full", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(("command", "code"), [("keygen mine", 0), ("calib check gone", 2), ("nonsense", 2)])
+def test_messages_that_nobody_can_read_end_nothing(
+    tmp_path: Path, where: str, command: str, code: int
+) -> None:
+    shell = f'exec "$0" -m sags_node {command} {where}'
+    ended = subprocess.run(
+        ["sh", "-c", shell, sys.executable], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (code, "", "")
+    assert (tmp_path / "mine.key").exists() == (code == 0)
+
+
+def test_help_that_a_full_disk_cannot_take_is_one_message() -> None:
+    with Path("/dev/full").open("w") as full:
+        help = [sys.executable, "-m", "sags_node", "--help"]
+        ended = subprocess.run(help, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    said = "error: cannot write what was asked for: No space left on device\n"
+    assert (ended.returncode, ended.stderr) == (1, said)
+
+
 def every_command(command: click.Command, *path: str) -> Iterator[tuple[tuple[str, ...], click.Command]]:
     yield path, command
     for name, part in command.commands.items() if isinstance(command, click.Group) else ():
@@ -416,8 +438,9 @@ def test_run_prints_nothing_but_json(user_files: Path) -> None:
     result = sags("run", *videos(user_files), "source.frames:=3", "--json")
     assert result.exit_code == 0 and pure_json(result.stdout)["gaussians"] > 100
     assert re.search(r"source: videos .*\n.* \d+x\d+ px at 10 frames/s, .* calibration \S+\n", result.stderr)
-    ended = sags("run", *videos(user_files), "source.frames:=3", "source.pace:=fast").stdout
+    ended = sags("run", *videos(user_files), "source.frames:=3", "source.pace:=step").stdout
     assert re.search(r"^state +ended, 3 of 3 frames published$", ended, re.MULTILINE)
+    assert re.search(r"^latency p50 / p99 +–$", ended, re.MULTILINE), "stamps are no times of day"
     looped = sags("run", *videos(user_files), "source.loop:=true", "--seconds", "0.3").stdout
     assert re.search(r"^state +ended, \d+ frames published$", looped, re.MULTILINE)
 

@@ -190,6 +190,15 @@ def test_a_part_without_a_unit_is_not_deformed(clip: Clip) -> None:
     assert not change[:, columns.COLOR].any()
 
 
+def test_of_one_frame_no_motion_is_learnt(clip: Clip) -> None:
+    """Which took minutes."""
+    told = []
+    Fit(dataclasses.replace(clip, train=clip.train[:1], test=()), SMALL).start(
+        lambda what, done, of: told.append(what)
+    )
+    assert told and "learning the paths" not in told
+
+
 @pytest.mark.parametrize("tokens", ["self", "nodes"])
 def test_an_online_start_is_what_the_mapper_saw(clip: Clip, tokens: Any) -> None:
     settings = dataclasses.replace(SMALL, tokens=tokens)

@@ -185,7 +185,7 @@ def test_a_listed_key_gets_data_and_answers(tmp_path: Path, keys: Path) -> None:
     [
         ("stranger", "node", "refuses this key"),
         (None, "node", "wants a key"),
-        ("clients/viewer", "stranger", "is --server-key the public key of this very node"),
+        ("clients/viewer", "stranger", "is --server-key (node_key) the public key of this very node"),
     ],
 )
 def test_others_are_refused_counted_and_told_why(
@@ -258,9 +258,9 @@ def test_missing_and_needless_keys_are_named_at_once(tmp_path: Path, keys: Path)
             pytest.raises(SagsError, match=r"is not encrypted; leave out --key|is it encrypted at all"),
         ):
             asker.request("ping", timeout=1.0)
-    with pytest.raises(UsageError, match="--key needs --server-key"):
+    with pytest.raises(UsageError, match=r"--key needs --server-key \(client_keys: node_key\)"):
         Subscriber([TOPIC], endpoint="tcp://127.0.0.1:9", keys=viewer)
-    with pytest.raises(UsageError, match="--server-key needs --key"):
+    with pytest.raises(UsageError, match=r"--server-key \(node_key\) needs --key: .*client_keys"):
         client_keys(None, str(keys / "node.pub"))
     for own in (keys / "stranger.key", str(keys / "stranger.key")):
         assert client_keys(own, str(keys / "node.pub")) == of(keys, "stranger")
