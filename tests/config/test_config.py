@@ -112,6 +112,7 @@ PANES = "{layout: panes, first: right, crop: [0, 0, 8, 8], crop_right: [8, 0, 8,
         ("vision.stereo.min_depth:=30", "(got 30); docs/launch.md: m; nothing is looked for nearer"),
         ("mapping.budget_ms:=-1", "greater than or equal to 1"),
         ("mapping.budget_ms:=0.033", "greater than or equal to 1"),  # in seconds
+        ("device:=gpu", "'auto', 'cpu' or 'cuda' (got 'gpu')"),
         ("vision.pose:=magic", "'session', 'fixed', 'estimate' or 'refine'"),
         ("vision.stereo:={min_depth: 0.2, max_depth: 0.1}", "must be below max_depth"),
         ("source.kind:=carrier_pigeon", "'folders'"),
