@@ -1,7 +1,5 @@
 """The C# client for Unity, compiled and run by Debian's mono: against a real gateway and a false one."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

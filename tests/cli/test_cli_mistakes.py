@@ -1,7 +1,5 @@
 """What a user gives a command, with every mistake: one clear message and the right exit code."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """What a command says and writes: nothing of the user's is lost, tables are whole, JSON is JSON."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re

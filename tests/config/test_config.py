@@ -1,7 +1,5 @@
 """Launch files: every key is known, paths are found, mistakes are explained."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

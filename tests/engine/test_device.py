@@ -1,7 +1,5 @@
 """Which device a launch gets, and what is said of a GPU that cannot be used."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Figures of merit against closed forms and cases made by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What `sags export` writes of every frame: read again by others, and compared with the phantom's truth."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

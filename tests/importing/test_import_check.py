@@ -1,7 +1,5 @@
 """Folders with one thing wrong each: it is found, and nothing else is."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """The C++ examples, written from the documents alone: one sees what the Python subscriber sees, one sends."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

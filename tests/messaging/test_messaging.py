@@ -1,7 +1,5 @@
 """The publisher over real sockets, judged by a client that knows only the wire contract."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

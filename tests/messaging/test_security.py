@@ -1,7 +1,5 @@
 """Keys, who is let in, and what strangers can do to the node: nothing."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Messages as bytes: equal to stock ROS 2 CDR, and proof against what strangers send."""
 
-from __future__ import annotations
-
 import tracemalloc
 from dataclasses import replace
 from typing import Any

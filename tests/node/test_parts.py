@@ -1,7 +1,5 @@
 """Parts of a node, each alone."""
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor

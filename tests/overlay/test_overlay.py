@@ -1,7 +1,5 @@
 """The overlay beside a node: on the tissue in both eyes, and blank when in any doubt."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 import json

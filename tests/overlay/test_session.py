@@ -1,7 +1,5 @@
 """A session from start to end over real sockets, on pictures of the phantom, whose truth is known."""
 
-from __future__ import annotations
-
 import time
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """ROS recordings as sources: every kind of file, which topics, which pairs, which calibration."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The recorder that a node starts: whatever it does or does not do, the node gets an answer and can end."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Pictures handed in over ZeroMQ, by processes and by hand."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What is common to pictures that other programs send: their stamps, their loss, their clock."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Video files by their own stamps and counts: pictures tell their number, so what comes is known exactly."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`sags view`: what it shows, what it takes away, and whom it lets in; the page in a real browser."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

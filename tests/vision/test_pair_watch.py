@@ -1,7 +1,5 @@
 """Whether both eyes show what they should: empty, equal and exchanged pictures are noticed, others not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice

@@ -1,7 +1,5 @@
 """Tissue masks from outside: the session's, a network's, another process's, and when they are wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

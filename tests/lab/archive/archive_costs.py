@@ -7,8 +7,6 @@
 Each takes some minutes of two cores; FOLDER must be new. benchmarks/archive.md has what came out.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
