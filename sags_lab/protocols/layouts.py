@@ -1,7 +1,5 @@
 """STIR's and StereoMIS's files: which pictures, which calibration, which truth."""
 
-from __future__ import annotations
-
 import configparser
 import json
 import sys

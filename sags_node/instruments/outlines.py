@@ -5,8 +5,6 @@ measured inside the mask (level sets of the geodesic distance), so that jaws may
 edge in several places, several instruments lie over each other: each is followed straight from its entry.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
