@@ -99,13 +99,6 @@ def test_python_style_exponents_are_numbers(folder: Path) -> None:
     assert load_rig(folder).left.distortion[0] == 1e-5
 
 
-def test_missing_file(folder: Path) -> None:
-    (folder / "right.yaml").unlink()
-    message = refusal(folder)
-    assert str(folder / "right.yaml") in message
-    assert "left.yaml and right.yaml" in message
-
-
 @pytest.mark.parametrize("text", ["- 1\n- 2\n", "", "a: [1, 2", "%YAML:1.0\n---\nM: 1\n", "\x00"])
 def test_not_a_camera_info_file(folder: Path, text: str) -> None:
     (folder / "left.yaml").write_text(text)

@@ -219,4 +219,4 @@ def test_a_right_video_that_ends_too_early_is_refused_before_it_plays(
 
 def test_lpips_weights_that_are_not_there(user_files: Path) -> None:
     session = [*videos(user_files), "source.frames:=2", "--pace", "step", "--lpips-weights", "gone.npz"]
-    refused(2, "eval", *session, said=("gone.npz",))
+    refused(2, "eval", *session, said=("no file of LPIPS weights at ", "gone.npz"))

@@ -93,13 +93,6 @@ def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
         sent.put("left", 100 * S, round((100 + age) * S), picture)
 
 
-@pytest.mark.fault("picture: a sender's has the wrong size")
-def test_another_size_is_refused_with_both_sizes() -> None:
-    sent = SentPictures(PushSource(), (640, 512))
-    with pytest.raises(SagsError, match=r"8x4 px.*640x512"):
-        sent.put("left", S, S, picture)
-
-
 def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:
     both = np.random.default_rng(3).integers(0, 256, (12, 8, 3), np.uint8)
     geometry = GeometryConfig(layout="over_under", first="right", crop=(2, 1, 5, 4), flip="vertical")
