@@ -1,7 +1,5 @@
 """`python -m benchmarks`, in a checkout: measure how fast and how good this machine is at it."""
 
-from __future__ import annotations
-
 from benchmarks.commands import engine, node, quality
 from sags_node.cli.main import begin, sags_group
 

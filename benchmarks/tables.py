@@ -1,7 +1,5 @@
 """Tables of figures for people."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from string import Formatter
 from typing import Any

@@ -7,8 +7,6 @@
 the point.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 

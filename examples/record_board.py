@@ -7,8 +7,6 @@
 What must come out is printed: how the camera sits on the robot, and that the robot's clock is 60 ms ahead.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -6,8 +6,6 @@
 The node then runs, in another terminal, with `launch/push.yaml` or `launch/ros2.yaml`.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import sys

@@ -3,8 +3,6 @@
 A running node's warnings are another thing: `findings`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Iterable, Mapping

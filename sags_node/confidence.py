@@ -6,8 +6,6 @@
 0.25 within 6 mm; below 1/64, 18 mm, no depth is stated.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors a person can act on. The command line prints them as they are, without a traceback."""
 
-from __future__ import annotations
-
 from reprlib import Repr
 
 

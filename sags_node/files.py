@@ -3,8 +3,6 @@
 Files that we make: each appears when all of it is there, and takes the place of nothing but our own results.
 """
 
-from __future__ import annotations
-
 import difflib
 import errno
 import json

@@ -1,7 +1,5 @@
 """Every warning that there is. docs/warnings.md says of each what causes it and how to fix it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 from sags_node.types import Finding

@@ -1,7 +1,5 @@
 """Pure geometry: SE(3), quaternions, projection, disparity. Conventions are in `sags_node.types`."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

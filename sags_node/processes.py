@@ -1,7 +1,5 @@
 """Processes: how others end, with a limit on every wait, and the memory of one."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from pathlib import Path

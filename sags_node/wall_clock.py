@@ -1,7 +1,5 @@
 """The wall clock at a time of a clock that nobody sets: stamps are even, and right again after it was set."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Threads that read for as long as a program runs: what nobody foresaw ends none of them."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable

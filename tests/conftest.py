@@ -1,7 +1,5 @@
 """Sessions and folders that several tests share."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import signal

@@ -7,8 +7,6 @@ Python 3.11, not the image `python:3.11-slim-bookworm`. PATH: what pip reads her
 proxy. At the end the image's user plays `sags demo`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

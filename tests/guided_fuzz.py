@@ -4,8 +4,6 @@
 in `out/fuzz`. What libraries in C do is not seen by the guidance, only by the checks.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import subprocess

@@ -5,8 +5,6 @@ whether a product and a sum are rounded once or twice. So each compile target gi
 bound that holds on one must hold on all. `make test-targets` runs them all, on one and on two threads.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

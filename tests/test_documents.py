@@ -1,7 +1,5 @@
 """Documents name files, threads, folders, warnings and each other as they are: docs/dev/check_docs.py."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The examples, run as their first lines say; others stand beside the tests of what they use."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy

@@ -1,7 +1,5 @@
 """What a frame may take: as long as it is until the next one, unless a person has set it."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

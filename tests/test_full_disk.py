@@ -1,7 +1,5 @@
 """Whatever is written, a full disk is one line and exit code 1, and nothing half written stays."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Iterator

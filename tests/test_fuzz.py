@@ -5,8 +5,6 @@ each time, and keeps those that fail in `out/fuzz`. One that ends the process it
 newest temporary folder.
 """
 
-from __future__ import annotations
-
 import logging
 import shutil
 import sys

@@ -44,14 +44,8 @@ def test_quaternions_round_trip_for_every_axis_and_up_to_half_a_turn(angle: floa
         quat = geometry.matrix_to_quat(R)
         assert quat[0] >= 0
         assert abs(np.linalg.norm(quat) - 1) < 1e-12
-        np.testing.assert_allclose(geometry.quat_to_matrix(quat), R, atol=1e-9)
-
-
-def test_quaternion_length_does_not_matter() -> None:
-    quats = np.random.default_rng(3).normal(size=(7, 4))
-    np.testing.assert_allclose(
-        geometry.quat_to_matrix(quats * 1e-6), geometry.quat_to_matrix(quats), atol=1e-12
-    )
+        for length in (1, 1e-6):  # which does not matter
+            np.testing.assert_allclose(geometry.quat_to_matrix(length * quat), R, atol=1e-9)
 
 
 def test_project_agrees_with_opencv_and_unproject_undoes_it() -> None:

@@ -1,7 +1,5 @@
 """What `sags doctor` says of the machine, for machines made of a few files."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

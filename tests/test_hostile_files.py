@@ -1,7 +1,5 @@
 """Files that claim too much, are no files, or make a C library talk: one message of ours, nothing else."""
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Whether the right eye is drawn is up to who looks: a node in this process, real sockets."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Iterator

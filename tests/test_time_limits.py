@@ -1,7 +1,5 @@
 """No wait for another process, thread or device is without an end."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

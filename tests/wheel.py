@@ -3,8 +3,6 @@
 `make wheel-test` takes some minutes and 3 GB in out/wheel, so it is none of the tests that always run.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

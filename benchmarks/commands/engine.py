@@ -1,7 +1,5 @@
 """Of the engine and the offline model."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from pathlib import Path
 

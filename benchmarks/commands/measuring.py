@@ -1,7 +1,5 @@
 """What commands of benchmarks have in common."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

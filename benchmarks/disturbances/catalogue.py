@@ -1,7 +1,5 @@
 """All disturbances by name, how long each lasts, and a stream of frames of which a stretch has one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """What sits on the lens, and what shakes it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

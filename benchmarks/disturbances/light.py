@@ -1,7 +1,5 @@
 """What changes the light: exposure, lamp, flash. In linear light, as it is in the camera."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """What a disturbance may know of one frame: everything it does is a function of this."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """How far away everything is that the eyes see: for smoke in front of it, and blood on it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import cv2

@@ -1,7 +1,5 @@
 """What goes wrong between the camera and the node: cables, capture cards, codecs, and another scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,8 +1,6 @@
 """What comes between the eyes and the tissue: smoke, and blood on it. Both have a depth, so that the eyes
 see it as they see the scene: with disparity."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import cv2

@@ -1,7 +1,5 @@
 """Has a kernel become slower? Its time in units of the machine's own peak, against a kept table."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What the rasteriser's time becomes when the cores were idle before, or are not ours alone."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

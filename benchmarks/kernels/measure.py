@@ -1,7 +1,5 @@
 """The table of `benchmarks kernels`: every kernel's time on this machine, beside the machine's own peak."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Times of the rasteriser, stage by stage."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The kernel table for people: a few tables for a terminal, and a plot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any

@@ -1,7 +1,5 @@
 """What the kernels are timed on: tissue-like surfaces of any number of Gaussians."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

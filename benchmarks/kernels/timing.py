@@ -1,7 +1,5 @@
 """Stop watches: medians of calls, the stages inside a call, and the least time that a machine could need."""
 
-from __future__ import annotations
-
 import inspect
 import statistics
 import time

@@ -1,7 +1,5 @@
 """`benchmarks bridges`: what each bridge gives its peer, how old that is, and what it costs."""
 
-from __future__ import annotations
-
 import json
 import select
 import socket

@@ -1,7 +1,5 @@
 """`benchmarks crowd`: whether slow, dead and many subscribers disturb a node."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import subprocess

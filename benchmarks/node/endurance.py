@@ -4,8 +4,6 @@ The frames of a recording are kept in memory and played there and back, so that 
 or in an order that never repeats. At the end one frame is shown again and again: what stillness costs.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

@@ -5,8 +5,6 @@ outside: what a subscriber gets, enlarged to the full working size. Who reads st
 takes only what the node leaves of the cores.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`benchmarks inputs`: what a live pair costs until the mapper can have it, for each way into the node."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -3,8 +3,6 @@
 Who reads stands for another machine, and takes only what the node leaves of the cores.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import select

@@ -1,7 +1,5 @@
 """What processes cost, which this one has started, and work in one that ends with us."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@ The node, the overlay, the viewer with a browser, a recorder and three subscribe
 The recorder and the subscribers come and go. Every frame is timed by its own stamps; sizes are the system's.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

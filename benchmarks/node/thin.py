@@ -1,7 +1,5 @@
 """`benchmarks thin`: what thin pictures cost to make and to read, and what they take of a link."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

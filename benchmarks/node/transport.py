@@ -1,7 +1,5 @@
 """`benchmarks transport`: what it costs to send one picture to another process."""
 
-from __future__ import annotations
-
 import multiprocessing
 import tempfile
 import time

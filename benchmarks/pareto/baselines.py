@@ -1,7 +1,5 @@
 """What the online mapper is compared with: the picture before, a warp by stereo, stereo alone, a fit."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Mapping, Sequence

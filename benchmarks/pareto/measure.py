@@ -4,8 +4,6 @@ Time budgets, working sizes and numbers of Gaussians are compared in the mode th
 of time. Rules that leave work out are compared with a fixed number of steps, so that only the rule changes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any

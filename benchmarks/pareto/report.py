@@ -1,7 +1,5 @@
 """Run time against error, for people: a table for each recording, and one of its skip rules."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The settings of the online mapper that are compared: each a few overrides of a launch file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 

@@ -6,8 +6,6 @@ to look ahead. Training frames are measured too, which tells what is over-fitted
 pictures of a half and a quarter of the size, which is what the filters are for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any

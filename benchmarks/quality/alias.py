@@ -5,8 +5,6 @@ nothing. Four models of one instant of the phantom are trained by the mapper, ea
 filters, and drawn where nothing was trained, against the ray-cast truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """What the phantom's tissue really looks like at other picture sizes and from other distances."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ below a plane whose motion is given, wave by wave: a wave of k rad/m has faded t
 z, upwards, and sooner sideways. Nothing of it is in the overlay, which fades every motion alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any

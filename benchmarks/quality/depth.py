@@ -1,7 +1,5 @@
 """Depth from stereo against what is known to be true: the node's stage at every scale, and SGBM."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -4,8 +4,6 @@ Maier-Hein et al., "Comparative Validation of Single-Shot Optical Techniques for
 Reconstruction", IEEE TMI 2014.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

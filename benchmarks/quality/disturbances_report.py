@@ -1,7 +1,5 @@
 """Disturbances for people: a table, and pictures to look at."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Each gets the points' pixels in the first picture, and then shown the pictures in turn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

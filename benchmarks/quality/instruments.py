@@ -1,7 +1,5 @@
 """How exactly instruments are placed: before the phantom, where their tips are known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

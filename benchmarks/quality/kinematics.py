@@ -1,7 +1,5 @@
 """How exactly tips are placed by a robot's kinematics, with and without the picture: before the phantom."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

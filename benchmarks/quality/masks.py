@@ -1,7 +1,5 @@
 """How right masks are that were not given, and what each source of masks is worth to the mapper."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 The phantom's tissue is pulled. Anchors are pinned at pixels of true points that its first frame shows.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import Any

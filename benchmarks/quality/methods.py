@@ -5,8 +5,6 @@ error. At the end of that the model is asked for all frames of the last two seco
 time; nodes only have what they are now.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

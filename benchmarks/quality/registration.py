@@ -3,8 +3,6 @@
 Each seed is another phantom, another part of its surface, and other errors of the picked points.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path

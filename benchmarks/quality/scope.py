@@ -5,8 +5,6 @@ that takes the scene for rigid, and the pose that fits the true surface points b
 error is a matter of definition, since the motion that all tissue shares cannot be told from the scope's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args

@@ -1,7 +1,5 @@
 """OpenCV's StereoSGBM (Hirschmueller, PAMI 2008), which the node's stage is compared with."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """How exactly the strain of a surface that is pulled is told: before the phantom, whose strain is known."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,8 +1,6 @@
 """How well points stay on the tissue of a recording: anchors and Gaussians, and beside anchors the common
 methods that know no model (`followers`)."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The tables of `python -m benchmarks tracking`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from rich.table import Table

@@ -3,8 +3,6 @@
 Each check yields a line for everything that is not as the code has it. tests/test_documents.py runs them.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import runpy

@@ -4,8 +4,6 @@ A test that shows what a fault does carries `@pytest.mark.fault("place: what")`.
 source, so nothing needs to run, and nothing that a test needs must be there.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from itertools import groupby

@@ -5,8 +5,6 @@ tissue. Beside it is what a rigid overlay shows whose scope is tracked without e
 is, the phantom knows: a thin line in both.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Writes docs/launch.md from the descriptions of `sags_node.config.schema`: `make docs`."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from itertools import chain

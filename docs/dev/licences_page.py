@@ -4,8 +4,6 @@ What is installed says it of itself (`importlib.metadata`); so the page has the 
 it was written.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ What the product asks for itself has a row of its own: what for, and what if it 
 along stands under them.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tomllib

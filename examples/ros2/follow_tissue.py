@@ -7,8 +7,6 @@
 It needs rclpy and ROS' messages, and nothing of this package. Tried with Kilted; see docs/bridges.md.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -3,8 +3,6 @@
 python -m sags_lab.archive.child PARENT MODULE|FILE.py ARGUMENT ...
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import runpy

@@ -1,7 +1,5 @@
 """The Ray instance that an archive runs on: one that starts here by itself, or a cluster that is there."""
 
-from __future__ import annotations
-
 import logging
 import os
 import secrets

@@ -1,7 +1,5 @@
 """What a job costs for an hour of video: measured on two lengths of a recording, extrapolated by frames."""
 
-from __future__ import annotations
-
 import multiprocessing
 import resource
 import tempfile

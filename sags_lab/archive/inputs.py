@@ -1,7 +1,5 @@
 """The files of a recording: what tells whether they changed, and how they come to the machine that works."""
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json

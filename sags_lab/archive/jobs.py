@@ -1,7 +1,5 @@
 """The jobs: each is a `sags` command for one recording, that leaves a folder and says its figures as JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """From a row of a manifest to the arguments that `sags eval`, `fit` and `export` take."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ empty where the recording brings one), `overrides` (`key:=value`, separated by s
 the overrides say; see `segments`). Only `recording` is needed.
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

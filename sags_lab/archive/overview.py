@@ -1,7 +1,5 @@
 """An archive on one page: how its figures are spread, run time against error, and the worst recordings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from html import escape

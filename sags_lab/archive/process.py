@@ -1,7 +1,5 @@
 """One command in a process of its own, within limits of time and memory. It ends with the one who waits."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """What an archive has come to: how far it is, what failed, and all figures in one table."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

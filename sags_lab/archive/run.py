@@ -1,7 +1,5 @@
 """Goes through an archive: what is not done yet is given to Ray, one task for each recording."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import Counter, deque

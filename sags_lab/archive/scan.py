@@ -1,7 +1,5 @@
 """Finds recordings in a folder: all that the node can play, and why it cannot play the others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

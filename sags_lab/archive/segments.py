@@ -4,8 +4,6 @@ The model learns while it plays, so a segment begins with a warm-up: frames that
 Borders are frame numbers. All segments together count each frame of the recording once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

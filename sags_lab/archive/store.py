@@ -9,8 +9,6 @@ partial/          what is being written
 results.parquet   one row for each recording; report.html shows them
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -1,7 +1,5 @@
 """One recording of an archive, on the machine that does it: fetch, run, put in place, say so."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """The statistics that a LeRobot data set carries: least, most, mean, spread and count of each feature."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

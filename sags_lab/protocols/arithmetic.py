@@ -1,7 +1,5 @@
 """The figures of public evaluators, by their published descriptions. Nothing here knows a layout."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

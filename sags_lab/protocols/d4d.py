@@ -1,7 +1,5 @@
 """D4D measured: depth at a clip's first and last frame against the scan before and after it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ pose maps points of the left rectified camera into the frame of the structured l
 is the instrument is not said there.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from itertools import chain

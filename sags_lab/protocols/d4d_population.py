@@ -5,8 +5,6 @@ By `d4d_meta` of github.com/TaiToTo/omnisurg-4d-scene-graph (2026): of 542 scans
 that are missing. Its rule reads no figure. Where tissue moves is not published, so the list stands here.
 """
 
-from __future__ import annotations
-
 LEFT_OUT: dict[str, dict[str, tuple[int, ...]]] = {  # numbers of clips, by their specimen and session
     "start": {
         "specimen_1/2025_03_06-16_56_00": (4, 5),

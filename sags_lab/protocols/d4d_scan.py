@@ -1,7 +1,5 @@
 """D4D's truth: what structured light saw as depth in the picture, and whether it can be there."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """STIR's and StereoMIS's files: which pictures, which calibration, which truth."""
 
-from __future__ import annotations
-
 import configparser
 import json
 import sys
@@ -67,7 +65,8 @@ def _stir_clip(left: Path) -> StirClip | None:
     """None where nothing is marked: its evaluator skips such sequences."""
     right = left.parent.with_name(left.parent.name.replace("left", "right", 1)) / left.name
     left_video, right_video = _one_video(left / "frames"), _one_video(right / "frames")
-    starts, ends = (_centres(left / f"segmentation/icg{when}seg.png") for when in ("start", "end"))
+    marked = (left / f"segmentation/icg{when}seg.png" for when in ("start", "end"))
+    starts, ends = (_middles(_boxes(file)).astype(np.float64) for file in marked)
     if not len(starts) or not len(ends):
         return None
     name = f"{left.parent.name}/{left.name}"
@@ -93,10 +92,6 @@ def _boxes(file: Path) -> I64:
 def _middles(boxes: I64) -> I64:
     """[P, 2] px, whole numbers as its evaluator takes them."""
     return boxes[:, :2] + boxes[:, 2:] // 2
-
-
-def _centres(file: Path) -> F64:
-    return _middles(_boxes(file)).astype(np.float64)
 
 
 def marked_in_both(left: Path, right: Path, when: str, rig: StereoRig) -> F64:

@@ -1,7 +1,5 @@
 """What all protocols play with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from sags_node.config.launch_file import load_launch

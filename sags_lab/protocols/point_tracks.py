@@ -1,8 +1,6 @@
 """How followed points are judged, as the field does it: shares within thresholds and average Jaccard, from
 TAP-Vid (Doersch et al., NeurIPS 2022); and how often what is said with some confidence is right."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

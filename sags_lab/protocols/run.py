@@ -1,7 +1,5 @@
 """Public data sets played through the node's own pipeline, and measured by their own rules."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ frame, also where they are in space, so the right eye is matched there too. The 
 frames but the first.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

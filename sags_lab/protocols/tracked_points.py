@@ -5,8 +5,6 @@ By the public description of Hayoz et al., "Online 3D reconstruction and dense t
 camera poses, masks, and where points are in each frame.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Whatever the file, a message is ROS 2 CDR. MCAP is read by `mcap_file`, record b
 false length nor an index that lies can take memory; db3 and ROS 1 files are read by `rosbags`.
 """
 
-from __future__ import annotations
-
 import logging
 import shlex
 from collections.abc import Callable, Collection, Iterator, Sequence

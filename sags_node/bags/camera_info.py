@@ -1,7 +1,5 @@
 """What cameras say of their calibration in ROS (`CameraInfo`, REP 104), now and over a recording."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Format: https://mcap.dev/spec. A file is magic, records, magic; a record is an o
 (8 bytes) and its content. Messages lie in chunks, which may be compressed and carry a checksum.
 """
 
-from __future__ import annotations
-
 import bz2
 import struct
 import zlib

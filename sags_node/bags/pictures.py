@@ -1,7 +1,5 @@
 """What cameras say in ROS: pictures, raw and compressed, checked and decoded."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Format: http://wiki.ros.org/Bags/Format/2.0. A record is header length, header fields, data length, data.
 """
 
-from __future__ import annotations
-
 import struct
 from functools import lru_cache
 from pathlib import Path

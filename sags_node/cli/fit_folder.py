@@ -1,7 +1,5 @@
 """`sags fit`: the offline fit of a recording, from its folder to a model, drawn test frames and figures."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

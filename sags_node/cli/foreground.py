@@ -1,7 +1,5 @@
 """`sags run`: the node in the foreground, with what it does shown live."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`sags new`: a launch file for a recording or for cameras, once they have been tried."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """Options of commands that look for a running node."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial, wraps
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`sags eval` and `sags fit`: what a recording, not a running node, is asked for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """`sags overlay`: meshes held by the tissue, over the live picture."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click

@@ -1,7 +1,5 @@
 """`sags bag record --session`: a recording played through a node of its own, all of it recorded."""
 
-from __future__ import annotations
-
 import tempfile
 import threading
 from collections.abc import Callable

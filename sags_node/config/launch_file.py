@@ -1,7 +1,5 @@
 """Reads launch files. An unknown key is an error that names the nearest known one."""
 
-from __future__ import annotations
-
 import difflib
 import os
 import re

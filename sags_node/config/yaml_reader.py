@@ -6,8 +6,6 @@ can hold, and names that cannot be told to anybody. Numbers with zeros in front 
 000100 and 000180 that makes 64 and a text.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -7,8 +7,6 @@ every fourth pixel along both axes (`trace`), and lies on straight lines between
 is looked up for each pixel that has none yet (`carry`): of a left view these are few.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

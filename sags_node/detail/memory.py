@@ -1,7 +1,5 @@
 """Pictures of tissue that is hidden now: the newest ones in which it was seen."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

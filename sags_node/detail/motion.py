@@ -1,7 +1,5 @@
 """What a view's tissue has in common over many pixels, drawn small: how far it moved since another moment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial

@@ -1,7 +1,5 @@
 """A frame that lends its picture to other moments and other cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -4,8 +4,6 @@ For each tile of a source's picture: of what the one guess lacked, how much lay 
 difference from it (least squares). Where highlights jump, or the motion is wrong, it is little.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.detail.seen import SeenFrame

@@ -1,7 +1,5 @@
 """What consumers are shown of a view: the drawn model, with the detail of pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """What every rasteriser takes and gives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

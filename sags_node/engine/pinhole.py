@@ -1,7 +1,5 @@
 """Projection inside kernels: a camera as twenty numbers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

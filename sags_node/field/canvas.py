@@ -1,7 +1,5 @@
 """Drawing on a device by Warp's kernels, from and to torch's tensors there. Nothing comes to the host."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 

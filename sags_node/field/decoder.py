@@ -13,8 +13,6 @@ the authors' code; softmax over one key is 1, so that MSA is its value layer and
 control nodes are decoded, and every node attends to all of them.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import torch

@@ -4,8 +4,6 @@ The 3D filter comes after the deformation, where a Gaussian's depth is known (`m
 variance is a constant of the gradient, as in Mip-Splatting. The 2D filter is part of the rasteriser.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

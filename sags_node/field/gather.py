@@ -4,8 +4,6 @@ torch's own gradient of it sorts all indices and takes several times as long as 
 float32 on the CPU; a test compares them with torch's.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

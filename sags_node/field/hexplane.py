@@ -12,8 +12,6 @@ features are blended, before the oldest and after the newest they are constant. 
 the newest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

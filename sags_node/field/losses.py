@@ -18,8 +18,6 @@ Beyond the paper's four, with a weight of 0 unless it is set:
     coverage          max(0, 0.9 - A)                       tissue
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The SAGS model: canonical Gaussians, the field that deforms them, and the exposure they are seen with."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

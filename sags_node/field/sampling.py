@@ -4,8 +4,6 @@
 float32 on the CPU, `sample` is kernels that keep none: a test compares both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 

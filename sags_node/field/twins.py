@@ -1,7 +1,5 @@
 """Which of two twins computes: a kernel of Numba's, or the same formula in torch."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -14,8 +14,6 @@ Both evaluations have a gradient. Without that of g(p, t0) the fit diverges: ste
 as those of the decoder and of the planes in space mostly do, would seem to help and change nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -5,8 +5,6 @@ inverse depth, and so the disparity, is linear in the picture: of all such lines
 patches agree with.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

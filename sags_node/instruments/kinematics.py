@@ -7,8 +7,6 @@ kinematic chain"). A Kalman filter learns it from the tips that both eyes see. H
 from the picture: the turn is learnt from how the tips are off in several places.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

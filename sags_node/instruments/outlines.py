@@ -5,8 +5,6 @@ measured inside the mask (level sets of the geodesic distance), so that jaws may
 edge in several places, several instruments lie over each other: each is followed straight from its entry.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
@@ -95,16 +93,13 @@ def _of_component(mask: U8, edge: U8) -> list[Outline]:
         outline = None if band is None else _of_band(band, start, edge, alone=count == 2)
         if outline is not None and band is not None:
             found[entry] = outline, band
-    for entry in sorted(found, key=lambda i: -_length(found[i][0])):
+    lengths = {entry: np.linalg.norm(outline.far - outline.back) for entry, (outline, _) in found.items()}
+    for entry in sorted(found, key=lambda i: -lengths[i]):
         if entry in found and found[entry][0].is_outside:  # where it leaves, nothing enters
             band = found[entry][1]
             left_at = {other for other in found if other != entry and band[entries == other].mean() > MOSTLY}
             found = {other: kept for other, kept in found.items() if other not in left_at}
     return [outline for outline, _ in found.values()]
-
-
-def _length(outline: Outline) -> float:
-    return float(np.linalg.norm(outline.far - outline.back))
 
 
 def _band(mask: U8, start: U8) -> U8 | None:

@@ -14,8 +14,6 @@ folder as an import of all its modules whose names stand in the text. So nothing
 changes the names of the files that stand on it and of few others.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import re

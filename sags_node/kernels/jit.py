@@ -28,8 +28,6 @@ it imports from and with the compile target (`digest`). So helpers, constants an
 file they belong to, and are imported. In machine code each kernel has its own copy of a helper (`linkage`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 

@@ -7,8 +7,6 @@ kernel. So a recording gave other figures at the first start than at all later o
 sees a copy.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from llvmlite.binding import Linkage

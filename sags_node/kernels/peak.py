@@ -5,8 +5,6 @@ multiply-adds that never leave the registers, and STREAM's triad (J. McCalpin, 1
 because the arrays of most kernels here stay in the last cache.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -18,8 +18,6 @@ Count: Numba keeps it per Python thread, and a new thread starts with all cores 
 one for the whole process, and its workers spin while they wait.
 """
 
-from __future__ import annotations
-
 import os
 
 import cv2

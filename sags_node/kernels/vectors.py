@@ -18,8 +18,6 @@ A vector can hold a *block* of a picture: `BLOCK_WIDTH` px wide and `LANES / BLO
 row. `block_x` and `block_y` say where a lane's pixel lies in its block.
 """
 
-from __future__ import annotations
-
 import operator
 import re
 from collections.abc import Callable, Sequence

@@ -6,8 +6,6 @@ found again, so that nothing drifts; along the ray, it keeps its distance to the
 out of sight for long is found by what surrounded it (`recall`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import cv2

@@ -1,8 +1,6 @@
 """What a frame gets: a rung of quality, and steps while its time lasts. The clock is an argument, so that
 results are reproducible."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

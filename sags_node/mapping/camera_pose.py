@@ -1,7 +1,5 @@
 """The camera's pose from points of the model that were found again in a picture: robust least squares."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

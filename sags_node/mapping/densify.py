@@ -1,7 +1,5 @@
 """Where Gaussians are added and which are removed. N stays under its cap."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

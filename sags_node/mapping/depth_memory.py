@@ -7,8 +7,6 @@ same calibration, and do not average out. Measurements that contradict it raise 
 contradiction. While it is not measured, its error grows with the way that it is taken unseen.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a launch means for the mapper: who refines, on which rungs, with how many Gaussians."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from functools import partial

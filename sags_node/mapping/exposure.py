@@ -1,7 +1,5 @@
 """The camera's gain from one frame to the next."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Places at rest of the model follow the flow, whose errors add up. So some pictur
 at rest of what has texture in them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

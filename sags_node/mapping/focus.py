@@ -1,7 +1,5 @@
 """Where in the picture another refinement step pays most."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """Where the camera is: what says so, and the simplest that does: its poses are given, or it stands still."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

@@ -1,7 +1,5 @@
 """New Gaussians from pixels and depth: already a good picture without any optimisation."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

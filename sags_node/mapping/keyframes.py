@@ -1,7 +1,5 @@
 """Pictures of the model from where the camera was, to find it again when it is lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 

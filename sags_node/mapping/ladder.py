@@ -6,8 +6,6 @@ count, since every machine measures how long its own frames take. `benchmarks/la
 and what it gives.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass

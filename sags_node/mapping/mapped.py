@@ -1,7 +1,5 @@
 """What every mapper makes of a frame, and how it judges one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The online mapper: one observation in, one immutable snapshot out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Scene flow: where each seen Gaussian went, from optical flow and the new depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -7,8 +7,6 @@ predictions would have wanted. Where such moments do not come again and again, o
 believed. A HexPlane field learnt beside the video was compared; see `benchmarks/motion_field.md`.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether a picture and its measured depth agree with what is expected from a camera pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

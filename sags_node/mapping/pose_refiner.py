@@ -1,7 +1,5 @@
 """Given camera poses, put right by the picture where they are off."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.geometry import invert

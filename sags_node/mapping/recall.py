@@ -5,8 +5,6 @@ features (ORB, `vision.landmarks`) are looked for again. Around an anchor they t
 turned and scaled; the anchor's own patch must then fit, and the scale must agree with the change of depth.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

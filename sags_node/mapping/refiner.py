@@ -1,7 +1,5 @@
 """What is done to the model many times per frame, behind one small interface; here on the CPU."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Protocol

@@ -1,7 +1,5 @@
 """The model's tissue where it rests, and the camera's pose against it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

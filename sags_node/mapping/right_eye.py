@@ -1,7 +1,5 @@
 """Which pixels of the right eye show tissue."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.types import F32, Bool

@@ -8,8 +8,6 @@ The right picture of a frame is never used to draw that frame. Instruments come 
 nor from the right one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

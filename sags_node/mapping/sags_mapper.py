@@ -6,8 +6,6 @@ frame: that is published. What prunes, inserts, splits and lights Gaussians work
 `Mapper`; the field then takes over what was done (`_take_over`).
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ A split changes the picture less than a new Gaussian does, which covers what was
 where the whole was, under its id: who follows the tissue by ids sees nothing jump.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

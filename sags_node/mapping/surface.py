@@ -1,7 +1,5 @@
 """What is measured where each Gaussian is seen: found once a frame, for all who ask."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

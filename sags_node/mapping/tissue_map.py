@@ -1,7 +1,5 @@
 """The map: the tissue's Gaussians, how they deform, and the light that their colours show."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ FFmpeg does not say it: streams hold neither length nor index, and the lengths t
 be a second off.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ Decoders take the memory that a header asks for, fill what is missing of a cut-o
 nothing of it, and print what they think of a file beside our own message, without the file's name.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re

@@ -1,7 +1,5 @@
 """A video that is written picture by picture: H.264 in MP4, which every browser plays."""
 
-from __future__ import annotations
-
 import errno
 import logging
 from fractions import Fraction

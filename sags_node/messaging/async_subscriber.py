@@ -5,8 +5,6 @@ async with AsyncSubscriber(["left/render/depth"]) as subscriber:
         ...
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import suppress

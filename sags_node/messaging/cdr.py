@@ -4,8 +4,6 @@ Images and point clouds are split in `prefix, data[, suffix]`, so that the bulk 
 array it lies in. The parts joined are byte for byte what a CDR library writes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache

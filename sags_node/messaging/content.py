@@ -1,7 +1,5 @@
 """What each topic says of one frame (`FrameResult`) or of the node (`NodeHealth`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any

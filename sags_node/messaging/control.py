@@ -1,7 +1,5 @@
 """Requests to the node: msgpack `{v, id, op, args}` -> `{v, id, ok, result | error}`."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import Counter

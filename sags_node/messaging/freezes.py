@@ -2,8 +2,6 @@
 three times the mean of those before, and 150 ms more than it (W3C, "Identifiers for WebRTC's Statistics API",
 `freezeCount`)."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """Is what one topic shows new enough to be believed? Pure bookkeeping of stamps and sequence numbers."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 Each function gives plain dictionaries that JSON can hold.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Tissue masks from another process on this machine."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numpy.typing import NDArray

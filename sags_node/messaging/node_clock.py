@@ -4,8 +4,6 @@ with NodeClock("tcp://node:5557") as clock, Subscriber(names, "tcp://node:5556",
     subscriber.ok("left/render/depth")  # it is new enough, by the node's clock
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Who is connected to a bound socket, from ZeroMQ's socket monitor: counted, capped, and expelled."""
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import os

@@ -4,8 +4,6 @@ Here, and nowhere else, what was worked out becomes what is published. Depths, c
 of the nearest working pixel: a mean across an edge is a surface that does not exist.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TypeVar
 

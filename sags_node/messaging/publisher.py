@@ -1,7 +1,5 @@
 """The node's sockets: results and health out, subscriptions and requests in. All from one thread."""
 
-from __future__ import annotations
-
 import logging
 import os
 import time

@@ -1,7 +1,5 @@
 """What a subscriber gets: each message as a typed value over the received memory."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from functools import cached_property

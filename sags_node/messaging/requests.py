@@ -1,7 +1,5 @@
 """What the control operations of consumers take as `args`, checked."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar

@@ -3,8 +3,6 @@
 Data may be had in every role. Each role may also do what those before it may.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args

@@ -5,8 +5,6 @@ The connection file tells a client on this machine where the node is:
 recording: path | null}`.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shlex

@@ -6,8 +6,6 @@ with FrameSender() as sender:
 The node must have `source.kind: push`; for poses `robot.kind: push`.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 import uuid

@@ -1,7 +1,5 @@
 """What every socket here has in common: bounded memory, and never more read than a message may hold."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Messages as they arrive: the one place that reads the data socket on the consumer's side."""
 
-from __future__ import annotations
-
 import difflib
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence

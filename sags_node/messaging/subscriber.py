@@ -7,8 +7,6 @@ with Subscriber(["left/render/depth"]) as subscriber:
 `received.TopicName` in place of a plain name makes the results typed; `async_subscriber` is for asyncio.
 """
 
-from __future__ import annotations
-
 import atexit
 import threading
 import time

@@ -4,8 +4,6 @@ Colour becomes JPEG, over black where it has an alpha; that comes beside it. Dep
 depth is never averaged with its neighbour: at half size every second one comes, as it is.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import replace

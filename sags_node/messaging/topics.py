@@ -6,8 +6,6 @@ Coordinates: images and depth belong to the left or right optical frame, `points
 harmonic f_dc = (rgb - 0.5) / 0.28209479. (A 3DGS PLY file holds the logarithm and the logit instead.)
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

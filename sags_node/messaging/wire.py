@@ -4,8 +4,6 @@
 Decoding looks only at bytes that have arrived: a claimed size is compared with them, never allocated.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ what has the unit of a variance.) In a deforming scene it belongs after the defo
 `engine.rasterizer.smoothing` applies the variance; the 2D filter is part of the projection.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

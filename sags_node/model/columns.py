@@ -3,8 +3,6 @@
 All are raw: the drawn scale is exp, the drawn opacity the logistic function of what stands here.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gaussians of one colour each, for viewers and files that know no slopes (`types.Gaussians.slopes`)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

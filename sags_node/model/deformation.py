@@ -1,8 +1,6 @@
 """How the tissue moves: what was observed of some Gaussians becomes a motion of all of them, the hidden ones
 too."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -5,8 +5,6 @@ would have to change with every frame. Not part of SAGS; the drift is 20 % withi
 recording.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.types import F32, I64

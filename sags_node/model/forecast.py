@@ -1,7 +1,5 @@
 """Where tissue is expected after a frame, by the motion of the control nodes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

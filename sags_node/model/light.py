@@ -1,7 +1,5 @@
 """Light that travels with the scope: how bright tissue looks when the lamp has moved."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

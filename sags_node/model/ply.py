@@ -1,7 +1,5 @@
 """Gaussians as a PLY file with the field names every splat viewer reads."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ It is not a low priority: threads of one process share the interpreter, and one 
 processor while it holds that keeps all others waiting.
 """
 
-from __future__ import annotations
-
 SHARE = 0.25  # of one core
 LEAST_SHARE = 0.05  # while the mapping is behind: less than its own rate varies by
 BEHIND = 0.05  # share of late frames from which on it is

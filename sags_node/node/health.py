@@ -1,7 +1,5 @@
 """What the node says of itself: rates, latencies and costs of its last frames."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -9,8 +9,6 @@ between two frames. Consumers' own views are drawn, and thin pictures made, on t
 take no more of a core than `allowance` says.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

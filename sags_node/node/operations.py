@@ -1,7 +1,5 @@
 """What clients may ask of a running node: by which name, and on which of its threads it is done."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait

@@ -1,7 +1,5 @@
 """What a service manager is notified of: systemd's protocol (sd_notify(3)), datagrams to `$NOTIFY_SOCKET`."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The detail of consumers' views, and what it takes to know how far to trust it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

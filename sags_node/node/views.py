@@ -5,8 +5,6 @@ keeps the same part of the rate it asked for. A view that nobody subscribes to i
 thread; only `status` and `pairs` may be read by others.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """A printed calibration board, drawn through the exact model of an eye."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,7 +1,5 @@
 """From bodies to a picture: one raw eye's view in linear light, smoke, then lens and sensor."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

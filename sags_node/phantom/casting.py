@@ -1,7 +1,5 @@
 """The bodies of one moment, and what rays meet when they are cast at them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

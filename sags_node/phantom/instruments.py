@@ -3,8 +3,6 @@
 Local axes: the tip of the closed instrument is the origin, the shaft runs along +z, the jaws open along x.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

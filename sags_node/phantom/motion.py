@@ -1,7 +1,5 @@
 """The clock of the phantom: periodic movements over the session's phase, 0 to 1."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

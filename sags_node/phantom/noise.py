@@ -1,7 +1,5 @@
 """Smooth random pictures: the raw material of shapes and colours."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -3,8 +3,6 @@
 Material coordinates are the x and y (m) of a surface point at rest. They never change; only positions do.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The phantom's stereo endoscope: two distorted cameras with a slight toe-in, and their exact rays."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

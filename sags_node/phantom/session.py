@@ -1,7 +1,5 @@
 """A phantom session on disk: pictures, masks, truth, calibration and the launch file that plays them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

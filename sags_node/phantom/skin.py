@@ -1,7 +1,5 @@
 """What the tissue looks like: colour, wetness and fine relief, fixed in material coordinates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

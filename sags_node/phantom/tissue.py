@@ -1,7 +1,5 @@
 """The deforming tissue: where every material point is at every phase of the session."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.phantom.motion import Clock, keyed

@@ -1,7 +1,5 @@
 """Dot products and unit vectors of pictures of float32 vectors, several times faster than `numpy.linalg`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.types import F32

@@ -6,8 +6,6 @@ confidence of a depth states an error in mm, and there is none to state. So no c
 programs that decide something by a depth, or show it as sure, take none of these.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """From a launch file to the three things the node runs on: configuration, rig and source."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Compile (once per machine) and load every kernel of the frame path, before the first frame needs it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A few frames of a run for a person to look at, their depth and error in colours, with the scales."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Pictures are float32 RGB 0..1 `[H, W, 3]`; `tissue` is True where a pixel counts
 mask is NaN: nothing is invented where nothing was measured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar

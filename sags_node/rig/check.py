@@ -1,7 +1,5 @@
 """What is right, odd or wrong with the numbers of a calibration. `rows` asks pictures."""
 
-from __future__ import annotations
-
 import logging
 import shlex
 from collections.abc import Callable, Iterator, Sequence

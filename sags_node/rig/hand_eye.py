@@ -1,7 +1,5 @@
 """How the camera sits on what the robot moves: `hand_eye.yaml` beside a rig's `left.yaml`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -7,8 +7,6 @@ Scikit-surgery's are text: `<prefix>.left.intrinsics.txt`, `.left.distortion.txt
 and `<prefix>.l2r.txt` [4, 4] from left to right camera coordinates, mm.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Rigs made from what calibrations say: matrices of two cameras and how they stand to each other."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -4,8 +4,6 @@ The keys are those of ROS `camera_calibration_parsers`, so files of `ros2 run ca
 cameracalibrator` are used unchanged. Lengths are metres.
 """
 
-from __future__ import annotations
-
 import gzip
 import re
 import tarfile

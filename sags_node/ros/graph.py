@@ -4,8 +4,6 @@ ROS 2 is DDS with conventions: a topic `/a` is called `rt/a`, a type `pkg/msg/Na
 `pkg::msg::dds_::Name_`, and the type's hash stands in the user data. So no message is defined here.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import threading

@@ -1,7 +1,5 @@
 """Which messages of a bag's two eyes are pairs, by their stamps, and whether these can be believed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

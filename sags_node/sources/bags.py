@@ -4,8 +4,6 @@ A bag is read through once when it is opened: that finds every damage, the stamp
 calibration. Playing reads it forward again.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass

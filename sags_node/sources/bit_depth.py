@@ -1,7 +1,5 @@
 """Eight bits of picture files that have more, or hold floating numbers."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 from pathlib import Path

@@ -5,8 +5,6 @@ difference between arrival and stamp is the difference of the clocks, and the sh
 difference grows is how far the clocks drift apart.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from statistics import median

@@ -5,8 +5,6 @@ the encoder kept another number of them, each frame of the video takes the stamp
 time.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

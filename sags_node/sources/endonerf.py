@@ -5,8 +5,6 @@
 is a source option; docs/recordings.md explains the defaults.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

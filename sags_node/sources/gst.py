@@ -5,8 +5,6 @@ that clock, whichever it is, is taken to the wall clock: it is the time of captu
 is late, at each step; files are played at their own rate, to their end.
 """
 
-from __future__ import annotations
-
 import logging
 import mmap
 import os

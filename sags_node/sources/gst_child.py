@@ -11,8 +11,6 @@ the sink's index and the slot. START plays a file, which is paused at first. The
 does. It is one of its own because plugins and drivers may crash or hang.
 """
 
-from __future__ import annotations
-
 import ctypes
 import ctypes.util
 import json

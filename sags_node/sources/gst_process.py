@@ -1,7 +1,5 @@
 """The parent's end of `gst_child`: starts it, hears it, and says in words why it failed."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

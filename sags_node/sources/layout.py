@@ -1,7 +1,5 @@
 """From pictures as a device or file gives them to those of the two eyes, as `source.geometry` says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

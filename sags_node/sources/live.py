@@ -3,8 +3,6 @@
 Cameras come and go: what fails or falls silent is closed and opened again, until `stop`.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Which values of a recording's instrument masks are instruments."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any

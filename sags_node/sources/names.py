@@ -1,7 +1,5 @@
 """What the names of pictures say: their order, and which pictures of several folders belong together."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Files of one kind, one per frame, in a folder or in a `.tar.gz`: found by the number in their names."""
 
-from __future__ import annotations
-
 import re
 import tarfile
 import zlib

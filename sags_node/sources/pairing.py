@@ -1,7 +1,5 @@
 """Which pictures of both eyes are of one moment: live, as they come, and in recordings, by their stamps."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Stereo pairs from two folders of pictures."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from functools import lru_cache

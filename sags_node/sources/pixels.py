@@ -1,7 +1,5 @@
 """Kernels for pictures on their way in: eight bits of those that have more, and instruments painted green."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import cv2

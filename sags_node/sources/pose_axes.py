@@ -3,8 +3,6 @@
 Tools disagree on axes and on direction, and their files do not say which they took.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ A pose is only given where it is known: between two samples that are close toget
 beyond the newest one.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from bisect import bisect_left, bisect_right, insort

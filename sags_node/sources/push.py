@@ -1,7 +1,5 @@
 """Live stereo that another program hands in over ZeroMQ: a simulator, an engine, a capture program."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import cv2

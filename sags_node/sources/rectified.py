@@ -1,7 +1,5 @@
 """Whether pictures come rectified: they must not be rectified a second time."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plays a recording: at its own pace, as fast as it is taken, or step by step with its own stamps."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

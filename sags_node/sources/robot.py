@@ -1,7 +1,5 @@
 """Where the robot says that the scope is, for each frame: from ROS 2, from another program, or from a bag."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

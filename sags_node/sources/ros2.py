@@ -1,7 +1,5 @@
 """Live stereo from a ROS 2 graph: two picture topics, paired by their stamps, or one that shows both eyes."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

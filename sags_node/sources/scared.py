@@ -5,8 +5,6 @@ from there: `endoscope_calibration.yaml`, `data/rgb.mp4` (left picture above the
 (poses) and `data/scene_points` (the measured surface seen from each frame). The files give millimetres.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What other programs stamp and send: checked, brought to this machine's clock, paired and counted."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping
 

@@ -1,7 +1,5 @@
 """What every source of stereo frames offers, and the one function that opens any of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, Self
 

@@ -1,7 +1,5 @@
 """What a recording knows of each frame besides the pictures: poses, and the references to measure against."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

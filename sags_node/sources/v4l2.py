@@ -1,7 +1,5 @@
 """Live stereo from V4L2: two cameras paired by their stamps, or one whose pictures show both eyes."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

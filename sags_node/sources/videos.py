@@ -1,7 +1,5 @@
 """Stereo pairs from video files: one file per eye, or one file that shows both."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 

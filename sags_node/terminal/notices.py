@@ -1,7 +1,5 @@
 """Warnings on a terminal: a line when one begins, and one when it is over."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 

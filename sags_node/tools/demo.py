@@ -1,7 +1,5 @@
 """`sags demo`: a session played live beside an overlay subscriber, and the report of both."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

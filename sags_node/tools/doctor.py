@@ -1,7 +1,5 @@
 """`sags doctor`: is everything here that the node needs, and all that a launch file names."""
 
-from __future__ import annotations
-
 import ctypes
 import ctypes.util
 import getpass

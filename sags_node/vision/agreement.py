@@ -1,7 +1,5 @@
 """Which matches to believe: those whose surroundings look alike, and that no nearer surface hides."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -2,8 +2,6 @@
 exchanged no longer fits its calibration, and stereo then fails bit by bit.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

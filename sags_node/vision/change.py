@@ -1,7 +1,5 @@
 """Whether anything moved."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

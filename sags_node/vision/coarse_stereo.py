@@ -1,8 +1,6 @@
 """A dense guess of the disparity in a small picture, by semi-global matching (Hirschmueller, PAMI 2008) along
 rows and columns: right to a pixel or so of the small picture, and smooth where there is nothing to see."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -5,8 +5,6 @@ pictures in between take longer to hand over than to compute. The result is the 
 threads.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depth of every frame: the session's own, a network's, or matched between the eyes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache, partial
 from typing import NamedTuple, Self

@@ -11,8 +11,6 @@ pushing and pulling through a pyramid (Gortler et al., The Lumigraph, 1996). A s
 than the little that it is trusted.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """Optical flow between consecutive pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.types import F32, GrayPyramid

@@ -7,8 +7,6 @@ the differences is computed once. Brightness may differ by a constant from patch
 a patch first tries those of its neighbours. The pictures have borders, see `pyramid`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

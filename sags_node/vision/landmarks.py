@@ -6,8 +6,6 @@ found again: what tells a scene that was lost from sight from another one. Tissu
 motion to vote for: a match counts when it moves as those around it do.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

@@ -1,7 +1,5 @@
 """Tissue that is far enough from instruments: what is measured beside one may be its own."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

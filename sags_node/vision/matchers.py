@@ -1,7 +1,5 @@
 """Stereo matching of rectified gray pictures, see `pyramid`, in one of their halves."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

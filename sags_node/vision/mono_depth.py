@@ -3,8 +3,6 @@
 What such a network says is right but for scale and shift of the inverse depth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

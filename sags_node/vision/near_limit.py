@@ -5,8 +5,6 @@ lies behind it. So now and then a small picture is searched as far as a scope ca
 what is found there.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import cv2

@@ -1,7 +1,5 @@
 """Pictures and depth -> what the mapper may know of one frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

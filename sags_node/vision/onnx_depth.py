@@ -1,7 +1,5 @@
 """Depth by a user's network, stereo or monocular, for as long as it delivers."""
 
-from __future__ import annotations
-
 import logging
 import time
 

@@ -4,8 +4,6 @@ What is said of a network stands in the file itself, in a YAML file beside it, a
 wins.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 """Gray pictures in halves, made once a frame for all who compare pictures: stereo, optical flow, and what
 tells whether anything moved."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """Raw stereo pictures -> row-aligned, undistorted pictures at the working size."""
 
-from __future__ import annotations
-
 import time
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Metric depth, and how far to trust it, from a rectified pair."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

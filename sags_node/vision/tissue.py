@@ -1,7 +1,5 @@
 """Which working pixels show tissue."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 

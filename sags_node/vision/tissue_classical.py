@@ -1,7 +1,5 @@
 """Instruments without masks or networks: by colour, by misfit to the model, by where they enter."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

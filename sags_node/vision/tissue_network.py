@@ -1,7 +1,5 @@
 """Tissue by a user's segmentation network."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

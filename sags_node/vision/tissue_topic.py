@@ -1,7 +1,5 @@
 """Tissue masks that another process makes of the published pictures, joined to the frames by time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

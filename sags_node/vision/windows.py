@@ -4,8 +4,6 @@ A row of sums over columns is gathered first, then summed along: `window_row` re
 16 px wide; the last pixels of a row may be done twice. Beyond a picture's edge its edge is repeated.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from sags_node.kernels.jit import inlined, kernel

@@ -1,7 +1,5 @@
 """`benchmarks kernels`: what it counts, what it reports, and that its check finds a slower kernel."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

@@ -1,7 +1,5 @@
 """`python -m benchmarks`: what commands say of a few frames, and how they explain a wrong call."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Disturbances do what they say, only then, and always the same; `benchmarks disturbances` measures them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """`benchmarks endurance`: the orders of frames, the slopes, and a table that tells a leak from noise."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """`benchmarks kernels --device cuda` on Warp's CPU device: everything but the speed."""
 
-from __future__ import annotations
-
 import pytest
 import warp as wp
 from warp_on_cpu import use_warp_on_cpu

@@ -1,7 +1,5 @@
 """What a live pair costs, by each way into the node: real pipelines and real senders."""
 
-from __future__ import annotations
-
 import pytest
 from gstreamer import need_gstreamer
 

@@ -1,7 +1,5 @@
 """`python -m benchmarks crowd`, `bridges`, `hosts` and `soak` on small nodes: real processes and sockets."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """`benchmarks pareto`: settings on common ground, and baselines that are what they say."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`python -m benchmarks recall`, `scope` and `tracking` on small phantoms, and followers."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The command: a node, a bridge and a peer, each a process of its own; and what the command refuses."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -1,7 +1,5 @@
 """The C# client for Unity, compiled and run by Debian's mono: against a real gateway and a false one."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -13,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +149,16 @@ def answer(asked: dict[str, object]) -> dict[str, object]:
     return {"id": asked["id"], "ok": True, "result": clock}
 
 
+def attended(connection: ServerConnection, *before: bytes, **said: Any) -> None:
+    """Sends `frame` each time that it is asked for the clock."""
+    while True:
+        asked = json.loads(connection.recv())
+        if "op" in asked:
+            connection.send(json.dumps(answer(asked)))
+        for each in (*before, *frame(time.time_ns(), **said)):
+            connection.send(each)
+
+
 @contextmanager
 def gateway(program: Path, attend: Callable[[ServerConnection], None]) -> Iterator[subprocess.Popen[str]]:
     """The program at a false gateway."""
@@ -173,13 +182,7 @@ def test_a_false_gateway_does_not_end_it(program: Path) -> None:
             connection.send(broken[attempts[-1]])
             connection.recv()
         else:
-            while True:
-                asked = json.loads(connection.recv())
-                if "op" in asked:
-                    connection.send(json.dumps(answer(asked)))
-                connection.send(message("sags/left/render/image", "rgba8", [3, 2, 4], bytes(16)))  # left out
-                for each in frame(time.time_ns()):
-                    connection.send(each)
+            attended(connection, message("sags/left/render/image", "rgba8", [3, 2, 4], bytes(16)))  # left out
 
     with gateway(program, attend) as process:
         found = LINE.fullmatch(until_line(process, "stamp_ns="))
@@ -187,27 +190,11 @@ def test_a_false_gateway_does_not_end_it(program: Path) -> None:
     assert len(attempts) > len(broken)
 
 
-@contextmanager
-def frames_of(program: Path, **said: Any) -> Iterator[subprocess.Popen[str]]:
-    """The program at a gateway that sends `frame` each time it is asked for the clock."""
-
-    def attend(connection: ServerConnection) -> None:
-        while True:
-            asked = json.loads(connection.recv())
-            if "op" in asked:
-                connection.send(json.dumps(answer(asked)))
-            for each in frame(time.time_ns(), **said):
-                connection.send(each)
-
-    with gateway(program, attend) as process:
-        yield process
-
-
 def test_what_an_older_node_does_not_send_is_not_sure(program: Path) -> None:
     """It is not what stands beside it: the last of the row before."""
     columns, rows = "x,y,z,id,u,v,visibility,confidence", np.zeros((2, 8), "<f4")
     rows[:, 3], rows[:, 6:] = np.array([3, 4], "<u4").view("<f4"), 1
-    with frames_of(program, columns=columns, anchors=rows.tobytes()) as process:
+    with gateway(program, partial(attended, columns=columns, anchors=rows.tobytes())) as process:
         found = LINE.fullmatch(until_line(process, "stamp_ns="))
     assert found is not None and found[6] == "3:0:1:0;4:0:1:0"
 
@@ -218,13 +205,9 @@ def test_a_gateway_that_fell_silent_is_connected_to_again(program: Path) -> None
 
     def attend(connection: ServerConnection) -> None:
         connections.append(len(connections))
-        while True:
-            asked = json.loads(connection.recv())
-            if connections[-1] > 0:
-                if "op" in asked:
-                    connection.send(json.dumps(answer(asked)))
-                for each in frame(time.time_ns()):
-                    connection.send(each)
+        while connections[-1] == 0:
+            connection.recv()
+        attended(connection)
 
     with gateway(program, attend) as process:
         until_line(process, "stamp_ns=")
@@ -260,5 +243,5 @@ def test_pictures_that_come_late_are_old_also_where_the_clock_s_answers_are_as_l
 
 
 def test_lengths_without_a_unit_are_not_said_to_be_millimetres(program: Path) -> None:
-    with frames_of(program, units="relative") as process:
+    with gateway(program, partial(attended, units="relative")) as process:
         assert " depth_no_unit=0.07 " in until_line(process, "stamp_ns=")

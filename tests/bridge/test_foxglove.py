@@ -1,7 +1,5 @@
 """What a client of Foxglove's WebSocket protocol gets, and what it may ask for."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

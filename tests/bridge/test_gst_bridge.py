@@ -1,7 +1,5 @@
 """The overlay on GStreamer's side: every pixel of both eyes, and nothing old."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

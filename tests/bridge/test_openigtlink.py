@@ -1,7 +1,5 @@
 """What a peer with OpenIGTLink's own library gets, and asks for; and what strangers can do."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import threading

@@ -1,7 +1,5 @@
 """What `sags bridge ros2` sends into a graph, and what may be asked there: read by DDS alone."""
 
-from __future__ import annotations
-
 import json
 import struct
 import time

@@ -1,7 +1,5 @@
 """`sags bridge ros2` and real ROS 2: nodes of rclpy with Fast DDS, where tests/ros2/prepare.sh was run."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The WebSocket gateway: what its peers get and may ask for, and the page in a real browser."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Callable
@@ -99,13 +97,6 @@ def test_python_style_exponents_are_numbers(folder: Path) -> None:
     tree["distortion_coefficients"]["data"] = "PLACE"
     file.write_text(yaml.safe_dump(tree).replace("PLACE", "[1e-05, 0.0, 0.0, 0.0, 0.0]"))
     assert load_rig(folder).left.distortion[0] == 1e-5
-
-
-def test_missing_file(folder: Path) -> None:
-    (folder / "right.yaml").unlink()
-    message = refusal(folder)
-    assert str(folder / "right.yaml") in message
-    assert "left.yaml and right.yaml" in message
 
 
 @pytest.mark.parametrize("text", ["- 1\n- 2\n", "", "a: [1, 2", "%YAML:1.0\n---\nM: 1\n", "\x00"])

@@ -1,7 +1,5 @@
 """A calibration that stops to fit while the node runs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Boards drawn through the exact model of a known rig, and the rig found again."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every form of calibration file is written here by others' means, and read back."""
 
-from __future__ import annotations
-
 import gzip
 import re
 import tarfile

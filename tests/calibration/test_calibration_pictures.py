@@ -1,7 +1,5 @@
 """Planted errors, and pictures that tell them."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

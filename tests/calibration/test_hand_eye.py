@@ -1,7 +1,5 @@
 """The camera on the robot's hand, found again: by the phantom's poses, and in a bag with drawn boards."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from typing import Any

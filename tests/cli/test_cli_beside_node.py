@@ -1,7 +1,5 @@
 """Commands that listen: beside no node, beside one that has died, and beside a running one."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal

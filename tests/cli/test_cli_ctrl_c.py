@@ -1,7 +1,5 @@
 """Ctrl-C ends every command that takes long: at once, with exit code 130, and leaves nothing behind."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import os

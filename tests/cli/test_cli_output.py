@@ -1,7 +1,5 @@
 """What a command says and writes: nothing of the user's is lost, tables are whole, JSON is JSON."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re
@@ -190,6 +188,7 @@ def test_phantom_overwrites_nothing(tmp_path: Path, user_files: Path) -> None:
     refused(2, "phantom", mine, "seconds:=0.1", said=(str(mine), "not empty", "another folder"))
     assert [file.name for file in mine.iterdir()] == ["mine.txt"]
     refused(2, "phantom", user_files / "file", said=(str(user_files / "file"), "exists"))
+    refused(1, "phantom", user_files / "file/new", "seconds:=0.1", said=("cannot write", "file/new"))
     refused(2, "phantom", tmp_path / "new", "secnds:=1", said=("secnds", "did you mean 'seconds'"))
     refused(2, "phantom", tmp_path / "new", "kind:=v4l2", said=("kind: ", "'phantom'", "v4l2"))
     assert not (tmp_path / "new").exists()

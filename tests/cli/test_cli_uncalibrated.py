@@ -1,7 +1,5 @@
 """A recording that nobody has calibrated plays, and nothing of it passes for metres."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Launch files: every key is known, paths are found, mistakes are explained."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -121,6 +119,7 @@ PANES = "{layout: panes, first: right, crop: [0, 0, 8, 8], crop_right: [8, 0, 8,
         ("vision.stereo.min_depth:=30", "(got 30); docs/launch.md: m; nothing is looked for nearer"),
         ("mapping.budget_ms:=-1", "greater than or equal to 1"),
         ("mapping.budget_ms:=0.033", "greater than or equal to 1"),  # in seconds
+        ("device:=gpu", "'auto', 'cpu' or 'cuda' (got 'gpu')"),
         ("vision.pose:=magic", "'session', 'fixed', 'estimate' or 'refine'"),
         ("vision.stereo:={min_depth: 0.2, max_depth: 0.1}", "must be below max_depth"),
         ("source.kind:=carrier_pigeon", "'folders'"),
@@ -134,6 +133,10 @@ PANES = "{layout: panes, first: right, crop: [0, 0, 8, 8], crop_right: [8, 0, 8,
         (f"source:={{kind: videos, left: a, geometry: {PANES}}}", "exchange crop and crop_right"),
         ("vision.tissue.path:=net.onnx", "path is for method onnx, which is not set"),
         ("vision.tissue.endpoint:=tcp://127.0.0.1:5600", "endpoint is for method topic"),
+        ("vision.tissue.exclude:=[[-1,0,5,5]]", "greater than or equal to 0 (got -1"),
+        ("vision.tissue:={method: onnx, path: net.onnx}", "tissue_is"),
+        ("publish.key:=a.key", "belong together"),
+        ("publish.allow:=clients", "belong together"),
         ("mapping.budget_ms", "key:=value"),
         ("mapping.budget_ms.x:=3", "mapping.budget_ms"),
     ],

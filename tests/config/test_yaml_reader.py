@@ -1,7 +1,5 @@
 """YAML as users, programs and pranksters write it: values, or one short line: what is wrong, and where."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Detail of pictures in views: the kernel beside its twin, what is learnt, remembered and shown."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The detail of pictures from outside: a real node process and real sockets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

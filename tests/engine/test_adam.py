@@ -1,7 +1,5 @@
 """Adam on rows of a table against torch's, row by row."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from engine_scenes import on_one_thread, relative_error

@@ -1,7 +1,5 @@
 """The colours of a drawn picture: enlarged when somebody asks, once, from memory of their own."""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any

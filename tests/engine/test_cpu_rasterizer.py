@@ -1,8 +1,6 @@
 """The CPU's rasteriser beyond what all must do (`test_rasterizer.py`): which splats rounding cuts, threads,
 kernels that compile once, room that grows, and wrong use."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from typing import Any

@@ -1,7 +1,5 @@
 """Which device a launch gets, and what is said of a GPU that cannot be used."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -10,11 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 import warp as wp
-from click.testing import CliRunner
+from command_line import refused
 from places import SESSION
 
-from sags_node.cli.main import main
-from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.engine import device as devices
 from sags_node.engine.device import choose_device, find_gpu
@@ -85,17 +81,13 @@ def test_a_missing_gpu_ends_the_command_with_one_message(
     machine: pytest.MonkeyPatch, phantom_session: Path
 ) -> None:
     without_hardware(machine)
+    said = ("\nerror: device: cuda cannot be used: this machine has no NVIDIA GPU",)
     for command in (["run"], ["eval", "--pace", "step"]):
-        result = CliRunner().invoke(main, [*command, str(phantom_session), "device:=cuda"])
-        assert result.exit_code == 2 and result.stdout == ""
-        said = result.stderr.splitlines()[-1]
-        assert said.startswith("error: device: cuda cannot be used: this machine has no NVIDIA GPU")
+        refused(2, *command, phantom_session, "device:=cuda", said=said)
 
 
 def test_a_fit_from_an_online_start_is_refused_on_a_gpu(phantom_session: Path) -> None:
-    result = CliRunner().invoke(main, ["fit", str(phantom_session), "device:=cuda"])
-    assert result.exit_code == 2 and result.stdout == ""
-    assert "--schedule paper" in result.stderr and "device:=cpu" in result.stderr
+    refused(2, "fit", phantom_session, "device:=cuda", said=("--schedule paper", "device:=cpu"))
 
 
 def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPatch) -> None:
@@ -127,9 +119,3 @@ print([name for name in ("torch", "warp") if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
-
-
-def test_device_is_a_launch_key() -> None:
-    assert load_launch().device == "auto"
-    with pytest.raises(UsageError, match="device"):
-        load_launch(None, ["device:=gpu"])

@@ -4,8 +4,6 @@ Numba has been seen to share variables of a parallel loop between threads; only 
 know no Python: what their kernels compute is compared elsewhere, with twins of their own.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import sys

@@ -1,7 +1,5 @@
 """The tissue loss, on the CPU and by the kernel for a GPU, against autograd of what it states."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """From Gaussians to splats: view-dependent colour, the 3D filter, and the derivatives of the float64 twin."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """What every rasteriser must do: Numba's kernels and Warp's, here on its CPU device, against the twin in
 float64, a closed form, or the same scene without what was spoilt."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures that are carried along a model's motion to a moment between them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The demo's video: what the overlay kept of each frame, and the picture that a display showed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import av

@@ -1,7 +1,5 @@
 """Recorded sessions replayed step by step must give the figures, and the bits, they gave before."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a run was worth, in words: with units and baselines, and no figure left out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from sags_node.tools.evaluation.figures import TABLE, flat, groups, headings, verdict

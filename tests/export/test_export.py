@@ -1,7 +1,5 @@
 """`sags export`: files that other programs open, true to the surface they show, and never half written."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What `sags export` writes of every frame: read again by others, and compared with the phantom's truth."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator
@@ -14,6 +12,7 @@ import numpy as np
 import open3d
 import pytest
 from command_line import pure_json, refused, sags
+from engine_scenes import round_gaussians
 from synthetic import plane_result
 from tiny_archive import TINY_FRAMES, write_tiny_session
 
@@ -379,18 +378,8 @@ def scenes(count: int = FRAMES) -> Iterator[Scene]:
     places = np.concatenate([rng.uniform(-0.01, 0.01, (400, 2)), np.full((400, 1), 0.06)], 1)
     for frame in range(count):
         size = 0 if frame == 0 else 400
-        yield Scene(
-            Gaussians(
-                (places[:size] + np.array([0.004 * frame, 0, 0])).astype(np.float32),
-                np.tile(np.array([1, 0, 0, 0], np.float32), (size, 1)),
-                np.full((size, 3), 6e-4, np.float32),
-                np.full(size, 0.9, np.float32),
-                np.full((size, 3), 0.9, np.float32),
-                np.arange(size),
-            ),
-            CAMERA,
-            frame * 33_000_000,
-        )
+        moved = (places[:size] + np.array([0.004 * frame, 0, 0])).astype(np.float32)
+        yield Scene(round_gaussians(moved, 6e-4, 0.9), CAMERA, frame * 33_000_000)
 
 
 def written(folder: Path, count: int = FRAMES) -> list[dict[str, Any]]:

@@ -1,7 +1,5 @@
 """The self-adaptive decoder: its equation, its gradients, and what must hold whatever its weights are."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """From raw rows to planes, and gradients against those of the rasteriser and of differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

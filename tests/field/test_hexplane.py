@@ -1,7 +1,5 @@
 """The HexPlane against its formula, the window that slides, and sums of rows against torch's own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The training loss: its terms by plain loops over pixels, and its gradient by differences."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The model over a sliding window: what leaves it is folded, and nothing that stays changes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

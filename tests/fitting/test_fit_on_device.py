@@ -1,7 +1,5 @@
 """The fit on a GPU, on Warp's and torch's CPU device: the same steps as by the kernels of the CPU."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The offline fit on a short phantom session: it learns, stops, goes on, and says what is wrong."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

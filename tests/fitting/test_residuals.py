@@ -1,7 +1,5 @@
 """Deltas of single Gaussians at some times: linear in between, each slot with an optimiser of its own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

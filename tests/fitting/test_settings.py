@@ -1,7 +1,5 @@
 """What can be set about a fit, and the numbers of the authors' code."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bags of every kind, written by `rosbags`, with pictures whose every pixel is known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A node that is only its sockets, and a bridge beside it in this process."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping

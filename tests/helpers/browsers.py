@@ -1,7 +1,5 @@
 """A page in the system's Chromium."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

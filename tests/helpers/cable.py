@@ -1,7 +1,5 @@
 """What lies between a node and its client: a connection that can be cut, and that may be slow."""
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

@@ -1,7 +1,5 @@
 """The command `sags`: in this process with what it said, or in one of its own."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Boards drawn through the exact model of a known rig."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

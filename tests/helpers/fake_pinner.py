@@ -1,7 +1,5 @@
 """The overlay's anchors without a node."""
 
-from __future__ import annotations
-
 from concurrent.futures import Future
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A flat piece of tissue seen straight on: one frame of it, with a model whose Gaussians lie on it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

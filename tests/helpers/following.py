@@ -1,7 +1,5 @@
 """A mapper that is given frames as the pipeline gives them: tracked from the one before."""
 
-from __future__ import annotations
-
 from sags_node.mapping.budget import Budget
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.mapper import Mapper

@@ -1,7 +1,5 @@
 """Python code in a new process that has loaded Numba already, which is most of a short one's time."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys

@@ -1,7 +1,5 @@
 """Stereo frames as a source gives them, and a robot's poses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Self
 

@@ -4,8 +4,6 @@ A reader gives values or an error of ours in one line, within a few seconds and 
 else is a fault of the product.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import resource

@@ -1,7 +1,5 @@
 """Compare the figures of a run with committed ones, field by field."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """GStreamer on this machine: is it there, and files that it can play to the pixel."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

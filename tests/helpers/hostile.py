@@ -1,7 +1,5 @@
 """Strangers: requests that are none, raw bytes on a port, and peers that speak ZeroMQ to do harm."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import time

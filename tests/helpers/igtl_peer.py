@@ -1,7 +1,5 @@
 """A program that speaks OpenIGTLink by Debian's own library."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import threading

@@ -4,8 +4,6 @@ Every check is a function with the expectation as its parameter, so that the sam
 synthetic publisher and a running node.
 """
 
-from __future__ import annotations
-
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence

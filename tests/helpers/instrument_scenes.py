@@ -1,7 +1,5 @@
 """Drawn masks of instruments, and one that the phantom films."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """A publisher that streams and answers, with keys or without, and its clients."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Taking frames of a live source in a thread, as a node does."""
 
-from __future__ import annotations
-
 import threading
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Messages that no node has sent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgpack

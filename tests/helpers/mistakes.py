@@ -1,7 +1,5 @@
 """Recordings that cannot be played: what is said when they are opened, or on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

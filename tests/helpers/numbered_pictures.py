@@ -1,7 +1,5 @@
 """Stereo recordings of every kind whose pictures tell their frame number and their eye."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Small depth networks of every convention, written as ONNX files: block matching, and a table of depths."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

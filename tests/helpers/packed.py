@@ -1,7 +1,5 @@
 """Archives as people download them."""
 
-from __future__ import annotations
-
 import io
 import tarfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ports that a test may come back to."""
 
-from __future__ import annotations
-
 import random
 import socket
 

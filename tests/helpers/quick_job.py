@@ -1,8 +1,6 @@
 """Stands in for a job where what schedules jobs is tested. Its recordings are text files that say what
 happens to them; it is run as `sags eval RECORDING ...` would be."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

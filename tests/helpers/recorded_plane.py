@@ -1,7 +1,5 @@
 """The plane of `synthetic`, recorded by a recorder of this process."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The recorded session of `replay/`, changed and played: what tests of the whole pipeline share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Others in a ROS 2 graph: a DDS process of ours, and nodes of rclpy where tests/ros2/prepare.sh was run."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

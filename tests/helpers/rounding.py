@@ -5,8 +5,6 @@ compiler and the processor. A bound must hold for all of them, so it is worked o
 roundings and the conditioning of what is computed, never read off one machine.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

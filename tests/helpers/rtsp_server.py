@@ -5,8 +5,6 @@
 Streams are rtsp://127.0.0.1:PORT/left and /right.
 """
 
-from __future__ import annotations
-
 import sys
 from ctypes import CDLL, c_char_p, c_void_p
 

@@ -1,7 +1,5 @@
 """A node in a process of its own, as users start it."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Processes that send pictures in the place of cameras."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

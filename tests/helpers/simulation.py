@@ -4,8 +4,6 @@ What waits gives way to another one; time passes only while all wait. So a run t
 repeats exactly, and a wait that nothing can end is found at once.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A disk of a few kB, and how it becomes full."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from collections.abc import Iterator

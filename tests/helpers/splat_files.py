@@ -1,7 +1,5 @@
 """Files of splats, read by their own header alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Videos written packet by packet: any stamps, containers, codecs, tags; each picture tells its number."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path

@@ -8,8 +8,6 @@ The number of each pair is painted into both pictures (`read_number`), so that a
 many pictures were left out because nobody took them in time.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A frame whose every number is known: a tilted, coloured plane seen by a moved camera."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager

@@ -1,7 +1,5 @@
 """A node that is only its sockets and makes thin pictures."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager

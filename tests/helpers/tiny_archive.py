@@ -1,7 +1,5 @@
 """Recordings that are played in no time."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures of tissue and instruments, made so that it is known which is which."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """What users have lying about: recordings and calibrations, most of them wrong in one way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

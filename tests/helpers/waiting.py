@@ -1,7 +1,5 @@
 """Waiting for what comes in its own time."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time

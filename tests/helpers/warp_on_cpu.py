@@ -1,8 +1,6 @@
 """The kernels for a GPU on Warp's CPU device, where a block's threads are fibers that change at
 barriers."""
 
-from __future__ import annotations
-
 import pytest
 
 from sags_node.engine import device

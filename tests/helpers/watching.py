@@ -1,7 +1,5 @@
 """Watchers, asked about a frame as the pipeline asks them."""
 
-from __future__ import annotations
-
 from sags_node.types import RectifiedPair, StereoFrame
 from sags_node.vision.watch.judgement import Evidence, Judgement, Watcher
 

@@ -1,7 +1,5 @@
 """`sags new`: what is odd about a recording is set right in the launch file that it writes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tools whose tips a robot tells: alone, corrected by the picture, and silent."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Instruments as objects: drawn masks whose tips are known, and the phantom's grasper."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Compiled kernels on disk: never stale, never mixed, never in the way."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

@@ -1,8 +1,6 @@
 """A node that is ready compiles nothing more: each kernel would stop it for a second or more, once on each
 machine."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

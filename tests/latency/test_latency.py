@@ -1,7 +1,5 @@
 """`sags latency`: codes, the figures on a virtual clock, and chains whose delay their own stamps tell."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time

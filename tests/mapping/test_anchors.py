@@ -1,7 +1,5 @@
 """Points pinned to tissue: known motion, hidden tissue, removed Gaussians, and the phantom's exact points."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

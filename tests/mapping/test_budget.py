@@ -1,7 +1,5 @@
 """What a frame gets while its time lasts, on a clock that only the tests move."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which tiles are worst, against numpy, and what may stand in the pictures."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

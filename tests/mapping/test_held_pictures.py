@@ -1,7 +1,5 @@
 """A bad picture is not a new scene: the model waits, says why, and is the same afterwards."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Instruments found without masks: by their colour, and by what they hide of the model."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

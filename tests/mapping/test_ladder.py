@@ -1,7 +1,5 @@
 """The ladder of quality, on machines that only the tests know: which rung it finds, and how it changes."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

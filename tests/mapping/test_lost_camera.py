@@ -1,7 +1,5 @@
 """A scope that jumps: it is lost until it is verified, and light that travels with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Motion is remembered: what repeats is foreseen; of what does not, nothing is said that does harm."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

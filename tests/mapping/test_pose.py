@@ -1,7 +1,5 @@
 """The camera's pose from pictures: recovered where it is known, kept from outliers, found again when lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

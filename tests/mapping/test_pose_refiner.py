@@ -1,7 +1,5 @@
 """Poses that a robot gives, put right by the picture: what is slow is the robot's."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any

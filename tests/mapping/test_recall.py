@@ -1,7 +1,5 @@
 """Anchors that were out of sight for long: found by what surrounds them, and only there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The right eye of a stereo display: beside the left picture warped there, and what may not come into it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

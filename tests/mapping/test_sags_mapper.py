@@ -1,7 +1,5 @@
 """The paper's model learnt while the video runs, on the phantom, whose truth is known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise

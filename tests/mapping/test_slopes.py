@@ -1,7 +1,5 @@
 """The closed-form step on colours and slopes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

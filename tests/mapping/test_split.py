@@ -1,7 +1,5 @@
 """Splitting: identity stays, numbers stay, what is hidden stays, and the picture gets better."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,8 +1,6 @@
 """While nothing moves: what is left out then, and that nothing is lost by it. What counts as still:
 `tests/vision/test_change.py`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial

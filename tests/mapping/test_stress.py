@@ -1,8 +1,6 @@
 """What no recording promises: unusable pictures, damage in the model, cuts, long runs. The node goes on,
 shows nothing that is not finite, and finds back."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from dataclasses import replace

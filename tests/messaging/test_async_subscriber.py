@@ -1,7 +1,5 @@
 """The subscriber for asyncio: what waits, what ends a wait, and that nothing spins meanwhile."""
 
-from __future__ import annotations
-
 import asyncio
 import selectors
 import threading

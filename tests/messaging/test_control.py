@@ -1,7 +1,5 @@
 """Requests to the node over a real socket, sane and insane."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

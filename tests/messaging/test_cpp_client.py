@@ -1,7 +1,5 @@
 """The C++ examples, written from the documents alone: one sees what the Python subscriber sees, one sends."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil
@@ -122,36 +120,37 @@ def test_it_says_stale_and_shows_nothing_while_no_frames_come(read_depth: Path, 
         assert int(after[1]) > paused - 1_000_000_000
 
 
+def told(read_depth: Path, *messages: list[bytes]) -> tuple[str, str]:
+    """What it says of one frame and complains of, when these come."""
+    with zmq_socket(zmq.XPUB, "tcp://127.0.0.1:*", bind=True) as socket:
+        with running(read_depth, socket.getsockopt_string(zmq.LAST_ENDPOINT), "1") as process:
+            for _ in range(2):
+                assert socket.poll(60_000) and socket.recv()[:1] == b"\x01"
+            for parts in messages:
+                socket.send_multipart(parts)
+            said = process.communicate(timeout=30)
+    assert process.returncode == 0
+    return said
+
+
 def test_hostile_messages_are_left_out(read_depth: Path) -> None:
     result = plane_result()
     depth = result.views["left"].depth.copy()
     depth[32, 48] = 0  # the centre is unknown
     result = replace(result, views={"left": replace(result.views["left"], depth=depth)})
-    with zmq_socket(zmq.XPUB, "tcp://127.0.0.1:*", bind=True) as socket:
-        with running(read_depth, socket.getsockopt_string(zmq.LAST_ENDPOINT), "1") as process:
-            for _ in range(2):
-                assert socket.poll(60_000) and socket.recv()[:1] == b"\x01"
-            good = {name: parts_of(name, result) for name in (IMAGE, DEPTH)}
-            bad = damaged(good[DEPTH], good[IMAGE][1])
-            unasked = [good[DEPTH][0] + b"/more", *good[DEPTH][1:]]  # which the prefix brings; no mistake
-            for parts in (*bad, unasked, good[IMAGE], good[DEPTH]):
-                socket.send_multipart(parts)
-            said, complaints = process.communicate(timeout=30)
-        assert process.returncode == 0
-        assert complaints.count("left out: ") == len(bad)
-        assert [row[4] for row in LINE.findall(said)] == ["unknown"]
+    good = {name: parts_of(name, result) for name in (IMAGE, DEPTH)}
+    bad = damaged(good[DEPTH], good[IMAGE][1])
+    unasked = [good[DEPTH][0] + b"/more", *good[DEPTH][1:]]  # which the prefix brings; no mistake
+    said, complaints = told(read_depth, *bad, unasked, good[IMAGE], good[DEPTH])
+    assert complaints.count("left out: ") == len(bad)
+    assert [row[4] for row in LINE.findall(said)] == ["unknown"]
 
 
 def test_lengths_without_a_unit_are_not_said_to_be_millimetres(read_depth: Path) -> None:
     result = plane_result()
-    with zmq_socket(zmq.XPUB, "tcp://127.0.0.1:*", bind=True) as socket:
-        with running(read_depth, socket.getsockopt_string(zmq.LAST_ENDPOINT), "1") as process:
-            for _ in range(2):
-                assert socket.poll(60_000) and socket.recv()[:1] == b"\x01"
-            for name in (IMAGE, DEPTH):
-                topic, meta, *rest = parts_of(name, result)
-                socket.send_multipart([topic, changed(meta, units="relative"), *rest])
-            said, _ = process.communicate(timeout=30)
+    whole = (parts_of(name, result) for name in (IMAGE, DEPTH))
+    relative = ([topic, changed(meta, units="relative"), *rest] for topic, meta, *rest in whole)
+    said, _ = told(read_depth, *relative)
     assert float(re.search(r" depth_no_unit=(\S+) ", said)[1]) == pytest.approx(
         result.views["left"].depth[HEIGHT // 2, WIDTH // 2], rel=1e-4
     )

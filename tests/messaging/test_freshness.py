@@ -1,7 +1,5 @@
 """When content is stale: the rules, with a clock of our own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

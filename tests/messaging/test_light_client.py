@@ -1,7 +1,5 @@
 """A program that uses a node needs nothing of what maps: `pip install .` does not bring it along."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

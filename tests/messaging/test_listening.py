@@ -1,7 +1,5 @@
 """Where a publisher listens: sockets, run directory and the file that tells of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Lengths and areas between anchors: their arithmetic, what is said of unsure ones, and the command."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The publisher over real sockets, judged by a client that knows only the wire contract."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -117,7 +115,7 @@ def test_cameras_and_pose_project_the_splats_to_their_pixels(
     assert np.abs(pixels - expected).max() < 1e-3
     assert (left["width"], left["height"], left["frame"]) == (WIDTH, HEIGHT, "left_optical_frame")
     right = client.camera_info(received["right/camera_info"][0])
-    assert right["frame"] == "right_optical_frame"
+    assert right["frame"] == "right_optical_frame" and np.array_equal(right["K"], left["K"])
     assert -right["P"][0, 3] / right["P"][0, 0] == pytest.approx(BASELINE)
     assert left["P"][0, 3] == 0
 

@@ -1,7 +1,5 @@
 """The clock of another machine: by arithmetic, and over real sockets with a clock that is off."""
 
-from __future__ import annotations
-
 import random
 import time
 from collections.abc import Callable, Iterator

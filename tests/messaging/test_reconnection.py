@@ -1,7 +1,5 @@
 """A node that restarts, dies or falls silent is followed as soon as it is back."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from contextlib import AbstractContextManager

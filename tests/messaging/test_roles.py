@@ -1,7 +1,5 @@
 """Which client may ask for what, and how often."""
 
-from __future__ import annotations
-
 import time
 from concurrent.futures import Future
 from contextlib import AbstractContextManager

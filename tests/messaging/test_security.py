@@ -1,7 +1,5 @@
 """Keys, who is let in, and what strangers can do to the node: nothing."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -25,7 +23,6 @@ from zmq.auth import load_certificate
 
 from sags_node.cli.main import main
 from sags_node.client import ClientKeys, client_keys
-from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.peers import MAX_PEERS, Peers
@@ -139,13 +136,6 @@ def test_allow_lists(keys: Path, tmp_path: Path) -> None:
         read_allow_list([keys / "node.key"])
     with pytest.raises(UsageError, match="no secret key"):
         read_key_pair(keys / "node.pub")
-
-
-def test_a_key_and_an_allow_list_belong_together() -> None:
-    with pytest.raises(UsageError, match="belong together"):
-        load_launch(None, ["publish.key:=a.key"])
-    with pytest.raises(UsageError, match="belong together"):
-        load_launch(None, ["publish.allow:=clients"])
 
 
 # ---- who is let in -------------------------------------------------------------------------------------

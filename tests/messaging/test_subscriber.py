@@ -1,7 +1,5 @@
 """The consumer's library over real sockets: what is joined, what is stale, what is refused."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Thin pictures over real sockets: what comes, how large and exact it is, and what wrong requests hear."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial

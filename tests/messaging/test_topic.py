@@ -1,7 +1,5 @@
 """`sags topic`: rates, sizes and contents of a live publisher."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A node and a client as two machines: network namespaces of their own, and clocks that are 80 ms apart."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

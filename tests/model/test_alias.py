@@ -1,7 +1,5 @@
 """Pictures stay right at other sizes and distances; the 3D filter where it belongs; exports draw the same."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache, partial
 from pathlib import Path

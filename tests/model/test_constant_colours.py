@@ -1,7 +1,5 @@
 """Slopes, for who knows none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Strain of a surface: of plain motions it is known exactly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """The running node, seen from outside: real processes, real sockets, real faults."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Parts of a node, each alone."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time
@@ -34,12 +32,15 @@ from sags_node.types import FrameResult, Gaussians, NodeHealth, RungState
 
 
 def test_newest_wins_and_the_replaced_are_counted() -> None:
-    slot: Latest[int] = Latest()
+    """Of each, and of the end, one is told that asks for it."""
+    calls = []
+    slot: Latest[int] = Latest(on_put=lambda: calls.append(1))
     for value in (1, 2, 3):
         slot.put(value)
-    assert slot.get() == 3
-    assert slot.dropped == 2
+    assert slot.get() == 3 and slot.dropped == 2 and len(calls) == 3
     assert slot.get(timeout=0.01) is None
+    slot.close()
+    assert len(calls) == 4
 
 
 def test_close_delivers_what_is_left_then_ends() -> None:
@@ -69,14 +70,6 @@ def test_hand_over_drops_nothing() -> None:
             got.append(value)
     assert got == list(range(50))
     assert slot.dropped == 0
-
-
-def test_on_put_is_called_for_values_and_for_the_end() -> None:
-    calls = []
-    slot: Latest[int] = Latest(on_put=lambda: calls.append(1))
-    slot.put(1)
-    slot.close()
-    assert len(calls) == 2
 
 
 # ---- what the node says of itself, on a clock that only the tests move ---------------------------------

@@ -1,7 +1,5 @@
 """A pixel means one thing: at whatever size a machine works, what it publishes and is asked for is of one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path

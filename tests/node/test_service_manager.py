@@ -1,7 +1,5 @@
 """`sags run` under a service manager: what systemd is told, what it is told by the exit code, and the log."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

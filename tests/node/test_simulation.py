@@ -4,8 +4,6 @@
 once failed stays in `FAILED_ONCE`.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

@@ -5,8 +5,6 @@ or does not end it prints where its threads were. For C code: `ulimit -c unlimit
 `gdb .venv/bin/python core`.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

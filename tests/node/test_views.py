@@ -1,7 +1,5 @@
 """Views on request, anchors and pausing, from outside: a real node process and real sockets."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from collections.abc import Iterator

@@ -1,13 +1,10 @@
 """The overlay beside a node: on the tissue in both eyes, and blank when in any doubt."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 import json
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from command_line import RUN_HERE
+from command_line import RUN_HERE, killed, start
 from places import ROOT
 from ports import free_port
 from synthetic import plane_result
@@ -46,22 +43,6 @@ MAX_AGE = 0.5  # s
 NOTICED = 0.1  # s more until it is noticed: what docs/wire.md promises
 FROZEN = 0.3  # s after the last new picture, from which on the node shows nothing
 BUSY = 1.0  # s that a busy machine may take on top
-
-
-@contextmanager
-def process(*arguments: str | Path) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "sags_node", *map(str, arguments)]
-    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        yield running
-    finally:
-        running.send_signal(signal.SIGCONT)
-        running.terminate()
-        try:
-            running.communicate(timeout=30)
-        except subprocess.TimeoutExpired:
-            running.kill()
-            running.communicate()
 
 
 class Overlay(threading.Thread):
@@ -96,7 +77,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def node(phantom_session: Path, run_dir: Path) -> Iterator[subprocess.Popen[str]]:
     """A node that plays the phantom in a loop. The last test kills it."""
     settings = ["source.loop:=true", f"publish.run_dir:={run_dir}", *RUN_HERE]
-    with process("run", phantom_session, *settings) as running:
+    with killed(start(["run", phantom_session, *settings])) as running:
         until(connection_path(run_dir, "sags").exists, START_SECONDS)
         yield running
 
@@ -380,7 +361,7 @@ def test_it_goes_blank_when_the_feed_freezes(phantom_session: Path, tmp_path: Pa
     said = [f"source.endpoint:={endpoint}", "source.rate:=10", f"rig:={phantom_session / 'calib'}"]
     said += ["vision.tissue.method:=none", f"publish.run_dir:={run_dir}", *RUN_HERE]
     scope = Scope(phantom_session, endpoint)
-    with process("run", ROOT / "launch/push.yaml", *said):
+    with killed(start(["run", ROOT / "launch/push.yaml", *said])):
         until(connection_path(run_dir, "sags").exists, START_SECONDS)
         scope.start()
         try:

@@ -1,7 +1,5 @@
 """Objects that are bent with the tissue over them, and those that are checked against its surface."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any

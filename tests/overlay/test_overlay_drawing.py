@@ -1,7 +1,5 @@
 """What the overlay draws: meshes over tissue, in both eyes, and the colour key."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scene files of the overlay and the meshes that they name."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

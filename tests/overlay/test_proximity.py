@@ -1,7 +1,5 @@
 """Tips and forbidden zones: distances known by arithmetic, what is told of them, and what is drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product

@@ -1,7 +1,5 @@
 """A model placed on tissue by pairs of points and its surface: how exactly, what is told, what is refused."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

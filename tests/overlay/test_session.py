@@ -1,7 +1,5 @@
 """A session from start to end over real sockets, on pictures of the phantom, whose truth is known."""
 
-from __future__ import annotations
-
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,10 +9,10 @@ import numpy as np
 import open3d as o3d
 import pytest
 import yaml
-from command_line import RUN_HERE, figures_of
+from command_line import RUN_HERE, figures_of, killed, start
 from places import ROOT
 from ports import free_port
-from test_overlay import overlay, process
+from test_overlay import overlay
 from test_registration import AWAY, HEIGHT, WIDTH, Organ, written
 from waiting import START_SECONDS, repeating, until
 
@@ -124,7 +122,7 @@ def test_register_hold_pull_occlude_come_near_and_measure(tmp_path: Path) -> Non
     more = (f"publish.run_dir:={run_dir}", "mapping.iterations:=1", *RUN_HERE)
     with ExitStack() as stack:
         enter = stack.enter_context
-        enter(process("run", ROOT / "launch" / "push.yaml", *settings, *more))
+        enter(killed(start(["run", ROOT / "launch/push.yaml", *settings, *more])))
         until(connection_path(run_dir, "sags").exists, START_SECONDS)
         control = enter(ControlClient(run_dir=run_dir))
         film = Film(enter(FrameSender(endpoint)), enter(Subscriber([ANCHORS], run_dir=run_dir)), rest)

@@ -8,7 +8,7 @@ import pytest
 
 from sags_node.config.launch_file import load_launch, section_of
 from sags_node.config.schema import FoldersSource, PhantomSource
-from sags_node.errors import SagsError, UsageError
+from sags_node.errors import UsageError
 from sags_node.geometry import invert, transform
 from sags_node.phantom import cached_session, write_session
 from sags_node.phantom.motion import CENTRE, Clock, scope_pose
@@ -254,25 +254,6 @@ def test_session_loads_as_a_launch_file_and_holds_what_it_says(tmp_path: Path) -
     rig = load_rig(launch.rig)
     assert np.allclose(rig.left.P, phantom_rig(96, 80).left.P, rtol=1e-9)
     assert np.allclose(rig.right.R, phantom_rig(96, 80).right.R, atol=1e-9)
-
-
-def test_interrupted_rendering_leaves_nothing(tmp_path: Path) -> None:
-    def interrupt(done: int, _count: int) -> None:
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_session(TINY, tmp_path / "session", progress=interrupt)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_session_never_overwrites(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("keep")
-    with pytest.raises(UsageError, match="not empty"):
-        write_session(TINY, tmp_path)
-    assert [f.name for f in tmp_path.iterdir()] == ["notes.txt"]
-    with pytest.raises(SagsError, match="cannot write"):
-        write_session(TINY, tmp_path / "notes.txt" / "session")
 
 
 def test_cache_renders_once_and_keys_on_what_shapes_the_pictures(

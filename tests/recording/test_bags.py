@@ -1,7 +1,5 @@
 """ROS recordings as sources: every kind of file, which topics, which pairs, which calibration."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -360,16 +358,11 @@ def test_pairs_are_mutual_nearest_and_near_enough() -> None:
     assert sorted(shuffled[pairs[:, 0]]) == [0, 1, 2] and pairs[:, 1].tolist() == [1, 0, 4]
 
 
-def test_a_picture_without_partner_is_left_out(tmp_path: Path) -> None:
+def test_a_picture_without_partner_is_left_out_and_poses_are_of_the_left_pictures(tmp_path: Path) -> None:
     rows = files.stereo_rows(ROS2, infos=False)
     del rows[7], rows[4]  # the right picture 3 and the left picture 2
-    assert_frames(play(files.write_rosbag2(tmp_path / "bag", rows)), [0, 1, 4, 5, 6, 7, 8, 9])
-
-
-def test_poses_of_a_bag_are_of_its_left_pictures(tmp_path: Path) -> None:
-    rows = files.stereo_rows(ROS2, infos=False)
-    del rows[7], rows[4]
     bag = files.write_rosbag2(tmp_path / "bag", rows)
+    assert_frames(play(bag), [0, 1, 4, 5, 6, 7, 8, 9])
     poses = np.tile(np.eye(4), (9, 1, 1))
     poses[:, 0, 3] = np.array([0, 1, 3, 4, 5, 6, 7, 8, 9]) * 1e-3  # of the left pictures that are there
     np.savez(tmp_path / "poses.npz", T_world_cam=poses)

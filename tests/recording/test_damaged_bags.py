@@ -1,7 +1,5 @@
 """ROS recordings that are cut off, forged or none at all: one clear message, and bounded memory."""
 
-from __future__ import annotations
-
 import random
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The recorder: what was published is in the file, and other readers find it there."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import time

@@ -1,7 +1,5 @@
 """What a recorder could not keep is counted, and what it cannot do is named."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext

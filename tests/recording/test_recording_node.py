@@ -1,7 +1,5 @@
 """A real node, a real recorder, and a real kill."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

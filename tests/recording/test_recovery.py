@@ -1,7 +1,5 @@
 """Damaged recordings: what is whole is saved, and nothing that is wrong."""
 
-from __future__ import annotations
-
 import errno
 import json
 import random

@@ -1,7 +1,5 @@
 """What is said of a recording's cameras: by camera_info, by names, and by the rows of the pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

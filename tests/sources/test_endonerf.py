@@ -1,7 +1,5 @@
 """Clips in the layout of EndoNeRF: read back exactly, refused when they cannot be right, measured."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Live pictures from the real GStreamer: pairs, lag, death and return, mistakes; split to the pixel."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket

@@ -1,7 +1,5 @@
 """One geometry for all sources: pictures are split, cropped and turned to the pixel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -3,8 +3,6 @@
 For cameras of the kernel see `test_v4l2.py` and `test_v4l2_vivid.py`.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator

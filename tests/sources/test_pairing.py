@@ -1,7 +1,5 @@
 """What every live source does with its pictures: pairs, numbers, epochs, and their end, on stamps alone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

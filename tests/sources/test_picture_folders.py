@@ -1,7 +1,5 @@
 """Folders as people bring them: masks of any values, deep pictures, times as names, missing partners."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A recording that is played again: for subscribers it is a node."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

@@ -1,7 +1,5 @@
 """Poses of a robot: interpolated where they are known, and said where they are not."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

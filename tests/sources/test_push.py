@@ -1,7 +1,5 @@
 """Pictures handed in over ZeroMQ, by processes and by hand."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -131,6 +129,7 @@ def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures
             assert words in problem and "\n" not in problem
 
 
+@pytest.mark.fault("picture: a sender's has the wrong size")
 def test_wrong_sizes_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
     with zmq_socket(zmq.DEALER, source.endpoint) as stranger:
         for parts in ([b""], [b"x"] * 9, [b"a/left/image_raw", b"\xc1", b"data"], [b"t"] * 100):

@@ -1,7 +1,5 @@
 """Pictures of a ROS 2 graph: of a DDS process, and of real rclpy where tests/ros2/prepare.sh was run."""
 
-from __future__ import annotations
-
 import logging
 import re
 import time

@@ -1,7 +1,5 @@
 """Keyframe folders of SCARED: a made-up scene whose depth, poses and pictures are known is read back."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

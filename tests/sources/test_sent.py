@@ -1,7 +1,5 @@
 """What is common to pictures that other programs send: their stamps, their loss, their clock."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -93,13 +91,6 @@ def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
     sent = SentPictures(PushSource(), None)
     with pytest.raises(SagsError, match=f"{said}.*source.stamps:=own"):
         sent.put("left", 100 * S, round((100 + age) * S), picture)
-
-
-@pytest.mark.fault("picture: a sender's has the wrong size")
-def test_another_size_is_refused_with_both_sizes() -> None:
-    sent = SentPictures(PushSource(), (640, 512))
-    with pytest.raises(SagsError, match=r"8x4 px.*640x512"):
-        sent.put("left", S, S, picture)
 
 
 def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:

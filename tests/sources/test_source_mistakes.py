@@ -1,7 +1,5 @@
 """Recordings that cannot be played: what users get wrong, and damage that shows late, named with its fix."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Replay of recordings: pairing, order, stamps, pace and truth."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -4,8 +4,6 @@
 very Python on them; it needs no rights here and takes some ten seconds.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

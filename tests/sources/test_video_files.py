@@ -1,7 +1,5 @@
 """Video files by their own stamps and counts: pictures tell their number, so what comes is known exactly."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -162,17 +160,19 @@ def test_poses_and_references_go_by_the_picture_of_the_left_eye(tmp_path: Path) 
     check_truth(played(config.model_copy(update={"start": 1.0})), [n for n in ALL if n >= 30])
 
 
-@pytest.mark.parametrize(("first", "lefts"), [("left", range(0, COUNT, 2)), ("right", range(1, COUNT, 2))])
-def test_poses_go_by_the_picture_of_the_left_eye_where_eyes_come_in_turn(
-    first: str, lefts: range, tmp_path: Path
+@pytest.mark.parametrize(("first", "begin", "later"), [("left", 0, 1), ("right", 1, -1)])
+@pytest.mark.parametrize("lost", [(16, 31), (17, 30, 31, 32)])
+def test_a_lost_picture_of_eyes_in_turn_exchanges_no_eyes_and_poses_go_by_the_left_one(
+    first: str, begin: int, later: int, lost: tuple[int, ...], tmp_path: Path
 ) -> None:
-    """Each eye loses a picture, whose partner is left out."""
-    scope = eye(tmp_path / "scope.mkv", without(16, 31))
-    there = [number for number in lefts if number not in (16, 31)]
+    """Its partner is left out."""
+    scope = eye(tmp_path / "scope.mkv", without(*lost))
     config = pair_of(tmp_path, scope, None, layout="frame_sequential", first=first)
-    frames = played(config.model_copy(update=with_truth(tmp_path, there)))
-    check_truth(frames, [number for number in lefts if number // 2 not in (8, 15)])
-    assert [number_in(frame.left) for frame in frames] == [n for n in lefts if n // 2 not in (8, 15)]
+    truth = with_truth(tmp_path, [number for number in range(begin, COUNT, 2) if number not in lost])
+    frames = played(config.model_copy(update=truth))
+    whole = [n for n in range(begin, COUNT, 2) if not {n, n + later} & {*lost}]
+    check_truth(frames, whole)
+    assert numbers_of(frames) == [(n, n + later) for n in whole]
 
 
 def test_files_of_other_rates_are_refused_also_with_gaps(tmp_path: Path) -> None:
@@ -181,14 +181,6 @@ def test_files_of_other_rates_are_refused_also_with_gaps(tmp_path: Path) -> None
         left = eye(tmp_path / "l.mp4", shown)
         with pytest.raises(UsageError, match=rf"30 frames/s but .*25; .*\(ffmpeg {way} NEW\)"):
             open_source(pair_of(tmp_path, left, right))
-
-
-@pytest.mark.parametrize("first", ["left", "right"])
-def test_a_lost_picture_exchanges_no_eyes(tmp_path: Path, first: str) -> None:
-    scope = eye(tmp_path / "scope.mkv", without(17, 30, 31, 32))
-    frames = played(pair_of(tmp_path, scope, None, layout="frame_sequential", first=first))
-    pairs = [(n, n + 1) for n in range(0, COUNT, 2) if n not in (16, 30, 32)]
-    assert numbers_of(frames) == [pair if first == "left" else pair[::-1] for pair in pairs]
 
 
 @pytest.mark.parametrize("lost", [(), (17,)], ids=["even", "a picture lost"])

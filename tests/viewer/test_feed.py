@@ -1,7 +1,5 @@
 """What the viewer takes from a node and from an overlay, over real sockets."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`sags view`: what it shows, what it takes away, and whom it lets in; the page in a real browser."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os
@@ -349,14 +347,13 @@ def page(view: RunningView) -> Iterator[Any]:
 
 
 @pytest.fixture
-def node(view: RunningView, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+def node(view: RunningView, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A node that the viewer finds by itself; small, for the browser draws without a graphics card."""
     session = tmp_path / "session"
     write_session(PhantomSource(seconds=2.0, width=160, height=128, seed=1), session, rate=10.0)
-    command = [sys.executable, "-m", "sags_node", "run", session, "source.loop:=true"]
-    command += ["source.rate:=5", "vision.scale:=1", "publish.data:=[]", "publish.control:=tcp://127.0.0.1:*"]
-    words, environment = list(map(str, command)), os.environ | {"XDG_RUNTIME_DIR": str(view.runtime)}
-    with killed(subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL)) as running:
+    played = ["source.loop:=true", "source.rate:=5", "vision.scale:=1"]
+    heard = ["publish.data:=[]", "publish.control:=tcp://127.0.0.1:*"]
+    with killed(start(["run", session, *played, *heard], XDG_RUNTIME_DIR=view.runtime)) as running:
         yield running
 
 
@@ -416,7 +413,7 @@ def test_a_page_that_hears_nothing_covers_itself_and_a_folded_one_does_not(
 
 @needs_viser
 def test_a_live_node_is_shown_obeys_and_disappears(
-    page: Any, view: RunningView, node: subprocess.Popen[bytes]
+    page: Any, view: RunningView, node: subprocess.Popen[str]
 ) -> None:
     run_dir = view.runtime / "sags"
     until(lambda: "running" in status(page), page, START_SECONDS)

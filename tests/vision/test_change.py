@@ -1,7 +1,5 @@
 """What counts as a scene in which nothing moves, and what as a picture that was sent twice."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Red and blue that are exchanged are told by check and run alike; sound pictures are not called so."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

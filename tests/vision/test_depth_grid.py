@@ -1,7 +1,5 @@
 """Depth that knows how good it is: measured against the phantom's truth, borrowed, and remembered."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

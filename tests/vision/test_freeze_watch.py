@@ -1,7 +1,5 @@
 """A live feed that repeats its picture is found; one that only looks alike, and a recording, are not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tissue is found again however far it was pulled; other tissue, or the same turned or mirrored, is not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -1,7 +1,5 @@
 """A drop on one lens is noticed, held out of the model, and soon over; what both eyes see is no drop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """An eye that is late, by what the matched rows tell of it: also where few frames are matched."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """The kernels of stereo and optical flow: plain NumPy says the same, and known motion is found."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

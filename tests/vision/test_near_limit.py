@@ -1,7 +1,5 @@
 """How near tissue may be follows the pictures: an organ at 15 mm gets its own depth, not the background's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Depth by networks of every convention, in real ONNX Runtime sessions, and what happens when one fails."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Whether both eyes show what they should: empty, equal and exchanged pictures are noticed, others not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
@@ -15,14 +13,13 @@ from recorded_session import both, noisy
 from synthetic import health
 from watching import judged
 
-from sags_node.config.schema import FoldersSource
 from sags_node.errors import UsageError
 from sags_node.mapping.budget import StepBudget
 from sags_node.messaging.cdr import decode
 from sags_node.messaging.content import diagnostics
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session, open_session
-from sags_node.sources.replay import Replay, refuse_one_eye_twice
+from sags_node.sources.replay import refuse_one_eye_twice
 from sags_node.types import U8, Finding, StereoFrame
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.watch.judgement import Judgement
@@ -261,27 +258,12 @@ def test_a_picture_that_was_enlarged_has_no_blocks(across: int, moving: list[Ste
 # ---- one eye that is fed to both inputs is refused at the start ------------------------------------------
 
 
-def test_the_same_folder_twice_is_refused(phantom_session: Path) -> None:
-    left = phantom_session / "left"
-    with Replay(FoldersSource(left=left, right=left, pace="step")) as source:
-        with pytest.raises(UsageError, match=r"both eyes get the same picture.*source\.right"):
-            next(iter(source))
-
-
 def test_captured_twice_is_refused(frames: list[StereoFrame]) -> None:
     """Noise and compression of two captures are no second eye."""
     rng = np.random.default_rng(0)
     once, again = (noisy(frames[0].left, rng, 3) for _ in range(2))
     with pytest.raises(UsageError):
         refuse_one_eye_twice(once, _jpeg(again, 60))
-
-
-@pytest.mark.parametrize("launch", ["d4d_pull", "hamlyn_heart"])
-@pytest.mark.usefixtures("data_folder")
-def test_two_eyes_pass(launch: str) -> None:
-    session = open_session(ROOT / f"launch/{launch}.yaml", ["source.pace:=step", "source.stride:=30"])
-    with session.source as source:
-        assert len(list(islice(source, 3))) == 3
 
 
 @pytest.mark.parametrize("level", [0, 128, 255])

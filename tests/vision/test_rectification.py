@@ -1,7 +1,5 @@
 """Rectified pictures and masks: where points land, and which rows agree."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Stereo depth: scenes with exact truth, and real recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

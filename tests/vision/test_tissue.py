@@ -1,7 +1,5 @@
 """Tissue masks from outside: the session's, a network's, another process's, and when they are wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -53,11 +51,6 @@ def test_no_method_uses_every_pixel_but_the_boxes() -> None:
 def test_a_box_outside_the_picture_is_refused(box: tuple[int, int, int, int]) -> None:
     with pytest.raises(UsageError, match="675x540"):
         TissueMask(TissueConfig(exclude=(box,)), Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512))
-
-
-def test_a_box_that_begins_outside_is_refused_by_the_configuration() -> None:
-    with pytest.raises(UsageError, match=r"vision\.tissue\.exclude.*greater than or equal to 0"):
-        load_launch(None, ["vision.tissue.exclude:=[[-1,0,5,5]]"])
 
 
 def test_masks_upside_down_are_refused_with_a_hint() -> None:
@@ -168,11 +161,6 @@ def test_where_the_network_fails_instruments_are_found_without(tmp_path: Path) -
     assert "not finite" in find_tissue.problem
     find_tissue(frame, rectifier(frame))
     assert find_tissue.problem == ""
-
-
-def test_the_launch_file_says_what_is_tissue(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="tissue_is"):
-        load_launch(None, ["vision.tissue.method:=onnx", f"vision.tissue.path:={tmp_path / 'net.onnx'}"])
 
 
 def save_a_number(path: Path) -> None:

@@ -1,7 +1,5 @@
 """Tissue masks from another process: a real node, and the example that this repository gives."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Warnings reach people, and every one of them can be looked up."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

@@ -3,8 +3,6 @@
 tests/sources/test_v4l2_vivid.py holds what must be true of it.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import threading

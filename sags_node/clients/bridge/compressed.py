@@ -4,8 +4,6 @@ Colour becomes JPEG; masks, confidence and overlays PNG. Depth becomes a PNG as 
 it: steps of equal disparity, as stereo measures. All are made coarser until they are small enough.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial

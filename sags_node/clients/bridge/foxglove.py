@@ -4,8 +4,6 @@ The messages are the node's own: ROS 2 CDR, byte for byte, stamped with the time
 offered as H.264 too, for thin links.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import threading

@@ -1,7 +1,5 @@
 """A layout for Foxglove: pictures, cloud with anchors, figures and what is wrong, at once."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from typing import Any

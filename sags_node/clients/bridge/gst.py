@@ -4,8 +4,6 @@ Each eye is a pipeline in a process of its own, which gets BGRx pictures at the 
 picture is replaced by the key colour alone, which displays show as nothing, as soon as it is too old.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -1,7 +1,5 @@
 """Pictures as H.264 for thin links, by PyAV: each message is one picture (Annex B)."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import av

@@ -3,8 +3,6 @@
 pyigtl packs and reads them. Here is what it has not: STATUS, and a check of what strangers send.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

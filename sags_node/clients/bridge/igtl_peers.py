@@ -3,8 +3,6 @@
 pyigtl's own holds a hundred messages, serves one peer and takes over the signals of its process.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket

@@ -5,8 +5,6 @@ forward is turned to R = -x, A = -y, S = z, so that Slicer's axial view shows a 
 for the world and for the camera; they are no directions of a patient.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import math

@@ -1,7 +1,5 @@
 """A list of named points that a peer keeps, mirrored as anchors: each is pinned where it has come to rest."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass

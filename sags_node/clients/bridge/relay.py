@@ -4,8 +4,6 @@ What has become too old is taken back, with the reason. The node never waits for
 waits for a peer.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 import threading

@@ -1,7 +1,5 @@
 """What peers of a bridge ask of the node: one after the other, in the background."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor

@@ -4,8 +4,6 @@ The messages are the node's own, byte for byte. Beside them stand small ones, fo
 them: pictures as files, and fewer points. What has stopped is not sent again; `/diagnostics` says why.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -4,8 +4,6 @@ They are no services: Fast DDS, with which ROS 2 comes, marks the answer to a se
 `cyclonedds` cannot write.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import time

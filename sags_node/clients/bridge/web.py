@@ -4,8 +4,6 @@ docs/bridges.md says what goes over it. Each peer has a thread and a relay of it
 the one before has left, so a slow peer misses some, and no other waits for it.
 """
 
-from __future__ import annotations
-
 import http
 import logging
 import re

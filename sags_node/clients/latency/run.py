@@ -1,7 +1,5 @@
 """What a screen shows of a node, and the codes in it."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """Codes are numbers that cameras can read; they are shown in pictures that are pushed, or on a page."""
 
-from __future__ import annotations
-
 import http
 import json
 import math

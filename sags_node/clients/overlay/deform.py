@@ -10,8 +10,6 @@ Anchors are the node's points of the tissue: the picture corrects them, they say
 back when they were lost. Control nodes and Gaussians do none of that, and are renewed under way.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future

@@ -1,7 +1,5 @@
 """The node's messages of one frame, joined to what the overlay needs of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import msgspec

@@ -1,7 +1,5 @@
 """Objects held by anchors: pinned once, then placed in every frame by where the node says its anchors are."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future

@@ -3,8 +3,6 @@
 It lies on the lower edge, over whatever is there: a warning must be seen just where nothing else is sure.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 

@@ -3,8 +3,6 @@
 Everything ends as one triangle mesh in metres; a point becomes a small octahedron.
 """
 
-from __future__ import annotations
-
 import re
 from codecs import BOM_UTF8
 from collections.abc import Sequence

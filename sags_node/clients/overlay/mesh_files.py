@@ -5,8 +5,6 @@ polygon, and end the process where something is wrong. trimesh's draw what came 
 vertex 0 of OBJ as the last one. Here Python and numpy read every number, and all must be there.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import struct

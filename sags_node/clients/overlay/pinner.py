@@ -1,7 +1,5 @@
 """Asks the node for anchors, and gives them back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any

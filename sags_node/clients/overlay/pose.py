@@ -1,7 +1,5 @@
 """Where an object lies, given the anchors that hold it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.clients.overlay.frame import TissueFrame

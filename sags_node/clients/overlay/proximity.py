@@ -4,8 +4,6 @@ Tips, and how far the tissue is, come from the node's topic `instruments`. The z
 are objects of the scene with a `margin`, where their anchors hold them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

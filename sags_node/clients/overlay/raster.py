@@ -4,8 +4,6 @@ Both eyes at 30 Hz are to take half a core in all. One eye's view of a vessel of
 here, lighting included, and 10 ms with Open3D's ray casting, which the tests hold this against.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

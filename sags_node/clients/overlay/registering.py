@@ -1,7 +1,5 @@
 """`sags register`: a model placed on the tissue of a running node, and the scene file that says so."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Sequence

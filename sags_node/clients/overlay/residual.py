@@ -9,8 +9,6 @@ from the plane of the triangle that its ray meets: a kernel finds that without t
 Open3D's search for the nearest place holds for a tenth of a second. A slide along the surface is not seen.
 """
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import Executor, Future
 

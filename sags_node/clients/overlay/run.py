@@ -4,8 +4,6 @@ It fails transparent: when anything it needs is stale, missing or lost, empty pi
 says why. The video itself does not pass through here, so nothing here can hide it.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """Keeps what `sags overlay` shows, for looking at it later."""
 
-from __future__ import annotations
-
 import struct
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `sags overlay` draws: a YAML file of objects and the anchors that hold them, typed and validated."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A picture is never left standing: when nothing fresh can be drawn, an empty one 
 every `BLANK_PERIOD`. Of these, those of the first `SAID` seconds say why on their lower edge.
 """
 
-from __future__ import annotations
-
 import time
 import uuid
 from pathlib import Path

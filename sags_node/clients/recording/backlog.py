@@ -1,7 +1,5 @@
 """What a recorder holds in memory: bounded in bytes, so that a slow disk costs messages and never memory."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

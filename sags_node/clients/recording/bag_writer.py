@@ -4,8 +4,6 @@ A message is in the file at the latest after the next `flush`: the file of a pro
 recovered up to there.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

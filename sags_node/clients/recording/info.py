@@ -1,7 +1,5 @@
 """What a bag holds: topics, types, counts, rates, and what is missing from them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """From messages of the wire to a bag: topics, compressed pictures; calibration and parameters attached."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Publishes a bag on the wire again, as a node would: same sockets, same messages, stamped as if live."""
 
-from __future__ import annotations
-
 import logging
 import struct
 import threading

@@ -4,8 +4,6 @@ The calling thread receives; a second one compresses and writes. What does not f
 counted, and so is what never arrived (gaps in `seq`).
 """
 
-from __future__ import annotations
-
 import logging
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """Saves what is whole of damaged MCAP files: everything up to the damage, and every intact chunk after it."""
 
-from __future__ import annotations
-
 import mmap
 from collections.abc import Iterable
 from contextlib import suppress

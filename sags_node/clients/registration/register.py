@@ -1,7 +1,5 @@
 """A model placed by pairs of points and by its surface, with the errors to expect and a plain verdict."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Literal

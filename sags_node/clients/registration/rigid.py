@@ -8,8 +8,6 @@ is Gaussian, so nine of ten follow as in Fitzpatrick and West ("The distribution
 error in rigid-body point-based registration", IEEE TMI 20(9), 2001).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.geometry import Array, rigid, transform

@@ -9,8 +9,6 @@ the nearest place on a mesh is used (`Shape`).
 Errors of a depth are much the same all over a patch of `PATCH`, so a patch counts as one measurement.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

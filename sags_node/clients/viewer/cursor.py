@@ -1,7 +1,5 @@
 """The depth under the cursor, looked up by the page itself: what a browser points at does not come here."""
 
-from __future__ import annotations
-
 import base64
 
 import numpy as np

@@ -4,8 +4,6 @@ The node may come, go and come back: the feed connects by itself and lets go of 
 thin, as small JPEG and PNG files, and those alone that somebody looks at.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Figures over the last minutes, for the plots."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

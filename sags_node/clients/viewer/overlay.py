@@ -1,7 +1,5 @@
 """What `sags overlay` shows on this machine: its pictures, and how its objects do."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The controls in the browser: status, pictures, plots, anchors, and what can be asked of the node."""
 
-from __future__ import annotations
-
 import html
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Pictures of the newest frame on one sheet: of both eyes, of the model, its depth and error, the overlay."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

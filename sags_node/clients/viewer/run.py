@@ -1,7 +1,5 @@
 """Brings what the node shows to the browser, at the rate that node, machine and browser can take."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """What a browser may keep of a moment: a picture of its page, and the model as files of `sags export`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -4,8 +4,6 @@ Its unit is the millimetre, because viser keeps covariances as float16: those of
 would vanish. Its axes are the node's world: x right, y down, z away from the first left camera (OpenCV).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """viser on this machine only: it has no keys, so nobody else may reach it."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Callable, Iterator

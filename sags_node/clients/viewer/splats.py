@@ -1,7 +1,5 @@
 """The node's Gaussians as a browser draws them, and the tissue that a ray through them meets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ planes of one scratch array does (see `jit`). Pictures are flat here, [P] with P
 `start` (uint64) and has `count` pixels. Where `count` is a constant these loops become straight copies.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a drawn picture should have been: one fused pass from planes to their cotangent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

@@ -1,7 +1,5 @@
 """What a rasteriser is given: checked, and as its kernels take it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

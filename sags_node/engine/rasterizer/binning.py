@@ -1,7 +1,5 @@
 """From splats to depth-sorted lists of splats per tile."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

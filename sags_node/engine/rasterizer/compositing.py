@@ -16,8 +16,6 @@ by adding a constant. The scratch of a worker holds a tile block by block, and o
 `median` uses the constants and helpers of this file. Tile sizes stand here only.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

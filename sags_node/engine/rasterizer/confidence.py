@@ -5,8 +5,6 @@ Where a frame measures another depth than is drawn, the difference is an error o
 that were left behind can be drawn together with new ones.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The CPU's rasteriser: filter, colour, project, bin, composite, and the same backwards."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

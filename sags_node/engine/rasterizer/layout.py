@@ -1,7 +1,5 @@
 """Records that the CPU kernels hand to each other. Each fills one or a quarter of a 64-byte cache line."""
 
-from __future__ import annotations
-
 import numpy as np
 
 # A Gaussian projected to one camera. With d = pixel - mean2d, u = whiten_xx dx + whiten_xy dy and

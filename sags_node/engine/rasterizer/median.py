@@ -3,8 +3,6 @@
 Unlike the mean it does not lie between two surfaces where one shines through the other.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

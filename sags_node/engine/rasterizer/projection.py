@@ -15,8 +15,6 @@ on LANES of them at a time, one in each lane of a vector, and copies the finishe
 `projection_backward` differentiates it with the same helpers.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

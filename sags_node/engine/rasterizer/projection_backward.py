@@ -1,8 +1,6 @@
 """The derivative of the projection (`projection`) by every parameter, from the gradients of pairs, which are
 summed first."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

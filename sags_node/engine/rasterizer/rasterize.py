@@ -1,7 +1,5 @@
 """The one way to draw Gaussians: `make_rasterizer`, then `forward`, `backward`, `to_view`."""
 
-from __future__ import annotations
-
 from sags_node.engine import device
 from sags_node.engine.interface import Gradients, Rasterizer
 from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH

@@ -14,8 +14,6 @@ alpha, as it is drawn, does not depend on it either. With three axes an online m
 It does not depend on the camera, so it is applied once per drawing, before the projection. f is a constant.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -7,8 +7,6 @@ Basis, signs and order are those of 3D Gaussian Splatting (Kerbl et al. 2023), s
 in `colors` and `sh_rest`, and one that leaves 0..1 still has a gradient that leads back.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

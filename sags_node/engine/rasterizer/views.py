@@ -1,7 +1,5 @@
 """From blended planes to the picture that is shown: colour and depth normalised by coverage."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

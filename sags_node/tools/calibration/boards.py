@@ -1,7 +1,5 @@
 """Calibration boards and their corners in pictures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 

@@ -1,7 +1,5 @@
 """`sags calib check`: a calibration, alone or against the pictures it is for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple

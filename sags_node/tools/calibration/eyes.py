@@ -1,7 +1,5 @@
 """What a source gives for each eye, as one picture: is it split, cropped and turned as it should be?"""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any

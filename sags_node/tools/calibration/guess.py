@@ -1,7 +1,5 @@
 """A rig for eyes that nobody has calibrated: usual optics, and the rows that their own pictures show."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

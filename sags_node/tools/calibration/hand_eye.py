@@ -1,7 +1,5 @@
 """`sags calib hand-eye`: from a recording of a board and the robot's poses to `hand_eye.yaml`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

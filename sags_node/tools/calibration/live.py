@@ -1,7 +1,5 @@
 """Taking pictures of a board from a running source: only views that add something, held still."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

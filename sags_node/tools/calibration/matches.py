@@ -1,7 +1,5 @@
 """Points that both raw pictures of a stereo pair show, found without the calibration they are to judge."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Stereo pictures to check a calibration with: files, folders, or some frames of a session."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

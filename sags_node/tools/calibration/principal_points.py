@@ -6,8 +6,6 @@ well. Only depths from elsewhere do, and only where these are right: an error of
 heights it is otherwise: rows must agree whatever the depth (`rows`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

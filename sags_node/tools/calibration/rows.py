@@ -5,8 +5,6 @@ Nothing is remapped: the raw pixels of a match go through the calibration, so th
 exchanged, a sign, another size) are tried at no cost.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A stereo rig from views of a board: both cameras first (Zhang, PAMI 2000), then all together."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

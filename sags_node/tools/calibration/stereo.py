@@ -1,7 +1,5 @@
 """`sags calib stereo`: from pictures of a board to a checked calibration on disk."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """What views from aside are worth, beside the exact truth, which only a made scene has."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from sags_node.config.schema import LaunchConfig, PhantomSource

@@ -1,7 +1,5 @@
 """Whether the predicted errors of published depth cover the real ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any

@@ -4,8 +4,6 @@
 tables (`groups`).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -246,6 +244,7 @@ def verdict(figures: Flat) -> list[tuple[str, str]]:
     right = ("right.psnr", "{:.1f} dB PSNR"), ("right.warp_psnr", f" ({_WARP}: {{:.1f}} dB)")
     hidden = ("hidden.psnr", "{:.1f} dB PSNR"), ("hidden.model_psnr", " (the model alone: {:.1f} dB;")
     last = "hidden.copy_psnr", " as it was last seen: {:.1f} dB)"
+    unseen = ("heldout.psnr", "{:.1f} dB PSNR on frames kept back"), ("heldout.copy_psnr", f" ({_BEFORE})")
     again = "the first {} frames, frame by frame, for the right eye, hidden tissue and what has no truth"
     warned = below(figures, "warnings").items()
     lines = {
@@ -256,7 +255,7 @@ def verdict(figures: Flat) -> list[tuple[str, str]]:
         "hidden": _said(figures, *hidden, last),
         "speed": _speed(figures),
         "latency": _latency(figures),
-        "unseen": _said(figures, ("heldout.psnr", "{:.1f} dB PSNR on frames kept back"), _copied("heldout")),
+        "unseen": _said(figures, *unseen),
         "picture": _picture(figures),
         "quality": _quality(figures),
         "warnings": ", ".join(f"{code} ({count} frames)" for code, count in warned),
@@ -292,10 +291,6 @@ def _points(figures: Flat) -> str:
         if said or figures.get(lost) is not None:
             return said or "all given up"
     return ""
-
-
-def _copied(group: str) -> tuple[str, str]:
-    return f"{group}.copy_psnr", f" ({_BEFORE})"
 
 
 def _off(group: str) -> tuple[tuple[str, str], ...]:

@@ -1,7 +1,5 @@
 """How much a view flickers where nothing moves: standard deviations in time, beside those of the input."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

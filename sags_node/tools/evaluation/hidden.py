@@ -1,7 +1,5 @@
 """What is shown of tissue that is hidden: boxes of a recording are taken from the node for a while."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

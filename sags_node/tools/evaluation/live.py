@@ -4,8 +4,6 @@ sockets that only copies.
 What the node alone knows of a frame, such as its Gaussians, is measured in steps (`session.run_step`).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Go through a recording once more and measure what a run showed of each of its frames."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace

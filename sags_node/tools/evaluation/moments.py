@@ -1,7 +1,5 @@
 """What a run says of a moment that the mapper never saw: later than its frames, or between two of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

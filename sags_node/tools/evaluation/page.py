@@ -1,7 +1,5 @@
 """A page that opens anywhere: its pictures and plots are in it."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """Where figures come from: without it nobody can tell later what they are worth."""
 
-from __future__ import annotations
-
 import os
 import platform
 import shlex

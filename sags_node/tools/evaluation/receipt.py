@@ -1,7 +1,5 @@
 """What figures were computed from, so that others can tell whether theirs compare."""
 
-from __future__ import annotations
-
 import hashlib
 from itertools import pairwise
 from pathlib import Path

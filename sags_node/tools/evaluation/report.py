@@ -1,7 +1,5 @@
 """A run on one page: its video, what it was worth, pictures, plots over time, and every figure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path

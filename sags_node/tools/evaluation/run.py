@@ -4,8 +4,6 @@ One file for each frame of a pipeline, or for each message of a live node. Only 
 stay in memory.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 from dataclasses import dataclass, field, replace

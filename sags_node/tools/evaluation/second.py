@@ -5,8 +5,6 @@ points are known, some are followed to the last frame that is played, and back t
 tissue must be as it was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Play a recording through the node's own pipeline, then measure what it showed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

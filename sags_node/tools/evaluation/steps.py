@@ -1,7 +1,5 @@
 """A recording frame by frame: every one in turn, none lost."""
 
-from __future__ import annotations
-
 import time
 
 from sags_node.kernels.threads import configure_threads

@@ -1,7 +1,5 @@
 """Per-frame rows -> the figures of a run, in the form that `sags eval --json` prints."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """How well the model's Gaussians stay on the surface points they were born on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How far estimated camera poses are from known ones."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """A drawn right view, and what it is compared with: the left picture, warped by depth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 A file appears, or replaces the one that stood there, only when it is complete.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A video around the tissue: the camera circles its own axis, turned towards the middle of the surface."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the node knows of every frame of a recording, as files: depth, tracks, drawn pictures, a data set."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `sags export` exports: the model at one moment, from a running node, a recording or a fit."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

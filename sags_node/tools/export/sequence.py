@@ -4,8 +4,6 @@ Each file appears when it is complete, and stays. So an export that was ended, b
 goes on when the same command is given again: frames that are there are not written anew.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import tempfile

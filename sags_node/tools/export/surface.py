@@ -15,8 +15,6 @@ On the phantom at its lift, median, p90 and p99:
 | Poisson, which closes holes | 0.23, 0.80, 2.8 | 0.21, 0.67, 1.9 | not taken |
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Open3D's writers report success on a full disk. Here a file is made in memory, and Python writes it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from io import BytesIO
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """A fit on disk: everything it needs to go on as if it had not been interrupted."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterable

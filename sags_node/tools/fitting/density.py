@@ -1,7 +1,5 @@
 """Densification and pruning of canonical Gaussians under a cap (Kerbl et al., SIGGRAPH 2023)."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """What every fit begins with: a fresh deformation field, and how fast Gaussians learn from nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ it looked; what is left are small corrections of the field and of single Gaussia
 squared colour residuals and the closed-form colour step, as the online mapper does.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

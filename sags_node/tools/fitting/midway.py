@@ -1,7 +1,5 @@
 """Pictures half way between training frames, by optical flow: they teach the model what moves in between."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise

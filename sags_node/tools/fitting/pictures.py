@@ -1,7 +1,5 @@
 """The training frames at one size, with what draws them: all that a fit looks at."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The model after an online start: what single Gaussians do beyond the field is added to it."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -5,8 +5,6 @@ does not quite follow, a colour that turns as light moves over wet tissue, tissu
 Not part of SAGS; curves of one's own for each Gaussian are known from Deform3DGS (MICCAI 2024).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How good a fit is on frames it never saw, in the literature's figures and in honest ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path

@@ -5,8 +5,6 @@
 learns these paths by regression, which needs no drawing and so is fast. What it leaves becomes residuals.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

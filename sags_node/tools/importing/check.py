@@ -1,7 +1,5 @@
 """`sags import --check`: one folder looked over, from what it is to how it is played."""
 
-from __future__ import annotations
-
 import logging
 import re
 import shlex

@@ -1,7 +1,5 @@
 """What a folder is, by the names of what lies in it."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """What is odd about the pictures of a recording: sizes, gaps, borders, interlacing, masks and depth."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from pathlib import Path
 

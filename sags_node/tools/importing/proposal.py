@@ -1,7 +1,5 @@
 """`sags new`: how a recording or a camera is best played, by what its pictures show."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -6,8 +6,6 @@ late. On D4D, a beating heart and the phantom the right delay correlates with 0.
 a frame or more with 0.57 at most, and always with 0.4 less than the right one.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """What is odd about the videos of a recording, and how the pictures of one show both eyes."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress

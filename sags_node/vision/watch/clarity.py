@@ -1,7 +1,5 @@
 """How clear the eyes see: contrast and fine detail, beside what they usually have and beside each other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -5,8 +5,6 @@ by 0.11 to 0.34 of R + G + B; with channels exchanged blue exceeds red by as muc
 shapes and depth are right, and in blue light (fluorescence) tissue is blue.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sags_node.types import U8, Finding

@@ -6,8 +6,6 @@ sends it anew with each key frame, equal up to quantisation. Where both eyes tak
 the other (`vision.watch.pair_watch`). Recordings may repeat pictures: nobody takes them for the present.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum, auto

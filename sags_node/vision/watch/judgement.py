@@ -1,7 +1,5 @@
 """What watchers say of a frame: the one question of all of them is what of it may be trusted."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 

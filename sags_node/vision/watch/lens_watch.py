@@ -6,8 +6,6 @@ right one at which the model's depth says the same tissue is. What moves, is smo
 both eyes.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

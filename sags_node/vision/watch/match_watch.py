@@ -5,8 +5,6 @@ that grow with the vertical motion are lateness; those that jump all over the pi
 scope. Both mean that disparities are off by as much.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import NamedTuple

@@ -4,8 +4,6 @@ Looked for in small pictures of every frame, whatever else is left out of it. An
 other one and with what it showed a moment ago: a scene that gets smooth or stands still does so in both.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -2,8 +2,6 @@
 far more of.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

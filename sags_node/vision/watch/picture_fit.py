@@ -1,7 +1,5 @@
 """How well a small picture agrees with the model as it was drawn: in exposure, colours and structure."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -6,8 +6,6 @@ channel. A veil, as smoke is, takes contrast away all over. Blood and other cove
 Another scene changes most of it, and no motion explains it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

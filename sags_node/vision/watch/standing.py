@@ -1,8 +1,6 @@
 """Which findings stand: one bad frame is none, and a warning ends soon after its cause. For how long
 something was watched."""
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from collections.abc import Sequence
 

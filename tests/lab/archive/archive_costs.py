@@ -7,8 +7,6 @@
 Each takes some minutes of two cores; FOLDER must be new. benchmarks/archive.md has what came out.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -34,6 +32,7 @@ from sags_lab.archive.run import Tally, about, run  # noqa: E402
 from sags_lab.archive.store import Store  # noqa: E402
 from sags_lab.archive.work import Plan, work  # noqa: E402
 from sags_node.phantom import PhantomScene, write_session  # noqa: E402
+from sags_node.processes import resident_mb  # noqa: E402
 from sags_node.tools.evaluation.provenance import revision  # noqa: E402
 
 SESSIONS = 12  # that are written
@@ -98,7 +97,7 @@ def tiny(folder: Path) -> None:
             first = time.monotonic()
         elif tally.done // 250 > len(memory) - 1:
             workers = [each for each in below(os.getpid()) if name_of(each).startswith("ray::quick_work")]
-            memory.append((tally.done, megabytes(os.getpid()), max(map(megabytes, workers), default=0.0)))
+            memory.append((tally.done, resident_mb(), max(map(resident_mb, workers), default=0.0)))
 
     with Store(plan.out).locked():
         tally = run(Store(plan.out), recordings, plan, ATTEMPTS, tell, task=quick_work)
@@ -129,7 +128,7 @@ def large(folder: Path) -> None:
     with timed("results.parquet", count):
         write_results(store, recordings)
     table = (folder / "out/results.parquet").stat().st_size * 1e-6
-    say(f"results.parquet has {table:.1f} MB; {megabytes(os.getpid()):.0f} MB of memory")
+    say(f"results.parquet has {table:.1f} MB; {resident_mb():.0f} MB of memory")
     with connected(None) as ray:
         waits = ray.remote(lambda: time.sleep(PATIENCE))
         tasks = [waits.remote() for _ in range(6400)]
@@ -165,14 +164,6 @@ def name_of(process: int) -> str:
         return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
     except OSError:
         return ""
-
-
-def megabytes(process: int) -> float:
-    try:
-        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    except OSError:
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") * 1e-6
 
 
 def say(line: str) -> None:

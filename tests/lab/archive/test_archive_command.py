@@ -1,7 +1,5 @@
 """`sags archive` as users give it, with real recordings and the real job."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """Whatever happens on the way, what comes out is the same: workers, machines and the driver are killed, the
 disk is full, recordings are broken or hang. `quick_job` stands in for the work itself."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

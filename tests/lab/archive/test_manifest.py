@@ -1,7 +1,5 @@
 """The list of recordings: what is found, what is refused, and that both kinds of file say the same."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

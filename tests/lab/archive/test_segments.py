@@ -1,7 +1,5 @@
 """A recording cut into segments: all of them together count each of its frames once."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from pathlib import Path

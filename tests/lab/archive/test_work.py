@@ -1,7 +1,5 @@
 """One recording on the machine that does it: limits, threads, URLs, and what is left behind."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the phantom is written from in the layouts of public data sets."""
 
-from __future__ import annotations
-
 import pytest
 from places import SESSION
 

@@ -1,7 +1,5 @@
 """Figures of public evaluators, by hand."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

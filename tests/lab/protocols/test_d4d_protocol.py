@@ -1,7 +1,5 @@
 """The phantom written in the layout of D4D: its surface is what structured light saw."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

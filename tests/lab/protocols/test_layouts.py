@@ -1,7 +1,5 @@
 """The phantom written in the layout of public data sets, and measured as they are."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

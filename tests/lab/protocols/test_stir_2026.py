@@ -1,7 +1,5 @@
 """The phantom written in the layout of STIR 2026, with points that are known in some frames."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Points handed from frame to frame, and the phantom written in the layout of StereoMIS-Tracking."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil
