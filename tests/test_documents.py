@@ -100,7 +100,7 @@ def test_results_are_written_with_their_origin(tmp_path: Path, monkeypatch: pyte
 def test_changed_sources_are_told_from_committed_ones(tmp_path: Path) -> None:
     def git(*arguments: str) -> None:
         who = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false"]
-        subprocess.run(["git", *who, *arguments], cwd=tmp_path, check=True, capture_output=True)
+        subprocess.run(["git", *who, *arguments], cwd=tmp_path, check=True, capture_output=True, timeout=300)
 
     for name in ("sags_node", "benchmarks", "launch"):
         (tmp_path / name).mkdir()

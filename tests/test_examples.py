@@ -151,7 +151,7 @@ def test_wrong_use_of_an_example_is_one_message(tmp_path: Path, example: str, sa
     (tmp_path / "file").touch()
     name, *words = (word.lower() if word.isupper() else word for word in example.split())
     command = [sys.executable, ROOT / "examples" / name, *words]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
     assert ended.returncode in (1, 2) and said in ended.stderr and "Traceback" not in ended.stderr
 
 

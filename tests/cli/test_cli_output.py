@@ -387,7 +387,12 @@ def test_messages_that_nobody_can_read_end_nothing(
 ) -> None:
     shell = f'exec "$0" -m sags_node {command} {where}'
     ended = subprocess.run(
-        ["sh", "-c", shell, sys.executable], cwd=tmp_path, capture_output=True, text=True, check=False
+        ["sh", "-c", shell, sys.executable],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (code, "", "")
     assert (tmp_path / "mine.key").exists() == (code == 0)
@@ -396,7 +401,7 @@ def test_messages_that_nobody_can_read_end_nothing(
 def test_help_that_a_full_disk_cannot_take_is_one_message() -> None:
     with Path("/dev/full").open("w") as full:
         help = [sys.executable, "-m", "sags_node", "--help"]
-        ended = subprocess.run(help, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        ended = subprocess.run(help, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=300)
     said = "error: cannot write what was asked for: No space left on device\n"
     assert (ended.returncode, ended.stderr) == (1, said)
 
@@ -489,7 +494,9 @@ def test_torch_and_open3d_stay_out_of_the_start(user_files: Path) -> None:
         f"import sags_node.clients.overlay.run, sags_node.messaging.introspection, sags_node.tools.demo\n"
         f"print(sorted({{'torch', 'open3d', 'onnxruntime'}} & set(sys.modules)))"
     )
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
+    )
     assert process.stdout.splitlines()[-1] == "[]"
 
 

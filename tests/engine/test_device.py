@@ -117,5 +117,7 @@ warm_up(LaunchConfig())
 assert "sags_node.mapping.mapper" in sys.modules
 print([name for name in ("torch", "warp") if name in sys.modules])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
+    )
     assert done.stdout == "[]\n"

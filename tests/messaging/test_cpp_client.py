@@ -48,14 +48,16 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if missing:
         pytest.skip(f"no C++ example without {', '.join(missing)}")
     compiler = ["g++", "-std=c++17", "-DMSGPACK_NO_BOOST", "-fsyntax-only", "-x", "c++", "-"]
-    if subprocess.run(compiler, input=HEADERS, text=True, check=False, capture_output=True).returncode:
+    if subprocess.run(
+        compiler, input=HEADERS, text=True, check=False, capture_output=True, timeout=300
+    ).returncode:
         pytest.skip("no C++ example without the Debian packages cppzmq-dev and libmsgpack-cxx-dev")
     folder = tmp_path_factory.mktemp("cpp")
     for command in (
         ["cmake", "-S", SOURCE, "-B", folder, "-DCMAKE_CXX_FLAGS=-Werror"],
         ["cmake", "--build", folder],
     ):
-        built = subprocess.run(command, check=False, capture_output=True, text=True)
+        built = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
         assert built.returncode == 0, built.stdout + built.stderr
     return folder
 

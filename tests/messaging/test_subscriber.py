@@ -248,7 +248,7 @@ async def follow() -> None:
     )
     checked = subprocess.run(
         [sys.executable, "-m", "mypy", "--strict", program],
-        cwd=ROOT, check=False, capture_output=True, text=True,
+        cwd=ROOT, check=False, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert checked.returncode == 0, checked.stdout + checked.stderr
 

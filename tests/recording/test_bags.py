@@ -273,7 +273,11 @@ def test_opening_a_large_bag_takes_little_memory(tmp_path: Path) -> None:
         "print(pairs.count, most() - before)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path / "bag")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", program, str(tmp_path / "bag")],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
     )
     count, grown_kb = map(int, done.stdout.split())
     assert count == 25 and grown_kb < 40_000

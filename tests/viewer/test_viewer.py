@@ -48,8 +48,9 @@ KEEP_ERRORS = """
 """
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
+LOAD_VISER = [sys.executable, "-c", "import viser"]
 needs_viser = pytest.mark.skipif(
-    subprocess.run([sys.executable, "-c", "import viser"], capture_output=True, check=False).returncode != 0,
+    subprocess.run(LOAD_VISER, capture_output=True, check=False, timeout=300).returncode != 0,
     reason="viser is not installed (extra: viewer)",
 )
 

@@ -155,6 +155,7 @@ def test_the_overlays_video_is_whole_all_the_same(home: Path, tmp_path: Path) ->
             capture_output=True,
             text=True,
             check=True,
+            timeout=300,
         )
         said = json.loads(done.stdout)
         return said if said["frames"] > 5 else None
