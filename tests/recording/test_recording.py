@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import time
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,21 +13,18 @@ from command_line import sags
 from mcap.reader import make_reader
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
-from recorded_plane import by_topic, content, record_plane, recording
+from recorded_plane import by_topic, content, record_plane
 from rosbags.highlevel import AnyReader
-from synthetic import plane_result, publisher, stream
-from waiting import until
+from synthetic import plane_result
 
 from sags_node.bags.bag import read_messages
 from sags_node.bags.pictures import decode_picture
 from sags_node.clients.recording.bag_writer import BagWriter, Limits
 from sags_node.clients.recording.info import bag_info
 from sags_node.clients.recording.player import Player, PlayOptions
-from sags_node.clients.recording.recorder import RecordOptions
 from sags_node.config.schema import PublishConfig
 from sags_node.errors import UsageError
 from sags_node.messaging import cdr
-from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.topics import TOPICS
 
 pytestmark = pytest.mark.live
@@ -152,28 +148,6 @@ def test_a_bag_that_is_not_in_the_order_of_time_is_told_of(
         told = [record.getMessage() for record in caplog.records]
         assert len(told) == (name == "after")
         assert all("b lies 0.9 s behind" in said and "ros2 bag convert" in said for said in told)
-
-
-def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
-    run_dir = tmp_path / "run"
-    with publisher(run_dir) as running:
-        running.publish_parameters({"seed": 6})
-        options = RecordOptions(tmp_path / "ring", snapshot_seconds=0.6, node=NodeAddress(run_dir=run_dir))
-        with stream(running), recording(options) as (recorder, said):
-            for number in range(2):
-                time.sleep(1.2)  # twice as long as is kept
-                until(lambda: recorder.summary()["kept_s"] > 0.2)  # also where this process stood still
-                recorder.snapshot()
-                until(lambda: len(said) > 1 + number)  # noqa: B023, used at once
-    summary = said.pop()
-    assert [Path(s["snapshot"]).name for s in said[1:]] == ["snapshot_000", "snapshot_001"]
-    assert summary["messages"] == sum(s["messages"] for s in said[1:]) and summary["dropped"] == 0
-    for told in said[1:]:
-        depth = by_topic(Path(told["snapshot"]))["left/depth"]
-        span = (depth[-1].log_ns - depth[0].log_ns) * 1e-9
-        assert 0 < span <= 0.6
-        latched = by_topic(Path(told["snapshot"]))["parameters"]
-        assert len(latched) == 1 and latched[0].log_ns < depth[0].log_ns  # older, and there all the same
 
 
 # ---- Recordings in several files: together they are one recording, and each can be read alone. ----

@@ -228,6 +228,23 @@ def test_a_ring_says_how_much_it_holds(tmp_path: Path) -> None:
     assert summary["snapshot_seconds"] == 60
 
 
+def test_snapshots_hold_the_last_seconds(tmp_path: Path) -> None:
+    """And the last message of a latched topic, however old it is."""
+    with recorded(tmp_path, snapshot_seconds=0.3) as (sender, recorder, said):
+        for number, name in enumerate(("parameters", "health", "tf")):
+            sender.send(message_of(name, cdr.string("{}"), 1, 1, frame_id=-1))
+            until(lambda: f"sags/{name}" in recorder.summary()["topics"])  # noqa: B023, used at once
+            recorder.snapshot()
+            until(lambda: len(said) > 1 + number)  # noqa: B023, used at once
+            time.sleep(0.4)  # longer than it is kept
+    summary, taken = said.pop(), said[1:]
+    assert [Path(told["snapshot"]).name for told in taken] == ["snapshot_000", "snapshot_001", "snapshot_002"]
+    assert [list(by_topic(Path(told["snapshot"]))) for told in taken] == [
+        ["parameters"], ["parameters", "health"], ["parameters", "tf"],
+    ]  # fmt: skip
+    assert summary["messages"] == sum(told["messages"] for told in taken) == 5 and summary["dropped"] == 0
+
+
 @pytest.mark.parametrize("set_by", [3600, -3600])
 def test_a_ring_keeps_its_seconds_where_the_wall_clock_is_set(set_by: int) -> None:
     """A message a second, 10 s of 30 are kept; and the camera_info of the beginning."""
