@@ -9,33 +9,36 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from bridging import sockets
 from command_line import RUN_HERE, killed, start
 from places import ROOT
 from ports import free_port
-from synthetic import plane_result
+from synthetic import at_frame, plane_camera, plane_depth, plane_result, stream
 from test_overlay_drawing import KEY, centre
-from waiting import START_SECONDS, until
+from waiting import START_SECONDS, repeating, until
 
 from sags_node.client import FrameSender
 from sags_node.clients.overlay.draw import color_key
 from sags_node.clients.overlay.frame import NEEDED
 from sags_node.clients.overlay.run import UNSEEN, OverlayOptions, run_overlay
 from sags_node.config.schema import PublishConfig
-from sags_node.geometry import project
+from sags_node.geometry import project, unproject
 from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.control import ControlClient
+from sags_node.messaging.node_clock import stamps
 from sags_node.messaging.publisher import Publisher
 from sags_node.messaging.received import ReceivedCloud, ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.rundir import connection_path
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.sources.pictures import read_picture
-from sags_node.types import Camera
+from sags_node.types import AnchorStates, Camera
 
 pytestmark = pytest.mark.live
 
@@ -51,7 +54,8 @@ class Overlay(threading.Thread):
     def __init__(self, run_dir: Path, **options: Any) -> None:
         super().__init__(daemon=True)
         self.said: list[str] = []
-        self._options = OverlayOptions(NodeAddress(run_dir=run_dir), max_age=MAX_AGE, **options)
+        said = {"node": NodeAddress(run_dir=run_dir), "max_age": MAX_AGE}
+        self._options = OverlayOptions(**said | options)
         self._summary: dict[str, Any] = {}
 
     def run(self) -> None:
@@ -378,6 +382,28 @@ def test_it_goes_blank_when_the_feed_freezes(phantom_session: Path, tmp_path: Pa
         finally:
             scope.ended.set()
             scope.join(10)
+
+
+@pytest.mark.fault("clock: the node's is set back by an hour as it falls silent, under an overlay")
+def test_it_goes_blank_when_the_clock_is_set_back_as_the_node_falls_silent(tmp_path: Path) -> None:
+    back_ns, camera, ones = 0, plane_camera(), np.ones(1, np.float32)
+    pixel = np.array([[30.0, 30.0]])
+    place = unproject(camera, pixel, plane_depth(camera)[30, 30:31].astype(float))
+    anchor = AnchorStates(np.array([3]), place.astype(np.float32), pixel.astype(np.float32), *[ones] * 4)
+    held = replace(plane_result(), anchors=anchor)
+    handlers = {
+        "add_anchor": lambda args: {"id": 3},
+        "remove_anchor": lambda args: None,
+        "get_clock": lambda args: {key: at_ns - back_ns for key, at_ns in stamps().items()},
+    }
+    with sockets(tmp_path, handlers) as node:
+        address = NodeAddress("sags", node.connection.data[0], node.connection.control, tmp_path)
+        with overlay(tmp_path, node=address, max_age=5.0) as (_, watcher):  # the clock is known before
+            with stream(node, lambda i: at_frame(held, i, time.time_ns())):
+                until(lambda: watcher.status().get("state") == "running")
+            back_ns = 3_600_000_000_000
+            with repeating(lambda i: node.poll(10)):
+                until(lambda: watcher.status()["state"] == "blank")
 
 
 def until_blank(watcher: Watcher) -> tuple[ReceivedImage, ReceivedImage]:

@@ -314,7 +314,7 @@ class _Overlay:
         if shown_ns is None:
             stale = self._stale() if self._source is not None else None  # before, nothing could be
             self._stream.blank(stale or self._stream.reason or "waiting for the node")
-        elif (self._node.now_ns() - shown_ns) * 1e-9 > self._options.max_age:
+        elif max((self._node.now_ns() - shown_ns) * 1e-9, self._stream.shown_for) > self._options.max_age:
             self._stream.blank(self._stale() or "no whole frame came")
 
     # ---- what is said --------------------------------------------------------------------------------------

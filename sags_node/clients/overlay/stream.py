@@ -52,10 +52,16 @@ class OverlayStream(Closes):
             "waiting for the node"  # why nothing is shown; None: the last picture sent is an overlay
         )
         self.shown_ns: int | None = None  # capture time of the frame shown last, while it is shown
+        self._shown_at = 0.0  # s, by a clock that nobody sets
 
     @property
     def endpoints(self) -> list[str]:
         return self._publisher.connection.data
+
+    @property
+    def shown_for(self) -> float:
+        """Seconds since the last frame was shown, whatever became of the wall clock."""
+        return time.monotonic() - self._shown_at
 
     def serve(self) -> None:
         """Take note of who has come and gone."""
@@ -74,6 +80,7 @@ class OverlayStream(Closes):
         An eye that has no picture gets an empty one.
         """
         self.reason, self.shown_ns, self._epoch = None, stamp_ns, epoch
+        self._shown_at = time.monotonic()
         self._size = next(iter(pictures.values())).shape[:2]
         for eye in EYES:
             if self.wants(eye):
