@@ -126,17 +126,30 @@ def _one_message(ctx: click.Context) -> Iterator[None]:
         said = f"{error.name} is not installed: this is for a client; for all of it {install('node')}"
         if library is not None:
             said = f"{library[1]} is missing on this system; sags doctor says which package has it"
-    except OSError as error:
-        if error.errno in CLOSED and error.filename is not None:
-            said, code = f"cannot open {error.filename}: {error.strerror}; check the path and your rights", 2
-        elif error.errno in NO_ROOM:
-            said, code = f"cannot write {error.filename or 'what was asked for'}: {error.strerror}", 1
-        else:
+    except Exception as error:
+        if (refused := _of_the_system(error)) is None:
             raise
+        said, code = refused
     if console.quiet:
         log.error("%s", said)
     console.print(f"[red]error:[/] {escape(said)}", soft_wrap=True)
     ctx.exit(code)
+
+
+def _of_the_system(error: Exception) -> tuple[str, int] | None:
+    """What this machine refuses, in words, and the exit code; a ZMQError is no OSError."""
+    number, file = getattr(error, "errno", None), getattr(error, "filename", None)
+    if number in CLOSED and file is not None:
+        return f"cannot open {file}: {os.strerror(number)}; check the path and your rights", 2
+    if number in NO_ROOM:
+        return f"cannot write {file or 'what was asked for'}: {os.strerror(number)}", 1
+    if number in (errno.EMFILE, errno.ENFILE):
+        return "too many open files; let this process open more, e.g. ulimit -n 1024", 1
+    if isinstance(error, MemoryError) or number == errno.ENOMEM:
+        return f"no memory is left{f' ({error})' if str(error) else ''}; end others, or see ulimit -v", 1
+    if str(error) == "can't start new thread":
+        return f"{error}; see ulimit -u and ulimit -v, or a container's limit of processes and memory", 1
+    return None
 
 
 def sags_group(function: Callable[..., None]) -> Sags:

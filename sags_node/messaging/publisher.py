@@ -2,6 +2,7 @@
 
 import logging
 import os
+import resource
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -38,6 +39,7 @@ MAX_THIN_NAME = 120  # bytes; a longer one is none, and is not answered
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
 EARLY_PICTURE = "left/image_rect_color"
 LOOK_SECONDS = 1.0  # between looks whether a client can still find this node
+ENOUGH_FILES = 512  # open at once; two sockets of 64 peers take 256, and a flood is told too late for fewer
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
@@ -110,6 +112,8 @@ class Publisher(Closes):
         self._has_ipc = config.ipc
         self._next_look = 0.0  # at the run directory
         self._seldom = RateLimitedLog()
+        if (most := resource.getrlimit(resource.RLIMIT_NOFILE)[0]) < ENOUGH_FILES:
+            log.warning("this process may open %d files only, and many clients end it; ulimit -n 1024", most)
         self._context = zmq.Context()
         try:
             gate = self._resources.enter_context(authenticated(self._context, config))

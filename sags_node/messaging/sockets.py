@@ -72,8 +72,9 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | 
         ours = dict.fromkeys(("publish.data", "publish.control"), OWN_SOCKETS)
         examples = ours | {"--endpoint": "--endpoint tcp://127.0.0.1:5560"}
         hint = f"choose another, e.g. {examples.get(option, f'{option}:=tcp://127.0.0.1:5561')}"
-        reason = "already in use" if error.errno == errno.EADDRINUSE else f"cannot be bound: {error.strerror}"
-        raise SagsError(f"{endpoint} is {reason}; {hint}") from None
+        taken = error.errno == errno.EADDRINUSE
+        reason = "is already in use" if taken else f"cannot be bound: {error.strerror}"
+        raise SagsError(f"{endpoint} {reason}; {hint}") from None
     bound = socket.getsockopt_string(zmq.LAST_ENDPOINT)
     if ipc:
         os.chmod(bound.removeprefix("ipc://"), 0o600)

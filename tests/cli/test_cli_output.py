@@ -2,11 +2,14 @@
 
 import json
 import logging
+import os
 import re
+import resource
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from ctypes.util import find_library
 from datetime import datetime
@@ -15,7 +18,9 @@ from typing import Any
 from unittest.mock import Mock
 
 import click
+import numpy as np
 import pytest
+import zmq
 from command_line import pure_json, refused, sags
 from onnx_networks import save_matcher
 from places import ROOT
@@ -23,7 +28,7 @@ from rich.markup import escape
 from user_files import videos
 
 from sags_node.cli.launching import write_json
-from sags_node.cli.main import main
+from sags_node.cli.main import main, sags_group
 from sags_node.errors import SagsError
 from sags_node.files import check_file, check_results, whole
 from sags_node.terminal import console as terminal
@@ -306,6 +311,44 @@ def test_a_missing_library_of_the_system_is_one_message(monkeypatch: pytest.Monk
     error = ImportError("libidn2.so.0: cannot open shared object file: No such file or directory")
     monkeypatch.setattr("sags_node.tools.doctor.examine", Mock(side_effect=error))
     refused(2, "doctor", said=("libidn2.so.0 is missing on this system; sags doctor says which package",))
+
+
+def _a_thread() -> None:
+    before = threading.stack_size(1 << 46)  # bytes: more than there are addresses
+    try:
+        threading.Thread(target=print).start()
+    finally:
+        threading.stack_size(before)
+
+
+@pytest.mark.fault("process: it may open no more files, start no more threads or take no more memory")
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        ("file", "ulimit -n"),
+        ("socket", "ulimit -n"),
+        (_a_thread, "ulimit -u"),
+        (lambda: np.empty(1 << 50), "ulimit -v"),
+    ],
+)
+def test_what_a_limit_refuses_is_one_message(ask: Any, said: str) -> None:
+    @click.command()
+    def greedy() -> None:
+        ask()
+
+    command = sags_group(lambda verbose, form: None)
+    command.add_command(greedy)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with zmq.Context() as context, context.socket(zmq.PUB):
+        ask = {"file": lambda: open(os.devnull), "socket": lambda: context.socket(zmq.SUB)}.get(ask, ask)
+        try:
+            if said == "ulimit -n":
+                resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+            result = sags("greedy", command=command)
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert result.exit_code == 1 and said in result.stderr
+    assert result.stderr.count("error:") == len(result.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize("file", ["Makefile", "README.md", "examples/container/Containerfile"])

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import resource
 import shlex
 import shutil
 import stat
@@ -124,6 +125,19 @@ def test_one_name_one_node(tmp_path: Path) -> None:
                 assert len(second.connection.data) == 2 and second.connection.control not in (None, control)
     with publisher(tmp_path / "run"):
         pass
+
+
+@pytest.mark.fault("process: it may open fewer files than its clients need")
+def test_a_limit_of_files_that_clients_may_reach_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (publishing.ENOUGH_FILES - 1, before[1]))
+        with publisher(tmp_path / "run"):
+            assert "ulimit -n" in caplog.text
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
 def test_an_open_run_directory_is_refused(tmp_path: Path) -> None:
