@@ -15,7 +15,7 @@ from zmq.utils.monitor import recv_monitor_message
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.rundir import read_connection
 from sags_node.messaging.security import KeyPair, public_key, read_key_pair
-from sags_node.messaging.sockets import HANDSHAKES
+from sags_node.messaging.sockets import HANDSHAKES, HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS
 
 HANDSHAKE_MS = 5000
 LOOK_S = 0.1  # between looks for a node that is not there
@@ -170,6 +170,8 @@ def connect(socket: zmq.Socket[bytes], address: Address, max_message_bytes: int)
     endpoint = address.endpoint
     socket.setsockopt(zmq.MAXMSGSIZE, max_message_bytes)
     socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+    socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)  # a machine without power closes no connection
+    socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.IPV6, int("[" in endpoint))
     if address.keys is not None:

@@ -10,7 +10,7 @@ import zmq
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging import cdr, topics, wire
 from sags_node.messaging.address import Address, HandshakeWatch, NodeAddress, connect
-from sags_node.messaging.sockets import HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS, receive_frames
+from sags_node.messaging.sockets import receive_frames
 
 MAX_MESSAGE_BYTES = 128 << 20  # of one part: a 4096 x 4096 picture of 8 bytes a pixel
 RECEIVE_HIGH_WATER = 32
@@ -46,8 +46,6 @@ def data_socket(
     try:
         socket = context.socket(zmq.SUB)
         socket.setsockopt(zmq.RCVHWM, high_water)
-        socket.setsockopt(zmq.HEARTBEAT_IVL, HEARTBEAT_MS)  # a machine without power closes no connection
-        socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, HEARTBEAT_TIMEOUT_MS)
         for prefix in prefixes:
             socket.setsockopt_string(zmq.SUBSCRIBE, prefix)
         yield socket, connect(socket, address, MAX_MESSAGE_BYTES)

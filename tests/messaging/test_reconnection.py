@@ -16,7 +16,7 @@ from synthetic import publisher, stream
 from waiting import until
 
 from sags_node.errors import SagsError, UsageError
-from sags_node.messaging import stream as data_stream
+from sags_node.messaging import address
 from sags_node.messaging.control import ControlClient
 from sags_node.messaging.subscriber import Subscriber
 
@@ -65,13 +65,20 @@ def test_a_killed_node_is_followed(tmp_path: Path, by_file: bool, ipc: bool, mov
         assert subscriber.lost("tf") == 0
 
 
-@pytest.mark.fault("socket: the cable is cut")
+def _answers(asker: ControlClient) -> bool:
+    try:
+        return asker.request("ping", timeout=0.5) == "pong"
+    except SagsError:
+        return False
+
+
+@pytest.mark.fault("socket: the cable is cut, that of requests too")
 def test_a_connection_that_died_without_a_word_is_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A machine that lost its power closes nothing: only a missing heartbeat tells."""
-    monkeypatch.setattr(data_stream, "HEARTBEAT_MS", 100)
-    monkeypatch.setattr(data_stream, "HEARTBEAT_TIMEOUT_MS", 300)
+    monkeypatch.setattr(address, "HEARTBEAT_MS", 100)
+    monkeypatch.setattr(address, "HEARTBEAT_TIMEOUT_MS", 300)
     with publisher(tmp_path / "run", ipc=False) as running, stream(running):
         with Cable(running.connection.data[0]) as cable:
             with Subscriber(["tf"], endpoint=cable.endpoint) as subscriber:
@@ -81,6 +88,11 @@ def test_a_connection_that_died_without_a_word_is_made_anew(
                 until(lambda: not subscriber.ok("tf"))
                 until(lambda: subscriber.ok("tf"))
                 assert cable.connections > before
+        with Cable(str(running.connection.control)) as cable, ControlClient(cable.endpoint) as asker:
+            assert asker.request("ping", timeout=30) == "pong"
+            cable.cut()
+            until(lambda: _answers(asker))
+            assert cable.connections == 2
 
 
 def test_a_node_that_wants_keys_after_its_restart_says_so(tmp_path: Path) -> None:
