@@ -563,6 +563,15 @@ class RobotPoses(Section):
     )
     tools: tuple[RobotTool, ...] = Field((), max_length=8, description="tools whose tips come from the robot")
 
+    @model_validator(mode="after")
+    def _a_topic_each(self) -> Self:
+        names = [getattr(self, "topic", None), *(tool.topic for tool in self.tools)]
+        topics = ["/" + name.lstrip("/") for name in names if name is not None]
+        if len(set(topics)) < len(topics):
+            twice = max(topics, key=topics.count)
+            raise ValueError(f"{twice} is named twice: the scope and each tool have a topic of their own")
+        return self
+
 
 class Ros2Robot(RobotPoses, RosGraph):
     """Live poses of a ROS 2 graph."""

@@ -13,7 +13,17 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import RUN_HERE, figures_of, pure_json, refused, sags, start, stopped, wait_for
+from command_line import (
+    RUN_HERE,
+    figures_at_last,
+    figures_of,
+    pure_json,
+    refused,
+    sags,
+    start,
+    stopped,
+    wait_for,
+)
 from places import ROOT
 from waiting import heard, until
 
@@ -205,8 +215,8 @@ def test_overlay_in_words_and_in_json(beside_node: dict[str, Any], tmp_path: Pat
 
 def test_anchors_are_pinned_listed_and_removed(beside_node: dict[str, Any]) -> None:
     assert "no anchors; pin one" in sags("anchor", "list").stdout
-    first = figures_of("anchor", "pin", "160", "128", "--json")["id"]
-    assert f"anchor {first + 1} in frame" in sags("anchor", "pin", 150.5, 120).stdout
+    first = figures_at_last("anchor", "pin", "160", "128", "--json")["id"]
+    until(lambda: f"anchor {first + 1} in frame" in sags("anchor", "pin", 150.5, 120).stdout)
     rows = {row["id"]: row for row in figures_of("anchor", "list", "--json")}
     while first + 1 not in rows:  # it comes with the next frame
         rows = {row["id"]: row for row in figures_of("anchor", "list", "--json")}
@@ -222,11 +232,14 @@ def test_anchors_are_pinned_listed_and_removed(beside_node: dict[str, Any]) -> N
 def test_the_example_follows_a_point_and_removes_it(beside_node: dict[str, Any]) -> None:
     """examples/follow_point.py, as its first lines say."""
     command = [sys.executable, ROOT / "examples/follow_point.py", "160", "128", "--frames", "5"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert len(re.findall(r"^pixel \d+\.\d \d+\.\d  -?0\.\d{4} ", done.stdout, re.MULTILINE)) == 5, (
-        done.stdout
-    )
+
+    def followed() -> bool:
+        """In five frames; a node that missed many says that depth is a guess."""
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+        return len(re.findall(r"^pixel \d+\.\d \d+\.\d  -?0\.\d{4} ", done.stdout, re.MULTILINE)) == 5
+
+    until(followed)
     while figures_of("anchor", "list", "--json"):  # it goes with the next frame
         pass
 

@@ -158,6 +158,8 @@ def test_a_mistake_is_named_with_its_fix(override: str, said: str) -> None:
         ("robot: {kind: foo}", "robot.kind: should be one of 'ros2', 'push', 'bag'"),
         ("source: {kind: folders, left: a, poses: b}\nrobot: {kind: push}", "source.poses too: leave one"),
         ("robot: {kind: bag, hand_eyes: a}", "robot.hand_eyes.; did you mean .hand_eye."),
+        ("robot: {kind: ros2, topic: a, tools: [{topic: /a}]}", "/a is named twice: the scope and each tool"),
+        ("robot: {kind: push, tools: [{topic: b}, {topic: /b}]}", "/b is named twice"),
     ],
 )
 def test_files_that_are_no_launch_files(tmp_path: Path, content: str, said: str) -> None:

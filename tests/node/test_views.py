@@ -241,7 +241,7 @@ def test_what_is_wrong_with_a_request_is_said(node: RunningNode, control: Contro
         ("open_view", {"name": "a", "width": 4000}, "1920"), ("close_view", {"name": "a"}, "open are: none"),
     ):  # fmt: skip
         with pytest.raises(SagsError, match=message):
-            control.request(op, args)
+            control.request(op, args, timeout=60)
     assert control.request("get_status")["views"] == {}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from bridging import anchored_at, sockets
-from command_line import figures_of, refused
+from command_line import figures_at_last, refused
 from running_node import RunningNode
 from synthetic import stream
 from test_overlay import overlay
@@ -264,7 +264,7 @@ def written(organ: Organ, folder: Path) -> Path:
 def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, files: Path) -> None:
     scene = files / "scene.yaml"
     given = (files / "organ.ply", "--points", files / "pairs.yaml", "-o", scene, "--run-dir", node.run_dir)
-    said = figures_of("register", *given, "--json")
+    said = figures_at_last("register", *given, "--json")
     thing = read_scene(scene).objects[0]
     kept = thing.registration and thing.registration.model_dump()
     assert kept == {key: said[key] for key in said if key != "scene"}

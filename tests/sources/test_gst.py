@@ -121,10 +121,10 @@ def test_a_pipeline_that_fails_is_started_again_and_it_is_told(
 ) -> None:
     frames: list[StereoFrame] = []
     with open_pipeline(config) as source, beside(lambda: frames.extend(source), source.stop):
+        until(lambda: re.search(said, caplog.text))
         until(lambda: "GStreamer is open again" in caplog.text)
         come = len(frames)
         until(lambda: len(frames) > come)
-    assert re.search(said, caplog.text)
 
 
 def test_network_cameras_over_rtsp() -> None:
