@@ -49,6 +49,7 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "red_blue_exchanged": "source",
     "no_frames": "source",
     "source_drops": "source",
+    "sent_refused": "source",
     "two_senders": "source",
     "frames_missed": "capture",
     "mapping_hangs": "capture",

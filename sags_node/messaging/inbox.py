@@ -99,6 +99,7 @@ class Inbox:
         self._senders: dict[bytes, _Sender] = {}
         self._holders: dict[str, _Holder] = {}
         self._two = "", -ALONE_S  # what two programs sent, and when the second one last did
+        self._refused = "", -ALONE_S  # why something was, and when
         self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
         self._resources = ExitStack()
@@ -123,8 +124,10 @@ class Inbox:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Return what is wrong with who sends, and how to fix it. May be read from any thread."""
-        said, when = self._two
-        return (Finding("two_senders", said),) if time.monotonic() - when < 2 * ALONE_S else ()
+        for code, (said, when) in (("two_senders", self._two), ("sent_refused", self._refused)):
+            if time.monotonic() - when < 2 * ALONE_S:
+                return (Finding(code, said),)
+        return ()
 
     def close(self) -> None:
         """End the thread and close the socket."""
@@ -197,8 +200,10 @@ class Inbox:
     def _refuse(self, sender: _Sender, why: str) -> None:
         sender.refused += 1
         sender.problem = why
+        said = f"{self._section} {self.endpoint}: left out: {why}"
+        self._refused = said, time.monotonic()
         if self._seldom.due():
-            log.warning("%s %s: left out: %s", self._section, self.endpoint, why)
+            log.warning("%s", said)
 
     def _tell(self) -> None:
         now = time.monotonic()

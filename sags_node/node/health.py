@@ -21,6 +21,7 @@ MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less of
 BACK_AT = 0.8  # of that: a warning ends
 DRAWN = 0.05  # of the tissue, at least: with less nothing is shown
 EVERY = 8  # px: what is drawn is looked at
+WHY_NONE = {"calibration_changed", "sent_refused"}  # these say why no frame comes
 LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is none that is too long
 
 
@@ -191,7 +192,7 @@ class Statistics:
         if state == "waiting" and working > WAITING_AFTER:
             said = f"one frame has been worked on for {working:.0f} s, as {missed}"
             found.append(Finding("mapping_hangs", f"{said}; if it stays, restart the node"))
-        elif state == "waiting" and "calibration_changed" not in by_code(known):  # which is why
+        elif state == "waiting" and not WHY_NONE & by_code(known).keys():
             said = f"no frame for {now - self._published[-1]:.0f} s" if self._published else "no frame comes"
             found.append(Finding("no_frames", f"{said}: {self._nothing_comes}"))
         if state == "running" and now - self._drawn > WAITING_AFTER:

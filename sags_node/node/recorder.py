@@ -355,8 +355,8 @@ def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
     if missing:
         yield Finding(
             "recording_loses",
-            f"{missing} messages are missing in {folder}: the disk or the machine is too slow; record fewer "
-            "topics, or with compression jpeg",
+            f"{missing} messages are missing in {folder}: the disk, the machine or the network is too slow, "
+            "or was away; record fewer topics, or with compression jpeg",
         )
     if summary["rejected"]:
         yield Finding(

@@ -138,8 +138,8 @@ class SentPictures(LivePairs):
         if self._own:
             return self._own_on_wall(eye, stamp_ns, arrival_ns)
         age = arrival_ns - stamp_ns
-        self._age_ns += SMOOTHED * (age - self._age_ns)
         if -AHEAD_NS <= age <= OLDEST_NS:
+            self._age_ns += SMOOTHED * (age - self._age_ns)
             return stamp_ns
         way = "old" if age > 0 else "ahead of this machine's clock"
         raise SagsError(

@@ -139,6 +139,7 @@ def test_wrong_sizes_damaged_files_and_messages_are_told_and_do_no_harm(source: 
         with FrameSender(source.endpoint) as sender:
             assert "320x120 px, it must be 160x120" in sent_until_told(sender, *[numbered(1, 320)] * 2)
             assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
+        until(lambda: [finding.code for finding in source.findings] == ["sent_refused"])
         assert stranger.poll(60_000)
 
 

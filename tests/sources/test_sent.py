@@ -1,5 +1,6 @@
 """What is common to pictures that other programs send: their stamps, their loss, their clock."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -81,8 +82,9 @@ def test_what_helps_depends_on_where_pictures_come_from(
     now += 1.0
     warnings = by_code(statistics.health({}, False, False, None, {}, {}, {}).warnings)
     assert warnings["no_frames"] == f"no frame comes: {said}"
-    why = by_stage([Finding("calibration_changed", "the zoom was turned")])
-    assert statistics.health({}, False, False, None, why, {}, {}).warnings == why, "it says it already"
+    for code in ("calibration_changed", "sent_refused"):
+        why = by_stage([Finding(code, "the zoom was turned")])
+        assert statistics.health({}, False, False, None, why, {}, {}).warnings == why, "it says it already"
 
 
 @pytest.mark.fault("stamp: 3.2 s old, or 0.5 s ahead")
@@ -91,6 +93,18 @@ def test_a_wrong_stamp_is_refused_with_its_age(age: float, said: str) -> None:
     sent = SentPictures(PushSource(), None)
     with pytest.raises(SagsError, match=f"{said}.*source.stamps:=own"):
         sent.put("left", 100 * S, round((100 + age) * S), picture)
+
+
+@pytest.mark.fault("stamp: an hour ahead or back for a second, then right again")
+@pytest.mark.parametrize("jump", [3600 * S, -3600 * S])
+def test_the_age_of_what_was_refused_is_not_told_of_what_comes_after(jump: int) -> None:
+    sent = SentPictures(PushSource(), None)
+    for number in range(-30, WINDOW):
+        stamp = number * PERIOD + (jump if number < 0 else 0)
+        for eye in ("left", "right"):
+            with nullcontext() if number >= 0 else pytest.raises(SagsError, match=r"3[56]\d\d\.\d s"):
+                sent.put(eye, stamp, number * PERIOD, picture)
+        assert sent.slowness() is None
 
 
 def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:
