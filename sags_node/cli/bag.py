@@ -233,6 +233,7 @@ def _recorded(launch: Sequence[str], options: RecordOptions) -> dict[str, Any]:
 @click.option("-m", "--remap", multiple=True, metavar="OLD:=NEW", help="Publish under another name.")
 @shown("--endpoint", default="tcp://127.0.0.1:5556", help="Where to publish.")
 @shown("--ns", default="sags", help="Namespace of the topics.")
+@path_option("--run-dir", metavar="FOLDER", help="Where consumers find it; default: your own.")
 @as_json
 def play(
     path: Path,
@@ -242,6 +243,7 @@ def play(
     remap: tuple[str, ...],
     endpoint: str,
     ns: str,
+    run_dir: Path | None,
     json_out: bool,
     **how: Any,
 ) -> None:
@@ -265,11 +267,16 @@ def play(
         remap=remappings(remap, ns),
         **how,
     )
-    player = Player(path, options, PublishConfig(data=(endpoint,), control=None), ns, start_paused)
+
+    def ready(endpoints: Sequence[str]) -> None:
+        where = ", ".join(endpoints)
+        console.print(escape(f"publishing {path} on {where} as {ns}/...  (Ctrl-C ends)"), soft_wrap=True)
+
+    config = PublishConfig(data=(endpoint,), control=None, run_dir=run_dir)
+    player = Player(path, options, config, ns, start_paused)
     on_stop_signals(player.stop)
     _on_lines(player.toggle_pause)
-    console.print(escape(f"publishing {path} on {endpoint} as {ns}/...  (Ctrl-C ends)"), soft_wrap=True)
-    summary = player.play()
+    summary = player.play(ready)
     show(summary if json_out else f"{summary['messages']} messages in {summary['seconds']} s")
 
 

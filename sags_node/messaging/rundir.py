@@ -19,6 +19,7 @@ from sags_node.messaging.sockets import OWN_SOCKETS
 
 MAX_CONNECTION_FILE_BYTES = 16384
 MAX_UNIX_SOCKET_PATH = 107  # bytes, sun_path of Linux without its final zero
+OPTION = "publish.run_dir (sags bag play: --run-dir)"
 
 
 class NoNodeError(SagsError):
@@ -50,17 +51,14 @@ def private_directory(path: Path) -> Path:
     Raises:
         UsageError: it is a link, belongs to somebody else or is open to others, or cannot be made.
     """
+    other = f"choose another with {OPTION}"
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         info = path.lstat()
     except OSError as error:
-        raise UsageError(
-            f"run directory {path}: {error.strerror}; choose another with publish.run_dir"
-        ) from None
+        raise UsageError(f"run directory {path}: {error.strerror}; {other}") from None
     if not stat.S_ISDIR(info.st_mode) or info.st_uid != os.getuid():
-        raise UsageError(
-            f"run directory {path} is not a directory of yours; choose another with publish.run_dir"
-        )
+        raise UsageError(f"run directory {path} is not a directory of yours; {other}")
     if info.st_mode & 0o077:
         raise UsageError(
             f"run directory {path} is open to other users; run: chmod 700 {shlex.quote(str(path))}"
@@ -126,9 +124,7 @@ class RunDirectory:
             UsageError: the path is too long for a Unix socket.
         """
         if len(os.fsencode(self.ipc_path)) > MAX_UNIX_SOCKET_PATH:
-            raise UsageError(
-                f"{self.ipc_path} is too long for a socket; set publish.run_dir or publish.ipc:=false"
-            )
+            raise UsageError(f"{self.ipc_path} is too long for a socket; set {OPTION} or publish.ipc:=false")
         return f"ipc://{self.ipc_path}"
 
     def write_connection(self, connection: Connection) -> None:

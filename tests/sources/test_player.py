@@ -1,6 +1,7 @@
 """A recording that is played again: for subscribers it is a node."""
 
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -109,6 +110,16 @@ def test_a_taken_port_is_named_with_the_option_that_takes_another(plane_bag: Pat
     assert (
         f"{taken} is already in use; choose another, e.g. --endpoint tcp://127.0.0.1:5560" in refused.output
     )
+    assert "publishing" not in refused.output
+
+
+def test_it_says_where_it_publishes_and_how_to_choose_another_place(plane_bag: Path, tmp_path: Path) -> None:
+    at = ("bag", "play", plane_bag, "--endpoint", "tcp://127.0.0.1:*", "--run-dir")
+    played = sags(*at, tmp_path / "run")
+    said = rf"on ipc://{tmp_path}/run/sags.ipc, tcp://127.0.0.1:\d+ as sags"
+    assert played.exit_code == 0 and re.search(said, played.stderr)
+    refused = sags(*at, plane_bag / "metadata.yaml")
+    assert refused.exit_code == 2 and "--run-dir" in refused.stderr and "publishing" not in refused.stderr
 
 
 def cdr_of(received: Any) -> bytes:

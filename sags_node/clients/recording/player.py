@@ -6,7 +6,7 @@ import threading
 import time
 import uuid
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -131,8 +131,11 @@ class Player:
     def toggle_pause(self) -> None:
         self._paused = not self._paused
 
-    def play(self) -> dict[str, Any]:
+    def play(self, ready: Callable[[Sequence[str]], None] = lambda endpoints: None) -> dict[str, Any]:
         """Publish until the bag ends or `stop`; returns messages, passes and seconds.
+
+        Args:
+            ready: called once with the endpoints, when clients can connect.
 
         Raises:
             UsageError: there is no bag, its name is no text, it has no topic of a name that was given, or an
@@ -154,6 +157,7 @@ class Player:
         )
         self._check_names()
         with Publisher(self._config, self._ns, session, offered=offered, recording=recording) as publisher:
+            ready(publisher.connection.data)
             self._delay(publisher)
             while not self._stopping.is_set():
                 self._play_once(publisher)
