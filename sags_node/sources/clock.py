@@ -39,8 +39,9 @@ class CaptureClock:
         """A picture of the sender's time `stamp_ns` arrived at `arrival_ns`, wall clock."""
         difference = arrival_ns - stamp_ns
         with self._lock:
-            if stamp_ns < self._last - STARTED_NS:
-                self._bins.clear()  # it was set back, or the sender was started anew
+            set_on = bool(self._bins) and difference < self._offset_at(stamp_ns) - SET_NS
+            if set_on or stamp_ns < self._last - STARTED_NS:
+                self._bins.clear()  # it was set, or the sender was started anew: no slope leads over that
                 self._slow.clear()
             elif self._bins and stamp_ns < self._last:
                 return  # a picture that was overtaken tells nothing that those before it did not

@@ -243,6 +243,18 @@ def test_a_clock_that_was_set_is_followed_within_three_seconds(jump: int) -> Non
     assert clock.to_wall(33 * S + jump) == pytest.approx(40 * S + 2 * MS, abs=MS)
 
 
+@pytest.mark.fault("clock: a sender's is set forward, by half a second to an hour")
+@pytest.mark.parametrize("jump", [S // 2, 3 * S, 3600 * S])
+def test_a_jump_is_no_drift(jump: int) -> None:
+    """A slope over it would let stamps stand still, and no picture would be newer than the one before."""
+    clock = CaptureClock()
+    watched(clock, 15, 0)
+    for second in range(30):
+        stamp = (15 + second) * S + jump
+        watched(clock, 1, 0, offset=7 * S - jump, begun=stamp)
+        assert clock.to_wall(stamp + S) == pytest.approx((23 + second) * S + 2 * MS, abs=MS)
+
+
 def test_a_slow_way_is_no_clock_that_was_set_for_ten_seconds() -> None:
     clock = CaptureClock()
     watched(clock, 30, 0)
