@@ -5,7 +5,9 @@ Files that we make: each appears when all of it is there, and takes the place of
 
 import difflib
 import errno
+import fcntl
 import json
+import logging
 import os
 import stat
 import tempfile
@@ -19,6 +21,7 @@ from sags_node.errors import SagsError, UsageError, brief
 SHOWN = "[!.]*"  # no hidden files: macOS puts `._NAME` beside each on foreign disks
 NO_TEXT = "holds bytes that are no UTF-8 text, so no other program can be told of it: rename it"
 LARGEST_RESULT = 64 << 20  # bytes of figures as JSON
+log = logging.getLogger(__name__)
 _checked: set[Path] = set()  # asked for without --force: what comes there before `whole` has ended stays
 _KINDS = (
     (stat.S_ISDIR, "it is a folder"),
@@ -143,6 +146,27 @@ def check_folder(folder: Path) -> None:
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """No second program that asks this writes into the folder meanwhile, as far as its disk has locks.
+
+    Raises:
+        UsageError: another one does.
+    """
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            said = f"another program writes into {folder}; wait for its end, or name another folder"
+            raise UsageError(said) from None
+        except OSError as error:  # disks of a network need not lock folders
+            log.debug("%s is not locked: %s", folder, error)
+        yield
+    finally:
+        os.close(opened)
 
 
 def check_file(file: Path, force: bool | None = None) -> None:

@@ -25,6 +25,7 @@ from sags_node.cli.launching import (
     write_json,
 )
 from sags_node.errors import UsageError
+from sags_node.files import alone
 from sags_node.terminal.console import console, progress, show
 from sags_node.tools.evaluation.plots import check_plots
 
@@ -233,7 +234,7 @@ def fit(
     check_fit(out)
     device = device_of(load_launch(path, overrides).device, settings.schedule)
     session = open_launched(path, [*overrides, f"device:={device or 'cpu'}", *STEPWISE])
-    with progress("fitting") as advance:
+    with alone(out), progress("fitting") as advance:
         found = fit_session(session, settings, options, out, resume, advance, device)
     if json_out:
         show(found)

@@ -20,6 +20,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.field.decoder import Decoder
 from sags_node.field.losses import LossWeights, compare
 from sags_node.field.model import FADE_NS, LOOK_BACK_NS
+from sags_node.files import alone
 from sags_node.geometry import quat_to_matrix, transform
 from sags_node.kernels.threads import configure_threads
 from sags_node.model import columns
@@ -491,6 +492,16 @@ def test_a_folder_holds_one_fit_alone(
         from_fit(out, session, None, lambda done, of, what: None)
     checked(0, "source.frames:=6", "--resume")
     assert left() == results
+
+
+@pytest.mark.fault("process: two fits write into one folder")
+def test_a_second_fit_does_not_mix_its_files_with_those_of_the_first(
+    phantom_session: Path, tmp_path: Path
+) -> None:
+    said = (f"another program writes into {tmp_path}", "name another folder")
+    with alone(tmp_path):
+        refused(2, "fit", phantom_session, "--out", tmp_path, *FRAMES, said=said)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_fit_that_holds_nothing_out_says_what_it_learnt(phantom_session: Path, tmp_path: Path) -> None:
