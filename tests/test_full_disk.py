@@ -145,6 +145,14 @@ def test_a_writer_without_a_command_does_the_same(disk: Path, name: str) -> None
     assert there(disk) <= {"rig", "all"}
 
 
+@pytest.mark.fault("disk: full while an overlay keeps its video")
+def test_a_video_that_gets_no_more_is_told_of_at_once(disk: Path, caplog: pytest.LogCaptureFixture) -> None:
+    fill(disk, 0)
+    with pytest.raises(SagsError, match=NO_SPACE):
+        a_video(disk)
+    assert caplog.messages == [f"{disk / 'x.mp4'} gets no more pictures: {NO_SPACE}; the overlay goes on"]
+
+
 @pytest.mark.fault("disk: full while recording")
 @pytest.mark.usefixtures("run_dir")
 def test_a_recording_keeps_what_it_has(disk: Path, tiny: Path) -> None:

@@ -1,5 +1,6 @@
 """Keeps what `sags overlay` shows, for looking at it later."""
 
+import logging
 import struct
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +15,8 @@ from sags_node.media.video_file import VideoFile
 from sags_node.types import U8
 
 RATE = 30.0  # Hz that the video's header begins with; its pictures have their own stamps
+
+log = logging.getLogger(__name__)
 
 _LAYER = struct.Struct("<5i")  # frame, first row and column, height and width of what follows: RGBA
 
@@ -109,7 +112,7 @@ class Output:
         self.saved: str | None = None  # what has been written
 
     def add(self, picture: U8, with_overlay: bool, stamp_ns: int) -> None:
-        """One picture [H, W, 3] RGB, by when it was captured. What a video then lacks is said by `close`.
+        """One picture [H, W, 3] RGB, by when it was captured. What a video then lacks is told, also by `close`.
 
         Raises:
             SagsError: the video cannot be begun.
@@ -128,7 +131,8 @@ class Output:
             try:
                 self._video.add(picture, stamp_ns)
             except OSError as error:
-                self._failed = error  # the overlay itself goes on
+                self._failed = error
+                log.warning("%s gets no more pictures: %s; the overlay goes on", self._file, error.strerror)
 
     def close(self) -> None:
         """Finish the file.
