@@ -112,7 +112,7 @@ class Output:
         self.saved: str | None = None  # what has been written
 
     def add(self, picture: U8, with_overlay: bool, stamp_ns: int) -> None:
-        """One picture [H, W, 3] RGB, by when it was captured. What a video then lacks is told, also by `close`.
+        """One picture [H, W, 3] RGB, by when it was captured. What a video then lacks is told.
 
         Raises:
             SagsError: the video cannot be begun.
