@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1824,
     "sags_node/tools/importing": 1168,
     "sags_node/vision": 5388,
-    "tests": 49811,
+    "tests": 49847,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
