@@ -13,6 +13,7 @@ the authors' code; softmax over one key is 1, so that MSA is its value layer and
 control nodes are decoded, and every node attends to all of them.
 """
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -147,7 +148,8 @@ class Decoder(nn.Module):
         """UsageError: too many nodes."""
         if self._most is None:
             part = PART if features.device.type == "cpu" else max(1, len(features))
-            return torch.cat([self._decode(each) for each in torch.split(features, part)])
+            decode = self._folded()
+            return torch.cat([decode(each) for each in torch.split(features, part)])
         if len(features) > self._most:
             raise UsageError(
                 f"{len(features)} control nodes are too many to attend to each other; "
@@ -157,8 +159,33 @@ class Decoder(nn.Module):
 
     def _decode(self, features: Tensor) -> Tensor:
         x = gelu(self.embed(features))
-        adapted = self.pre(x)
-        y = self.post(adapted + self.gamma_1 * self.attention(adapted))
+        y = self._mixed(x)
         y = gelu(y + self.gamma_2 * self.mlp(y) + x)
-        last = torch.block_diag(*self.head_out)  # type: ignore[no-untyped-call]
-        return linear(gelu(self.head_in(y)), last, self.head_bias)
+        return linear(gelu(self.head_in(y)), self._last(), self.head_bias)
+
+    def _mixed(self, x: Tensor) -> Tensor:
+        """A_post(y') of tokens x."""
+        adapted = self.pre(x)
+        mixed: Tensor = self.post(adapted + self.gamma_1 * self.attention(adapted))
+        return mixed
+
+    def _last(self) -> Tensor:
+        """The last layers of all heads, [14, heads * width]."""
+        last: Tensor = torch.block_diag(*self.head_out)  # type: ignore[no-untyped-call]
+        return last
+
+    def _folded(self) -> Callable[[Tensor], Tensor]:
+        """`_decode` of tokens that attend to themselves alone: what is affine between two GELUs is multiplied
+        once, instead of for every token. What it makes of unit vectors and of 0 says all."""
+        unit = self.gamma_1.new_zeros(len(self.gamma_1) + 1, len(self.gamma_1)).fill_diagonal_(1)
+        mixed = self._mixed(unit)
+        first, second, skip = self.mlp[0](mixed), self.gamma_2 * self.mlp[2](unit), mixed + unit
+        into, out, along = (each[:-1] - each[-1] for each in (first, second, skip))
+        bias, last = second[-1] + skip[-1], self._last().T
+
+        def decode(features: Tensor) -> Tensor:
+            x = gelu(self.embed(features))
+            y = torch.addmm(bias, x, along).addmm(gelu(torch.addmm(first[-1], x, into)), out)
+            return torch.addmm(self.head_bias, gelu(self.head_in(gelu(y))), last)
+
+        return decode

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sags_node.engine.interface import Rasterizer
 from sags_node.field.canvas import Canvas, smoothing
-from sags_node.model import columns
+from sags_node.field.decoder import HEADS
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.types import F32, I64, Camera, Gaussians
 
@@ -23,13 +23,9 @@ TABLES = ("means", "quats", "scales", "opacities", "colors", "slopes")
 
 def activate(rows: Tensor) -> tuple[Tensor, ...]:
     """Means [N, 3] m, quats [N, 4], scales [N, 3] m, opacities [N] and colours [N, 3] of raw rows [N, 14]."""
-    return (
-        rows[:, columns.MEAN],
-        rows[:, columns.QUAT],
-        rows[:, columns.LOG_SCALE].exp(),
-        rows[:, columns.LOGIT].sigmoid(),
-        rows[:, columns.COLOR],
-    )
+    # Split at once: parts taken one by one would each have a gradient of whole rows
+    means, log_scales, quats, colors, logits = torch.split(rows, list(HEADS.values()), 1)
+    return means, quats, log_scales.exp(), logits[:, 0].sigmoid(), colors
 
 
 def deactivate(gaussians: Gaussians) -> F32:
@@ -41,12 +37,12 @@ def deactivate(gaussians: Gaussians) -> F32:
 
 
 def to_gaussians(
-    rows: Tensor, slopes: Tensor | None, ids: I64, cameras: Sequence[Camera] | None
+    activated: Sequence[Tensor], slopes: Tensor | None, ids: I64, cameras: Sequence[Camera] | None
 ) -> Gaussians:
-    """Rows [N, 14] and slopes [N, 3] as they are drawn; `cameras`: those they were fitted to, for the 3D
-    filter; None: no filter."""
+    """What `activate` returns and slopes [N, 3], as they are drawn; `cameras`: those they were fitted to, for
+    the 3D filter; None: no filter."""
     means, quats, scales, opacities, colors = (
-        np.ascontiguousarray(part.detach().cpu().numpy()) for part in activate(rows)
+        np.ascontiguousarray(part.detach().cpu().numpy()) for part in activated
     )
     return Gaussians(
         means, quats, scales, opacities, colors, ids,
@@ -76,12 +72,13 @@ class Drawing:
         ids: I64,
         cameras: Sequence[Camera] | None,
     ) -> None:
-        """See `to_gaussians`."""
+        """See `to_gaussians`; `rows` [N, 14] are raw."""
+        activated = activate(rows)
         self.rasterizer, self.camera, self.cameras = rasterizer, camera, cameras
         self.weight: Tensor | None = None
         if not isinstance(rasterizer, Canvas):
-            self.gaussians = to_gaussians(rows, slopes, ids, cameras)
-        self.planes: Tensor = _Rasterize.apply(*activate(rows), slopes, self)  # type: ignore[no-untyped-call]
+            self.gaussians = to_gaussians(activated, slopes, ids, cameras)
+        self.planes: Tensor = _Rasterize.apply(*activated, slopes, self)  # type: ignore[no-untyped-call]
 
     def differentiate(self, loss: Tensor | F32, weight: Tensor | F32) -> None:
         """Add the gradients of a loss to all leaves that the drawing came from.

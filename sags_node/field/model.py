@@ -12,7 +12,7 @@ from sags_node.engine.interface import Rasterizer
 from sags_node.field.adam import RowAdam
 from sags_node.field.canvas import Canvas
 from sags_node.field.deformation import Field, FieldRates
-from sags_node.field.drawing import Drawing, to_gaussians
+from sags_node.field.drawing import Drawing, activate, to_gaussians
 from sags_node.model import columns
 from sags_node.model.exposure import Exposure
 from sags_node.types import F32, I64, Bool, Camera, Gaussians
@@ -115,17 +115,14 @@ class DeformableModel:
 
     def _shown(self, rows: Tensor, t_ns: int, cameras: Sequence[Camera]) -> Gaussians:
         exposed, slopes = self._exposed(rows, t_ns)
-        return to_gaussians(exposed, slopes, self.ids, cameras if self.smooth else None)
+        return to_gaussians(activate(exposed), slopes, self.ids, cameras if self.smooth else None)
 
     def _exposed(self, rows: Tensor, t_ns: int) -> tuple[Tensor, Tensor | None]:
         gain = torch.from_numpy(self.exposure.at(t_ns)).to(self.device, non_blocking=True)
-        before, color, after = (
-            rows[:, : columns.COLOR.start],
-            rows[:, columns.COLOR],
-            rows[:, columns.LOGIT :],
-        )
+        gains = rows.new_ones(columns.COUNT)  # of all: parts would each have a gradient of whole rows
+        gains[columns.COLOR] = gain
         slopes = None if self.slopes is None else self.slopes * gain.mean()
-        return torch.cat([before, color * gain, after], 1), slopes
+        return rows * gains, slopes
 
     def descend(self, drawings: Sequence[Drawing], rates: Rates) -> None:
         """One step of Adam on all that the drawings came from, against the gradients they were given.

@@ -175,6 +175,31 @@ def test_who_comes_later_is_told_what_is_missing_too(tmp_path: Path) -> None:
             until(lambda: any("no node" in said.get("message", "").lower() for said in second.said))
 
 
+def test_who_looks_at_everything_is_told_at_once_what_is_missing_and_stays(tmp_path: Path) -> None:
+    """The server disconnects a client for which more statuses wait than there are channels."""
+    with bridged(run_foxglove, options(tmp_path)) as port, Client(port) as first, Client(port) as second:
+        for each in (first, second):
+            until(lambda each=each: "/sags/figures" in each.channels)
+            each.subscribe(*each.channels)
+            until(lambda each=each: each.said)
+        with sockets(tmp_path) as running, stream(running, anchored_at):
+            until(lambda: first.came["/sags/tf"] and second.came["/sags/tf"])
+
+
+def test_an_age_that_grows_is_told_once_a_second(tmp_path: Path) -> None:
+    def ages() -> list[float]:
+        told = (re.search(r"too old: ([\d.]+) s", said.get("message", "")) for said in joined.said)
+        return [float(age[1]) for age in told if age is not None]
+
+    with sockets(tmp_path) as running, bridged(run_foxglove, options(tmp_path)) as port:
+        with Client(port) as joined:
+            joined.subscribe("/sags/anchors")
+            with stream(running, anchored_at):
+                until(lambda: joined.came["/sags/anchors"])
+            until(lambda: len(ages()) > 2)
+    assert np.diff(ages()).min() > 0.9
+
+
 def test_without_pyav_there_is_no_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("av", reason="no H.264 without PyAV")
     assert any(output.name.endswith("/h264") for output in outputs(options(tmp_path)))

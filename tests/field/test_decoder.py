@@ -32,8 +32,9 @@ def features(count: int, seed: int = 1) -> torch.Tensor:
 
 @every_choice
 def test_it_is_the_equation_of_the_paper(tokens: Tokens) -> None:
-    """y' = A_pre(x) + g1 MSA(A_pre(x)),  y = A_post(y') + g2 MLP(A_post(y')) + x; MSA is torch's own."""
-    d, f = trained(tokens), features(9)
+    """y' = A_pre(x) + g1 MSA(A_pre(x)),  y = A_post(y') + g2 MLP(A_post(y')) + x; MSA is torch's own. And its
+    gradient."""
+    d, f = trained(tokens), features(9).requires_grad_()
     w = dict(d.named_parameters())
 
     def layer(x: torch.Tensor, name: str) -> torch.Tensor:
@@ -57,7 +58,17 @@ def test_it_is_the_equation_of_the_paper(tokens: Tokens) -> None:
     y = y + w["gamma_2"] * layer(gelu(layer(y, "mlp.0")), "mlp.2") + x
     hidden = gelu(layer(gelu(y), "head_in")).split(32, 1)
     heads = [linear(part, weights) for part, weights in zip(hidden, d.head_out, strict=True)]
-    assert torch.allclose(d(f), torch.cat(heads, 1) + w["head_bias"], rtol=1e-10, atol=1e-12)
+    found, expected = d(f), torch.cat(heads, 1) + w["head_bias"]
+    assert torch.allclose(found, expected, rtol=1e-10, atol=1e-12)
+    learnt = [f, *w.values()]
+    v = torch.randn(found.shape, generator=torch.Generator().manual_seed(2), dtype=f.dtype)
+    for name, ours, theirs in zip(
+        ("features", *w),
+        torch.autograd.grad(found, learnt, v),
+        torch.autograd.grad(expected, learnt, v),
+        strict=True,
+    ):
+        assert torch.allclose(ours, theirs, rtol=1e-10, atol=1e-12), name
 
 
 @every_choice

@@ -34,7 +34,7 @@ def test_rows_and_gaussians_are_the_same_thing() -> None:
 @pytest.mark.parametrize("smooth", [True, False])
 def test_the_3d_filter_is_that_of_the_deformed_places(smooth: bool) -> None:
     rows, _ = leaves()
-    found = to_gaussians(rows, None, np.arange(60), [VIEW] if smooth else None)
+    found = to_gaussians(activate(rows), None, np.arange(60), [VIEW] if smooth else None)
     expected = smoothing_variances(np.ascontiguousarray(rows.detach()[:, columns.MEAN].numpy()), [VIEW])
     assert found.slopes is None
     if smooth:
@@ -49,7 +49,7 @@ def test_planes_and_gradients_are_those_of_the_rasteriser() -> None:
     v_planes = np.random.default_rng(2).normal(size=(5, 48, 64)).astype(np.float32)
     drawing.differentiate(v_planes, WEIGHT)
     other = make_rasterizer("numba", 64, 48)
-    gaussians = to_gaussians(rows, slopes, np.arange(60), [VIEW])
+    gaussians = to_gaussians(activate(rows), slopes, np.arange(60), [VIEW])
     np.testing.assert_array_equal(drawing.planes.detach().numpy(), other.forward(gaussians, VIEW))
     expected = other.backward(v_planes, WEIGHT)
     np.testing.assert_array_equal(drawing.contribution, expected.contribution)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from synthetic import at_frame, plane_result, publisher, stream
+from synthetic import at_frame, losing_nothing, plane_result, publisher, stream
 from waiting import beside, until
 
 from sags_node.bags.bag import BagMessage, read_messages
@@ -35,7 +35,7 @@ def record_plane(tmp_path: Path, seconds: float = 1.0, **options: Any) -> tuple[
         count = number
         return at_frame(plane, number, time.time_ns())
 
-    with publisher(run_dir, right=True) as running:
+    with losing_nothing(), publisher(run_dir, right=True) as running:
         running.publish_parameters({"seed": 5})
         with stream(running, frame, RATE):
             until(lambda: count > 2)  # the last values are there

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from waiting import repeating
 
 from sags_node.config.schema import PublishConfig
@@ -135,6 +136,15 @@ def health(state: str = "running") -> NodeHealth:
         rss_mb=900.0,
         skipped={"duplicate": 2},
     )
+
+
+@contextmanager
+def losing_nothing() -> Iterator[None]:
+    """By contract a reader that is two frames behind loses messages. Publishers begun within keep all,
+    however busy the machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sags_node.messaging.publisher.SEND_HIGH_WATER", 0)
+        yield
 
 
 @contextmanager

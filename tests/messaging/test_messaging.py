@@ -21,6 +21,7 @@ from synthetic import (
     WIDTH,
     at_frame,
     health,
+    losing_nothing,
     plane_depth,
     plane_instruments,
     plane_result,
@@ -45,14 +46,10 @@ def received(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[client.
     """Five messages of every topic but `parameters`, as the independent client gets them over tcp."""
     names = [t.name for t in topics.TOPICS if t.name != "parameters"]
     run_dir = tmp_path_factory.mktemp("run", numbered=True) / "sags"
-    # By contract a reader that is two frames behind loses messages. These tests are about what the
-    # publisher sends, so its queue holds all of it, however busy the machine is.
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sags_node.messaging.publisher.SEND_HIGH_WATER", 0)
-        with publisher(run_dir) as running, stream(running):
-            endpoint = running.connection.data[-1]
-            assert endpoint.startswith("tcp://")
-            return client.collect(endpoint, names, count=5, timeout=60)
+    with losing_nothing(), publisher(run_dir) as running, stream(running):
+        endpoint = running.connection.data[-1]
+        assert endpoint.startswith("tcp://")
+        return client.collect(endpoint, names, count=5, timeout=60)
 
 
 # ---- what the frame topics say -------------------------------------------------------------------------
@@ -292,9 +289,12 @@ def test_a_subscriber_that_never_reads_harms_nobody(tmp_path: Path) -> None:
     """Publishing goes on, memory stays bounded, and a good peer beside it gets every message."""
     big = plane_result()
     frames = 400
-    with publisher(tmp_path / "run") as running:
-        dead = client.subscribed(running.connection.data[-1], "sags/", high_water=1)
-        with dead, client.subscribed(running.connection.data[0], "sags/tf") as good:
+    with (
+        publisher(tmp_path / "run") as running,
+        client.subscribed(running.connection.data[0], "sags/tf") as good,
+    ):
+        _poll_until(running, lambda: running.wanted("tf"))
+        with client.subscribed(running.connection.data[-1], "sags/", high_water=1):
             _poll_until(running, lambda: running.wanted("splats"))
             before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
             seen = []

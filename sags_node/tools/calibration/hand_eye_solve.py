@@ -8,8 +8,9 @@ base, and the offset, so that the corners of all views fall on those that both e
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import product
 
 import cv2
 import numpy as np
@@ -34,6 +35,9 @@ SCALED = np.append(STEPS, 1e-4)  # and how many times longer the robot's ways ar
 LARGEST_SCALE = 0.02  # robots are off by less, and a page that is printed to fit by more
 BETTER = 0.95  # of the residuals' spread: so much is not by chance
 ROUNDS = 30
+WEIGHINGS = 2
+STILL = np.zeros(6)
+SIZES = (0.0, *np.geomspace(1e-6, 3e-2, 19))  # rad or m, of a robot's error
 UNSURE = (0.005, np.radians(1.0))  # m, rad: beyond it the motion does not tell enough
 LEAST_TURN = np.radians(0.5)  # root mean square: a board's turn is seen to a tenth of it
 _TURN = "turn the scope about two different axes, by 20 degrees and more"
@@ -78,11 +82,13 @@ def solve_hand_eye(
     X = _linear(hands, boards)
     Z = hands[0] @ X @ boards[0]
     residuals = _Residuals(views, stamps, points, rig, known_at, X, Z, offset)
-    parameters, covariance, spread = _least_squares(residuals, STEPS)
+    parameters = np.zeros(len(STEPS))
+    for _ in range(WEIGHINGS):
+        residuals = replace(residuals, weights=_weights(residuals, parameters))
+        parameters, covariance, spread = _least_squares(residuals, STEPS)
     X, _, offset = residuals.unpacked(parameters)
-    corners = residuals(parameters).reshape(-1, 2)
-    ends = np.cumsum([2 * len(view.ids) for view in views])
-    errors = np.array([np.sqrt(np.mean(np.sum(part**2, 1))) for part in np.split(corners, ends[:-1])])
+    corners = residuals.of_corners(parameters)
+    errors = np.array([np.sqrt(np.mean(np.sum(part.reshape(-1, 2) ** 2, 1))) for part in corners])
     if np.sqrt(np.mean(errors**2)) > LARGEST_ERROR:
         raise SagsError(
             f"the poses fit the pictures only to {np.sqrt(np.mean(errors**2)):.1f} px: the board must lie "
@@ -95,7 +101,7 @@ def solve_hand_eye(
             f"the motion does not tell where the camera sits (to {place * 1e3:.1f} mm, "
             f"{np.degrees(turn):.2f} degrees): {_TURN}"
         )
-    _check_scale(residuals, spread)
+    _check_scale(residuals)
     names = [view.name for view in views]
     return HandEyeSolution(HandEye(X, offset), errors, names, float(place), float(turn), float(clock * 1e9))
 
@@ -127,13 +133,18 @@ def _turned_enough(turns: F64) -> None:
         )
 
 
-def _check_scale(residuals: _Residuals, spread: float) -> None:
+def _check_scale(residuals: _Residuals) -> None:
     """
     Raises:
         SagsError: the robot's ways and those in the pictures differ in length: all fits better then. About
             one point alone a scope turns alike at any length.
     """
-    parameters, _, scaled = _least_squares(residuals, SCALED)
+    parameters = _least_squares(residuals, SCALED)[0]
+    if abs(parameters[-1]) <= LARGEST_SCALE:
+        return
+    # What other lengths explain was taken for the robot's error.
+    residuals = replace(residuals, weights=_weights(residuals, parameters))
+    (parameters, _, scaled), (_, _, spread) = (_least_squares(residuals, steps) for steps in (SCALED, STEPS))
     if abs(parameters[-1]) > LARGEST_SCALE and scaled < BETTER * spread:
         raise SagsError(
             f"by the pictures the scope moved {1 + parameters[-1]:.3f} times as far as the robot says: "
@@ -224,7 +235,7 @@ def _linear(hands: F64, boards: F64) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class _Residuals:
-    """How far all corners are from where the parameters put them, px, left eye and right eye.
+    """How far each view is from where the parameters put it, [6 V] in standard deviations.
 
     Parameters [13]: a small motion of the camera on the hand (turn, place), one of the board, and the
     offset's difference from the first one, s; [14]: also by how much longer the robot's ways are.
@@ -238,32 +249,76 @@ class _Residuals:
     X: F64  # where the search begins: camera to hand, board to base, and the offset, ns
     Z: F64
     offset: int
+    weights: Sequence[F64] = ()  # of each view [6, 4 N], see `_weights`
 
     def unpacked(self, parameters: F64) -> tuple[F64, F64, int]:
         X, Z = self.X @ _rigid(parameters[:6]), self.Z @ _rigid(parameters[6:12])
         return X, Z, self.offset + round(parameters[12] * 1e9)
 
     def __call__(self, parameters: F64) -> F64:
+        parts = self.of_corners(parameters)
+        if not parts:  # the search has left what is known: no place for it
+            return np.full(6 * len(self.views), 1e3)
+        return np.concatenate([weight @ part for weight, part in zip(self.weights, parts, strict=True)])
+
+    def of_corners(self, parameters: F64, slip: F64 = STILL) -> list[F64]:
+        """The residuals of each view's corners [4 N], px, left eye and right eye; none: a pose is not known.
+
+        `slip` [6]: turn and place by which the hand is elsewhere than the robot says, in its own axes.
+        """
         X, Z, offset = self.unpacked(parameters)
-        eye_base, parts = invert(X), []
+        eye_base, parts = invert(X) @ invert(_rigid(slip)), []
         for view, stamp in zip(self.views, self.stamps, strict=True):
             hand = self.pose_at(stamp + offset)
-            if hand is None:  # the search has left what is known: no place for it
-                return np.full(sum(4 * len(view.ids) for view in self.views), 1e3)
+            if hand is None:
+                return []
             longer = parameters[len(STEPS) :].sum()
             left = eye_base @ invert(rigid(hand[:3, :3], (1 + longer) * hand[:3, 3])) @ Z
             points = self.points[view.ids].astype(np.float64)
-            for eye, T, seen in (
+            eyes = (
                 (self.rig.left, left, view.left),
                 (self.rig.right, self.rig.T_right_left @ left, view.right),
-            ):
-                drawn, _ = cv2.projectPoints(points, T[:3, :3], T[:3, 3], eye.K, eye.distortion)
-                parts.append((drawn.reshape(-1, 2) - seen).ravel())
-        return np.concatenate(parts)
+            )
+            off = [
+                cv2.projectPoints(points, T[:3, :3], T[:3, 3], eye.K, eye.distortion)[0].reshape(-1, 2) - seen
+                for eye, T, seen in eyes
+            ]
+            parts.append(np.ravel(off))
+        return parts
+
+
+def _weights(residuals: _Residuals, parameters: F64) -> list[F64]:
+    """Find what makes of each view's corners six residuals, of where its hand is, with a variance of 1.
+
+    Such a place is off by the corners' noise, which all of them average, and by the robot's own error, which
+    they share: it has the sizes, of turns and of places, that make the residuals most probable. Taken for
+    noise of the corners it would count some ten times too little.
+    """
+
+    def moved(way: float) -> list[F64]:
+        slips = (residuals.of_corners(parameters, slip) for slip in way * np.eye(6))
+        return [np.stack(view, 1) for view in zip(*slips, strict=True)]
+
+    seen = residuals.of_corners(parameters)
+    J = [(more - less) / 2e-6 for more, less in zip(moved(1e-6), moved(-1e-6), strict=True)]
+    back = [np.linalg.pinv(part) for part in J]
+    off = np.stack([inverse @ part for inverse, part in zip(back, seen, strict=True)])
+    rest = sum(float(np.sum((part - j @ o) ** 2)) for part, j, o in zip(seen, J, off, strict=True))
+    noise = rest / sum(len(part) - 6 for part in seen)  # px^2, of a corner
+    by_corners = noise * np.stack([inverse @ inverse.T for inverse in back])
+
+    def improbable(sizes: tuple[float, float]) -> float:
+        whole = by_corners + np.diag(np.square(np.repeat(sizes, 3)))
+        quadratic = np.einsum("vi,vij,vj->", off, np.linalg.inv(whole), off)
+        return float(np.linalg.slogdet(whole)[1].sum() + quadratic)
+
+    robot = np.diag(np.square(np.repeat(min(product(SIZES, SIZES), key=improbable), 3)))
+    roots = np.linalg.cholesky(np.linalg.inv(by_corners + robot))
+    return [root.T @ inverse for root, inverse in zip(roots, back, strict=True)]
 
 
 def _least_squares(residuals: _Residuals, steps: F64) -> tuple[F64, F64, float]:
-    """Levenberg and Marquardt: parameters [P], their covariance for residuals of 1 px, residuals' spread."""
+    """Levenberg and Marquardt: parameters [P], their covariance for residuals of 1, residuals' spread."""
     parameters, damping = np.zeros(len(steps)), 1e-3
     now = residuals(parameters)
     for _ in range(ROUNDS):
@@ -281,7 +336,7 @@ def _least_squares(residuals: _Residuals, steps: F64) -> tuple[F64, F64, float]:
             damping *= 10
         else:
             break
-        converged = gain < 1e-9 * (now @ now)
+        converged = gain < 1e-6 * (now @ now)
         parameters, now, damping = parameters + change, then, damping * 0.1
         if converged:
             break
