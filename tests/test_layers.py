@@ -49,7 +49,7 @@ LINES = {
     "sags_node/kernels": 1219,
     "sags_node/mapping": 5539,
     "sags_node/media": 910,
-    "sags_node/messaging": 5357,
+    "sags_node/messaging": 5358,
     "sags_node/model": 1078,
     "sags_node/node": 1840,
     "sags_node/phantom": 1554,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1824,
     "sags_node/tools/importing": 1168,
     "sags_node/vision": 5388,
-    "tests": 49904,
+    "tests": 49905,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

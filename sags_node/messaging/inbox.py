@@ -201,7 +201,8 @@ class Inbox:
         sender.refused += 1
         sender.problem = why
         said = f"{self._section} {self.endpoint}: left out: {why}"
-        self._refused = said, time.monotonic()
+        if self._section == "source":  # a robot may send poses that nobody asked for
+            self._refused = said, time.monotonic()
         if self._seldom.due():
             log.warning("%s", said)
 

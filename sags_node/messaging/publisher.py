@@ -39,7 +39,7 @@ MAX_THIN_NAME = 120  # bytes; a longer one is none, and is not answered
 PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
 EARLY_PICTURE = "left/image_rect_color"
 LOOK_SECONDS = 1.0  # between looks whether a client can still find this node
-ENOUGH_FILES = 512  # open at once; two sockets of 64 peers take 256, and a flood is told too late for fewer
+ENOUGH_FILES = 512  # open at once: 64 peers of two sockets take 256
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
@@ -113,7 +113,7 @@ class Publisher(Closes):
         self._next_look = 0.0  # at the run directory
         self._seldom = RateLimitedLog()
         if (most := resource.getrlimit(resource.RLIMIT_NOFILE)[0]) < ENOUGH_FILES:
-            log.warning("this process may open %d files only, and many clients end it; ulimit -n 1024", most)
+            log.warning("only %d files may be open: many clients would end this; ulimit -n 1024 first", most)
         self._context = zmq.Context()
         try:
             gate = self._resources.enter_context(authenticated(self._context, config))

@@ -284,6 +284,7 @@ def test_a_named_topic_is_the_scopes_whoever_speaks_first(tmp_path: Path) -> Non
             for number in range(3):
                 sender.send(np.eye(4), S + number, "ECM/pose")
             until(lambda: robot.track.newest_ns == S + 2 and robot.tools["/pose"].newest_ns == S)
+        assert robot.findings == ()  # what nobody asked for is no warning, and hides none
         assert robot.track.at(S)[0, 3] == 0
         assert robot.tools["/pose"].at(S)[0, 3] == pytest.approx(0.1)
     finally:
