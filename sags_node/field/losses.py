@@ -19,18 +19,16 @@ Beyond the paper's four, with a weight of 0 unless it is set:
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sags_node.field import twins
+from sags_node.field.loss_kernel import COVERED, DEPTH_COVERED, FULL, NEAREST, TERMS, compare_by_kernels
 from sags_node.types import F32, U8, Bool
 
-COVERED = 0.05  # below this coverage the normalised colour means nothing
-DEPTH_COVERED = 0.3  # the same for depth
-FULL = 0.9  # coverage that tissue should reach
-NEAREST = 1e-3  # m: a nearer depth means nothing
 FLAT = 1e-6  # inverse depths whose relative spread is below this have no correlation
 
 
@@ -81,6 +79,8 @@ def compare(
         softness: s of sqrt(d^2 + s^2) - s, which is what a difference d of colours counts (Charbonnier et
             al. 1994): where it is smaller than s by its square, as in PSNR. 0, as in the paper: |d|.
     """
+    if twins.by_kernels(planes) and not (weights.correlation or weights.similarity):
+        return _by_kernels(planes, image, tissue, depth, unseen, weights, softness)
     device = planes.device
     explained, given = torch.as_tensor(tissue, device=device), torch.as_tensor(depth, device=device)
     given, truth = given.to(planes.dtype), torch.as_tensor(image, device=device)
@@ -112,6 +112,33 @@ def compare(
         terms["coverage"] = lack.sum() / explained.sum().clamp(min=1)
     loss = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
     return Compared(loss, terms, torch.where(used, 1 / coverage.detach(), 0).float())
+
+
+def _by_kernels(
+    planes: Tensor, image: U8 | Tensor, tissue: Bool | Tensor, depth: F32 | Tensor, unseen: Bool | Tensor,
+    weights: LossWeights, softness: float,
+) -> Compared:  # fmt: skip
+    image, tissue, depth, unseen = (np.asarray(each) for each in (image, tissue, depth, unseen))
+    by_term = np.array([getattr(weights, name) for name in TERMS])
+    terms, v_planes, weight = compare_by_kernels(
+        planes.detach().numpy(), image, tissue, depth, unseen, by_term, softness
+    )
+    total, gradient = planes.new_tensor(by_term @ terms), torch.from_numpy(v_planes)
+    loss: Tensor = _Known.apply(planes, total, gradient)  # type: ignore[no-untyped-call]
+    return Compared(loss, dict(zip(TERMS, planes.new_tensor(terms), strict=True)), torch.from_numpy(weight))
+
+
+class _Known(torch.autograd.Function):
+    """A value of planes whose gradient is known already."""
+
+    @staticmethod
+    def forward(ctx: Any, planes: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
+        ctx.gradient = gradient
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, v_value: Tensor) -> tuple[Tensor, None, None]:
+        return v_value * ctx.gradient, None, None
 
 
 def _charbonnier(difference: Tensor, softness: float) -> Tensor:

@@ -165,6 +165,14 @@ class DeformableModel:
         """Add Gaussians [M, 14], canonical, that otherwise do as their parents, rows [M] of the model."""
         self._take(np.arange(len(self)), rows, parents)
 
+    def arrange(self) -> None:
+        """Order Gaussians by the cells of the field that they stand in: neighbours then find the same ones in
+        the processor's cache."""
+        hexplane = self.field.deltas.hexplane
+        low, high = hexplane.box
+        x, y, z = ((self.means - low) / (high - low) * hexplane.nodes[0]).astype(np.int64).T
+        self._take(np.lexsort((z, x, y)), self.table[:0], np.zeros(0, np.int64))
+
     def _take(self, kept: I64, rows: F32, parents: I64) -> None:
         """The Gaussians in `kept`, then new ones, which have the slopes of their parents."""
         ids = np.arange(self.next_id, self.next_id + len(rows))

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from sags_node.field.losses import LossWeights, compare, dissimilarity
+from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.quality import metrics
 
 HEIGHT, WIDTH = 17, 23
@@ -147,3 +148,28 @@ def test_nothing_to_explain_is_no_loss() -> None:
     found = compare(planes, **given, weights=ALL)
     (gradient,) = torch.autograd.grad(found.loss, planes)
     assert float(found.loss) == pytest.approx(ALL.correlation * 0) and not gradient.any()
+
+
+@pytest.mark.parametrize("softness", [0.0, 0.15])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_kernels_find_what_torch_finds(softness: float, threads: int) -> None:
+    weights = dataclasses.replace(ALL, correlation=0.0, similarity=0.0)
+    given = frame()
+    planes = given.pop("planes")
+    planes[1, 3, 4], planes[4, 5, 5], planes[3, 7, 7], planes[:, 9, 9] = np.nan, np.inf, 0, 0
+    given["depth"][2, 2], given["depth"][2, 3] = np.nan, np.inf
+    loss, gradients = [], []
+    before = thread_count()
+    configure_threads(threads)
+    for each in (planes.requires_grad_(), planes.detach().float().requires_grad_()):
+        found = compare(each, **given, weights=weights, softness=softness)
+        gradients += torch.autograd.grad(2 * found.loss, each)
+        loss.append(found)
+    configure_threads(before)
+    by_torch, by_kernels = loss
+    for name in by_torch.terms:
+        assert float(by_kernels.terms[name]) == pytest.approx(float(by_torch.terms[name]), rel=1e-5), name
+    assert float(by_kernels.loss) == pytest.approx(float(by_torch.loss.detach()), rel=1e-5)
+    expected = gradients[0].float().numpy()
+    np.testing.assert_allclose(gradients[1].numpy(), expected, rtol=2e-5, atol=2e-7 * np.abs(expected).max())
+    np.testing.assert_allclose(by_kernels.weight, by_torch.weight, rtol=1e-6)

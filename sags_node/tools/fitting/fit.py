@@ -106,6 +106,7 @@ class Fit:
             field = self._make_field(rows[:, columns.MEAN])
             slopes = np.zeros((len(rows), 3), np.float32) if settings.slopes else None
             self.model = DeformableModel(rows, field, exposure, settings.antialias, slopes)
+            self.model.arrange()
         else:
             rows, slopes, paths = follow_online(self.clip, self.rasterizer, exposure, settings, progress)
             field = self._make_field(rows[:, columns.MEAN])
@@ -213,10 +214,12 @@ class Fit:
         if was_coarse and not self.is_coarse:
             self._look()
             quarter(self.model)
+            self.model.arrange()
             self._density = self._make_density()
         elif self.iteration % growth.every == 0 and self._progress() < growth.until:
             pruned, split = self._density.adapt(self._rng)
             self.pruned, self.split = self.pruned + pruned, self.split + split
+            self.model.arrange()
 
     def _refine(self, model: RefinedModel) -> None:
         """A step of the joint refinement after the online pass."""
