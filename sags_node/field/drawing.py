@@ -93,6 +93,12 @@ class Drawing:
         else:
             self.planes.backward(torch.from_numpy(loss))  # type: ignore[no-untyped-call]
 
+    def gradients(self, loss: Tensor, weight: Tensor, leaves: Sequence[Tensor]) -> Sequence[Tensor | None]:
+        """Find the gradients of a loss as `differentiate` does, and add them to nothing: threads that draw at
+        the same time would add at the same time. None: the drawing does not come from that leaf."""
+        self.weight = weight
+        return torch.autograd.grad(loss, leaves, allow_unused=True)
+
 
 class _Rasterize(torch.autograd.Function):
     """The rasteriser, whichever stands behind `Rasterizer`."""

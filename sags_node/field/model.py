@@ -63,6 +63,13 @@ class DeformableModel:
         return len(self.rows)
 
     @property
+    def leaves(self) -> list[Tensor]:
+        """All that is learnt."""
+        deltas = self.field.deltas
+        leaves = (self.rows, self.slopes, deltas.hexplane.cells, *deltas.decoder.parameters())
+        return [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
+
+    @property
     def table(self) -> F32:
         """The canonical rows: the same memory, or a copy of what a GPU has."""
         rows: F32 = self.rows.detach().cpu().numpy()
@@ -138,10 +145,8 @@ class DeformableModel:
 
     def forget(self) -> None:
         """Clear all gradients."""
-        deltas = self.field.deltas
-        for leaf in (self.rows, self.slopes, deltas.hexplane.cells, *deltas.decoder.parameters()):
-            if leaf is not None:
-                leaf.grad = None
+        for leaf in self.leaves:
+            leaf.grad = None
 
     @torch.no_grad()
     def _solve_colors(self, drawings: Sequence[Drawing], length: float) -> None:

@@ -414,6 +414,17 @@ def test_a_resumed_fit_gives_the_same_bits(clip: Clip, settings: FitSettings, tm
         np.testing.assert_array_equal(resumed.arrays()[name], array, err_msg=name)
 
 
+def test_a_core_for_each_picture_changes_no_bit(clip: Clip) -> None:
+    settings = dataclasses.replace(STEEP, batch_size=3, warm_up=2, iterations=8)
+    found = []
+    for threads in (1, 2):
+        torch.set_num_threads(configure_threads(threads))
+        found.append(fitted(clip, settings).arrays())
+    torch.set_num_threads(configure_threads(None))
+    for name, array in found[0].items():
+        np.testing.assert_array_equal(found[1][name], array, err_msg=name)
+
+
 def test_a_checkpoint_of_another_fit_is_refused(clip: Clip, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.npz"
     settings = dataclasses.replace(PAPER, iterations=5, warm_up=2)

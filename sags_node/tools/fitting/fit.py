@@ -8,7 +8,10 @@ squared colour residuals and the closed-form colour step, as the online mapper d
 import math
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import reduce
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -18,13 +21,15 @@ from torch import Tensor
 
 from sags_node.engine.adam import AdamState
 from sags_node.engine.losses.tissue import tissue_loss
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.field.adam import RowAdam
+from sags_node.field.canvas import Canvas
 from sags_node.field.decoder import Decoder
 from sags_node.field.deformation import Deltas, Field, NodeField
 from sags_node.field.drawing import Drawing
 from sags_node.field.hexplane import for_clip
 from sags_node.field.model import DeformableModel, Rates
+from sags_node.kernels.threads import configure_threads, thread_count
 from sags_node.mapping.optimiser import LearningRates
 from sags_node.mapping.refiner import DEPTH_SCALE, DEPTH_WEIGHT
 from sags_node.model import columns
@@ -62,6 +67,9 @@ class Fit:
         self.clip = clip
         self.settings = settings = settings.of_clip(int(np.count_nonzero(seen)), len(clip.train))
         self._on_device = device
+        # What two cores share waits at each of some thousand small operations: each has a picture of its own
+        cores = 1 if device else min(self._batch, thread_count())
+        self._cores = ThreadPoolExecutor(cores, initializer=_take_one_core) if cores > 1 else None
         self._device = torch.device(device or "cpu")
         self.iteration = 0
         self.seconds = 0.0  # spent on starting and iterating
@@ -163,42 +171,55 @@ class Fit:
         plain = max(0, self.warm_up - self.iteration)
         deformed = rest - fine - plain + (4 if self.is_coarse else 1) * fine
         seconds = 0.0
-        for with_field, count in ((False, plain), (True, deformed * self._batch)):
+        for with_field, count in ((False, plain), (True, deformed)):
             took = []
             for _ in range(3 if count else 0):  # the first may compile kernels, and be given memory
                 started = time.perf_counter()
-                self._differentiated(self._pictures.frames[0], with_field)
+                self._differentiated(self._pictures.frames[: self._batch if with_field else 1], with_field)
                 float(self._residual)  # waits for the device
                 took.append(time.perf_counter() - started)
             seconds += count * min(took, default=0.0)
         self.model.forget()
         return seconds
 
-    def _differentiated(self, frame: ClipFrame, deformed: bool) -> Drawing:
-        """A training frame, drawn and compared; all that is learnt has the gradients of that."""
+    def _differentiated(self, frames: Sequence[ClipFrame], deformed: bool) -> list[Drawing]:
+        """Training frames, drawn and compared; all that is learnt has the gradients of that."""
         if isinstance(self.model, RefinedModel):
+            (frame,) = frames
             drawing = self.model.draw_to_refine(self.rasterizer, frame.t_capture_ns, frame.camera)
             self._residual = tissue_loss(
                 drawing.planes.detach().numpy(), frame.image, frame.tissue, frame.depth, self._v_planes,
                 self._weight, DEPTH_WEIGHT, DEPTH_SCALE,
             )  # fmt: skip
             drawing.differentiate(self._v_planes, self._weight)
-            return drawing
-        drawing = self.model.draw(self._pictures.drawer, frame.t_capture_ns, frame.camera, deformed)
+            return [drawing]
+        each = self._cores.map if self._cores is not None and len(frames) > 1 else map
+        found = list(each(self._compared, self._pictures.drawers, frames, repeat(deformed)))
+        drawings, gradients, residuals = zip(*found, strict=True)
+        for leaf, *parts in zip(self.model.leaves, *gradients, strict=True):
+            given = [part for part in parts if part is not None]
+            leaf.grad = reduce(torch.add, given) if given else None
+        self._residual = residuals[-1]
+        return list(drawings)
+
+    def _compared(
+        self, drawer: Rasterizer | Canvas, frame: ClipFrame, deformed: bool
+    ) -> tuple[Drawing, Sequence[Tensor | None], Tensor]:
+        """A drawing, the gradients of its loss by the model's leaves, and how much colours differ in it."""
+        drawing = self.model.draw(drawer, frame.t_capture_ns, frame.camera, deformed)
         found = self._pictures.compare(drawing.planes, frame)
         gain = float(self.model.exposure.at(frame.t_capture_ns).mean())
-        drawing.differentiate(found.loss, found.weight * gain**2)  # of a colour before exposure
-        self._residual = found.terms["color"].detach()
-        return drawing
+        weight = found.weight * gain**2  # of a colour before exposure
+        gradients = drawing.gradients(found.loss, weight, self.model.leaves)
+        return drawing, gradients, found.terms["color"].detach()
 
     def _descend(self) -> None:
         """A step of the paper's schedule."""
         settings, deformed = self.settings, self.iteration >= self.warm_up
         frames = [self._next_frame() for _ in range(self._batch)] if deformed else self._pictures.frames[:1]
-        drawings = []
-        for frame in frames:
-            drawings.append(self._differentiated(frame, deformed))
-            self._density.observe(drawings[-1].v_means, drawings[-1].contribution)
+        drawings = self._differentiated(frames, deformed)
+        for drawing in drawings:
+            self._density.observe(drawing.v_means, drawing.contribution)
         share = 1.0 if deformed and self.is_coarse else settings.rate_share(*self.stage)
         colors = 0.0
         if settings.slopes:
@@ -224,7 +245,7 @@ class Fit:
     def _refine(self, model: RefinedModel) -> None:
         """A step of the joint refinement after the online pass."""
         share = REFINE_DECAY ** self._progress()
-        drawing = self._differentiated(self._next_frame(), deformed=True)
+        (drawing,) = self._differentiated([self._next_frame()], deformed=True)
         model.refine(
             drawing,
             self._refine_rates * np.float32(share),
@@ -389,3 +410,8 @@ class Fit:
 def _array(values: Tensor | NDArray[Any]) -> NDArray[Any]:
     found: NDArray[Any] = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
     return found
+
+
+def _take_one_core() -> None:
+    configure_threads(1)
+    torch.set_num_threads(1)

@@ -19,7 +19,7 @@ class Pictures:
 
     Attributes:
         frames: all that are learnt, the first one of them first.
-        drawer: draws pictures of their size.
+        drawers: draw pictures of their size, one for each picture of an iteration.
         pixel: m, how wide one is at the tissue's median depth in the first frame.
     """
 
@@ -28,11 +28,12 @@ class Pictures:
         self.frames, self._settings, self._device = frames, settings, torch.device(device or "cpu")
         first = frames[0]
         height, width = first.tissue.shape
-        self.drawer: Rasterizer | Canvas
-        if device is None:
-            self.drawer = make_rasterizer("numba", width, height, antialias=settings.antialias)
-        else:
-            self.drawer = Canvas(width, height, self._device, settings.antialias)
+        self.drawers: list[Rasterizer | Canvas] = [
+            make_rasterizer("numba", width, height, antialias=settings.antialias)
+            if device is None
+            else Canvas(width, height, self._device, settings.antialias)
+            for _ in range(settings.batch_size)
+        ]
         known = first.depth[first.depth > 0]
         self.pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
         unseen = ~np.any([frame.tissue for frame in frames], axis=0) | settings.smooth_everywhere
