@@ -137,9 +137,7 @@ def follow(
 
 
 def _line(said: Record) -> str:
-    if said["seconds"] is None:
-        return f"no {said['kind']}: {said['unsure']}"
-    when = f"{said['seconds']:7.2f} s  "
+    when = "" if said["seconds"] is None else f"{said['seconds']:7.2f} s  "
     if said["value"] is None:
         return f"{when}no {said['kind']}: {said['unsure']}"
     unit = said["unit"] or "(no unit: the node has no calibration)"
