@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -81,8 +82,8 @@ def follow(
     from sags_node.messaging.measure import ANCHORS, MEASURING, Measured, measure
     from sags_node.messaging.subscriber import Subscriber
 
-    begun, due, silence = time.monotonic(), 0.0, None
-    first = newest = reference = None
+    begun, due, elapsed, silence = time.monotonic(), 0.0, 0.0, None
+    before = newest = reference = None
     unit, scale = ("mm2", 1e6) if area else ("mm", 1e3)
 
     def record(measured: Measured) -> Record:
@@ -102,13 +103,14 @@ def follow(
             came = subscriber.wait(ANCHORS, LOOK, after=newest)
             newest = came or newest
             problem = subscriber.problem(ANCHORS)
-            if first is None and problem is not None:
+            if before is None and problem is not None:
                 if time.monotonic() - begun > PATIENCE:
                     raise SagsError(f"no anchors came: {problem}")
                 continue
             if problem is not None:
-                if silence != problem:
-                    silence = problem
+                kind = re.sub(r"\d", "", problem)  # it tells an age, which grows
+                if silence != kind:
+                    silence = kind
                     yield {"seconds": None, "stamp_ns": None} | record(Measured(None, None, problem))
                 continue
             silence = None
@@ -117,26 +119,25 @@ def follow(
                 continue
             due = max(due + 1 / rate, time.monotonic())
             measured = measure(frame, numbers, area)
-            if first is None:
-                first = came
+            if before is None:
                 there = [int(row["id"]) for row in came.points]
                 if not set(numbers) <= set(there):
                     pinned = f"there are {', '.join(map(str, there))}" if there else "there are none"
                     raise SagsError(f"{measured.unsure}; {pinned}; pin one: sags anchor pin U V")
-            elif came.meta.session != first.meta.session:
+            elif came.meta.session != before.meta.session:
                 raise SagsError(
                     "the node was started anew: its anchors are other points; pin and measure anew"
                 )
+            else:
+                elapsed += 1e-9 * max(0, came.stamp_ns - before.stamp_ns)  # clocks may be set back
+            before = came
             if reference is None and measured.unsure is None:
                 reference = measured
-            elapsed = 1e-9 * (came.stamp_ns - first.stamp_ns)
             yield {"seconds": elapsed, "stamp_ns": came.stamp_ns} | record(measured)
 
 
 def _line(said: Record) -> str:
-    if said["seconds"] is None:
-        return f"no {said['kind']}: {said['unsure']}"
-    when = f"{said['seconds']:7.2f} s  "
+    when = "" if said["seconds"] is None else f"{said['seconds']:7.2f} s  "
     if said["value"] is None:
         return f"{when}no {said['kind']}: {said['unsure']}"
     unit = said["unit"] or "(no unit: the node has no calibration)"

@@ -3,6 +3,7 @@
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,8 @@ def test_what_is_lost_hidden_or_unsure_is_never_given_as_sure() -> None:
 
 @pytest.mark.live
 def test_the_command_follows_a_node(tmp_path: Path) -> None:
-    """It stretches by half, then an anchor is lost, then the node is silent: each once it was told."""
+    """It stretches by half, then an anchor is lost, then the node is silent for long: each once it was told.
+    The clock is set back when it stretches; the seconds go on. An age that grows is no news."""
     stages = ["rest", "longer", "lost", "silent"]
     now = [stages[0]]
     with publisher(tmp_path / "run") as running:
@@ -153,15 +155,19 @@ def test_the_command_follows_a_node(tmp_path: Path) -> None:
             until(lambda: now[0] != "silent")
             result = pinned([1e-3] * 4)
             points = result.anchors.points.copy()
-            points[1] += {"rest": 0, "longer": 0.5, "lost": np.nan}[now[0]] * (points[1] - points[0])
+            stage = now[0]
+            points[1] += {"longer": 0.5, "lost": np.nan}.get(stage, 0) * (points[1] - points[0])
             anchors = replace(result.anchors, points=points)
-            return at_frame(replace(result, anchors=anchors), number, time.time_ns())
+            set_back = stage != "rest"
+            stamp_ns = time.time_ns() - 300_000_000 * set_back
+            return at_frame(replace(result, anchors=anchors), number, stamp_ns, epoch=2 + set_back)
 
         with stream(running, frame):
             address = NodeAddress(endpoint=running.connection.data[-1])
             stop = threading.Event()
-            values, said = [], []
+            values, said, seconds = [], [], []
             for record in follow(address, (1, 2), False, 1000.0, None, stop):
+                seconds.append(record["seconds"])
                 is_new = record["stretch"] is None or record["stretch"] > 1.4
                 if now[0] in ("rest", "longer") and record["sure"] and (now[0] == "rest" or is_new):
                     values.append((record["value"], record["stretch"], record["unit"]))
@@ -170,8 +176,8 @@ def test_the_command_follows_a_node(tmp_path: Path) -> None:
                     said.append(record["unsure"])
                     now[0] = "silent"
                     if record["stamp_ns"] is None:
-                        stop.set()
-            now[0] = "rest"
+                        threading.Timer(1.0, stop.set).start()
+            now[0] = "again"
             node = ("--endpoint", address.endpoint)
             measured = ("measure", 2, 3, *node, "--json")
             (first, *_) = heard(lambda seconds: ran(*measured, "--seconds", seconds)[1].splitlines(), 2.0)
@@ -182,5 +188,7 @@ def test_the_command_follows_a_node(tmp_path: Path) -> None:
         (pytest.approx(30, rel=1e-4), pytest.approx(1.5), "mm"),
     ]
     assert said[0] == "anchor 2 is lost" and len(said) >= 2 and said[-1] != said[0]
+    assert all(now is None or then is None or 0 <= now - then for then, now in pairwise(seconds))
+    assert not any(then is now is None for then, now in pairwise(seconds))
     assert pure_json(first)["kind"] == "distance" and pure_json(first)["value"] == pytest.approx(12, rel=1e-4)
     refused(2, "measure", 1, 1, said=("twice",))

@@ -426,6 +426,15 @@ def test_after_a_new_start_it_is_lost_or_pinned_anew(how: str, repin: bool) -> N
     assert thing.status()["pinned"] == 2 and pinner.removed == ([] if how == "node" else [1])
 
 
+def test_after_a_start_with_another_size_it_is_pinned_at_the_same_place_of_the_picture() -> None:
+    thing = held([{"pixel": [30, 40]}], True, pinner := FakePinner())
+    placed_at(thing, with_anchors([on_plane(30, 40)]))
+    larger = {name: getattr(FRAME, name).repeat(2, 0).repeat(2, 1) for name in ("depth", "tissue")}
+    for _ in range(2):
+        thing.place(replace(FRAME, **larger, session="another"))
+    assert pinner.asked == [[{"u": 30, "v": 40}], [{"u": 60.5, "v": 80.5}]]  # middles of pixels are integers
+
+
 @pytest.mark.fault("model: the tissue at an object's anchors leaves it")
 @pytest.mark.parametrize(("count", "least"), [(1, 1), (3, 3), (4, 3)])
 def test_what_lost_its_anchors_comes_back_with_them_where_they_are_then(count: int, least: int) -> None:

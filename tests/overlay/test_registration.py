@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from bridging import anchored, anchored_at, sockets
+from bridging import SEEN, anchored, sockets
 from command_line import figures_at_last, refused
 from running_node import RunningNode
 from synthetic import at_frame, stream
@@ -26,7 +27,7 @@ from sags_node.geometry import project, transform
 from sags_node.messaging.address import NodeAddress
 from sags_node.phantom import write_session
 from sags_node.phantom.scene import Phantom, PhantomScene
-from sags_node.types import F64, I32, Camera
+from sags_node.types import F64, I32, AnchorsAhead, Camera
 
 WIDTH, HEIGHT = 320, 256
 SCENE = PhantomScene(seconds=4.0, width=WIDTH, height=HEIGHT, seed=1, still_tissue=True)
@@ -292,8 +293,11 @@ def test_the_command_writes_a_scene_that_plays(node: RunningNode, organ: Organ, 
 
 @pytest.mark.live
 def test_frames_of_before_a_gap_are_not_used_with_those_after_it(tmp_path: Path) -> None:
-    """As where frames are held for a while: an organ may lie elsewhere since."""
-    seconds, gap = 1.0, 1.5
+    """As where frames are held for a while: an organ may lie elsewhere since. Anchors that somebody wants
+    ahead lie in them where they were seen, as the surface does."""
+    seconds, gap, states = 1.0, 1.5, anchored().anchors
+    ahead = AnchorsAhead(np.full(4, np.float32(0.1)), states.points + np.float32(0.005), states.pixels)
+    expected = replace(anchored(), anchors=replace(states, ahead=ahead))
     with sockets(tmp_path) as running, ThreadPoolExecutor(1) as pool:
         looking = pool.submit(frames_of, NodeAddress(run_dir=tmp_path), seconds)
         until(lambda: running.poll(10) or running.wanted("tf"))
@@ -304,8 +308,10 @@ def test_frames_of_before_a_gap_are_not_used_with_those_after_it(tmp_path: Path)
         time.sleep(gap)
         assert not looking.done()
         resumed = time.time()
-        with stream(running, anchored_at):
-            stamps = [frame.stamp_ns * 1e-9 for frame in looking.result(60)]
+        with stream(running, lambda number: at_frame(expected, number, time.time_ns())):
+            seen = looking.result(60)
+    stamps = [frame.stamp_ns * 1e-9 for frame in seen]
+    assert np.allclose([frame.anchors[SEEN].place for frame in seen], states.points[0])
     assert stamps[0] > resumed and np.diff(stamps).max() < seconds
     assert stamps[-1] - stamps[0] > 0.89 * seconds
 

@@ -82,19 +82,21 @@ class TissueFrame:
 
 
 def tissue_frame(
-    messages: Frame, right: ReceivedCameraInfo | None, confidence: ReceivedImage | None = None
-) -> TissueFrame | None:
+    messages: Frame, right: ReceivedCameraInfo | None, confidence: ReceivedImage | None = None,
+    ahead: bool = True,
+) -> TissueFrame | None:  # fmt: skip
     """The messages `NEEDED` of one frame joined; None when they do not fit together.
 
     Args:
         confidence: of its depth; None: from a node or a recording that does not tell.
+        ahead: anchors are where they are expected, if somebody asked for that; else where they were.
     """
     depth, tissue, info, anchors = messages[DEPTH], messages[TISSUE], messages[INFO], messages[ANCHORS]
     size = (info.height, info.width)
-    fields = anchors.points.dtype.names or ()
+    fields = {*(anchors.points.dtype.names or ())} - (set() if ahead else {"ahead"})
     said = {(message.meta.session, message.meta.epoch) for message in messages.values()}
     shapes = {each.array.shape for each in (depth, tissue, confidence) if each is not None}
-    if shapes != {size} or len(said) != 1 or not {"id", "visibility", "confidence"} <= set(fields):
+    if shapes != {size} or len(said) != 1 or not {"id", "visibility", "confidence"} <= fields:
         return None
     try:
         T_world_cam = messages[POSE].pose()

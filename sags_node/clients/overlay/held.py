@@ -20,7 +20,7 @@ from sags_node.clients.registration.rigid import on_a_line, rigid_fit
 from sags_node.clients.registration.surfaces import Shape
 from sags_node.confidence import LEAST
 from sags_node.errors import SagsError, UsageError
-from sags_node.geometry import invert, transform
+from sags_node.geometry import invert, scale_pixels, transform
 from sags_node.types import F64
 
 LEAST_ANCHORS = 3  # for a rigid fit
@@ -89,6 +89,7 @@ class HeldObject:
         self._refused: str | None = None  # for good
         self._misread = self._misreadings()
         self._doubt: str | None = None  # of its `at`, once their unit is known, and of its places
+        self._size: tuple[int, int] | None = None  # of the picture that its pixels are meant in: the first
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
@@ -236,12 +237,13 @@ class HeldObject:
         if not self.spec.anchors:
             pixel = _middle(frame)
             return "no tissue in the picture" if pixel is None else [{"u": pixel[0], "v": pixel[1]}]
+        self._size = self._size or (width, height)
         requests: list[Request] = []
         for anchor in self.spec.anchors:
             if anchor.pixel is None:
                 requests.append(dict(zip("xyz", anchor.place or (), strict=True)))
                 continue
-            u, v = anchor.pixel
+            u, v = scale_pixels(np.array(anchor.pixel), self._size, (width, height)).tolist()
             if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
                 raise UsageError(
                     f"{self._where} {u:g} {v:g} lies outside the left picture of {width}x{height} px"

@@ -83,8 +83,8 @@ def frames_of(node: NodeAddress, seconds: float) -> list[TissueFrame]:
             last = subscriber.wait(NEEDED[0], max(0.0, deadline - time.monotonic()), after=last)
             if last is None:
                 break
-            messages = subscriber.aligned([*NEEDED, CONFIDENCE], last.stamp_ns, WAIT_FOR_REST)
-            frame = None if messages is None else tissue_frame(messages, None, messages[CONFIDENCE])
+            whole = subscriber.aligned([*NEEDED, CONFIDENCE], last.stamp_ns, WAIT_FOR_REST)
+            frame = None if whole is None else tissue_frame(whole, None, whole[CONFIDENCE], ahead=False)
             if frame is None or subscriber.problem(NEEDED[0]) is not None:
                 continue
             if not last.metric:
