@@ -76,8 +76,9 @@ def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
         if path == "-" or (path.endswith(".json") and len(paths) > 1):
             raise UsageError(f"'{path}' is no launch file: --json prints on stdout, --out FILE writes a file")
     if len(paths) > 1:
-        joined = f"{', '.join(paths)}; sags new LEFT RIGHT makes a launch file of two videos"
-        raise UsageError(f"one launch file or session at a time, not {joined}")
+        raise UsageError(
+            f"one launch file or folder, not {', '.join(paths)}; two videos: sags new LEFT RIGHT"
+        )
     return (paths[0] if paths else None), overrides
 
 
