@@ -216,7 +216,7 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
 
 @calib.command()
 @click.argument("folders", nargs=-1, type=click.Path(path_type=Path), metavar="[LEFT_FOLDER RIGHT_FOLDER]")
-@path_option("--live", metavar="LAUNCH", help="Take the pictures here.")
+@path_option("--live", metavar="LAUNCH", help="Take them from its cameras, or its recording of a board.")
 @board_options
 @shown(
     "--coefficients",

@@ -76,7 +76,7 @@ def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
         if path == "-" or (path.endswith(".json") and len(paths) > 1):
             raise UsageError(f"'{path}' is no launch file: --json prints on stdout, --out FILE writes a file")
     if len(paths) > 1:
-        raise UsageError(f"one launch file or session at a time, not {', '.join(paths)}")
+        raise UsageError(f"one launch file or folder, not {', '.join(paths)}; of videos: sags new LEFT RIGHT")
     return (paths[0] if paths else None), overrides
 
 

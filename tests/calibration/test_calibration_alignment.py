@@ -142,12 +142,13 @@ def test_dense_rows_of_nothing() -> None:
 
 
 @pytest.mark.fault("calibration: the eyes have moved against each other")
-@pytest.mark.parametrize("degrees", [0.0, 0.3])
-def test_the_node_warns_while_it_runs(degrees: float) -> None:
+@pytest.mark.parametrize(("degrees", "metric"), [(0.0, True), (0.3, True), (0.3, False)])
+def test_the_node_warns_while_it_runs(degrees: float, metric: bool) -> None:
+    """Not of a calibration that was guessed: that it is one says the warning of its own."""
     session = open_session(SESSION, ["source.pace:=step", "mapping.max_gaussians:=2000"])
     turn = cv2.Rodrigues(np.radians((degrees, 0.0, 0.0)))[0]
     right = replace(session.rig.right, R=turn @ session.rig.right.R)
-    pipeline = Pipeline(session.config, StereoRig("turned", session.rig.left, right))
+    pipeline = Pipeline(session.config, StereoRig("turned", session.rig.left, right, metric=metric))
     with session.source as source:
         for frame, _ in zip(source, range(FEWEST_FIELDS + 2), strict=False):
             pipeline.process(frame, StepBudget(0))
@@ -155,4 +156,8 @@ def test_the_node_warns_while_it_runs(degrees: float) -> None:
     assert list(warnings) == (["calibration"] if degrees else [])
     content = diagnostics(replace(health(), warnings=warnings), 0)
     statuses = decode(b"".join(content.parts), "diagnostic_msgs/msg/DiagnosticArray").status
-    assert ("rows of the eyes differ" in " ".join(status.message for status in statuses)) == bool(degrees)
+    said = " ".join(status.message for status in statuses)
+    assert ("rows of the eyes differ" in said, "no calibration" in said) == (
+        degrees > 0 and metric,
+        not metric,
+    )

@@ -130,12 +130,12 @@ def test_live_takes_new_views_that_are_held_still(chess_pairs: list[tuple[U8, U8
     held += chess_pairs[:1] * 2
     write_pairs(tmp_path / "session", held)
     launch = tmp_path / "session/launch.yaml"
-    launch.write_text(
-        yaml.safe_dump(
-            {"source": {"kind": "folders", "left": "left", "right": "right", "rate": 30, "pace": "step"}}
-        )
-    )
+    source = {"kind": "folders", "left": "left", "right": "right", "rate": 30, "pace": "step"}
     out = tmp_path / "rig"
+    launch.write_text(yaml.safe_dump({"source": {**source, "frames": 1}}))
+    code, _, err = sags("--live", launch, *BOARD, "-o", out)
+    assert code == 1 and "no view was taken" in err  # and it may be tried again
+    launch.write_text(yaml.safe_dump({"source": source}))
     code, said, err = sags("--live", launch, *BOARD, "-o", out, "--json")
     assert code == 0, err
     summary = json.loads(said)

@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures("run_dir")]
         (["nowhere.yaml"], ("nowhere.yaml", "No such file", "check the path")),
         (["[/bold]:x:.yaml"], ("[/bold]:x:.yaml", "check the path")),  # no markup and no emoji of rich
         ([f"{ROOT}/launch/d4d_pul.yaml"], ("No such file", f"did you mean {ROOT}/launch/d4d_pull.yaml?")),
-        (["a.yaml", "b.yaml"], ("one launch file", "a.yaml, b.yaml")),
+        (["a.yaml", "b.yaml"], ("one launch file", "a.yaml, b.yaml", "sags new LEFT RIGHT")),
         (["mapping.budgt_ms:=25"], ("mapping.budgt_ms", "did you mean 'budget_ms'")),
         (["budget_ms:=25"], ("'budget_ms'", "did you mean 'mapping.budget_ms'")),
         (["mapping.budget_ms:=soon"], ("mapping.budget_ms", "valid number", "'soon'")),

@@ -45,13 +45,14 @@ def picture(t: float) -> GrayPyramid:
 
 
 def codes_at(
-    row: Row, rate: float, kept: str, every: int, share: F32 = SHARE[4::8]
+    row: Row, rate: float, kept: str, every: int, share: F32 = SHARE[4::8], lasting: float = 0.0
 ) -> dict[float, tuple[str, ...]]:
     """What is found at the times (s) of the frames that come, of which every so many are matched.
 
     Args:
         kept: which frames come, again and again.
         row: how far below its row in the left picture a point lies in the right one, on the right.
+        lasting: px of that, there from the beginning: the calibration fits badly.
     """
     watch, found = MatchWatch(), {}
     frames = [i / rate for i in range(round(4 * rate)) if kept[i % len(kept)] == "1"]
@@ -59,9 +60,9 @@ def codes_at(
         stamp = round(t * SECOND)
         watch.see(stamp, picture(t))
         if number % every == 0:
-            errors = row(t) * share + np.random.default_rng(number).normal(0, 0.3, (32, 40)).astype(
-                np.float32
-            )
+            errors = (lasting + row(t)) * share + np.random.default_rng(number).normal(
+                0, 0.3, (32, 40)
+            ).astype(np.float32)
             watch(stamp, RowErrors(errors, np.ones((32, 40), np.bool_), float(np.median(errors))))
         found[t] = tuple(finding.code for finding in watch.findings)
     return found
@@ -76,14 +77,15 @@ def codes_at(
 )
 def test_a_late_eye_is_found_however_few_frames_are_matched(rate: float, kept: str, every: int) -> None:
     """Within three of the fields that show it, and half a period: at its turns the tissue hardly moves."""
-    for late in (0.12, -0.08):
-        found = codes_at(lambda t, late=late: down(t - late) - down(t), rate, kept, every)
+    for late, lasting in ((0.12, 0.0), (-0.08, 0.0), (0.12, 2.5)):
+        found = codes_at(lambda t, late=late: down(t - late) - down(t), rate, kept, every, lasting=lasting)
         assert {code for codes in found.values() for code in codes} == {"eyes_late"}
         field = every * len(kept) / kept.count("1") / rate
         first = min(t for t, codes in found.items() if codes)
         assert BEGINS < first < BEGINS + 0.5 + 3 * field
-    in_time = codes_at(lambda t: 0.0, rate, kept, every)
-    assert set(in_time.values()) == {()}
+    for lasting in (0.0, 2.5):
+        in_time = codes_at(lambda t: 0.0, rate, kept, every, lasting=lasting)
+        assert set(in_time.values()) == {()}
 
 
 @pytest.mark.parametrize("at", [1.08, 1.32, 1.56])

@@ -38,11 +38,11 @@ def grab_views(
         SagsError: no view was taken, or the source fails.
     """
     sides = folder / "left", folder / "right"
-    if folder.exists() and any(folder.iterdir()):
+    if any(file.is_file() for file in folder.rglob("*")):  # not the folders of an attempt without a view
         raise UsageError(f"{folder} is not empty; name a new folder, or calibrate from the pictures in it")
     with writing(folder):
         for side in sides:
-            side.mkdir(parents=True)
+            side.mkdir(parents=True, exist_ok=True)
     taken: list[StereoView] = []
     before: StereoView | None = None
     try:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sags_node.types import Finding, GrayPyramid
+from sags_node.types import F32, Finding, GrayPyramid
 from sags_node.vision.alignment import RowErrors
 from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.pyramid import inner, narrowed
@@ -72,6 +72,7 @@ class MatchWatch(Debounced):
         self._seen: deque[tuple[int, GrayPyramid]] = deque()  # stamps and left pictures of the last frames
         self._sums: deque[_Sums] = deque()
         self._median: float | None = None  # px, usual
+        self._errors: F32 | None = None  # px, usual at each place: a calibration that fits badly leaves some
         self._matched: float | None = None  # usual share
         self._stamp_ns: int | None = None
 
@@ -88,6 +89,8 @@ class MatchWatch(Debounced):
         median, matched = rows.median, np.count_nonzero(rows.matched) / rows.matched.size
         if self._median is None or self._matched is None:
             self._median, self._matched = median, matched
+        if self._errors is None or self._errors.shape != rows.errors.shape:
+            self._errors = np.where(rows.matched, rows.errors, np.float32(median))
         found = []
         apart = abs(median - self._median) > KNOCKED  # fast motion brings the rows of a late eye there, too
         self.is_late = self._follows_motion(stamp_ns, rows, knocked=apart and _LATE not in self.findings)
@@ -97,6 +100,7 @@ class MatchWatch(Debounced):
             found.append(_KNOCKED)
         else:
             self._median += share * (median - self._median)
+            self._errors += np.float32(share) * np.where(rows.matched, rows.errors - self._errors, 0)
         self.note(stamp_ns, found)
         usual, self._matched = self._matched, self._matched + share * (matched - self._matched)
         if found:
@@ -114,12 +118,12 @@ class MatchWatch(Debounced):
                 break
             sums.popleft()
         if before:
-            assert self._median is not None
+            assert self._errors is not None
             height, width = rows.errors.shape
             down = self._flow(before[-1], small)[..., 1]
             scale = small.full.shape[1] / (2 * inner(small.halves[0]).shape[1])
             motion = scale * cv2.resize(down, (width, height), interpolation=cv2.INTER_AREA)[rows.matched]
-            errors = rows.errors[rows.matched] - np.float32(self._median)
+            errors = (rows.errors - self._errors)[rows.matched]
             products = float(motion @ motion), float(motion @ errors), float(errors.sum())
             sums.append(_Sums(stamp_ns, motion.size, *products))
         if len(sums) < FEWEST_LATE:

@@ -49,7 +49,7 @@ _TEXTS = {
 _EQUAL = Finding("eyes_equal", "both eyes show the same picture, so there is no depth: connect the other eye")
 _EXCHANGED = Finding(
     "eyes_exchanged",
-    "left and right seem to be exchanged: exchange source.left and source.right, or set geometry.first",
+    "left and right seem to be exchanged: exchange source.left and source.right or set source.geometry.first",
 )
 _UNCLEAR = {
     "": [],
