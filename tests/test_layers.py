@@ -65,8 +65,8 @@ LINES = {
     "sags_node/tools/export": 947,
     "sags_node/tools/fitting": 1854,
     "sags_node/tools/importing": 1168,
-    "sags_node/vision": 5388,
-    "tests": 49965,
+    "sags_node/vision": 5392,
+    "tests": 49972,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
