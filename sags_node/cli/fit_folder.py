@@ -19,7 +19,7 @@ from sags_node.kernels.threads import configure_threads
 from sags_node.model.ply import write_ply
 from sags_node.pipeline.session import Session
 from sags_node.terminal import text
-from sags_node.terminal.console import tell, time_text
+from sags_node.terminal.console import stop_signals, tell, time_text
 from sags_node.tools.evaluation.lpips import BACKBONE, Lpips
 from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.provenance import machine_name
@@ -192,19 +192,22 @@ def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
     """All iterations that are left. Ctrl-C leaves a checkpoint, too."""
     tell(f"{fit.total - fit.iteration} iterations take about {time_text(fit.seconds_left())}")
     saved = time.monotonic()
-    try:
-        while not fit.done:
-            fit.iterate()
-            stage = "warming up" if fit.iteration < fit.warm_up else "fitting"
-            stage += " at half the size" if fit.is_coarse else ""
-            if fit.iteration % SHOWN_EVERY == 0 or fit.done:
-                what = f"{stage}, colours differ by {fit.residual:.4f}, {len(fit.model)} Gaussians"
-                advance(*fit.stage, what)
-            if time.monotonic() - saved > CHECKPOINT_PERIOD:
-                checkpoint.save(fit, stored)
-                saved = time.monotonic()
-    finally:
-        checkpoint.save(fit, stored)
+    with stop_signals() as stop:  # half an iteration is nothing to go on from
+        try:
+            while not (fit.done or stop.is_set()):
+                fit.iterate()
+                stage = "warming up" if fit.iteration < fit.warm_up else "fitting"
+                stage += " at half the size" if fit.is_coarse else ""
+                if fit.iteration % SHOWN_EVERY == 0 or fit.done:
+                    what = f"{stage}, colours differ by {fit.residual:.4f}, {len(fit.model)} Gaussians"
+                    advance(*fit.stage, what)
+                if time.monotonic() - saved > CHECKPOINT_PERIOD:
+                    checkpoint.save(fit, stored)
+                    saved = time.monotonic()
+        finally:
+            checkpoint.save(fit, stored)
+    if stop.is_set():
+        raise KeyboardInterrupt
 
 
 def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:

@@ -3,8 +3,10 @@
 import dataclasses
 import io
 import json
+import signal
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 from unittest.mock import ANY
@@ -19,7 +21,7 @@ from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError, UsageError
 from sags_node.field.decoder import Decoder
 from sags_node.field.losses import LossWeights, compare
-from sags_node.field.model import FADE_NS, LOOK_BACK_NS
+from sags_node.field.model import FADE_NS, LOOK_BACK_NS, DeformableModel
 from sags_node.files import alone
 from sags_node.geometry import quat_to_matrix, transform
 from sags_node.kernels.threads import configure_threads
@@ -480,6 +482,34 @@ def test_the_command_leaves_model_pictures_and_figures(phantom_session: Path, tm
 
     again = figures_of("fit", phantom_session, "source.frames:=10", *options, "--resume")
     assert again["heldout"]["psnr"] == found["heldout"]["psnr"]
+
+
+def test_ctrl_c_waits_for_the_end_of_an_iteration(
+    phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fit that goes on from there ends with the same bits as one that nobody disturbed."""
+    options = "--schedule paper --warm-up 2 --iterations 5 --max-gaussians 300 --set coarse=0".split()
+
+    def fit_into(name: str, *more: str) -> int:
+        return int(
+            sags_fit(phantom_session, "source.frames:=8", *options, "--out", tmp_path / name, *more).exit_code
+        )
+
+    assert fit_into("whole") == 0
+    descend, calls = DeformableModel.descend, count(1)
+
+    def interrupted(model: DeformableModel, *arguments: Any) -> None:
+        if next(calls) == 4:
+            signal.raise_signal(signal.SIGINT)
+        descend(model, *arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(DeformableModel, "descend", interrupted)
+        assert fit_into("broken_off") == 130 and next(calls) == 5
+    assert fit_into("broken_off", "--resume") == 0
+    whole, resumed = (np.load(tmp_path / name / "checkpoint.npz") for name in ("whole", "broken_off"))
+    for name in set(whole.files) - {"about"}:
+        np.testing.assert_array_equal(resumed[name], whole[name], err_msg=name)
 
 
 def test_a_folder_holds_one_fit_alone(
