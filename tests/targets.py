@@ -21,7 +21,7 @@ TESTS = tuple(
     ROOT / "tests" / room / f"test_{name}.py"
     for room, names in {
         "engine": ("rasterizer", "cpu_rasterizer", "projection", "losses", "colours", "adam", "kernels"),
-        "field": ("hexplane", "decoder", "deformation"),
+        "field": ("hexplane", "decoder", "deformation", "paper_losses"),
         "fitting": ("residuals",),
         "mapping": ("slopes",),
         "detail": ("detail",),

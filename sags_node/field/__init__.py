@@ -26,4 +26,4 @@ Importing it imports torch, which takes a second: only what fits imports it, and
 Imports engine, kernels and model.
 """
 
-import sags_node.kernels.threads  # noqa: F401 - before torch: it says how idle workers wait
+import sags_node.kernels.threads  # noqa: F401 - in a node before torch, whose idle workers must not spin there

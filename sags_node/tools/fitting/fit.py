@@ -67,7 +67,7 @@ class Fit:
         self.clip = clip
         self.settings = settings = settings.of_clip(int(np.count_nonzero(seen)), len(clip.train))
         self._on_device = device
-        # What two cores share waits at each of some thousand small operations: each has a picture of its own
+        # A core for each picture of an iteration: two that share one wait for each other all the time
         cores = 1 if device else min(self._batch, thread_count())
         self._cores = ThreadPoolExecutor(cores, initializer=_take_one_core) if cores > 1 else None
         self._device = torch.device(device or "cpu")
@@ -193,8 +193,8 @@ class Fit:
             )  # fmt: skip
             drawing.differentiate(self._v_planes, self._weight)
             return [drawing]
-        each = self._cores.map if self._cores is not None and len(frames) > 1 else map
-        found = list(each(self._compared, self._pictures.drawers, frames, repeat(deformed)))
+        apply = self._cores.map if self._cores is not None and len(frames) > 1 else map
+        found = list(apply(self._compared, self._pictures.drawers, frames, repeat(deformed)))
         drawings, gradients, residuals = zip(*found, strict=True)
         for leaf, *parts in zip(self.model.leaves, *gradients, strict=True):
             given = [part for part in parts if part is not None]
