@@ -30,7 +30,7 @@ FOLDERS = sorted(PLACES)
 # one that needs less lowers it.
 LINES = {
     "benchmarks": 9927,
-    "sags_lab": 5022,
+    "sags_lab": 5021,
     "sags_node": 1299,
     "sags_node/bags": 1001,
     "sags_node/cli": 3587,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1854,
     "sags_node/tools/importing": 1168,
     "sags_node/vision": 5392,
-    "tests": 50002,
+    "tests": 50014,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -136,19 +136,18 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str], he
         place, rig = fetched(recording, stage, plan.limits.staged_gb)
         said = command(plan.job, _said(place, rig, recording, plan), plan.options, out)
         cores = needs(plan, recording).cores
-        ended = run_limited([*program, *said], cores, plan.limits, out / FIGURES, out / LOG)
+        figures_file, log = stage / FIGURES, stage / LOG  # where `out` is full, the log can still say so
+        ended = run_limited([*program, *said], cores, plan.limits, figures_file, log)
         is_full = shutil.disk_usage(out).free < LEAST_FREE  # not all that writes pictures and videos says so
-        if is_full or NO_SPACE in _tail(out / LOG):
+        if is_full or NO_SPACE in _tail(log):
             raise _FailedError("no space", NO_SPACE)
         if ended != Ended(0):
-            store.write(f"{FAILED}/{recording.id}.log", _tail(out / LOG).encode())
-            raise _FailedError(
-                "refused" if ended.code == WRONG_REQUEST else "failed", _reason(ended, out / LOG)
-            )
+            store.write(f"{FAILED}/{recording.id}.log", _tail(log).encode())
+            raise _FailedError("refused" if ended.code == WRONG_REQUEST else "failed", _reason(ended, log))
         final = f"{plan.out.rstrip('/')}/{RECORDINGS}/{recording.id}"
-        for name in (FIGURES, LOG):  # they say where results are
-            (out / name).write_bytes((out / name).read_bytes().replace(os.fsencode(out), final.encode()))
-        figures = row_of(json.loads((out / FIGURES).read_bytes()))
+        for file in (figures_file, log):  # they say where results are
+            (out / file.name).write_bytes(file.read_bytes().replace(os.fsencode(out), final.encode()))
+        figures = row_of(json.loads(figures_file.read_bytes()))
         store.finish(recording.id, key, out, _row(recording, figures, plan, time.monotonic() - began))
     return int(figures.get("frames") or 0)
 

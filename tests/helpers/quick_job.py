@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -26,7 +27,7 @@ def main() -> None:
         time.sleep(60)
         del held
     if said.get("writes"):
-        (report / "large").write_bytes(bytes(said["writes"] << 20))
+        write_large(report / "large", said["writes"] << 20)
     if said.get("signal"):
         os.kill(os.getpid(), signal.Signals[said["signal"]])
     if said.get("fails"):
@@ -36,6 +37,17 @@ def main() -> None:
     figures = {"frames": 3, "online": {"psnr": said["psnr"]}, "warnings": {}}
     told = {"threads": os.environ["OMP_NUM_THREADS"], "gpu": os.environ.get("CUDA_VISIBLE_DEVICES")}
     print(json.dumps(figures | told | {"played": str(recording)}))
+
+
+def write_large(file: Path, size: int) -> None:
+    """As `sags` writes: in a line it is said that the disk is full, and it is not full any more."""
+    try:
+        file.write_bytes(bytes(size))
+    except OSError as error:
+        with suppress(OSError):
+            print(f"error: {error.strerror}", file=sys.stderr, flush=True)
+        file.unlink()
+        sys.exit(1)
 
 
 if __name__ == "__main__":
