@@ -91,7 +91,7 @@ def topic_echo(
 
 
 def _measuring(name: Literal["hz", "bw", "delay"], doc: str, *more: Callable[..., Any]) -> None:
-    """The commands that listen to topics, one after the other; `more` are options of one alone."""
+    """Add a command that listens to topics, one after the other; `more` are options that only it has."""
 
     @topic.command(name, help=doc)
     @some_topics
