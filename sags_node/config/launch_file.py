@@ -184,8 +184,8 @@ def known_recording(folder: Path) -> dict[str, Any] | None:
 
 
 def _bag_of(path: Path) -> Path | None:
-    """The ROS recording that a file or folder is; its metadata may be missing, as of a recorder that was
-    killed. Of ROS 1 a folder may hold one bag."""
+    """The ROS recording that a file or folder is. Its metadata may be missing, as after a recorder was
+    killed. A folder with a single bag of ROS 1 counts, too."""
     if path.suffix in BAG_SUFFIXES or path.name.endswith(UNFINISHED):
         return path
     if (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3")):
@@ -195,7 +195,7 @@ def _bag_of(path: Path) -> Path | None:
 
 
 def is_sidecar(file: Path) -> bool:
-    """Tell whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
+    """Tell whether a file is the sidecar of a video of dVRK's `record`: its type is near either end of it."""
     if file.suffix != ".json" or not file.is_file():
         return False
     with open_file(file) as opened:

@@ -89,7 +89,7 @@ def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
 
 Row = tuple[Finite, Finite, Finite, Finite]
 Pose = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]  # m
-FARTHEST_BASE = 10.0  # m
+FARTHEST_BASE = 10.0  # m, largest translation of a pose along an axis
 NAMESPACE = r"^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$"
 
 
