@@ -38,7 +38,7 @@ def topic() -> None:
 @shown("--seconds", type=positive, default=3.0, help="How long to listen.")
 @as_json
 def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
-    """Every topic with its type, and the rate and size of what was heard.
+    """List the topics: their types, and rate and size of what was heard.
 
     \b
     sags topic list
