@@ -1,4 +1,4 @@
-"""What an archive has come to: how far it is, what failed, and all figures in one table."""
+"""The state of an archive: how far it is, what failed, and all figures in one table."""
 
 import io
 from collections.abc import Iterator, Mapping, Sequence

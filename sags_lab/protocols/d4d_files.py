@@ -25,7 +25,7 @@ LARGEST_JSON = 64 << 20  # bytes
 BASELINES = (1e-3, 50e-3)  # m: outside, the calibration is not in metres
 LOOKED_AT = 8  # masks, at most
 UNSURE = (0.4, 0.6)  # share of a picture that is white: it does not tell which colour is the instrument
-MOVED = (5e-3, 3.0)  # m and degrees between the curated poses of a clip: the endoscope was moved
+MOVED = (5e-3, 3.0)  # m and degrees between the curated poses of a clip; beyond, the endoscope was moved
 DEFAULT_RATE = 15.0  # Hz, where names are no stamps
 
 

@@ -2,7 +2,7 @@
 
 By `d4d_meta` of github.com/TaiToTo/omnisurg-4d-scene-graph (2026): of 542 scans, two for each of 271 clips,
 487 are kept. Left out are 45 beside which the tissue moves, 8 more than 10 s from the nearest frame, and 2
-that are missing. The choice reads no figure. Where tissue moves is not published, so the list stands here.
+that are missing. The rule reads no figure. Its record of motion is not published, so the result is listed.
 """
 
 LEFT_OUT: dict[str, dict[str, tuple[int, ...]]] = {  # numbers of clips, by their specimen and session
