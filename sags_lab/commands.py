@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def extend(sags: click.Group) -> None:
-    """Add them. Called by `sags_node.cli.main`, by the entry point `sags.commands`."""
+    """Add these to `sags`. `sags_node.cli.main` calls it, through the entry point `sags.commands`."""
     sags.add_command(archive)
     _wrap(sags.commands["eval"], _by_protocol, protocol_option)
     _wrap(sags.commands["export"], _with_lerobot, lerobot_option, version_option)
@@ -71,7 +71,7 @@ def evaluate_protocol(
         others: options of `sags eval` that no protocol takes.
 
     Raises:
-        UsageError: one of these is given, or the folder is wrong.
+        UsageError: one of `others` is given, or the folder is wrong.
         SagsError: the data set cannot be measured.
     """
     from sags_lab.protocols import run

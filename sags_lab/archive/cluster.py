@@ -1,4 +1,4 @@
-"""The Ray instance that an archive runs on: one that starts here by itself, or a cluster that is there."""
+"""The Ray instance that an archive runs on: one started on this machine, or an existing cluster."""
 
 import logging
 import os
@@ -11,7 +11,7 @@ from typing import Any
 from sags_node.errors import SagsError, UsageError, install
 
 NEEDED = ("ray", "pyarrow", "fsspec")  # the extra `archive`
-OBJECT_STORE = 80 << 20  # bytes: nothing large is passed; Ray wants 75 MiB at least
+OBJECT_STORE = 80 << 20  # bytes: tasks pass nothing large; Ray needs at least 75 MiB
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 LOCAL = {
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # its sockets are of loopback only
@@ -20,7 +20,7 @@ LOCAL = {
 
 
 def check_installed() -> None:
-    """To be asked before anything else is done.
+    """Check, before anything else is done, that the packages are there.
 
     Raises:
         UsageError: a package that archives need is not installed.
@@ -32,9 +32,9 @@ def check_installed() -> None:
 
 @contextmanager
 def connected(address: str | None) -> Iterator[Any]:
-    """Ray, started on this machine for as long as this lasts, or connected to a cluster.
+    """Start Ray on this machine for as long as the context lasts, or connect to a cluster.
 
-    Where this process is connected already, that connection is used, and stays.
+    Where this process is connected already, that connection is used, and stays open.
 
     Args:
         address: HOST:PORT of the cluster's head; None: this machine alone, by loopback only.

@@ -83,8 +83,8 @@ def scan(
 ) -> None:
     """List the recordings below a folder in a manifest.
 
-    It says why others cannot be played. Each one is opened once, as sags run would. The manifest is a
-    table: recording, rig, overrides, weight, segment.
+    What cannot be played is named with the reason. Each one is opened once, as sags run would. The manifest
+    is a table: recording, rig, overrides, weight, segment.
 
     \b
     sags archive scan /data/theatre3 --out theatre3.parquet

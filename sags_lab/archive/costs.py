@@ -16,19 +16,19 @@ from sags_lab.archive.work import Outcome, Plan, work
 from sags_node.errors import SagsError
 from sags_node.tools.evaluation.provenance import revision
 
-SHORT = 4  # the shorter length is so many times shorter
+SHORT = 4  # the longer run has so many times the frames of the shorter one
 HOUR = 3600.0  # s
-IN_CLIPS = frozenset({"fit"})  # holds a recording in memory: an hour is so many clips of the longer length
+IN_CLIPS = frozenset({"fit"})  # held in memory as a whole: its hour is made of clips of the longer length
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Of one run."""
+    """What one run costs."""
 
     cpu_s: float
     wall_s: float
     peak_mb: float  # of its largest process
-    bytes: float  # that it leaves
+    bytes: float  # of the files that it leaves
 
 
 def job_costs(
@@ -39,11 +39,11 @@ def job_costs(
     rate: float,
     tell: Callable[[int, str], None] = lambda done, what: None,
 ) -> list[dict[str, Any]]:
-    """A row for each job; one runs after the other, on one core unless `engine.threads` says another.
+    """Measure jobs, one after the other, on one core unless `engine.threads` says another number.
 
     Args:
         launch: a launch file or session.
-        frames: the longer length.
+        frames: of the longer run.
         rate: of the recording, frames per second.
         tell: called with how many jobs are done, and which one is next.
 
@@ -71,8 +71,8 @@ def job_costs(
 
 
 def of_an_hour(job: str, short: Cost, long: Cost, frames: int, rate: float) -> dict[str, int]:
-    """CPU and wall seconds, and bytes: what each further frame costs, times the frames, and what a start
-    costs once."""
+    """Return CPU seconds, wall seconds and bytes of an hour of video. A start costs once; what each further
+    frame costs follows from the two runs."""
     count, fewer = HOUR * rate, max(1, frames // SHORT)
 
     def scaled(less: float, more: float) -> int:
@@ -92,7 +92,7 @@ def _cost(launch: str, overrides: Sequence[str], job: str, frames: int) -> Cost:
     recording = Recording(launch, "", overrides=(*overrides, f"source.frames:={frames}"))
     with tempfile.TemporaryDirectory(prefix="sags-costs-") as out:
         plan = Plan(job, (), (), out, revision(), Limits())
-        # A new process for each: what its children used is of this job alone.
+        # A new process for each: all that its children used was used by this job.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
             outcome, cpu_s, peak_mb = alone.submit(_measured, recording, plan).result()
         if outcome.state != "done":

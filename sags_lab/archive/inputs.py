@@ -1,4 +1,4 @@
-"""The files of a recording: what tells whether they changed, and how they come to the machine that works."""
+"""The files of a recording: how a change of them is seen, and how they get to the machine that works."""
 
 import fcntl
 import hashlib
@@ -18,23 +18,23 @@ from sags_node.config.launch_file import load_launch
 from sags_node.config.schema import LaunchConfig
 from sags_node.errors import SagsError, UsageError
 
-Stat = tuple[str, int, str]  # name, bytes, and when it changed or what the server says of its content
+Stat = tuple[str, int, str]  # name, bytes, and the time of change or the server's checksum
 
 _SCRATCH = "sags-archive-"
-_CHANGED = ("ETag", "etag", "md5Hash", "LastModified", "mtime")  # of fsspec's info, the surest first
+_CHANGED = ("ETag", "etag", "md5Hash", "LastModified", "mtime")  # keys of fsspec's info, the surest first
 
 
 def settings_of(about: Mapping[str, Any]) -> str:
-    """The beginning of every key that is made with these settings: job, options, overrides and version."""
+    """Return how all keys with these settings (job, options, overrides, version) begin: their hash."""
     return _hash({name: about[name] for name in ("job", "options", "overrides", "version")})[:8]
 
 
 def key_of(recording: Recording, about: Mapping[str, Any]) -> str:
-    """A hash of all that is done with a recording, and by which version, then one of its files.
+    """Return a hash of the settings, see `settings_of`, followed by one of the recording's own inputs.
 
-    A file counts by its name, size and time of change (of a URL: the server's ETag, where it has one); what
-    is in it is not read. The files are those of the recording, of its calibration, and all that its launch
-    file names.
+    Of a file its name, size and time of change count (of a URL the server's ETag, where it has one); its
+    content is not read. The files are those of the recording, of its calibration, and all that its launch
+    file names. The overrides of its row count, too.
 
     Args:
         about: job, options, overrides and version.
@@ -49,7 +49,7 @@ def _hash(said: Any) -> str:
 
 
 def places(recording: Recording) -> list[str]:
-    """All paths and URLs that a recording needs; what cannot be known stays unknown."""
+    """Return all paths and URLs that a recording needs, as far as they can be found out."""
     found = belongs(recording.place, recording.overrides)
     if recording.rig is not None:
         found.append(recording.rig)
@@ -63,7 +63,7 @@ def places(recording: Recording) -> list[str]:
 
 def _named(config: LaunchConfig) -> Iterator[Path]:
     trees: list[Any] = [config.model_dump(include={"source", "rig", "robot", "vision"})]
-    for tree in trees:  # grows
+    for tree in trees:  # the list grows meanwhile
         if isinstance(tree, Path):
             yield tree
         elif isinstance(tree, dict):
@@ -101,7 +101,7 @@ def _remote_stats(url: str) -> list[Stat]:
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """An empty folder for temporary files. Those that killed workers of this machine left are removed."""
+    """Make an empty temporary folder. Those that killed workers of this machine left behind are removed."""
     parent = Path(tempfile.gettempdir())
     for old in parent.glob(f"{_SCRATCH}*"):
         _remove_orphan(old)
@@ -121,13 +121,13 @@ def _remove_orphan(folder: Path) -> None:
 
 
 def fetched(recording: Recording, folder: Path, most_gb: float) -> tuple[Path, Path | None]:
-    """A recording and its calibration on this machine: URLs are copied to `folder`.
+    """Bring a recording and its calibration to this machine: URLs are copied to `folder`.
 
     Returns:
-        Their paths.
+        Their paths here; None for no calibration.
 
     Raises:
-        UsageError: it is larger than `most_gb` (10^9 bytes).
+        UsageError: what must be copied is larger than `most_gb` (10^9 bytes).
         OSError: it cannot be fetched.
     """
     names = belongs(recording.place, recording.overrides)
@@ -137,7 +137,7 @@ def fetched(recording: Recording, folder: Path, most_gb: float) -> tuple[Path, P
     if size > most_gb:
         raise UsageError(f"{recording.name} has {size:.2f} GB, {most_gb:g} may be fetched (--stage-limit)")
     here = {place: _fetch(place, folder / str(number)) for number, place in enumerate(remote)}
-    if len(names) == 2 and names[0] in here:  # the eyes' videos, which find each other by name
+    if len(names) == 2 and names[0] in here:  # the eyes' videos: the right one is found beside the left
         (right := here[names[1]]).rename(here[names[0]].with_name(right.name))
     found = [here.get(place) or Path(place) for place in places]
     return found[0], None if recording.rig is None else found[-1]

@@ -1,4 +1,4 @@
-"""The jobs: each is a `sags` command for one recording, that leaves a folder and says its figures as JSON."""
+"""The jobs: each is a `sags` command for one recording. It fills a folder and prints figures as JSON."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,18 +26,18 @@ NEEDS_PLOTS = frozenset({"eval"})
 
 
 def command(job: str, said: Sequence[str], options: Sequence[str], out: Path) -> list[str]:
-    """What follows `sags`.
+    """Return the arguments after `sags`.
 
     Args:
         said: launch file or session, and overrides, as `launching.arguments`.
-        options: further ones of that command.
+        options: further options of that command.
         out: the folder that it fills.
     """
     return [*JOBS[job](list(said), out), *options]
 
 
 def row_of(figures: Any) -> dict[str, Any]:
-    """The figures of a job in one row, named by their way: `online.psnr`."""
+    """Return the figures of a job in one row; names of nested ones are joined: `online.psnr`."""
     if isinstance(figures, list):  # of `sags export`: a row for each kind of file
         figures = {each["kind"]: {"holds": each["holds"], "bytes": each["bytes"]} for each in figures}
     return flat(figures)

@@ -9,9 +9,9 @@ from sags_node.errors import UsageError
 
 
 def counterpart(left: str) -> str | None:
-    """The name of the right eye's file or folder; None where this is not named as a left one.
+    """Return the name of the right eye's file or folder; None where `left` is not named as a left one.
 
-    The last "left" of the name becomes "right", else an l that stands alone at its end an r.
+    The last "left" of the name becomes "right"; else an "l" at its end, after _ or -, becomes "r".
     """
     stem, dot, suffix = left.rpartition(".") if "." in left else (left, "", "")
     for pattern in (r"^(.*)(left)(.*)$", r"^(.*[_-])(l)()$"):
@@ -29,13 +29,13 @@ def is_video(name: str) -> bool:
 
 
 def belongs(name: str, overrides: Sequence[str]) -> list[str]:
-    """The names (paths or URLs) of all files and folders of a recording: two where each eye has its video."""
+    """Return the paths or URLs of a recording's files and folders: two where each eye has its video."""
     right = counterpart(name) if is_video(name) and _kind(overrides) == "videos" else None
     return [name] if right is None or _shows_both(overrides) else [name, right]
 
 
 def arguments(place: Path, rig: Path | None, overrides: Sequence[str]) -> list[str]:
-    """What follows `sags eval`: a launch file or session, and `key:=value`.
+    """Return the arguments after `sags eval`: a launch file or session, and `key:=value`.
 
     Args:
         place: of the recording, on this machine.
@@ -76,6 +76,6 @@ def _shows_both(overrides: Sequence[str]) -> bool:
 
 
 def split(said: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Arguments as `load_launch` and `open_session` take them: what is launched, and the overrides."""
+    """Split arguments for `load_launch` and `open_session`: what is launched, and the overrides."""
     launch = next((each for each in said if ":=" not in each), None)
     return launch, [each for each in said if ":=" in each]

@@ -33,9 +33,9 @@ class Recording:
 
     Attributes:
         name: path or URL as the manifest says it.
-        folder: of the manifest; relative names are in there.
-        weight: what it costs, against the others.
-        segment: names the part of it that this is; empty: all of it.
+        folder: of the manifest; relative names start there.
+        weight: what it costs, relative to the others.
+        segment: name of the part that the row stands for; empty: all of it.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Recording:
 
     @property
     def id(self) -> str:
-        """Names it in files: the end of its path, its segment, and a hash of what makes it another one."""
+        """Its name in file names: the end of its path, its segment, and a hash of its name and overrides."""
         parts = [part for part in PurePosixPath(self.name).parts if part not in ("/", "..")]
         end = re.sub(r"[^A-Za-z0-9-]+", "_", "_".join(parts[-2:])).strip("_")
         said = "\n".join((self.name, *self.overrides))
@@ -56,7 +56,7 @@ class Recording:
 
     @property
     def place(self) -> str:
-        """Path or URL, from anywhere."""
+        """Its full path or URL."""
         return _from(self.folder, self.name)
 
     @property
@@ -73,13 +73,13 @@ def _from(folder: str, name: str) -> str:
 
 
 def read_manifest(url: str) -> list[Recording]:
-    """All rows, in the file's order.
+    """Read all rows, in the file's order.
 
     Args:
         url: path or URL (fsspec) of a .csv or .parquet file.
 
     Raises:
-        UsageError: it is missing, no such file, or a row is wrong; the message names the row.
+        UsageError: it is missing, no CSV or Parquet file, or a row is wrong; the message names the row.
     """
     try:
         fs, path = url_to_fs(url)
@@ -144,8 +144,8 @@ def _recording(row: Mapping[str, Any], number: int, folder: str, url: str) -> Re
 
 
 def beside(recording: Recording, url: str) -> Recording:
-    """The row of a recording of this machine in a manifest at `url`: names are relative to it where they can
-    be, else absolute."""
+    """Return the row of a recording of this machine for a manifest at `url`. Names below its folder become
+    relative to that; others stay absolute."""
     folder = url.rpartition("/")[0] if is_url(url) else str(Path(url).resolve().parent)
 
     def name(place: str) -> str:
@@ -157,7 +157,7 @@ def beside(recording: Recording, url: str) -> Recording:
 
 
 def check_manifest(url: str, force: bool) -> None:
-    """Before any work: may a manifest be written there?
+    """Check, before any work, that a manifest may be written there.
 
     Raises:
         UsageError: another suffix than .csv or .parquet, or it exists already and `force` is not given.
@@ -196,7 +196,7 @@ def write_manifest(url: str, recordings: Sequence[Recording]) -> None:
 
 
 def as_csv(recordings: Sequence[Recording]) -> bytes:
-    """The content of a .csv file."""
+    """Return the content of a .csv file."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
@@ -226,7 +226,7 @@ def _as_parquet(recordings: Sequence[Recording]) -> bytes:
 
 
 def parquet() -> Any:
-    """`pyarrow.parquet`.
+    """Import and return `pyarrow.parquet`.
 
     Raises:
         UsageError: it is not installed.

@@ -26,7 +26,7 @@ AGAINST = {  # two columns -> title
     ("frame_ms.p50", "depth.median_mm"): "depth error (mm), over the median time of a frame (ms)",
     ("frames", "seconds"): "seconds for a recording, over its frames",
 }
-WORST_BY = ("online.psnr", "heldout.psnr")  # the first one that is known; the lowest are the worst
+WORST_BY = ("online.psnr", "heldout.psnr")  # the first that any recording has; the lowest are the worst
 WORST = 6  # recordings that are shown
 MOST_FAILURES = 200  # lines
 SHEET_WIDTH = 1000  # px
@@ -64,7 +64,7 @@ def _failures(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _spreads(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Each figure sorted: over how many percent of the recordings are below it."""
+    """A plot for each figure: its sorted values over the percentage of recordings below."""
     plots = []
     for column, title in SPREAD.items():
         values = sorted(value for row in rows if (value := _number(row, column)) is not None)
@@ -100,7 +100,7 @@ def _grid(plots: Sequence[str]) -> str:
 
 
 def _worst(store: Store, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Pictures of the recordings that were shown least well: of each, what its own report shows."""
+    """The `WORST` recordings, each with the sheet of pictures of its own report."""
     column = next((each for each in WORST_BY if any(_number(row, each) is not None for row in rows)), None)
     if column is None:
         return ['<p class="quiet">no figure to tell them by</p>']

@@ -1,4 +1,4 @@
-"""One command in a process of its own, within limits of time and memory. It ends with the one who waits."""
+"""One command in a process of its own, within limits of time and memory. It is killed with its parent."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ class Limits:
     Attributes:
         memory_gb: resident, of the process and its children; None: no limit.
         seconds: of wall time; None: no limit.
-        staged_gb: bytes that are fetched for it, 10^9.
+        staged_gb: size of what is fetched for it; 10^9 bytes.
     """
 
     memory_gb: float | None = None
@@ -37,7 +37,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a command ended: its exit code, negative for a signal, or the limit that ended it."""
+    """How a command ended: its exit code, negative for a signal, and the limit that ended it, if one did."""
 
     code: int
     limit: str | None = None
@@ -47,7 +47,7 @@ def run_limited(command: Sequence[str], cores: int, limits: Limits, stdout: Path
     """Run a command, and all that it starts. It is killed with this process.
 
     Args:
-        cores: threads of each library.
+        cores: number of threads of each library.
 
     Raises:
         OSError: it cannot be started.
@@ -69,7 +69,7 @@ def run_limited(command: Sequence[str], cores: int, limits: Limits, stdout: Path
 
 
 def _wait(process: subprocess.Popen[bytes], limits: Limits) -> str | None:
-    """Until it ends, or a limit does; which one."""
+    """Wait until the process ends or exceeds a limit; says which limit, or None."""
     began = looked = time.monotonic()
     while process.poll() is None:
         time.sleep(LOOK_PERIOD)
@@ -85,7 +85,7 @@ def _wait(process: subprocess.Popen[bytes], limits: Limits) -> str | None:
 
 
 def resident_bytes(session: int) -> int:
-    """Memory of all processes of a session."""
+    """Return the resident memory of all processes of a session, bytes."""
     total = 0
     for entry in os.scandir("/proc"):
         if not entry.name.isdigit():

@@ -1,4 +1,4 @@
-"""What an archive has come to: how far it is, what failed, and all figures in one table."""
+"""The state of an archive: how far it is, what failed, and all figures in one table."""
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,11 +10,11 @@ from sags_lab.archive.manifest import Recording, parquet, read_manifest
 from sags_lab.archive.store import ABOUT, DONE, FAILED, MANIFEST, RESULTS, Store
 from sags_node.errors import UsageError
 
-BATCH = 2000  # rows that are in memory as text, and are read at the same time
+BATCH = 2000  # rows that are read together, and are in memory as Python objects
 
 
 def listed(store: Store) -> tuple[dict[str, Any], list[Recording]]:
-    """The settings of the newest run, and its recordings.
+    """Return the settings of the newest run, and its recordings.
 
     Raises:
         UsageError: there was no run.
@@ -27,7 +27,7 @@ def listed(store: Store) -> tuple[dict[str, Any], list[Recording]]:
 
 
 def status(store: Store) -> dict[str, Any]:
-    """Counts, and a row for each recording that failed.
+    """Return counts, and a row for each recording that failed.
 
     Raises:
         UsageError: there was no run.
@@ -58,13 +58,13 @@ def status(store: Store) -> dict[str, Any]:
 
 
 def settings(store: Store) -> str:
-    """Those of the newest run, as keys have them: what was done with others is to be done again."""
+    """Return the hash of the newest run's settings with which valid keys begin; "" where there was no run."""
     about = store.read_json(ABOUT)
     return "" if about is None else settings_of(about)
 
 
 def failed(store: Store) -> list[dict[str, Any]]:
-    """The records of all recordings whose last attempt failed, with the settings of the newest run."""
+    """Return the records of recordings whose last attempt, with the newest run's settings, failed."""
     own = settings(store)
     names = [f"{FAILED}/{name}" for name in store.names(FAILED) if name.endswith(".json")]
     records = store.read_all_json(names)
@@ -72,10 +72,10 @@ def failed(store: Store) -> list[dict[str, Any]]:
 
 
 def of_one(store: Store, id: str) -> dict[str, Any]:
-    """What is known of one recording: its figures, or its failed attempts and what the last one said.
+    """Return what is known of one recording: its figures, or its failed attempts, and the log.
 
     Args:
-        id: or the beginning of one.
+        id: of the recording, or the beginning of it.
 
     Raises:
         UsageError: no recording, or several, are named so.
@@ -130,7 +130,7 @@ def write_results(store: Store, recordings: Sequence[Recording]) -> int:
     for field in (field for table in tables for field in table.schema):
         kinds.setdefault(field.name, {"null"}).add(str(field.type))
     mixed = {name for name, those in kinds.items() if len(those) > 2 and those != {"null", "int64", "double"}}
-    for number, table in enumerate(tables):  # as in one batch
+    for number, table in enumerate(tables):  # types that differ between batches become text, as within one
         texts = [field.with_type(pa.string()) if field.name in mixed else field for field in table.schema]
         tables[number] = table.cast(pa.schema(texts))
     file = io.BytesIO()
@@ -140,7 +140,7 @@ def write_results(store: Store, recordings: Sequence[Recording]) -> int:
 
 
 def read_results(store: Store) -> list[dict[str, Any]]:
-    """The rows of `results.parquet`; none where there is no table."""
+    """Read the rows of `results.parquet`; none where there is no table."""
     pq = parquet()
     import pyarrow as pa
 
@@ -152,7 +152,7 @@ def read_results(store: Store) -> list[dict[str, Any]]:
 def _batches(
     store: Store, recordings: Sequence[Recording], records: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[list[dict[str, Any]]]:
-    """The rows of all, by id, so many at a time."""
+    """The rows of all recordings, sorted by id, `BATCH` at a time."""
     done = store.done(settings(store))
     ordered = sorted(recordings, key=lambda each: each.id)
     for begin in range(0, len(ordered), BATCH):
@@ -178,7 +178,7 @@ def _row(
 
 
 def _column(pa: Any, values: list[Any]) -> Any:
-    """Numbers are numbers, 1 as well as 1.0; what is of several kinds becomes text."""
+    """A column of a table: int and float together become float, other mixed types text."""
     kinds = {type(value) for value in values if value is not None}
     if kinds == {int, float}:
         return pa.array(values, pa.float64())

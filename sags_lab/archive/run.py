@@ -18,7 +18,7 @@ from sags_node.terminal.console import on_stop_signals
 
 Task = Callable[[Recording, Plan, str], Outcome]
 
-AHEAD = 2  # tasks handed to Ray for each that runs: so many wait where they will run
+AHEAD = 2  # tasks handed to Ray for each that can run, so that the next ones wait on their machine
 LOOK_PERIOD = 0.5  # s
 STOP_SECONDS = 15.0  # for the tasks to end what they started
 SLOTS_PERIOD = 10.0  # s until a cluster is asked again how large it is
@@ -26,14 +26,14 @@ SLOTS_PERIOD = 10.0  # s until a cluster is asked again how large it is
 
 @dataclass(slots=True)
 class Tally:
-    """How far it is.
+    """How far a run is.
 
     Attributes:
         kept: done before this run.
-        frames: of those done in this run.
+        frames: of the recordings done in this run.
         hosts: recordings done, by machine.
-        waits: what recordings that were not begun need, and no machine has; empty: there are none.
-        stopping: set by Ctrl-C: what runs is ended, and may be done again later.
+        waits: says what waiting recordings need that no machine has; empty: none wait for that.
+        stopping: set by Ctrl-C: running tasks are ended; a later run does them again.
     """
 
     of: int
@@ -68,14 +68,14 @@ def run(
     """Do what is missing, until all is done or Ctrl-C. The store must be locked.
 
     Args:
-        attempts: a recording is tried so often, in this and earlier runs; then it is quarantined.
-        tell: called with how far it is, and a line where something failed.
-        retry_failed: quarantined recordings have all their attempts anew.
+        attempts: after so many, in this and earlier runs, a recording is quarantined.
+        tell: called with how far it is, and a line where something failed or waits; else "".
+        retry_failed: forget all failed attempts, also of quarantined recordings.
         address: of a Ray cluster; None: this machine alone.
-        task: what is done with each.
+        task: what is done with each recording.
 
     Raises:
-        UsageError: Ray is not installed, or a recording needs what is no number of cores.
+        UsageError: Ray is not installed, or `engine.threads` of a recording is no number of cores.
         SagsError: Ray does not start, or the output is full.
     """
     tally = Tally(len(recordings))
@@ -156,7 +156,7 @@ def _work_through(
 
 
 def about(plan: Plan) -> dict[str, Any]:
-    """What decides what comes out, beside a recording itself."""
+    """Return what results depend on, beside the recording itself."""
     return {
         "job": plan.job,
         "overrides": list(plan.overrides),
@@ -166,13 +166,13 @@ def about(plan: Plan) -> dict[str, Any]:
 
 
 def describe(store: Store, recordings: Sequence[Recording], plan: Plan, manifest: bytes) -> None:
-    """Keep what is being run, for `sags archive status`."""
+    """Write what is being run into the store, for `sags archive status`."""
     store.write(MANIFEST, manifest)
     store.write_json(ABOUT, {**about(plan), "folder": recordings[0].folder, "limits": asdict(plan.limits)})
 
 
 def forget(store: Store, id: str) -> None:
-    """Of a recording's failures."""
+    """Remove the record of a recording's failures."""
     for suffix in ("json", "log"):
         store.remove(f"{FAILED}/{id}.{suffix}")
 
@@ -186,7 +186,7 @@ def _missing(
     retry_failed: bool,
     tally: Tally,
 ) -> Iterator[Todo]:
-    """Recordings that are not done as they are now, in this order. Files are looked at one recording ahead of
+    """Recordings without up-to-date results, in this order. Their files are looked at one recording ahead of
     the work, not all at once."""
     done = store.done()
     for recording in recordings:
@@ -196,7 +196,7 @@ def _missing(
             tally.kept += 1
             continue
         if before is not None:
-            store.remove(f"{DONE}/{recording.id}.{before}.json")  # first: its results are about to go
+            store.remove(f"{DONE}/{recording.id}.{before}.json")  # before its results are replaced
         if recording.id in failed:
             record = store.read_json(f"{FAILED}/{recording.id}.json")
             if retry_failed or record["key"] != key:
@@ -208,7 +208,7 @@ def _missing(
 
 
 def _remote(ray: Any, task: Task, what: Needs) -> Any:
-    """The task, as Ray is asked to run it."""
+    """The task as a Ray function that asks for these resources."""
     memory = {"memory": what.memory} if what.memory else {}
     return ray.remote(task).options(num_cpus=what.cores, num_gpus=what.gpus, max_retries=0, **memory)
 
@@ -222,7 +222,7 @@ def _slots(nodes: Sequence[Mapping[str, float]], what: Needs) -> int:
 
 
 def _unmet(nodes: Sequence[Mapping[str, float]], those: Sequence[Needs]) -> str:
-    """What recordings wait for in vain, in a line; empty: for nothing."""
+    """A line that says what recordings need and no machine has; empty where `those` is."""
     if not those:
         return ""
     most = {name: max((node.get(name, 0) for node in nodes), default=0) for name in ("CPU", "GPU", "memory")}
@@ -251,7 +251,7 @@ def _count(tally: Tally, outcome: Outcome) -> None:
 
 
 def _note(store: Store, todo: Todo, plan: Plan, outcome: Outcome, attempts: int) -> bool:
-    """Keep why an attempt failed; whether the recording is quarantined now."""
+    """Write why an attempt failed; return whether the recording is quarantined now."""
     name = f"{FAILED}/{outcome.id}.json"
     before = store.read_json(name)
     tried = [*(before["attempts"] if before is not None and before["key"] == todo.key else [])]
@@ -272,7 +272,7 @@ def _note(store: Store, todo: Todo, plan: Plan, outcome: Outcome, attempts: int)
 
 
 def _end(ray: Any, running: dict[Any, Todo]) -> None:
-    """End what runs: each task ends its own process."""
+    """Cancel the running tasks: each ends its own process."""
     for reference in running:
         ray.cancel(reference, force=False)
     if running:

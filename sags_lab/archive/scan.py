@@ -17,8 +17,8 @@ from sags_node.sources.dvrk import read_sidecar
 from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source, recorded_rig
 
-WIDE = 2.2  # times as wide as high: two pictures beside each other; one alone is at most 1.9 (16:9, 17:9)
-PHANTOM_RATE = 30.0  # frames per second, unless it says another
+WIDE = 2.2  # width / height of two pictures side by side, at least; of one it is at most 1.9 (16:9, 17:9)
+PHANTOM_RATE = 30.0  # frames per second, where the launch file names none
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ def scan(
 
     Args:
         rig: the calibration of those that bring none; None: the nearest folder `calib` beside or above.
-        cut: into segments, a row for each; None: recordings stay whole.
+        cut: how to cut recordings into segments, a row for each; None: they stay whole.
         progress: called with how many were looked at.
 
     Raises:
@@ -69,7 +69,7 @@ def scan(
 
 
 def _candidates(folder: Path) -> Iterator[Path]:
-    """What may be a recording, in order. What is inside one is none."""
+    """Paths that may be recordings, in order. Nothing inside a recording is another one."""
     if (folder / "launch.yaml").is_file() or _is_whole(folder):
         yield folder
         return
@@ -85,7 +85,7 @@ def _candidates(folder: Path) -> Iterator[Path]:
 
 
 def _is_whole(folder: Path) -> bool:
-    """Whether a folder is one recording, and not one that holds some."""
+    """Whether a folder is itself one recording, and not a folder of recordings."""
     pictures = all((folder / eye).is_dir() for eye in ("left", "right"))
     known = known_recording(folder)
     if known is None:
@@ -112,7 +112,7 @@ def _is_right_eye(file: Path) -> bool:
 
 
 def _has_sidecar(video: Path) -> bool:
-    """Whether a session of dVRK's `record` in this folder is of this video."""
+    """Whether a sidecar file of dVRK's `record` beside this video names it."""
     return any(
         read_sidecar(file).video_file == video.name
         for file in video.parent.glob("*.json")
@@ -124,7 +124,7 @@ def _opened(root: Path, name: str, rig: Path | None, cut: Cut | None) -> list[Re
     """The row of a recording that can be played, or those of its segments.
 
     Raises:
-        SagsError: it cannot.
+        SagsError: it cannot be played.
     """
     path = root / name
     overrides = _says_how(path) if is_video(path.name) else []
@@ -158,7 +158,7 @@ def _weight(frames: int, width: int, height: int) -> float:
 
 
 def _segments(row: Recording, config: Source, cut: Cut) -> list[Recording]:
-    """Of a recording that is opened for it; a phantom is rendered then."""
+    """`segments` of a recording that is not open yet: a phantom is rendered for it."""
     with open_source(config, references=False) as source:
         assert isinstance(source, Replay) and not isinstance(config, LiveSource)
         return segments(row, config, source, cut)

@@ -1,6 +1,6 @@
 """Long recordings as several rows of a manifest, one for each segment.
 
-The model learns while it plays, so a segment begins with a warm-up: frames that count in the segment before.
+The model learns while it plays, so a segment begins with a warm-up: frames that the segment before counts.
 Borders are frame numbers. All segments together count each frame of the recording once.
 """
 
@@ -25,23 +25,23 @@ class Cut:
 
 
 def borders(first: int, count: int, most: int) -> list[int]:
-    """Where parts of at most `most` frames begin, and where the last one ends.
+    """Return where parts of at most `most` frames begin, and where the last one ends.
 
-    There are as few as possible, and none is more than a frame longer than another.
+    There are as few parts as possible, and their lengths differ by at most one frame.
     """
     parts = -(-count // most)
     return [first + part * count // parts for part in range(parts + 1)]
 
 
 def segments(recording: Recording, config: RecordedSource, source: Replay, cut: Cut) -> list[Recording]:
-    """The rows of a recording; itself where it is short enough.
+    """Return a row for each segment of a recording; its own row where it is short enough.
 
     The last one has no `source.frames` where the recording is played to its end: files may hold more frames
     than they announce.
 
     Args:
         config: how the recording is played, without `loop`.
-        source: it, opened.
+        source: the recording, opened.
     """
     announced = source.frame_count
     assert announced is not None  # it does not loop
@@ -54,7 +54,7 @@ def segments(recording: Recording, config: RecordedSource, source: Replay, cut: 
     found = []
     for begin, end in pairwise(marks):
         start = source.seconds_of(max(source.first, begin - round(cut.warm_up * source.rate)))
-        played = source.frame_at(start)  # where several frames have one stamp it is the first of them
+        played = source.frame_at(start)  # the first of several frames with this stamp
         said = [f"source.start:={start:.9f}".rstrip("0").rstrip("."), f"source.warm_up:={begin - played}"]
         to_the_end = end == marks[-1] and config.frames is None
         if not to_the_end:
@@ -75,7 +75,7 @@ def check_frames(recordings: Sequence[Recording], overrides: Sequence[str]) -> N
     """Refuse overrides for all recordings that change which frames a segment has.
 
     Raises:
-        UsageError: there is one, and a segment.
+        UsageError: there is such an override, and a row that is a segment.
     """
     changed = [each for each in overrides if each.partition(":=")[0] in FRAMES_BY]
     if changed and any(recording.segment for recording in recordings):

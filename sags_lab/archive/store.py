@@ -3,7 +3,7 @@
 archive.json      the job, its settings, and where the recordings lie
 manifest.csv      the recordings
 recordings/ID/    what the job left of one, and log.txt
-done/ID.KEY.json  its figures. There once all of recordings/ID is; KEY is the hash of what it was made of
+done/ID.KEY.json  its figures, written after all of recordings/ID; KEY is the hash of what it was made of
 failed/ID.json    the attempts that failed, and why; failed/ID.log: what the last one said
 partial/          what is being written
 results.parquet   one row for each recording; report.html shows them
@@ -33,7 +33,7 @@ class Store:
     """Reads and writes under one folder or URL.
 
     Attributes:
-        local: the folder, where it is one that this machine sees.
+        local: the folder; None: it is a URL of something else.
 
     Raises:
         UsageError: fsspec does not know such a URL, or a package for it is missing.
@@ -48,7 +48,7 @@ class Store:
         self.local = Path(self._root) if isinstance(self._fs, LocalFileSystem) else None
 
     def read(self, name: str) -> bytes | None:
-        """A file, None where there is none."""
+        """Read a file; None where there is none."""
         try:
             data: bytes = self._fs.cat_file(f"{self._root}/{name}")
         except FileNotFoundError:
@@ -56,7 +56,7 @@ class Store:
         return data
 
     def read_many(self, names: Sequence[str]) -> list[bytes | None]:
-        """As `read`, of each; of a URL many at the same time.
+        """Read files, as `read`; from a URL many at the same time.
 
         Raises:
             OSError: one is there and cannot be read.
@@ -71,11 +71,11 @@ class Store:
         return [data if isinstance(data := found.get(path), bytes) else None for path in paths]
 
     def read_json(self, name: str) -> Any:
-        """A file of JSON; see `read_all_json`."""
+        """Read a JSON file; see `read_all_json`."""
         return self.read_all_json([name])[0]
 
     def read_all_json(self, names: Sequence[str]) -> list[Any]:
-        """As `read_many`.
+        """Read JSON files, as `read_many`.
 
         Raises:
             SagsError: one is damaged.
@@ -90,7 +90,7 @@ class Store:
         return found
 
     def write(self, name: str, data: bytes) -> None:
-        """A file, whole or not at all; an earlier one is replaced.
+        """Write a file, whole or not at all; an earlier one is replaced.
 
         Raises:
             OSError: it cannot be written.
@@ -113,12 +113,12 @@ class Store:
         self.write(name, json.dumps(value, indent=1).encode() + b"\n")
 
     def remove(self, name: str) -> None:
-        """A file or folder, where there is one."""
+        """Remove a file or folder, where there is one."""
         with suppress(FileNotFoundError):
             self._fs.rm(f"{self._root}/{name}", recursive=True)
 
     def names(self, folder: str) -> list[str]:
-        """The files and folders in a folder, sorted; those still being written are left out."""
+        """Return the names of files and folders in a folder, sorted, without those still being written."""
         try:
             found = self._fs.ls(f"{self._root}/{folder}", detail=False)
         except FileNotFoundError:
@@ -127,13 +127,13 @@ class Store:
         return [name for name in names if not name.startswith(".")]
 
     def done(self, settings: str = "") -> dict[str, str]:
-        """The key of each recording that is done with these settings (`settings_of`), or any; by its id."""
+        """Return the keys, by id, of recordings done with these settings (of `settings_of`; "": with any)."""
         found = (name.split(".")[:2] for name in self.names(DONE))
         return {id: key for id, key in found if key.startswith(settings)}
 
     @contextmanager
     def partial(self, name: str) -> Iterator[Path]:
-        """An empty folder of this machine to write in, gone at the end."""
+        """Make an empty folder of this machine to write in; it is removed at the end."""
         parent = None if self.local is None else self.local / PARTIAL
         if parent is not None:
             parent.mkdir(parents=True, exist_ok=True)
@@ -147,11 +147,11 @@ class Store:
         """Put a recording's results in their place, then say that it is done.
 
         Raises:
-            OSError: not all can be written; it is not done then.
+            OSError: something cannot be written; then it does not count as done.
         """
         marker = f"{DONE}/{id}.{key}.json"
         if self.read(marker) is not None:
-            return  # a worker that was taken for lost has done it
+            return  # done already, by a worker that was believed lost
         self.remove(f"{RECORDINGS}/{id}")  # of an attempt that was cut off, or from before something changed
         if self.local is None:
             self._fs.put(f"{folder}/", f"{self._root}/{RECORDINGS}/{id}/", recursive=True)

@@ -1,4 +1,4 @@
-"""One recording of an archive, on the machine that does it: fetch, run, put in place, say so."""
+"""One recording of an archive, on the worker: fetch it, run the job, store the results, report."""
 
 import errno
 import json
@@ -25,8 +25,8 @@ from sags_node.tools.evaluation.provenance import machine_name, revision
 
 State = Literal["done", "failed", "refused", "no space"]
 NO_SPACE = os.strerror(errno.ENOSPC)
-WRONG_REQUEST = UsageError.exit_code  # of a recording that no further attempt can fix
-LEAST_FREE = 1 << 20  # bytes; a file system with less is full
+WRONG_REQUEST = UsageError.exit_code  # exit code where a further attempt would fail, too
+LEAST_FREE = 1 << 20  # bytes; a file system with less counts as full
 TAIL = 20_000  # bytes of a log that are looked at
 LONGEST_REASON = 500  # characters
 
@@ -37,7 +37,7 @@ class Plan:
 
     Attributes:
         overrides: `key:=value` for all; a recording's own come after them.
-        options: further ones of the job's command.
+        options: further options of the job's command.
         out: path or URL of the store.
         version: of this package; another one on a worker is an error.
     """
@@ -63,7 +63,7 @@ class Needs:
 
 
 def needs(plan: Plan, recording: Recording | None = None) -> Needs:
-    """As the overrides say: `engine.threads`, and `device:=cuda`. The recording's own count.
+    """Return what the overrides ask for with `engine.threads` and `device:=cuda`; the recording's own win.
 
     Raises:
         UsageError: `engine.threads` is no number of cores.
@@ -79,12 +79,12 @@ def needs(plan: Plan, recording: Recording | None = None) -> Needs:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one attempt.
+    """The result of one attempt.
 
     Attributes:
         state: `refused`: another attempt would fail, too; `no space`: the output is full.
-        reason: of what is not done, in a line.
-        host: that did it.
+        reason: why it is not done, in a line.
+        host: name of the machine that did it.
     """
 
     id: str
@@ -98,11 +98,11 @@ class Outcome:
 def work(
     recording: Recording, plan: Plan, key: str, program: Sequence[str] = PROGRAM, here: str | None = None
 ) -> Outcome:
-    """Do one recording. Whatever is wrong with it is in the outcome; nothing is raised for that.
+    """Do the job for one recording. What is wrong with it is in the outcome, and not raised.
 
     Args:
         program: what the job's arguments are given to.
-        here: the revision of `program` on this machine; default: ours.
+        here: the revision of `program` on this machine; default: that of this package.
     """
     began, frames = time.monotonic(), 0
     state: State = "done"
@@ -120,7 +120,7 @@ def work(
 
 
 class _FailedError(Exception):
-    """The command did not do it."""
+    """The command failed."""
 
     def __init__(self, state: State, reason: str) -> None:
         super().__init__(reason)
@@ -128,7 +128,7 @@ class _FailedError(Exception):
 
 
 def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str], here: str) -> int:
-    """`work`; the frames of the recording, where the job counts them."""
+    """Do as `work`; returns the number of frames, 0 where the job does not count them."""
     if here != plan.version:
         raise SagsError(f"this machine has sags-node {here}, not {plan.version}; install that")
     began, store = time.monotonic(), Store(plan.out)
@@ -136,16 +136,16 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str], he
         place, rig = fetched(recording, stage, plan.limits.staged_gb)
         said = command(plan.job, _said(place, rig, recording, plan), plan.options, out)
         cores = needs(plan, recording).cores
-        figures_file, log = stage / FIGURES, stage / LOG  # where `out` is full, the log can still say so
+        figures_file, log = stage / FIGURES, stage / LOG  # not in `out`, which may become full
         ended = run_limited([*program, *said], cores, plan.limits, figures_file, log)
-        is_full = shutil.disk_usage(out).free < LEAST_FREE  # not all that writes pictures and videos says so
+        is_full = shutil.disk_usage(out).free < LEAST_FREE  # not all writers of pictures report it
         if is_full or NO_SPACE in _tail(log):
             raise _FailedError("no space", NO_SPACE)
         if ended != Ended(0):
             store.write(f"{FAILED}/{recording.id}.log", _tail(log).encode())
             raise _FailedError("refused" if ended.code == WRONG_REQUEST else "failed", _reason(ended, log))
         final = f"{plan.out.rstrip('/')}/{RECORDINGS}/{recording.id}"
-        for file in (figures_file, log):  # they say where results are
+        for file in (figures_file, log):  # they name the folder of the results
             (out / file.name).write_bytes(file.read_bytes().replace(os.fsencode(out), final.encode()))
         figures = row_of(json.loads(figures_file.read_bytes()))
         store.finish(recording.id, key, out, _row(recording, figures, plan, time.monotonic() - began))
@@ -153,7 +153,7 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str], he
 
 
 def _said(place: Path, rig: Path | None, recording: Recording, plan: Plan) -> list[str]:
-    """What is launched; then resources, what all recordings get, and this one's own: the last one counts."""
+    """What is launched; then overrides for resources, for all recordings and its own: later ones win."""
     cores = needs(plan, recording).cores
     threads = [f"engine.threads:={cores}", f"vision.onnx.threads:={cores}"]
     launch, own = split(arguments(place, rig, recording.overrides))
@@ -161,7 +161,7 @@ def _said(place: Path, rig: Path | None, recording: Recording, plan: Plan) -> li
 
 
 def repeating(recording: Recording, plan: Plan) -> str:
-    """The command that does the same by hand."""
+    """Return the command that does the same by hand."""
     rig = None if recording.rig is None else Path(recording.rig)
     try:
         said = _said(Path(recording.place), rig, recording, plan)
@@ -185,7 +185,7 @@ def _row(recording: Recording, figures: dict[str, Any], plan: Plan, seconds: flo
 
 
 def _reason(ended: Ended, log: Path) -> str:
-    """In a line: the limit, the signal, or the last thing that the command said."""
+    """Why a command failed, in a line: the limit, the signal, or the last thing that it printed."""
     if ended.limit is not None:
         return ended.limit
     if ended.code < 0:

@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-UNEVEN = 0.02  # of a rate that is still whole: that of 30 Hz by stamps in whole ms is 1 % off
-ROWS = 64  # frames that are in memory
-PICTURES_LOOKED_AT = 10  # one frame in so many, for the statistics
-STATISTICS = {  # feature -> the shape of its statistics; what is a field has one for all of it
+UNEVEN = 0.02  # share that a rate may be off a whole one: stamps in whole ms make 30 Hz 1 % wrong
+ROWS = 64  # frames that are kept in memory until they are written
+PICTURES_LOOKED_AT = 10  # one frame in so many counts in the statistics of pictures
+STATISTICS = {  # feature -> shape of its statistics; (1,): one number for all pixels or values
     DEPTH: (1,), TISSUE: (1,), POSE: (4, 4), POINTS: (3,), VISIBILITY: (1,), "timestamp": (1,),
     LEFT: (3, 1, 1), RIGHT: (3, 1, 1),
 }  # fmt: skip
@@ -60,7 +60,7 @@ class LeRobot:
     not known), and 64 points that are followed ([64, 3] m, world; NaN: lost) with their visibility 0..1.
 
     Args:
-        folder: to be made.
+        folder: is made here.
         rate: frames per second; LeRobot takes whole ones, without gaps.
 
     Raises:
@@ -86,7 +86,7 @@ class LeRobot:
         self._table: Any = None  # a ParquetWriter
 
     def _open(self, pair: RectifiedPair) -> None:
-        """The files of a recording that begins so."""
+        """Open the videos of a recording whose first pair this is."""
         size = pair.camera.width, pair.camera.height
         eyes = (LEFT,) if pair.right is None else (LEFT, RIGHT)
         self._features = features_of(size, eyes, self._fps)
@@ -160,7 +160,7 @@ class LeRobot:
 
 
 def merge(folders: Sequence[Path], out: Path, version: Version) -> int:
-    """One data set of several, in this order; videos are linked where that is possible.
+    """Merge data sets into one, in this order; videos are hard-linked where that is possible.
 
     Args:
         folders: data sets of one episode each, of any version.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Version = Literal["v3.0", "v2.1"]
 
-PATHS: dict[str, dict[str, str]] = {  # version -> what info.json says of the places of files
+PATHS: dict[str, dict[str, str]] = {  # version -> paths of files, as info.json gives them
     "v3.0": {
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
@@ -40,7 +40,7 @@ TASK = "observe the tissue"
 
 
 def check_lerobot() -> None:
-    """To be asked before long work.
+    """Check before long work that pyarrow is installed.
 
     Raises:
         UsageError: pyarrow is not installed.
@@ -67,7 +67,7 @@ def _places(episode: int) -> dict[str, int]:
 
 
 def features_of(size: tuple[int, int], eyes: Sequence[str], fps: int) -> dict[str, Any]:
-    """As info.json says them, of pictures with this width and height; a video has even ones."""
+    """Return the features as info.json has them, for pictures of this size; sides of videos are even."""
     width, height = (side - side % 2 for side in size)
     coarse = [height // COARSE, width // COARSE]
     video = {
@@ -103,7 +103,7 @@ def videos_of(features: Mapping[str, Any]) -> list[str]:
 
 
 def schema_of(features: Mapping[str, Any]) -> pa.Schema:
-    """Of the Parquet files, which hold all but the videos."""
+    """Return the schema of the Parquet files, which hold all but the videos."""
     import pyarrow as pa
 
     fields = []
@@ -152,7 +152,7 @@ def describe(
         info["total_chunks"] = -(-len(lengths) // FILES_PER_CHUNK)
         _describe_v21(meta, lengths, stats)
     else:
-        info |= {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}  # its own defaults
+        info |= {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}  # LeRobot's defaults
         _describe_v30(meta, features, fps, lengths, stats)
     _write_json(meta / "info.json", info)
     _write_json(meta / "stats.json", {name: merged([each[name] for each in stats]) for name in stats[0]})
@@ -198,7 +198,7 @@ def _describe_v30(
 
 
 def _tasks() -> pa.Table:
-    """As pandas writes a table whose index says the task: LeRobot looks tasks up by it."""
+    """The tasks, as pandas writes a table whose index is the task: LeRobot looks tasks up by it."""
     import pyarrow as pa
 
     index = "__index_level_0__"

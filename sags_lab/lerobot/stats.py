@@ -1,4 +1,4 @@
-"""The statistics that a LeRobot data set carries: least, most, mean, spread and count of each feature."""
+"""The statistics that a LeRobot data set has of each feature: min, max, mean, std and count."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ Stats = dict[str, list[Any]]  # of one feature: statistic -> its values
 
 
 class Sums:
-    """What the mean and spread of numbers [N, C] are made of, for each of C; NaN is left out."""
+    """Running sums for min, max, mean and std of numbers [N, C], for each of C; NaN is left out."""
 
     def __init__(self) -> None:
         self._count: F64 | float = 0.0
@@ -29,7 +29,7 @@ class Sums:
         self._most = np.maximum(self._most, np.where(known, values, -np.inf).max(0))
 
     def stats(self, shape: Sequence[int]) -> Stats:
-        """In this shape of C numbers; 0 where nothing is known."""
+        """Return the statistics, reshaped from C numbers to `shape`; 0 where nothing is known."""
         count = np.maximum(self._count, 1)
         mean = self._sum / count
         std = np.sqrt(np.maximum(self._squares / count - mean**2, 0))
@@ -42,7 +42,7 @@ class Sums:
 
 
 def merged(stats: Sequence[Stats]) -> Stats:
-    """Of several episodes, each weighed by its count; one in which nothing is known has no say."""
+    """Merge statistics of episodes, weighted by their counts. Those without a known value are ignored."""
     stats = [each for each in stats if each["count"] != [0]] or stats[:1]
     values = {name: np.array([each[name] for each in stats], np.float64) for name in stats[0]}
     counts = values["count"].reshape(-1, *[1] * (values["mean"].ndim - 1))

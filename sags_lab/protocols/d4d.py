@@ -28,15 +28,15 @@ REGIONS = ("visible", "occluded")
 
 
 def measure_d4d(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Of each clip: depth errors at its first frame against the scan before it, and at its last against the
-    one after it; of stereo (`measured`), the drawn model, and the data set's own stereo depth; where the left
-    eye sees tissue (`visible`), and where it sees an instrument and the scan tissue (`occluded`). PSNR of the
-    drawn model over tissue, beside that of the frame before. All figures are means over clips; `population`
-    has those over the public population, in which no scan is refused.
+    """Measure each clip: depth at its first frame against the scan before it, at its last against the one
+    after it. Measured are stereo (`measured`), the drawn model and the data set's own stereo, where the left
+    eye sees tissue (`visible`), and where it sees an instrument but the scan tissue (`occluded`). PSNR over
+    tissue is that of the drawn model, and of the frame before in its place. All figures are means over clips;
+    `population` has those of depth over the public population, in which no scan is refused.
 
     Raises:
-        SagsError: no scan lies where stereo sees the surface, or a file is wrong. A single scan that does not
-            is `refused`, says why, and counts in the population only.
+        SagsError: every scan disagrees with stereo, or a file is wrong. A single scan that does is `refused`,
+            says why, and counts in the population only.
     """
     clips = {clip.name: _measure_clip(clip, overrides, progress) for clip in d4d_clips(folder)}
     scans = [(name, when) for name, clip in clips.items() for when in WHEN if when in clip]
@@ -87,11 +87,11 @@ class _Run:
         self._before: F32 | None = None
 
     def number_of(self, frame_id: int) -> int:
-        """Of a frame, among all pictures of the clip."""
+        """The number of a frame among all pictures of the clip."""
         return frame_id * self._stride
 
     def look(self, number: int, result: FrameResult, tools: Bool | None) -> None:
-        """Compare what is shown of a frame with its picture, and with the scan that belongs to it."""
+        """Compare the drawn frame with its picture, and depth with the scan that belongs to the frame."""
         tissue, image = result.observation.tissue, metrics.as_float(result.observation.image)
         self._drawn.append(metrics.psnr(metrics.as_float(result.views["left"].rgb), image, tissue))
         if self._before is not None:
@@ -133,7 +133,7 @@ class _Run:
         }
 
     def _data_sets(self, number: int, shape: tuple[int, ...]) -> F32 | None:
-        """Depth [H, W] m by the data set's own stereo, at the working size."""
+        """Depth [H, W] m by the data set's own stereo, at the working size; None: it has none."""
         if not self._clip.stereo:
             return None
         rig = self._clip.rig
@@ -148,13 +148,13 @@ class _Run:
 
 
 def _average(values: Sequence[float]) -> float | None:
-    """Of those that are numbers: a picture without tissue has none."""
+    """Mean of the finite values: the PSNR of a picture without tissue is not finite."""
     numbers = [value for value in values if math.isfinite(value)]
     return float(np.mean(numbers)) if numbers else None
 
 
 def _mean(rows: Sequence[Figures]) -> Figures:
-    """Of each number over the rows that have it, in its group."""
+    """Mean of each number over the rows that have it; groups stay groups."""
     found: Figures = {}
     for key in dict.fromkeys(key for row in rows for key in row):
         values = [row[key] for row in rows if row.get(key) is not None]

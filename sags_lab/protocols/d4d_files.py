@@ -23,9 +23,9 @@ from sags_node.types import F64, Bool, Eye, StereoRig
 
 LARGEST_JSON = 64 << 20  # bytes
 BASELINES = (1e-3, 50e-3)  # m: outside, the calibration is not in metres
-LOOKED_AT = 8  # masks
-UNSURE = (0.4, 0.6)  # share of a picture: whether so much is instrument or the rest is, nobody can tell
-MOVED = (5e-3, 3.0)  # m and degrees between the curated poses of a clip: the endoscope was moved
+LOOKED_AT = 8  # masks, at most
+UNSURE = (0.4, 0.6)  # share of a picture that is white: it does not tell which colour is the instrument
+MOVED = (5e-3, 3.0)  # m and degrees between the curated poses of a clip; beyond, the endoscope was moved
 DEFAULT_RATE = 15.0  # Hz, where names are no stamps
 
 
@@ -66,7 +66,7 @@ class D4dClip:
 
 
 def d4d_clips(folder: Path) -> list[D4dClip]:
-    """All clips with a scan below a folder: of the whole set, a specimen, a session, or one clip.
+    """Return all clips with a scan below a folder: of the whole set, a specimen, a session, or one clip.
 
     Raises:
         UsageError: there are none, or a file is missing or wrong.
@@ -142,7 +142,7 @@ def _read_pose(file: Path) -> F64:
 
 
 def _rate(pictures: list[Path]) -> float:
-    """Of pictures named `seconds_nanoseconds`."""
+    """Frames per second of pictures named `seconds_nanoseconds`."""
     stamps = [file.stem.split("_") for file in pictures]
     if len(stamps) < 2 or not all(len(each) == 2 and "".join(each).isdecimal() for each in stamps):
         return DEFAULT_RATE
@@ -151,7 +151,7 @@ def _rate(pictures: list[Path]) -> float:
 
 
 def _masks(folder: Path, pictures: list[Path]) -> dict[int, Path]:
-    """Named as their pictures, or, where none is, one for each picture in order."""
+    """Masks by number of the frame: those named as pictures, else, if as many, in order."""
     files = sorted(folder.glob("*.png"))
     stems = {file.stem: file for file in files}
     named = {number: stems[file.stem] for number, file in enumerate(pictures) if file.stem in stems}
@@ -162,7 +162,7 @@ def _masks(folder: Path, pictures: list[Path]) -> dict[int, Path]:
 
 
 def _rig(folder: Path, session: Path) -> StereoRig:
-    """Of rectified pictures, from the projection matrices: of the clip, else of its session."""
+    """The rig of rectified pictures, by the projection matrices of the clip, else of its session."""
     places = ((folder, "{}_rect*.yaml"), (folder, "{}.yaml"), (session, "{}.yaml"))
     files = []
     for side in ("left", "right"):
@@ -184,7 +184,7 @@ def _rig(folder: Path, session: Path) -> StereoRig:
             f"{BASELINES[1] * 1e3:g}; P is in metres times pixels"
         )
     eyes = []
-    for P, shift in ((P_left, 0.0), (P_right, baseline)):  # both come to the left one's principal point
+    for P, shift in ((P_left, 0.0), (P_right, baseline)):  # `placed` has the left principal point for both
         placed = np.column_stack([P_left[:, :3], [-P_left[0, 0] * shift, 0, 0]])
         eyes.append(Eye(width, height, P[:, :3], np.zeros(5), np.eye(3), placed))
     return StereoRig(folder.name, *eyes)
@@ -204,7 +204,7 @@ def _camera_info(file: Path) -> tuple[int, int, F64]:
 
 
 def matrix_in(said: dict[str, Any], short: str, long: str, shape: tuple[int, int]) -> F64:
-    """A matrix of a camera_info file, by either of its names.
+    """Return a matrix of a camera_info file, by either of its names.
 
     Raises:
         KeyError, TypeError, ValueError: it is missing or wrong.
@@ -220,7 +220,7 @@ def matrix_in(said: dict[str, Any], short: str, long: str, shape: tuple[int, int
 
 
 def instruments_are_white(masks: list[Path]) -> bool | None:
-    """Which colour of masks is the instrument: the one that covers less. None without masks.
+    """Tell whether white is the instrument in masks: the colour that covers less is. None without masks.
 
     Raises:
         SagsError: about half of the pictures is white, or a mask cannot be read.
@@ -238,7 +238,7 @@ def instruments_are_white(masks: list[Path]) -> bool | None:
 
 
 def read_tools(file: Path, white: bool) -> Bool:
-    """Where a mask marks an instrument, [H, W].
+    """Read where a mask marks an instrument, [H, W].
 
     Raises:
         SagsError: it cannot be read.

@@ -1,8 +1,8 @@
-"""D4D's public population: the scans that others measure on, whatever stereo says of them.
+"""D4D's public population: the scans that others measure on, chosen without a check against stereo.
 
 By `d4d_meta` of github.com/TaiToTo/omnisurg-4d-scene-graph (2026): of 542 scans, two for each of 271 clips,
 487 are kept. Left out are 45 beside which the tissue moves, 8 more than 10 s from the nearest frame, and 2
-that are missing. Its rule reads no figure. Where tissue moves is not published, so the list stands here.
+that are missing. The rule reads no figure. Its record of motion is not published, so the result is listed.
 """
 
 LEFT_OUT: dict[str, dict[str, tuple[int, ...]]] = {  # numbers of clips, by their specimen and session
@@ -52,6 +52,6 @@ LEFT_OUT: dict[str, dict[str, tuple[int, ...]]] = {  # numbers of clips, by thei
 
 
 def in_population(clip: str, when: str) -> bool:
-    """Whether the scan before (`start`) or after (`end`) a clip, `specimen/session/Clip_K`, is kept."""
+    """Tell whether the scan at the `start` or `end` of a clip, `specimen/session/Clip_K`, is kept."""
     session, _, name = clip.rpartition("/")
     return name not in {f"Clip_{number}" for number in LEFT_OUT[when].get(session, ())}

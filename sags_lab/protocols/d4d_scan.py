@@ -1,4 +1,4 @@
-"""D4D's truth: what structured light saw as depth in the picture, and whether it can be there."""
+"""D4D's truth: the scans of structured light as depth in the left picture, and a check of their place."""
 
 from itertools import product
 from pathlib import Path
@@ -15,20 +15,20 @@ from sags_node.files import read_file
 from sags_node.types import F32, F64, Bool, Camera
 
 LARGEST_CLOUD = 1 << 30  # bytes
-BEHIND = 3e-3  # m: a point so far behind one within `AROUND` px is seen through the gaps between points
+BEHIND = 3e-3  # m: a point so far behind another within `AROUND` px may be seen through gaps in the surface
 AROUND = 2  # px
-ALIKE = 0.1  # of the depth: so near to stereo a surface in the right place is, but for edges
-LEAST_ALIKE = 0.5  # share of the pixels that both know
-LEAST_SHARED = 0.05  # share of the pixels that stereo knows
-LEAST_INSIDE = 0.9  # share of a scan that lies in the mask over the scanner's picture
+ALIKE = 0.1  # share of the depth that scan and stereo may differ by, if the scan is in the right place
+LEAST_ALIKE = 0.5  # share of the pixels known to both that must be alike
+LEAST_SHARED = 0.05  # share of the pixels known to stereo that the scan must know, too
+LEAST_INSIDE = 0.9  # share of a scan that must lie inside the mask over the scanner's picture
 
 
 def read_surface(scan: Scan) -> tuple[F64, Bool | None]:
-    """Points [P, 3] m of a scan, and which of them are tissue [P] by the mask over the scanner's picture;
-    None: there is no such mask.
+    """Read the points [P, 3] m of a scan, and which of them are tissue [P] by the mask over the scanner's
+    picture; None: there is no such mask.
 
     Raises:
-        SagsError: a file is missing, damaged, or they do not fit each other.
+        SagsError: a file is missing or damaged, or the files do not fit each other.
     """
     try:
         data = read_file(scan.cloud, LARGEST_CLOUD)
@@ -65,7 +65,7 @@ def _is_tissue(points: F64, scan: Scan, tools: Path) -> Bool:
 
 
 def scan_depth(points: F64, T_cloud_cam: F64, camera: Camera) -> F32:
-    """Depth [H, W] m, 0 unknown, of points [P, 3] in the picture of a camera that stands at `T_cloud_cam`.
+    """Draw points [P, 3] as depth [H, W] m, 0 unknown, of a camera whose pose is `T_cloud_cam`.
 
     Each pixel takes the nearest of the points that fall on it. What is then far behind a neighbour is left
     out: it may be seen through the gaps between points.
@@ -83,7 +83,7 @@ def scan_depth(points: F64, T_cloud_cam: F64, camera: Camera) -> F32:
 
 
 def check_scan(scan: Scan, points: F64, camera: Camera, measured: F32) -> float:
-    """Share of the pixels that scan and stereo (`measured` [H, W] m, 0 unknown) know, in which they agree.
+    """Return the share of pixels known to scan and stereo (`measured` [H, W] m, 0 unknown) that agree.
 
     Raises:
         SagsError: the surface is not where stereo sees it; it says whether another unit or the pose taken the

@@ -20,8 +20,8 @@ from sags_node.sources.pictures import read_picture
 from sags_node.types import F64, I64, Bool, StereoRig
 
 LARGEST_TEXT = 64 << 20  # bytes
-ROWS_APART, LEAST_PX, MOST_PX = 10, 8, 105  # of marks in both eyes of STIR that may be one point
-COEFFICIENTS = 8  # of distortion in StereoCalibration.ini
+ROWS_APART, LEAST_PX, MOST_PX = 10, 8, 105  # px, row and disparity of two marks of STIR that may be one
+COEFFICIENTS = 8  # of distortion, for each eye in StereoCalibration.ini
 # In calib.json: intrinsics, distortion, rotation and translation.
 STIR_NAMES = ("{}cameramat", "{}distortioncoeffs", "rotation", "translation")
 STIR_NAMES_2026 = ("K_{}", "D_{}", "R_left_to_right", "t_left_to_right")
@@ -42,7 +42,7 @@ class StirClip:
 
 
 def stir_clips(folder: Path) -> list[StirClip]:
-    """All labelled sequences below a folder: of the whole set, one experiment, or one sequence.
+    """Return all labelled sequences below a folder: of the whole set, one experiment, or one sequence.
 
     Raises:
         UsageError: there are none, or a file is missing or wrong.
@@ -62,7 +62,7 @@ def stir_clips(folder: Path) -> list[StirClip]:
 
 
 def _stir_clip(left: Path) -> StirClip | None:
-    """None where nothing is marked: its evaluator skips such sequences."""
+    """Read a sequence; None where nothing is marked: STIR's evaluator skips such sequences."""
     right = left.parent.with_name(left.parent.name.replace("left", "right", 1)) / left.name
     left_video, right_video = _one_video(left / "frames"), _one_video(right / "frames")
     marked = (left / f"segmentation/icg{when}seg.png" for when in ("start", "end"))
@@ -90,17 +90,17 @@ def _boxes(file: Path) -> I64:
 
 
 def _middles(boxes: I64) -> I64:
-    """[P, 2] px, whole numbers as its evaluator takes them."""
+    """Middles of boxes [P, 2] px, rounded down as by STIR's evaluator."""
     return boxes[:, :2] + boxes[:, 2:] // 2
 
 
 def marked_in_both(left: Path, right: Path, when: str, rig: StereoRig) -> F64:
-    """Points [P, 3] mm that are marked in both eyes; none where the right eye's marks or an infrared picture
-    are missing.
+    """Return points [P, 3] mm that are marked in both eyes; none where the right eye's marks or an infrared
+    picture are missing.
 
-    Which marks belong together is found as its loader does: of those whose row and disparity are possible,
-    the one whose infrared patch correlates *least* with the left one's. That may be a slip, but published
-    truth is made so; it matters only where several are possible.
+    Marks are paired as STIR's loader pairs them: of those whose row and disparity are possible, it takes the
+    one whose infrared patch correlates *least* with the left one's. That may be a slip, but published truth
+    is made so; it matters only where several are possible.
     """
     marks = [folder / f"segmentation/icg{when}seg.png" for folder in (left, right)]
     infrared = [next(iter(sorted(folder.glob(f"*_icg{when}.png"))), None) for folder in (left, right)]
@@ -126,20 +126,20 @@ def marked_in_both(left: Path, right: Path, when: str, rig: StereoRig) -> F64:
 
 
 def as_stir_counts(rig: StereoRig, left: F64, right: F64) -> F64:
-    """Points [P, 3] mm where the arithmetic of STIR's truth puts pixels [P, 2] of both raw pictures."""
+    """Return points [P, 3] mm of pixels [P, 2] of both raw pictures, by the arithmetic of STIR's truth."""
     baseline_mm = 1e3 * abs(float(rig.T_right_left[0, 3]))
     return stereo_points_mm(left, right, rig.left.K, rig.right.K, baseline_mm)
 
 
 def _correlation(a: F64, b: F64) -> float:
-    """Zero-mean, normalised; 0 where one is of one colour."""
+    """Zero-mean normalised cross-correlation; 0 where a patch is uniform."""
     spread = float(a.std() * b.std())
     return float(np.mean((a - a.mean()) * (b - b.mean()))) / spread if spread > 0 else 0.0
 
 
 def stir_rig(file: Path, size: tuple[int, int]) -> StereoRig:
-    """From `calib.json`, of any year: metres, from left to right or from right to left; the baseline is what
-    counts.
+    """Read `calib.json` of any year, in metres. Its transform is from left to right or the inverse, as the
+    sign of x tells.
 
     Args:
         size: width and height of the pictures, px.
@@ -170,11 +170,11 @@ class StereoMisSequence:
     rig: StereoRig
     frames: tuple[int, ...]  # numbers of frames whose poses are known
     poses: F64  # [len(frames), 4, 4] T_world_cam of the left raw camera, m
-    ranges: tuple[range, ...]  # of frames to be measured, each for itself
+    ranges: tuple[range, ...]  # of frames; each range is measured by itself
     masks: Path | None  # folder of `NNNNNNl.png`, not black where it is tissue; None: there are none
 
     def tissue_in(self, frame: int) -> Bool | None:
-        """[H, W] of the raw left picture of a frame; None: it has no mask.
+        """Return where the raw left picture of a frame shows tissue, [H, W]; None: it has no mask.
 
         Raises:
             SagsError: the mask is damaged, or of another size than the picture.
@@ -214,7 +214,7 @@ def stereomis_sequence(folder: Path) -> StereoMisSequence:
 
 
 def _ranges(file: Path) -> tuple[range, ...]:
-    """Of its table: a line of headings, then the first and last frame of each; without one, all frames."""
+    """Ranges of the table: headings, then lines with first and last frame; all frames without a table."""
     if not file.is_file():
         return (range(sys.maxsize),)
     try:
@@ -230,7 +230,7 @@ def _ranges(file: Path) -> tuple[range, ...]:
 
 
 def read_tum(file: Path) -> tuple[F64, F64]:
-    """Stamps [T] and poses [T, 4, 4] m of a TUM trajectory: `stamp tx ty tz qx qy qz qw`, # begins comments.
+    """Read stamps [T] and poses [T, 4, 4] m, in TUM format: `stamp tx ty tz qx qy qz qw`, # begins comments.
 
     Raises:
         UsageError: it is missing, or holds something else.
@@ -252,7 +252,7 @@ def read_tum(file: Path) -> tuple[F64, F64]:
 
 
 def _stereomis_rig(file: Path) -> StereoRig:
-    """From `StereoCalibration.ini`: sections StereoLeft and StereoRight; `T_` in mm, from left to right."""
+    """Read `StereoCalibration.ini`: sections StereoLeft and StereoRight; `T_` in mm, from left to right."""
     parser = configparser.ConfigParser()
     try:
         parser.read_string(read_file(file, LARGEST_TEXT).decode())
@@ -272,7 +272,7 @@ def _stereomis_rig(file: Path) -> StereoRig:
 
 
 def check_sizes(video: Video, rig: StereoRig) -> None:
-    """Raises: SagsError: both eyes, one above the other, do not have the calibration's size."""
+    """Raise SagsError where a picture, both eyes one above the other, is not of the calibration's size."""
     wanted = rig.left.width, 2 * rig.left.height
     if video.size != wanted:
         raise SagsError(f"{video.path} is {video.size} px, its calibration is for {wanted}; is it resized?")

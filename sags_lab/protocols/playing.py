@@ -1,4 +1,4 @@
-"""What all protocols play with."""
+"""What all protocols need to play a recording."""
 
 from collections.abc import Callable, Sequence
 
@@ -14,17 +14,17 @@ Progress = Callable[[int, str], None]  # frames done, of what
 
 
 def configured(given: Sequence[str], overrides: Sequence[str]) -> LaunchConfig:
-    """The launch that plays what is `given`, each frame in its turn, and what the user changes of it."""
+    """Return the configuration that plays what is `given`, each frame in turn, with the user's overrides."""
     config = load_launch(None, [*given, *STEP, *overrides])
     prepare(config)
     return config
 
 
 def check_default(config: LaunchConfig, *keys: str) -> None:
-    """To be asked where the truth is that of a recording's first frame, last frame, or each.
+    """Check that these keys of `source` are not set: the truth is of certain frames of the recording.
 
     Raises:
-        UsageError: one of these keys of `source` is set, so another frame would be compared with it.
+        UsageError: one is set, so the truth would be compared with other frames.
     """
     default = type(config.source).model_fields
     for key in keys:

@@ -1,10 +1,10 @@
 """Points followed from one stereo frame to the next, as STIR's evaluator calls a method.
 
-Its interface is x(t+1) = f(x(t), I(t), I(t+1)): at each step the caller hands points in. What it hands back
-as it got it goes on as the same point: its anchor remembers how it looked when it was pinned, so nothing
-drifts and it is found again after an instrument. A point that the caller moved, or brings anew, is pinned in
-frame t, where it is now. One that is handed in anew at every step is followed by two frames only: its errors
-add up, and it goes on under an instrument as if it were the instrument.
+Its interface is x(t+1) = f(x(t), I(t), I(t+1)): at each step the caller hands points in. A point that is
+handed in just as it was returned stays the same point: its anchor remembers how it looked when it was pinned,
+so it does not drift, and it is found again after an instrument. A point that is new, or was moved by the
+caller, is pinned in frame t. A point that is new at every step is followed from two frames only: its errors
+add up, and under an instrument it follows the instrument.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from sags_node.mapping.anchors import MAX_ANCHORS
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import F64, I64, AnchorStates, Bool, Camera, Eye, FrameResult, StereoFrame, StereoRig
 
-SAME = 0.01  # px: a point so near to where it was said to be is the same, whatever type of number kept it
+SAME = 0.01  # px: a point this near to one that was returned is the same one, even if stored as float32
 
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """Points in one frame; where one is not found, as it was known last."""
+    """Points in one frame; one that is not found keeps its last known values."""
 
     pixels: F64  # [P, 2] px, raw left picture
     points: F64  # [P, 3] m, left rectified camera; NaN: never known
     found: Bool  # [P]
     visible: Bool  # [P] found, and surely seen by the left eye
-    anchors: I64  # [P] that follow them; -1: none could be pinned there
+    anchors: I64  # [P] ids of their anchors; -1: none could be pinned
 
     @staticmethod
     def unknown(pixels: F64) -> Followed:
@@ -43,7 +43,7 @@ class Followed:
 
 
 class PointTracker:
-    """One recording's points. A new recording needs a new one.
+    """Follows points of one recording. Another recording needs another tracker.
 
     Args:
         config: of the pipeline; its source is not opened.
@@ -55,12 +55,12 @@ class PointTracker:
         self._pipeline = Pipeline(config, rig)
         self._budget = self._pipeline.make_budget()
         self._newest: FrameResult | None = None
-        self._said: dict[int, tuple[F64, F64]] = {}  # by anchor: pixel [2] and point [3] as given back last
+        self._said: dict[int, tuple[F64, F64]] = {}  # by anchor: pixel [2] and point [3] as last returned
 
     def follow(self, pixels: F64, now: StereoFrame, following: StereoFrame) -> Followed:
-        """Where the points at `pixels` [P, 2] (px, raw left picture) of frame `now` are in frame `following`.
+        """Return where points at `pixels` [P, 2] (px, raw left picture) of frame `now` are in `following`.
 
-        Frames are known by their stamps: `now` is worked again only if it is not the `following` of the call
+        Frames are known by their stamps: `now` is processed only if it is not the `following` of the call
         before. A point that cannot be pinned (instrument, no depth, outside) stays where it is.
 
         Raises:
@@ -73,8 +73,8 @@ class PointTracker:
         return self._found(anchors, pixels, self._newest, self._newest.anchors)
 
     def pin(self, pixels: F64, now: StereoFrame) -> Followed:
-        """The points at `pixels` [P, 2] (px, raw left picture) of frame `now`, in that frame: what else is
-        known of them, where they lie in space.
+        """Pin points at `pixels` [P, 2] (px, raw left picture) of frame `now`, and return them in that frame,
+        with what else is known there, such as their 3D points.
 
         Raises:
             SagsError: as `follow`.
@@ -84,7 +84,7 @@ class PointTracker:
         return self._found(anchors, pixels, self._newest, self._pipeline.anchors.states())
 
     def _pinned(self, pixels: F64, now: StereoFrame) -> I64:
-        """Anchors of the points [P], -1: it cannot be pinned. Those of points not asked for are removed."""
+        """Ids of the points' anchors [P]; -1: it cannot be pinned. All other anchors are removed."""
         if len(pixels) > MAX_ANCHORS:
             raise SagsError(f"{len(pixels)} points, {MAX_ANCHORS} at most; follow them in several trackers")
         if self._newest is None or self._newest.pair.t_capture_ns != now.t_capture_ns:
@@ -128,7 +128,7 @@ class PointTracker:
 
 
 def to_working(eye: Eye, camera: Camera, pixels: F64) -> F64:
-    """Raw pixels [P, 2] of an eye in the rectified camera at the working size."""
+    """Return raw pixels [P, 2] of an eye as pixels of the rectified camera at the working size."""
     if not len(pixels):
         return pixels
     there: F64 = cv2.undistortPoints(pixels[:, None], eye.K, eye.distortion, R=eye.R, P=camera.K)[:, 0]
@@ -136,17 +136,17 @@ def to_working(eye: Eye, camera: Camera, pixels: F64) -> F64:
 
 
 def to_raw(eye: Eye, camera: Camera, pixels: F64) -> F64:
-    """The inverse of `to_working`."""
+    """Return raw pixels [P, 2] of working ones: the inverse of `to_working`."""
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.K).T @ eye.R
     raw: F64 = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]
     return raw
 
 
 def raw_pair(rig: StereoRig, points: F64) -> tuple[F64, F64]:
-    """Points [P, 3] (m, of the rectified left camera) in the raw pictures of both eyes, [P, 2] px each."""
+    """Project points [P, 3] (m, rectified left camera) into the raw pictures of both eyes, [P, 2] px each."""
     if not len(points):
         return np.empty((0, 2)), np.empty((0, 2))
-    left = points @ rig.left.R  # the raw camera's
+    left = points @ rig.left.R  # in the raw left camera
     T = rig.T_right_left
     left_px, right_px = (
         cv2.projectPoints(seen[:, None], np.zeros(3), np.zeros(3), eye.K, eye.distortion)[0][:, 0]

@@ -9,12 +9,12 @@ import numpy as np
 from sags_node.types import F64, AnchorStates, Bool
 
 THRESHOLDS_PX = (2, 4, 8, 16, 32)
-SURE = 0.5  # confidence
+SURE = 0.5  # least confidence, and least visibility, of a point that counts as seen
 BINS = (0.0, 0.02, 0.1, 0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # of confidence
 
 
 def shares_within(distances: F64, thresholds: Sequence[float] = THRESHOLDS_PX) -> dict[str, float]:
-    """Share of distances up to each threshold, and the mean of the shares (delta_avg of TAP-Vid)."""
+    """Return the share of distances up to each threshold, and their mean (delta_avg of TAP-Vid)."""
     shares = {f"within_{threshold:g}": float(np.mean(distances <= threshold)) for threshold in thresholds}
     return {**shares, "average": float(np.mean(list(shares.values())))}
 
@@ -22,10 +22,10 @@ def shares_within(distances: F64, thresholds: Sequence[float] = THRESHOLDS_PX) -
 def average_jaccard(
     distances: F64, visible: Bool, said: Bool, thresholds: Sequence[float] = THRESHOLDS_PX
 ) -> float:
-    """TAP-Vid's figure for where points are and whether they are seen, over all points and frames [N].
+    """Return TAP-Vid's figure of where points are and whether they are seen, over all points and frames [N].
 
-    Of those said to be seen, the ones that are and lie within the threshold are right. A Jaccard index is
-    their share of all that are seen or wrongly said to be; the average is over the thresholds.
+    A point is right if it is seen, is said to be, and lies within the threshold. A Jaccard index is right
+    points / (seen points + points wrongly said to be seen there); the average is over the thresholds.
     """
     found = []
     for threshold in thresholds:
@@ -36,13 +36,13 @@ def average_jaccard(
 
 
 def surely_seen(states: AnchorStates) -> Bool:
-    """Which anchors [A] are said to be seen where they are."""
+    """Tell which anchors [A] are sure and visible, by `SURE`."""
     return (states.confidence >= SURE) & (states.visibility >= SURE)
 
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """What came of all that was said with about the same confidence."""
+    """One bin of a reliability diagram: what was said with about the same confidence."""
 
     least: float
     most: float
@@ -52,7 +52,7 @@ class Bin:
 
 
 def reliability(confidence: F64, right: Bool) -> list[Bin]:
-    """How often what was said with a confidence [N] was right [N]; bins without any are left out."""
+    """Return the reliability diagram of a confidence [N] and what was right [N], without empty bins."""
     places = np.clip(np.searchsorted(BINS, confidence, side="right") - 1, 0, len(BINS) - 2)
     return [
         Bin(
@@ -67,7 +67,7 @@ def reliability(confidence: F64, right: Bool) -> list[Bin]:
 
 
 def calibration_error(bins: Sequence[Bin]) -> float:
-    """Mean distance between confidence and share that was right, over all that was said (expected calibration
-    error; Guo et al., ICML 2017)."""
+    """Return the mean distance between confidence and share that was right, over all that was said (expected
+    calibration error; Guo et al., ICML 2017)."""
     counts = np.array([each.count for each in bins])
     return float(np.average([abs(each.said - each.right) for each in bins], weights=counts))

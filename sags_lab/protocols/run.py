@@ -35,18 +35,18 @@ from sags_node.tools.evaluation.measure import MeasureOptions
 from sags_node.tools.evaluation.session import evaluate
 from sags_node.types import F64, StereoRig
 
-LEAST_POSES = 3  # to align
-HOLD_OUT = 8  # EndoNeRF's split, as EndoGaussian and those after it take it
+LEAST_POSES = 3  # for an alignment
+HOLD_OUT = 8  # every so many frames: the split of EndoNeRF that EndoGaussian and later papers use
 PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
 
 
 def measure_endonerf(
     folder: Path, overrides: Sequence[str], lpips: Path | None, progress: Progress
 ) -> dict[str, Any]:
-    """Frames 1, 9, 17, ... are held out; masked pixels are black in both pictures and count. The masks are
-    taken as they are, without the margin that a node puts around instruments.
+    """Measure with frames 1, 9, 17, ... held out; masked pixels are black in both pictures and count. Masks
+    are used as they are, without the margin that a node puts around instruments.
 
-    Each held-out frame is drawn from those before it. Published fits see those after it, too.
+    Each held-out frame is drawn from the frames before it. Published fits see those after it, too.
     """
     options = MeasureOptions(HOLD_OUT, every=1, lpips_weights=lpips, paper_psnr=True)
     found = evaluate(
@@ -61,7 +61,7 @@ def measure_endonerf(
 
 
 def measure_scared(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Mean absolute depth error of each frame, mm, and its mean over frames: of stereo and of the model."""
+    """Measure the mean absolute depth error of each frame, mm, mean over frames: of stereo and the model."""
     config = load_launch(folder, [*overrides, *STEP])
     rig = rig_of(config)
     prepare(config)
@@ -94,9 +94,9 @@ def mean(rows: Sequence[tuple[float, ...]], column: int) -> float:
 
 
 def measure_stir(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Points pinned in each clip's first frame and followed to its last. In 2D a point that cannot be pinned
-    or is lost counts where it was last; in 3D one that cannot be pinned counts as missed. Sequences of 2026
-    are measured by their own rules."""
+    """Measure points pinned in each clip's first frame and followed to its last. In 2D a point that is lost
+    or cannot be pinned counts where it was last; in 3D one that cannot be pinned counts as missed. Sequences
+    of 2026 are measured by their own rules."""
     if is_stir_2026(folder):
         return measure_stir_2026(folder, overrides, progress)
     clips, distances, unmoved, times, lost = {}, [], [], [], 0
@@ -135,8 +135,8 @@ def _within_mm(distances: Sequence[F64]) -> dict[str, float] | None:
 
 
 def measure_stereomis(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """The camera's way as the node estimates it, against the robot's: the means over the ranges of the
-    sequence's table, each begun anew; without a table all of it. Of StereoMIS-Tracking the points instead."""
+    """Measure the trajectory that the node estimates against the robot's: means over the ranges of the
+    sequence's table, each with a new model, or over all of it. Of StereoMIS-Tracking points are measured."""
     if is_tracked(folder):
         return measure_tracked(folder, overrides, progress)
     sequence = stereomis_sequence(folder)
@@ -190,11 +190,11 @@ class _Tracks:
     pixels: F64  # [P, 2] raw, left
     points_mm: F64  # [P, 3] in the raw left camera, as STIR counts; infinite: never pinned
     lost: int
-    times_ms: list[float]  # of calls; the first takes two frames
+    times_ms: list[float]  # of calls; the first one processes two frames
 
 
 def _follow(config: LaunchConfig, rig: StereoRig, starts: F64, name: str, progress: Progress) -> _Tracks:
-    """As STIR's evaluator drives a method: each call is given what the one before it returned."""
+    """Follow points as STIR's evaluator does: each call gets what the call before it returned."""
     tracker, followed = PointTracker(config, rig), Followed.unknown(starts)
     points_mm = np.full((len(starts), 3), np.inf)
     times: list[float] = []

@@ -1,9 +1,9 @@
 """STIR by the rules of 2026: points known in many frames, and whether each eye sees them.
 
 By the challenge's page (stir-challenge.github.io/evaluation) and its evaluator
-(github.com/mertkaraoglu/stir-challenge-2026-metrics): points are asked for in the left picture of the first
-frame, also where they are in space, so the right eye is matched there too. The evaluator counts all annotated
-frames but the first.
+(github.com/mertkaraoglu/stir-challenge-2026-metrics): points are given in the left picture of the first
+frame. Their 3D positions there are asked for, so the right eye is matched, too. The evaluator counts all
+annotated frames but the first.
 """
 
 import json
@@ -27,7 +27,7 @@ from sags_node.pipeline.session import open_posed
 from sags_node.types import F64, Bool, StereoFrame, StereoRig
 
 QUERIES, TRUTH = "queries.json", "annotations.json"
-WARM_UP = 10  # number of the last frame whose latency does not count
+WARM_UP = 10  # number of the last frame whose latency is not counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def _below(folder: Path, name: str) -> chain[Path]:
 
 
 def stir_2026_sequences(folder: Path) -> list[Stir2026Sequence]:
-    """All annotated sequences below a folder.
+    """Return all annotated sequences below a folder.
 
     Raises:
         UsageError: there are none, or a file is missing or wrong.
@@ -89,8 +89,8 @@ def _sequence(folder: Path) -> Stir2026Sequence:
 
 
 def _rows(file: Path, names: Sequence[str]) -> dict[int, F64]:
-    """Values [names, P] of each frame, unknown ones NaN. A key is frame/instance: as theirs, only the first
-    instance is taken."""
+    """Values [names, P] of each frame, unknown ones NaN. A key is frame/instance: as in the evaluator, only
+    instance 0 is taken."""
     try:
         said = json.loads(read_file(file, LARGEST_TEXT))
         rows = {tuple(map(int, key.split("/"))): row for key, row in said.items()}
@@ -121,7 +121,7 @@ class _Judged:
     said: list[Bool] = field(default_factory=list)
 
     def add(self, found: F64, truth: F64, visible: Bool, said: Bool) -> None:
-        known = visible & np.isfinite(found).all(1)  # where it is not visible, how far it is does not matter
+        known = visible & np.isfinite(found).all(1)  # distances of invisible points do not count
         distances = np.full(len(found), np.inf)
         distances[known] = np.linalg.norm(found[known] - truth[known], axis=1)
         self.distances.append(distances)
@@ -136,10 +136,10 @@ class _Judged:
 
 
 def measure_stir_2026(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Points followed from the first frame on: `mono`, px in the left picture; `stereo`, mm, where a point is
-    visible if both eyes see it; that in the first frame alone (`stereo_first_frame`), where the right eye is
-    matched; and `unmoved`, px, for points that stay and are said to be visible. All are pooled over points,
-    frames and sequences, as theirs. `latency_p95_ms` is that of a frame after the first ones."""
+    """Measure points followed from the first frame on: `mono`, px in the left picture; `stereo`, mm, where a
+    point is visible if both eyes see it; `stereo_first_frame`, the same in the first frame alone; `unmoved`,
+    px, for points that stay and are said to be visible. All are pooled over points, frames and sequences, as
+    in the evaluator. `latency_p95_ms` is of frames after number `WARM_UP`."""
     judged = {name: _Judged() for name in ("mono", "stereo", "stereo_first_frame", "unmoved")}
     times: list[float] = []
     points = 0
@@ -162,7 +162,7 @@ def measure_stir_2026(folder: Path, overrides: Sequence[str], progress: Progress
 def _play(
     sequence: Stir2026Sequence, overrides: Sequence[str], judged: dict[str, _Judged], progress: Progress
 ) -> list[float]:
-    """Judge one sequence; times of the frames whose latency counts, ms."""
+    """Judge one sequence; returns the times of the frames whose latency counts, ms."""
     left, right = sequence.folder / "left.mp4", sequence.folder / "right.mp4"
     given = ["source.kind:=videos", f"source.left:={left}", f"source.right:={right}"]
     check_default(config := configured(given, overrides), "start")

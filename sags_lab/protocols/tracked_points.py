@@ -36,7 +36,7 @@ CONVERT = (
 )
 LARGEST_JSON = 256 << 20  # bytes
 RATE = 30.0  # Hz; the files do not say it
-ERODED = 7  # px: their margin around instruments
+ERODED = 7  # px: the authors' margin around instruments
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def tracked_sequence(folder: Path) -> TrackedSequence:
 
 
 def _configuration(folder: Path) -> tuple[StereoRig, slice]:
-    """`cam` of their configuration: px, and `stereo_baseline` in px mm, focal length times baseline."""
+    """Rig and frames of the authors' configuration; `stereo_baseline` is focal length x baseline, px mm."""
     files = sorted(folder.glob("*.yaml"))
     for file in files:
         said = read_yaml(file, "configuration")
@@ -116,7 +116,7 @@ def _configuration(folder: Path) -> tuple[StereoRig, slice]:
 
 
 def _tracks(file: Path) -> tuple[F64, Bool]:
-    """Pixels [P, T, 2] and whether they are visible [P, T], of the points that are so in the first frame."""
+    """Pixels [P, T, 2] and visibility [P, T] of the points that are visible in the first frame."""
     if not file.is_file():
         raise UsageError(
             f"{file.with_name(PUBLISHED)} is a pickle, which may run any code, so it is not opened here. "
@@ -138,8 +138,8 @@ def _tracks(file: Path) -> tuple[F64, Bool]:
 
 
 def measure_tracked(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Points of the first frame followed to the last, with the camera's poses given as their authors give
-    them; beside points that never move."""
+    """Measure points of the first frame followed to the last, with given poses of the camera, as the authors
+    do; beside them points that never move."""
     sequence = tracked_sequence(folder)
     eyes = [f"source.{eye}:={folder}" for eye in ("left", "right")]
     config = configured(["source.kind:=folders", *eyes, f"source.rate:={RATE}"], overrides)
@@ -158,7 +158,7 @@ def measure_tracked(folder: Path, overrides: Sequence[str], progress: Progress) 
 
 
 def _followed(sequence: TrackedSequence, config: LaunchConfig, progress: Progress) -> F64:
-    """Pixels [P, T, 2]; as theirs, none leaves the picture."""
+    """Pixels [P, T, 2], clipped to the picture as the authors do."""
     tracker = PointTracker(config, sequence.rig)
     frames = config.source.frames if isinstance(config.source, RecordedSource) else None
     numbers = range(len(sequence.left))[:frames]

@@ -108,7 +108,7 @@ def record(
 ) -> None:
     """Record what a running node publishes until Ctrl-C.
 
-    Of a recording: it is played through a node of its own, and all that comes of it is recorded.
+    If a recording is named, it is played through a node of its own, and what that publishes is recorded.
 
     Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
     Calibration and parameters are attached. Uncompressed pictures of both eyes take up to 27 bytes for each
@@ -313,7 +313,7 @@ def recover(path: Path, out: Path, json_out: bool) -> None:
 
 @contextmanager
 def _failure_reported(tell: Callable[[dict[str, Any]], None] | None) -> Iterator[None]:
-    """Also report a failure where a program reads it: `{"error": text}`; None: nobody reads."""
+    """Report a failure through `tell`, too, as `{"error": text}`; None: no program reads it."""
     try:
         yield
     except SagsError as error:
@@ -336,7 +336,7 @@ def _on_lines(call: Callable[[], None], at_the_end: Callable[[], None] = lambda:
 
 
 def remappings(said: Sequence[str], ns: str) -> dict[str, str]:
-    """`old:=new` of `--remap`.
+    """Return the new names of topics by their old ones, from `old:=new` of `--remap`.
 
     Raises:
         UsageError: one is written otherwise.
@@ -349,7 +349,7 @@ def remappings(said: Sequence[str], ns: str) -> dict[str, str]:
 
 
 def recorded_table(summary: Mapping[str, Any]) -> Table:
-    """Return what a recorder wrote and what it could not."""
+    """Return a table of what a recorder wrote, dropped and lost."""
     from sags_node.node.recorder import SILENT_SECONDS  # brings NumPy along, which --help does not need
 
     table = text.table("topic", "messages", "dropped", "lost")
@@ -364,7 +364,7 @@ def recorded_table(summary: Mapping[str, Any]) -> Table:
 
 
 def info_table(info: Mapping[str, Any]) -> Table:
-    """Return what a bag holds."""
+    """Return a table of what a bag holds."""
     table = text.table("topic", "type", "messages", "Hz", "lost", "longest gap (s)")
     for row in info["topics"]:
         cells = (row[key] for key in ("topic", "type", "messages", "rate_hz", "lost", "longest_gap_s"))

@@ -118,7 +118,7 @@ def _listening(port: int) -> Callable[[Callable[..., None]], Callable[..., None]
 
 
 def _check_open(option: str, insecure: bool) -> None:
-    """Check an option that lets other machines in."""
+    """Refuse an option that lets other machines in, unless `insecure`; then warn."""
     if not insecure:
         raise UsageError(
             f"{option} would show the video to all who reach it, without keys or encryption; leave it "

@@ -23,7 +23,7 @@ asking = group_of(asked_options, as_json)  # of a command that asks a node; it g
 
 
 def ask(node: NodeAddress, op: str, args: dict[str, Any] | None = None) -> Any:
-    """The node's answer; see `ControlClient.request`."""
+    """Return the node's answer; see `ControlClient.request`."""
     from sags_node.messaging.control import ControlClient
 
     with ControlClient.at(node) as client:
@@ -142,9 +142,9 @@ param.add_command(get, "dump")  # its name in ros2
 @click.argument("file", metavar="FILE.yaml", type=click.Path(path_type=Path))
 @asking
 def load(file: Path, json_out: bool, node: NodeAddress) -> None:
-    """Change what a file of sags param dump says otherwise than the node.
+    """Set what differs between a file of sags param dump and the node.
 
-    All of it or, if one of the keys cannot change, nothing: see sags param set.
+    If one of these keys cannot change, nothing is set: see sags param set.
     """
     from sags_node.config.launch_file import leaves
     from sags_node.config.yaml_reader import read_yaml

@@ -88,8 +88,8 @@ def export(
 ) -> None:
     """Write the model at one moment for other programs, in metres.
 
-    Of the running node, its newest frame; or of a recording, played as fast as it goes, at any time; then no
-    node need run.
+    Without a recording it is the newest frame of the running node. A recording is played as fast as it goes,
+    up to any time; then no node need run.
 
     \b
     sags export --mesh now.ply --points now.pcd

@@ -41,7 +41,7 @@ Advance = Callable[[int, int | None, str], None]  # done, of, what
 
 
 def check_fit(out: Path) -> None:
-    """Before any work: may a fit be written into this folder?
+    """Check, before any work, that a fit may be written into this folder.
 
     Raises:
         UsageError: other files of its names are there.
@@ -53,7 +53,7 @@ def check_fit(out: Path) -> None:
 
 
 def device_of(wanted: DeviceName, schedule: Schedule) -> str | None:
-    """Find where a fit learns, as `Fit` takes it.
+    """Return the device that a fit runs on, as `Fit` takes it: "cuda", or None for the CPU.
 
     Raises:
         UsageError: a GPU is wanted, and none can be used, or not for this schedule.
@@ -95,7 +95,7 @@ def fit_session(
         out: an existing folder. An earlier result there is removed as soon as this one has started.
         resume: go on from its checkpoint.
         advance: called with what is going on.
-        device: of `device_of`.
+        device: as `device_of` returns it.
 
     Returns:
         The figures.
@@ -189,10 +189,10 @@ def _clear(out: Path, *names: str) -> None:
 
 
 def _iterate(fit: Fit, stored: Path, advance: Advance) -> None:
-    """All iterations that are left. Ctrl-C leaves a checkpoint, too."""
+    """Run all iterations that are left. Ctrl-C leaves a checkpoint, too."""
     tell(f"{fit.total - fit.iteration} iterations take about {time_text(fit.seconds_left())}")
     saved = time.monotonic()
-    with stop_signals() as stop:  # half an iteration is nothing to go on from
+    with stop_signals() as stop:  # Ctrl-C waits: no fit can go on from half an iteration
         try:
             while not (fit.done or stop.is_set()):
                 fit.iterate()
@@ -236,7 +236,7 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def figures_table(found: dict[str, Any]) -> Table:
-    """All figures of the pictures; beside them those published for the same clip."""
+    """Return a table of all figures of the pictures, and of those published for the same clip."""
     table = text.table("", "frames", "PSNR over tissue", "PSNR, masked pixels equal", "SSIM", "LPIPS")
     between = found["between"] or {}
     rows = {

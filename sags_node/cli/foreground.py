@@ -25,7 +25,7 @@ REFRESH = 4.0  # per second
 def run_node(node: Node, seconds: float | None, console: Console, stop: threading.Event) -> NodeHealth:
     """Run until the source ends, `seconds` have passed or `stop` is set; returns the last health.
 
-    Tells of every warning that holds for `1 / REFRESH` s, when it begins and when it ends.
+    Prints every warning that holds for `1 / REFRESH` s, when it begins and when it ends.
 
     Raises:
         SagsError: what ended the node, if something did.
@@ -47,7 +47,7 @@ def run_node(node: Node, seconds: float | None, console: Console, stop: threadin
 
 
 def inputs_text(config: LaunchConfig) -> list[str]:
-    """Find where other programs hand in what the node takes; a line each."""
+    """Return where the node takes pictures and poses of other programs, a line each."""
     lines = []
     for what, part in (("pictures", config.source), ("poses", config.robot)):
         if isinstance(part, PushSource | PushRobot):
@@ -72,12 +72,12 @@ def _watch(
 
 
 def ended_text(sent: int, count: int | None) -> str:
-    """Return what a node that has ended published; `count`: frames of its recording, where it has an end."""
+    """Return how many frames were published; `count`: frames of the recording, None if it has no end."""
     return f"ended, {sent:,} {'' if count is None else f'of {count:,} '}frames published"
 
 
 def health_table(health: NodeHealth, state: str | None = None) -> Table:
-    """One screen of what a person wants to know; `state`: in the place of what the node says."""
+    """Return a table of a node's health; `state` stands in the place of the node's own."""
     table = text.table()
     table.add_row("state", state or health.state)
     table.add_row("published", f"{health.rate_hz:.1f} Hz")

@@ -1,4 +1,4 @@
-"""`sags latency`: from a code that is shown to that code in what a display would show."""
+"""`sags latency`: the time from showing a code to that code in what a display would show."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ Command = Callable[..., Any]
 
 
 class Number(click.FloatRange):
-    """A number of an option. What is no number is in no range."""
+    """The value of an option, a number in a range; NaN is refused."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         number = float(super().convert(value, param, ctx))
@@ -67,7 +67,7 @@ def group_of(*options: Callable[[Command], Command]) -> Callable[[Command], Comm
 
 
 def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """The path among the arguments, if there is one, and the overrides."""
+    """Return the path among the arguments, or None, and the overrides."""
     overrides = [argument for argument in arguments if ":=" in argument]
     paths = [argument for argument in arguments if ":=" not in argument]
     for path in paths:
@@ -81,8 +81,8 @@ def words_of(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
-    """A launch file, session or recording, if there is one, and the overrides; those that play a video, or a
-    folder without a launch file, come first."""
+    """Return the launch file, session or recording, or None, and the overrides. First are those that say how
+    to play a video, or a folder without a launch file."""
     from sags_node.config.launch_file import is_launch, known_recording
 
     path, overrides = words_of(arguments)
@@ -94,7 +94,7 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
 
 
 def launched(path: Path, overrides: Sequence[str]) -> LaunchConfig:
-    """The configuration of what `split` takes."""
+    """Load the configuration that `path` and the overrides say, see `split`."""
     from sags_node.config.launch_file import load_launch
 
     return load_launch(*split([str(path), *overrides]))
@@ -104,19 +104,19 @@ session_option = click.option("--session", metavar="RECORDING", help="The record
 
 
 def played_instead(launch: Sequence[str], session: str | None) -> list[str] | None:
-    """Return what `split` takes, for a command that plays a recording where one is named; None: it asks a
-    node.
+    """Return the arguments for `split` where a recording is named; None where none is, and the command asks
+    a running node.
 
     Args:
         launch: arguments, the recording among them.
-        session: the recording, where it is an option, as it was before it came first.
+        session: the recording, where the option `--session` names it.
     """
     words = [*([] if session is None else [session]), *launch]
     return words if session is not None or any(":=" not in word for word in launch) else None
 
 
 def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | None, list[str]]:
-    """`split`, for a command that cannot do with live cameras; `no_cameras` says what to do instead.
+    """Do as `split`, and refuse live cameras; the message `no_cameras` says what to do instead.
 
     Raises:
         UsageError: the source is live cameras, or the launch is wrong.
@@ -131,7 +131,7 @@ def split_recording(arguments: Sequence[str], no_cameras: str) -> tuple[str | No
 
 
 def part_of(found: Any, name: str) -> Any:
-    """The value under a key in words, `a.b.0`.
+    """Return the value under a dotted key, e.g. `a.b.0`.
 
     Raises:
         UsageError: there is none.
@@ -147,7 +147,7 @@ def part_of(found: Any, name: str) -> Any:
 
 
 def open_launched(path: str | None, overrides: Sequence[str], guess: Guess | None = None) -> Session:
-    """Open a session and make its kernels ready; says what is played, what takes long and what it runs on.
+    """Open a session and make its kernels ready; print what is played, at what size and on which device.
 
     Args:
         guess: makes a calibration where there is none, see `open_session`.
@@ -203,7 +203,7 @@ def _pictures_text(session: Session) -> str:
 
 
 def check_files(*files: Path | None, force: bool | None = None) -> None:
-    """A long run must not end with nowhere to put its figures: `check_file` of those that were asked for."""
+    """Check before a long run, with `check_file`, that the files that were asked for can be written."""
     for file in files:
         if file is not None:
             check_file(file, force)
@@ -227,7 +227,7 @@ def show_outcome(summary: Mapping[str, Any], report: Path | None, verbose: bool,
 
 
 def show_verdict(lines: Sequence[tuple[str, str]]) -> None:
-    """Print what and how good, a line each."""
+    """Print a verdict: what was measured and how good it is, a line each."""
     table = text.table()
     for what, said in lines:
         table.add_row(what, said)
@@ -235,10 +235,10 @@ def show_verdict(lines: Sequence[tuple[str, str]]) -> None:
 
 
 def show_findings(rows: list[dict[str, Any]], json_out: bool, wrong: str) -> None:
-    """Print what was looked at, each with its fix.
+    """Print findings, each with its fix.
 
     Raises:
-        SagsError: one is an error; `wrong` says of what.
+        SagsError: a finding is an error; the message begins with `wrong`.
     """
     show(rows if json_out else text.findings_table(rows))
     if any(row["level"] == "error" for row in rows):
@@ -251,8 +251,8 @@ def show_rows(rows: list[dict[str, Any]], json_out: bool) -> None:
 
 
 def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> None:
-    """Keep figures, if a file was asked for, and under `provenance` where they come from. A list of them is
-    kept under `rows`.
+    """Write figures, if a file was asked for, and under `provenance` where they come from. A list of them
+    stands under `rows`.
 
     Raises:
         SagsError: it cannot be written.

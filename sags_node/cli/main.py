@@ -56,8 +56,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 OF_THE_NODE = frozenset("torch cv2 open3d onnxruntime numba PIL mcap lz4 zstandard av".split())
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # of a disk; also of what stdout leads to
-CLOSED = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG)  # whatever looks for a file at a path meets them
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, also the one that stdout goes to
+CLOSED = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG)  # the path cannot be looked up
 
 
 SECTIONS = {
@@ -70,7 +70,7 @@ SECTIONS = {
 
 
 class Sags(click.Group):
-    """Turns expected errors into `_one_message`; its help has the commands in sections."""
+    """A group that reports expected errors as `_one_message` does; its help has the commands in sections."""
 
     sections: Mapping[str, str] = {}
 
@@ -97,8 +97,8 @@ class Sags(click.Group):
             with _one_message(ctx):
                 return super().invoke(ctx)
         except (KeyboardInterrupt, SystemError) as error:
-            # A Ctrl-C becomes a SystemError in C code that calls Python, and one more in C code around that:
-            # loading a kernel.
+            # C code that calls Python turns a Ctrl-C into a SystemError, and C code around that, as where a
+            # kernel is loaded, into one more.
             cause: BaseException | None = error
             while isinstance(cause, SystemError):
                 cause = cause.__cause__
@@ -110,7 +110,7 @@ class Sags(click.Group):
 
 @contextmanager
 def _one_message(ctx: click.Context) -> Iterator[None]:
-    """An expected error becomes one message and an exit code."""
+    """Turn an expected error into one message and an exit code."""
     try:
         return (yield)
     except click.UsageError as error:
@@ -137,7 +137,7 @@ def _one_message(ctx: click.Context) -> Iterator[None]:
 
 
 def _of_the_system(error: Exception) -> tuple[str, int] | None:
-    """What this machine refuses, in words, and the exit code; a ZMQError is no OSError."""
+    """Message and exit code of an error of the system, else None. Not by type: a ZMQError is no OSError."""
     number, file = getattr(error, "errno", None), getattr(error, "filename", None)
     if number in CLOSED and file is not None:
         return f"cannot open {file}: {os.strerror(number)}; check the path and your rights", 2
@@ -153,7 +153,7 @@ def _of_the_system(error: Exception) -> tuple[str, int] | None:
 
 
 def sags_group(function: Callable[..., None]) -> Sags:
-    """A group of commands, each error of which is one message; its options are those that `begin` takes."""
+    """Make a `Sags` group of a function that takes the arguments of `begin`: they are its options."""
     function = click.option(
         "--log",
         "form",
@@ -169,10 +169,10 @@ def sags_group(function: Callable[..., None]) -> Sags:
 def begin(verbose: bool, form: str) -> None:
     """Set up messages and signals before a command runs."""
     level = logging.INFO if verbose else logging.WARNING
-    signal.signal(signal.SIGINT, interrupt)  # also where a script's `&` had it ignored: kill -INT ends it
+    signal.signal(signal.SIGINT, interrupt)  # even if `&` in a script had it ignored: then kill -INT works
     signal.signal(signal.SIGTERM, interrupt)  # a service manager's stop is a Ctrl-C
     sys.unraisablehook = interrupt.unraisable
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # so is the end of the terminal, but for nohup
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # so is the terminal's end, except under nohup
         signal.signal(signal.SIGHUP, interrupt)
     console.quiet = form == "json"
     logging.basicConfig(level=level, format="%(message)s", handlers=[log_handler()])
@@ -418,4 +418,4 @@ for command in (
     main.add_command(command)
 main.sections = SECTIONS
 for more in distribution("sags-node").entry_points.select(group="sags.commands"):
-    more.load()(main)  # of packages that stand beside this one
+    more.load()(main)  # the commands of packages beside this one

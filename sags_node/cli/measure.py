@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sags_node.messaging.address import NodeAddress
 
 PATIENCE = 3.0  # s for the anchors of a first frame
-LOOK = 0.2  # s; also for what belongs to a frame
+LOOK = 0.2  # s to wait for new anchors, and for the other messages of their frame
 
 Record = dict[str, Any]
 
@@ -49,8 +49,8 @@ def measure(
 
     Nine of ten errors are meant to be smaller than the one that is told. It follows from the confidence of
     the anchors' depth, and from how exactly anchors are followed in the picture. A value is unsure, and says
-    why, while one of its anchors is hidden, may be on other tissue, or has a guessed depth. Of a lost one
-    there is none. Without a calibration lengths have no unit.
+    why, while one of its anchors is hidden, may be on other tissue, or has a guessed depth. With a lost
+    anchor there is no value. Without a calibration lengths have no unit.
 
     \b
     sags anchor pin 250 200                    # prints 1; then 2, 3
@@ -72,7 +72,7 @@ def follow(
     node: NodeAddress, numbers: tuple[int, ...], area: bool, rate: float, seconds: float | None,
     stop: threading.Event,
 ) -> Iterator[Record]:  # fmt: skip
-    """Each value until `seconds` have passed or `stop` is set; mm, or mm2 of an area.
+    """Yield a record for each value until `seconds` have passed or `stop` is set; mm, areas in mm2.
 
     While nothing fresh comes there is one record, which says why.
 

@@ -17,7 +17,7 @@ from sags_node.files import check_file, whole
 from sags_node.terminal import text
 from sags_node.terminal.console import console, show
 
-SAID_BY_PICTURES = ("source", "calibration")  # checks of the doctor that were made already
+SAID_BY_PICTURES = ("source", "calibration")  # checks of sags doctor that are made already
 
 
 @click.command()
@@ -67,7 +67,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
         tree = written_in(file.parent, tree_of(found.launch))
         with whole(file) as partial:
             partial.write_text(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True), encoding="utf-8")
-        load_launch(file)  # it is said to play: this says why not, if it does not
+        load_launch(file)  # an error where the file is not valid as written
     show({"launch": None if wrong else str(file), "found": rows} if json_out else text.findings_table(rows))
     if wrong:
         raise SagsError(f"{named[0]} cannot be played as it is; see the fixes above")
@@ -76,7 +76,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
 
 
 def _asked(out: Path | None) -> tuple[list[Path], Path | None]:
-    """Return what the user answers."""
+    """Ask the user for the source and, where it is not given, the launch file."""
     if not sys.stdin.isatty():
         raise UsageError("name a folder, a video or a device, e.g. sags new my_folder -o mine.yaml")
     said = click.prompt("Folder, video or device (two: left and right, with a space between)", err=True)
@@ -87,7 +87,7 @@ def _asked(out: Path | None) -> tuple[list[Path], Path | None]:
 
 
 def _paths(said: str) -> list[Path]:
-    """Paths as in a shell, or one that has spaces and no quotes."""
+    """Split paths as a shell does; a single path that exists may have spaces without quotes."""
     try:
         words = [said] if os.path.exists(said) else shlex.split(said)
     except ValueError as error:

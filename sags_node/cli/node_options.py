@@ -22,7 +22,7 @@ WHICH_NODE = {  # said once, by `sags --help`
 
 
 class NodeOption(click.Option):
-    """Where a node is: the help of a command names those that it takes in one line."""
+    """An option that says where a node is. The help of a command names all of these in one line."""
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         taken = [each for each in ctx.command.params if isinstance(each, NodeOption)]
@@ -42,8 +42,8 @@ run_dir_option = _path("--run-dir", metavar="FOLDER")
 
 
 def node_options(command: Command) -> Command:
-    """Options for a node that wants keys; the command gets them, and what other options say of where the node
-    is, as `node`."""
+    """Add the options for a node that wants keys. The command gets them, and the other options that say where
+    the node is, as `node`."""
 
     @_path("--key", metavar="FILE.key")
     @_option("--server-key", metavar="KEY")
@@ -57,6 +57,6 @@ def node_options(command: Command) -> Command:
     return with_node
 
 
-data_options = group_of(endpoint_option, ns_option, node_options)  # for what the node sends
-asked_options = group_of(control_option, ns_option, run_dir_option, node_options)  # for what it is asked
+data_options = group_of(endpoint_option, ns_option, node_options)  # for commands that listen to it
+asked_options = group_of(control_option, ns_option, run_dir_option, node_options)  # for commands that ask it
 both_options = group_of(control_option, data_options)

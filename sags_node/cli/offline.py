@@ -1,4 +1,4 @@
-"""`sags eval` and `sags fit`: what a recording, not a running node, is asked for."""
+"""`sags eval` and `sags fit`: they work on a recording, not on a running node."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -25,15 +25,15 @@ Advance = Callable[[int, int | None, str], None]  # done, of, what
 
 
 def record_session(session: Session, options: RecordOptions, advance: Advance) -> dict[str, Any]:
-    """Play a recording and record what the node publishes; neither uses the sockets of another node.
+    """Play a recording and record what the node publishes, over sockets that no other node uses.
 
     Args:
         session: a recording with `source.pace` step: the node waits for nobody, and no frame is left out.
-        options: where and how; `node` is this one.
+        options: where and how to record; `node` is ignored, as the node is made here.
         advance: called with what is going on.
 
     Returns:
-        As `Recorder.run`.
+        As `Recorder.run`, and the number of `frames`.
 
     Raises:
         SagsError: the node or the recorder failed, or a message was lost on the way.

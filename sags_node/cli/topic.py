@@ -38,7 +38,7 @@ def topic() -> None:
 @shown("--seconds", type=positive, default=3.0, help="How long to listen.")
 @as_json
 def topic_list(seconds: float, json_out: bool, node: NodeAddress) -> None:
-    """Every topic with its type, and the rate and size of what was heard.
+    """List the topics: their types, and rate and size of what was heard.
 
     \b
     sags topic list
@@ -91,7 +91,7 @@ def topic_echo(
 
 
 def _measuring(name: Literal["hz", "bw", "delay"], doc: str, *more: Callable[..., Any]) -> None:
-    """The commands that listen to topics, one after the other; `more` are options of one alone."""
+    """Add a command that listens to topics, one after the other; `more` are options that only it has."""
 
     @topic.command(name, help=doc)
     @some_topics

@@ -17,7 +17,7 @@ from sags_node.files import SHOWN, check_name, open_file
 
 S = TypeVar("S", bound=Section)
 
-MOST_MISTAKES = 10  # named at once
+MOST_MISTAKES = 10  # in one message
 COMMAND_LINE = "command line"
 DEFAULT_DATA = "../shared/data"
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -37,14 +37,14 @@ _SOURCES: dict[str, type[Section]] = {
 
 def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -> LaunchConfig:
     """Read a launch file, or a folder that holds `launch.yaml` or a known recording, and apply `key:=value`
-    overrides. Any other folder, or a video, is a name only: then `overrides` say what is played of it.
+    overrides. Any other folder, or a video, is not read here: `overrides` must say how it is played.
 
     `$SAGS_DATA` and other variables are expanded; relative paths in the file are relative to the file.
     `path=None` gives the defaults: the built-in phantom session.
 
     Raises:
-        UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value; or there is a
-            calibration for the phantom, which is played where no source is named.
+        UsageError: the file is missing, is not YAML, or holds an unknown key or a wrong value; a calibration
+            is named for the phantom; or there is one camera only, and no network for its depth.
     """
     tree: dict[str, Any] = {"source": {"kind": "phantom"}}
     name = COMMAND_LINE
@@ -85,15 +85,15 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
 
 
 def is_launch(path: Path) -> bool:
-    """Tell whether it is a launch file, or a folder with one: neither a video nor a folder of something
-    else."""
+    """Tell whether a path is a folder that holds `launch.yaml`, or a file (it need not exist) that is no
+    video."""
     if path.is_dir():
         return (path / "launch.yaml").exists()
     return path.suffix.lower() not in VIDEO_SUFFIXES
 
 
 def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
-    """The sections and keys of a launch file that says what these `key:=value` say.
+    """Return the nested sections and keys that these `key:=value` overrides set.
 
     Raises:
         UsageError: one is no override.
@@ -105,7 +105,7 @@ def tree_of(overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def leaves(tree: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """Each value of nested keys, by its whole key."""
+    """Yield each value of nested keys, with its full dotted key."""
     for key, value in tree.items():
         if isinstance(value, dict) and value:
             yield from leaves(value, f"{within}{key}.")
@@ -133,13 +133,13 @@ def _with_texts(
     """A tree with every text in it changed: `change` gets its key, the text, and whether it is a path.
 
     Args:
-        section: of the configuration, which has these keys; None: of none.
+        section: the section of the configuration that has these keys; None: they are unknown.
     """
 
     def changed(key: str, value: Any) -> Any:
         if isinstance(value, dict):
             sections = _sections_in(section, key)
-            if len(sections) > 1:  # of which `kind` chooses one
+            if len(sections) > 1:  # `kind` chooses one of them
                 named = value.get("kind")
                 sections = [each for each in sections if each.model_fields["kind"].default == named]
             return _with_texts(value, change, next(iter(sections), None))
@@ -151,7 +151,7 @@ def _with_texts(
 
 
 def section_of(kind: type[S], overrides: Sequence[str]) -> S:
-    """A section by itself, as `key:=value` say.
+    """Return a section by itself, as `key:=value` overrides set it.
 
     Raises:
         UsageError: an unknown key or a wrong value.
@@ -164,7 +164,7 @@ def section_of(kind: type[S], overrides: Sequence[str]) -> S:
 
 
 def known_recording(folder: Path) -> dict[str, Any] | None:
-    """How to play what is no session of ours but a ROS bag, or laid out as dVRK or a research data set."""
+    """Return how to play a ROS bag, a dVRK recording or a known data set; None: it is none of these."""
     if (folder / "launch.yaml").exists():
         return None
     is_folder = folder.is_dir()
@@ -184,8 +184,8 @@ def known_recording(folder: Path) -> dict[str, Any] | None:
 
 
 def _bag_of(path: Path) -> Path | None:
-    """The ROS recording that a file or folder is; its metadata may be missing, as of a recorder that was
-    killed. Of ROS 1 a folder may hold one bag."""
+    """The ROS recording that a file or folder is. Its metadata may be missing, as after a recorder was
+    killed. A folder with a single bag of ROS 1 counts, too."""
     if path.suffix in BAG_SUFFIXES or path.name.endswith(UNFINISHED):
         return path
     if (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3")):
@@ -195,7 +195,7 @@ def _bag_of(path: Path) -> Path | None:
 
 
 def is_sidecar(file: Path) -> bool:
-    """Tell whether this describes a video of dVRK's `record`; its type stands at the beginning or the end."""
+    """Tell whether a file is the sidecar of a video of dVRK's `record`: its type is near either end of it."""
     if file.suffix != ".json" or not file.is_file():
         return False
     with open_file(file) as opened:
@@ -205,7 +205,7 @@ def is_sidecar(file: Path) -> bool:
 
 
 def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> LaunchConfig:
-    """The same configuration with some `section.key` values replaced, validated again.
+    """Return the configuration with some `section.key` values replaced, validated again.
 
     Raises:
         UsageError: an unknown key or a wrong value.
@@ -269,9 +269,9 @@ def _explain(
     """One line per mistake: where, what, and for an unknown key the nearest known one.
 
     Args:
-        name: of what was read.
-        given: keys that were said on the command line instead.
-        root: what it should be.
+        name: of the file that was read.
+        given: keys that were set on the command line instead.
+        root: type of the section that was validated.
     """
     lines = []
     mistakes = error.errors()
@@ -297,7 +297,7 @@ def _explain(
     return "\n".join(lines)
 
 
-_PLAIN = {  # where pydantic speaks of Python
+_PLAIN = {  # where pydantic's message names types of Python
     "path_type": "Input should be a path",
     "tuple_type": "Input should be a list, e.g. [a, b]",
     "model_type": "Input should be a section of keys",
@@ -306,7 +306,7 @@ _PLAIN = {  # where pydantic speaks of Python
 
 
 def _described(path: Sequence[str], root: type[Section]) -> str:
-    """What the documents say of a key, and so its unit; "" of what is none."""
+    """What docs/launch.md says of a key, and so its unit; "" where there is no such key."""
     key = path[-1] if path else ""
     fields = [one.model_fields[key] for one in _sections_at(path[:-1], root) if key in one.model_fields]
     said = next((field.description for field in fields if field.description), None)
@@ -327,7 +327,7 @@ def _known_keys(path: Sequence[str], root: type[Section]) -> list[str]:
 
 
 def _sections_at(path: Sequence[str], root: type[Section]) -> list[type[Section]]:
-    """What a section may be."""
+    """The types that the section at this path may have."""
     there = [root]
     for part in path:  # a key, a kind, or a number in a list
         kinds = [one for one in there if (kind := one.model_fields.get("kind")) and kind.default == part]
@@ -337,15 +337,15 @@ def _sections_at(path: Sequence[str], root: type[Section]) -> list[type[Section]
 
 
 def _sections_in(section: type[Section] | None, key: str) -> list[type[Section]]:
-    """What may stand under a key: one, one of several, or a list of them."""
+    """The types of the sections that a key may hold: one, one of several, or a list of them."""
     return [kind for kind in _kinds(section, key) if isinstance(kind, type) and issubclass(kind, Section)]
 
 
 def _kinds(section: type[Section] | None, key: str) -> list[Any]:
-    """The type of a key, and all that it is made of."""
+    """The type of a key, and all type arguments in it."""
     field = None if section is None else section.model_fields.get(key)
     kinds: list[Any] = [] if field is None else [field.annotation]
-    for kind in kinds:  # grows
+    for kind in kinds:  # the list grows meanwhile
         kinds += get_args(kind)
     return kinds
 

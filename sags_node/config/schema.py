@@ -20,7 +20,7 @@ from pydantic import (
 
 from sags_node.geometry import is_rotation
 
-# Every number has a lower and an upper limit: a slip is told when it is read, not by what it leads to.
+# Every number has a lower and an upper limit: a slip is an error on reading, not in what it leads to.
 Pixels = Annotated[int, Ge(0), Le(65536)]
 Box = tuple[Pixels, Pixels, Pixels, Pixels]  # x, y, width, height in px
 ClassNumber = Annotated[int, Ge(0), Le(65535)]
@@ -38,7 +38,7 @@ Share = Annotated[float, Ge(0), Le(1)]
 Finite = Annotated[float, Ge(-1_000_000), Le(1_000_000)]
 Positive = Annotated[float, Ge(1e-6), Le(1_000_000)]
 Side = Annotated[int, Ge(16), Le(4096)]  # px
-Name = Annotated[  # also of digits alone, as PyTorch gives them: YAML reads those as a number
+Name = Annotated[  # it may be digits alone, as PyTorch names tensors: YAML reads those as a number
     str, BeforeValidator(lambda said: str(said) if type(said) in (int, float) else said)
 ]
 
@@ -89,7 +89,7 @@ def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
 
 Row = tuple[Finite, Finite, Finite, Finite]
 Pose = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]  # m
-FARTHEST_BASE = 10.0  # m
+FARTHEST_BASE = 10.0  # m, largest translation of a pose along an axis
 NAMESPACE = r"^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$"
 
 
@@ -232,7 +232,7 @@ def _first_of_both(geometry: GeometryConfig) -> GeometryConfig:
     return geometry
 
 
-# Of a source that gives pictures of one kind: of both eyes, or of each.
+# For sources whose pictures are all of one kind: each shows both eyes, or each shows one.
 Geometry = Annotated[GeometryConfig, AfterValidator(_first_of_both)]
 
 
@@ -626,7 +626,7 @@ class StereoConfig(Section):
 
     @property
     def nearest(self) -> float:
-        """m: what nothing is nearer than, as long as no picture says otherwise."""
+        """The nearest depth that is searched, m, unless the pictures show something nearer."""
         return USUAL_NEAREST if self.min_depth is None else self.min_depth
 
 
@@ -780,8 +780,8 @@ class VisionConfig(Section):
     )
 
     def published_size(self, width: int, height: int) -> tuple[int, int]:
-        """Width and height of the pictures that are published, for a camera of `width` x `height` px. Where
-        one is set, the other keeps the proportions."""
+        """Return width and height of published pictures, for a camera of `width` x `height` px. Where one is
+        set, the other keeps the proportions."""
         if self.width is not None:
             return self.width, self.height or round(height * self.width / width)
         if self.height is not None:
@@ -789,8 +789,8 @@ class VisionConfig(Section):
         return width, height
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
-        """The size of the pictures that are worked on, as `published_size`. A scale that is still to be
-        chosen counts as 1."""
+        """Return the size of the pictures that are worked on, as `published_size` does. A scale that is still
+        to be chosen counts as 1."""
         scale = 1.0 if self.scale == "auto" else self.scale
         width, height = self.published_size(width, height)
         return round(scale * width), round(scale * height)
@@ -804,11 +804,11 @@ class EngineConfig(Section):
     )
 
 
-USUAL_MS = 33.0  # of a frame, where nothing says when the next one comes
-# Of the time until the next frame comes. A node that uses all of it never makes up for a late one: the frames
-# after it wait, too. benchmarks/ladder.md has what the rest is worth.
+USUAL_MS = 33.0  # ms, budget of a frame where nothing says when the next one comes
+# Share of the time until the next frame. A node that uses all of it never makes up for a late frame: those
+# after it wait, too. benchmarks/ladder.md says what this reserve is worth.
 SHARE = 0.9
-LONGEST_MS = 100.0  # of a frame, where they come more seldom: what is shown of it must still be new
+LONGEST_MS = 100.0  # ms, longest budget where frames come more seldom: what is shown must still be new
 
 
 MappingMethod = Literal["nodes", "sags"]
@@ -861,10 +861,10 @@ class MappingConfig(Section):
         return self
 
     def frame_ms(self, rate: float | None = None) -> float:
-        """Return what a frame may take, ms.
+        """Return the time budget of a frame, ms.
 
         Args:
-            rate: frames that come a second; None: they come when they are taken.
+            rate: frames per second; None: each comes when the node takes it.
         """
         if self.budget_ms is not None:
             return self.budget_ms
@@ -953,18 +953,18 @@ class LaunchConfig(Section):
 
     @property
     def played_segments(self) -> Segments:
-        """`segments` in the numbers of frames that are played, of which a stride leaves some out."""
+        """`segments` in numbers of played frames: a stride leaves frames out."""
         stride = self.source.stride if isinstance(self.source, RecordedSource) else 1
         return {name: (-(-first // stride), last // stride) for name, (first, last) in self.segments.items()}
 
     @property
     def in_real_time(self) -> bool:
-        """Frames come whether or not they are taken."""
+        """Whether frames come at their own times, taken or not."""
         return isinstance(self.source, LiveSource) or self.source.pace == "realtime"
 
     @property
     def one_camera(self) -> bool:
-        """There is no right eye, and nothing in its place."""
+        """Whether there is only one eye: no source for the right one, and no pictures that show both."""
         if isinstance(self.source, VideosSource) and self.source.geometry.layout != "separate":
             return False
         return isinstance(self.source, FoldersSource | VideosSource) and self.source.right is None

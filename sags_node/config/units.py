@@ -8,14 +8,14 @@ NAMES = {"m": "metres", "mm": "millimetres", "cm": "centimetres", "inch": "inche
 
 
 def fitting_units(length: float, least: float, most: float, read_in: str = "m") -> list[str]:
-    """The units but the one it was `read_in` in which a length lies between two others, m."""
+    """Return the units, without `read_in`, in which a length lies from `least` to `most`, m."""
     counts = length / UNITS[read_in]
     return [unit for unit, metres in UNITS.items() if unit != read_in and least <= counts * metres <= most]
 
 
 def in_metres(units: list[str], path: Path | str, read_in: str = "m") -> str:
-    """How to fix lengths of the calibration at `path` that are in one of these units, and were `read_in`
-    another one."""
+    """Return how to fix a calibration at `path` whose lengths are in one of `units`, but were read as
+    `read_in`."""
     convert = f"sags calib convert {shlex.quote(str(path))} -o FOLDER --unit"
     if read_in != "m":
         ways = " or ".join(f"{convert} {unit}" for unit in units)

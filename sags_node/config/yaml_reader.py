@@ -1,9 +1,9 @@
 """The one reader of YAML that others wrote.
 
-It gives what `yaml.safe_load` gives, and refuses what that takes in silence: keys that are given twice;
+It returns what `yaml.safe_load` returns, and refuses what that takes in silence: keys that are given twice;
 aliases that contain themselves or unfold to far more than was written; zero characters, which no file name
-can hold, and names that cannot be told to anybody. Numbers with zeros in front stay as they were written: of
-000100 and 000180 that makes 64 and a text.
+can hold, and texts that are no valid UTF-8. Octal numbers stay text, as they were written: `safe_load` makes
+64 of 000100, but a text of 000180.
 """
 
 import re
@@ -20,15 +20,15 @@ LARGEST_FILE = 1 << 20  # bytes
 MOST_VALUES = 100_000  # with all aliases unfolded
 LONGEST = 200  # characters of what PyYAML says
 _INT, _TEXT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:str"
-_OCTAL = re.compile("[-+]?0[0_]*[1-7][0-7_]+")  # another number than in decimal digits
+_OCTAL = re.compile("[-+]?0[0_]*[1-7][0-7_]+")  # octal, and not the same number in decimal
 EMPTY = {"", "~", "null", "Null", "NULL"}  # as YAML writes None
 
 
 def read_yaml(file: Path, what: str, largest: int = LARGEST_FILE) -> Any:
-    """The content of a file.
+    """Read the content of a YAML file.
 
     Args:
-        what: the file is meant to be, for the message, e.g. "launch file".
+        what: what the file is meant to be, for the message, e.g. "launch file".
         largest: bytes it may have.
 
     Raises:
@@ -42,10 +42,10 @@ def read_yaml(file: Path, what: str, largest: int = LARGEST_FILE) -> Any:
 
 
 def parse_yaml(content: bytes | str, where: str) -> Any:
-    """The values of one document; None for an empty one.
+    """Return the values of one document; None for an empty one.
 
     Args:
-        where: it stands, for the message.
+        where: where the text stands, for the message.
 
     Raises:
         UsageError: it is not UTF-8 or not YAML, or is one of the things that this module refuses.
@@ -68,8 +68,8 @@ def parse_yaml(content: bytes | str, where: str) -> Any:
 
 
 def parse_word(text: str, where: str) -> Any:
-    """The value of a word on the command line. There `#` begins no comment and `&` names nothing: a text that
-    YAML would shorten stays as it is.
+    """Return the value of a word on the command line. There `#` begins no comment and `&` no anchor: a text
+    that YAML would shorten stays as it is.
 
     Raises:
         UsageError: as `parse_yaml`.
@@ -80,7 +80,7 @@ def parse_word(text: str, where: str) -> Any:
 
 
 def check_dialect(text: str, where: str) -> None:
-    """Refuse what this module refuses, of text that is read elsewhere and need not be proper YAML.
+    """Refuse what this module refuses, in text that another parser reads and that need not be valid YAML.
 
     Raises:
         UsageError: a key is given twice, and so on.
@@ -90,18 +90,18 @@ def check_dialect(text: str, where: str) -> None:
     except _RefusedError as error:
         raise UsageError(f"{where} is not valid YAML: {_in_words(error)}") from None
     except (yaml.YAMLError, RecursionError, ValueError):
-        return  # its own reader says what it thinks of it
+        return  # the other parser says what is wrong
 
 
 class _RefusedError(ConstructorError):
-    """What PyYAML would take."""
+    """A document that this module refuses and PyYAML would accept."""
 
     def __init__(self, node: yaml.Node, problem: str) -> None:
         super().__init__(None, None, problem, node.start_mark)
 
 
 class _Loader(yaml.SafeLoader):
-    """Looks at each part of a document as it was written, before any value is made of it."""
+    """Checks each node of a document as it was written, before a value is made of it."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -110,7 +110,7 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
         is_alias = self.check_event(yaml.AliasEvent)
         node = super().compose_node(parent, index)
-        assert node is not None  # PyYAML's types say that it may be
+        assert node is not None  # PyYAML's types say that it may be None
         if is_alias:
             if node not in self._sizes:
                 raise _RefusedError(node, "it contains itself, through an alias")
@@ -126,7 +126,7 @@ class _Loader(yaml.SafeLoader):
         elif not is_text(node.value):
             raise _RefusedError(node, f"{brief(node.value)} {NO_TEXT}")
         elif node.tag == _INT and _OCTAL.fullmatch(node.value):
-            node.tag = _TEXT  # a number where one is wanted: of decimal digits
+            node.tag = _TEXT  # where a number is wanted, pydantic reads it as decimal
         self._sizes[node] = 1 + sum(self._sizes[part] for part in parts)
         if self._sizes[node] > MOST_VALUES:
             raise _RefusedError(node, f"it holds more than {MOST_VALUES} values, with its aliases unfolded")
@@ -144,25 +144,25 @@ class _Loader(yaml.SafeLoader):
 
 
 def _unfolded(value: Any) -> Any:
-    """Without parts that two places share: to change one would change the other."""
+    """A copy in which no two places share a part: to change one would change the other."""
     if isinstance(value, dict):
         return {key: _unfolded(part) for key, part in value.items()}
     return list(map(_unfolded, value)) if isinstance(value, list) else value
 
 
 def _in_words(error: yaml.YAMLError) -> str:
-    """One line of what PyYAML says in several."""
+    """PyYAML's message of several lines, in one."""
     if isinstance(error, yaml.MarkedYAMLError):
         problem = error.problem or error.context or "it cannot be read"
         begun = error.context_mark if error.context == "while scanning a simple key" else None
-        mark = begun or error.problem_mark  # what is missing is missed later
+        mark = begun or error.problem_mark  # a missing ':' is noticed on a later line
         line = "" if mark is None else f"line {mark.line + 1}: "
         fix = next((fix for said, fix in _FIXES.items() if problem.startswith(said)), "")
         return line + problem[:LONGEST] + fix
     return " ".join(str(error).split())[:LONGEST]
 
 
-_FIXES = {  # of the beginning of what PyYAML says
+_FIXES = {  # by the beginning of PyYAML's message
     "found character '\\t'": "; indent with spaces, not with tabs",
     "mapping values": "; give keys of one section the same indent, and put a text with ': ' in quotes",
     "expected <block end>": "; give keys of one section the same indent",
