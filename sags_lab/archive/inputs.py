@@ -105,9 +105,10 @@ def scratch() -> Iterator[Path]:
     parent = Path(tempfile.gettempdir())
     for old in parent.glob(f"{_SCRATCH}*"):
         _remove_orphan(old)
-    folder = Path(tempfile.mkdtemp(prefix=_SCRATCH, dir=parent))
-    with (folder / ".lock").open("w") as lock:
+    new = Path(tempfile.mkdtemp(dir=parent))
+    with (new / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
+        folder = new.rename(parent / f"{_SCRATCH}{new.name}")  # locked before others look for it
         try:
             yield folder
         finally:

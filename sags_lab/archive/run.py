@@ -199,7 +199,7 @@ def _missing(
             store.remove(f"{DONE}/{recording.id}.{before}.json")  # before its results are replaced
         if recording.id in failed:
             record = store.read_json(f"{FAILED}/{recording.id}.json")
-            if retry_failed or record["key"] != key:
+            if retry_failed or record is None or record["key"] != key:
                 forget(store, recording.id)
             elif record["quarantined"]:
                 tally.quarantined += 1

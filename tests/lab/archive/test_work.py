@@ -1,9 +1,11 @@
 """One recording on the machine that does it: limits, threads, URLs, and what is left behind."""
 
+import fcntl
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fsspec.core import url_to_fs
@@ -193,6 +195,19 @@ def test_what_killed_workers_left_is_removed(tmp_path: Path) -> None:
         (orphan / "video.mp4").write_bytes(b"x")
         with scratch() as other:
             assert mine.is_dir() and other.is_dir() and not orphan.exists()
+
+
+def test_no_other_worker_removes_a_folder_before_it_is_locked(monkeypatch: pytest.MonkeyPatch) -> None:
+    lock = fcntl.flock
+
+    def another_comes_first(*asked: Any) -> None:
+        monkeypatch.setattr(fcntl, "flock", lock)
+        with scratch():
+            lock(*asked)
+
+    monkeypatch.setattr(fcntl, "flock", another_comes_first)
+    with scratch() as folder:
+        assert folder.is_dir()
 
 
 def test_a_log_says_the_reason(tmp_path: Path) -> None:
