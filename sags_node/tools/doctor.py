@@ -296,7 +296,7 @@ def _keys(key: Path, allow: Sequence[Path]) -> Finding:
 
 def _clock() -> Finding:
     """Tell whether anything sets this machine's clock right. Clients on other machines ask the node for its
-    clock, so one that is not kept is no fault."""
+    clock, so one that is not synchronised is no fault."""
     by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
     timex = ctypes.create_string_buffer(256)  # of which the kernel writes 208 bytes
     if ctypes.CDLL(None).adjtimex(timex) in (-1, TIME_ERROR):

@@ -38,7 +38,7 @@ from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import FULL_SIZE_BELOW
 
 FEWEST_KNOWN = 0.1  # share of the patches that must match
-FOUND_BACK = 0.7  # px: so near to itself a patch must be matched back
+FOUND_BACK = 0.7  # px: largest distance at which a patch is matched back to itself
 
 Progress = Callable[[int, int], None]
 Launched = Callable[[Path, Sequence[str]], LaunchConfig]
@@ -172,7 +172,7 @@ def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | 
 
 
 def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
-    """A finding on dense row errors, finer than those of matched points, which must fit roughly before."""
+    """A finding on dense row errors: more exact than matched points, which must fit roughly already."""
     rectifier = Rectifier(rig, rig.left.width, rig.left.height)
     smallest, largest = np.percentile(rows.disparities, [2, 98])
     measured = []

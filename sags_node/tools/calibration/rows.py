@@ -44,7 +44,7 @@ class Rows(NamedTuple):
     in_front: float  # share of points in front of both eyes
     median: float  # px, of the errors without their sign
     p90: float
-    turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best, with
+    turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best; with them:
     scale: float  # by how much larger the right picture is than its calibration says, 0.01: 1 %
     scale_error: float  # standard error of that
     left_over: float  # px, RMS of the errors that turn and scale leave

@@ -322,7 +322,7 @@ def _latency(figures: Flat) -> str:
 
 def _picture(figures: Flat) -> str:
     """The line on the picture: how good a view of the next frame is, as a frame's left render is mostly its
-    own picture. Of a live run, whose views are not known, it is that render."""
+    own picture. Of a live run, whose views are not known, it is on that render."""
     shown = {
         "predict.psnr": "of the next frame",
         "shown.psnr": "of the frame itself, mostly its own picture",

@@ -157,7 +157,7 @@ def read_clip(
 
 
 def check_memory(frame: ClipFrame, count: int | None) -> None:
-    """Check that `count` frames of this size fit into memory; None: the count is unknown, and all is well.
+    """Check that `count` frames of this size fit into memory; None: it is unknown, and nothing is checked.
 
     Raises:
         SagsError: they do not.

@@ -10,7 +10,7 @@ from sags_node.model import columns
 from sags_node.types import F32
 
 MIN_OPACITY_LOGIT = float(np.log(0.005 / 0.995))
-SHRINK = 1.6  # times smaller than a Gaussian are the two that it is split into
+SHRINK = 1.6  # how many times smaller the two are that a Gaussian is split into
 
 
 class Density:
@@ -72,7 +72,7 @@ def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
 
 def quarter(model: DeformableModel) -> None:
     """Replace each Gaussian by four, side by side and half as large in its plane, for pictures of twice the
-    size. Each takes the colour that its parent has at its centre."""
+    size. The colour of each is that of the old one at the new centre."""
     every, parents = np.arange(len(model)), model.table.copy()
     scales = np.exp(parents[:, columns.LOG_SCALE])
     axes = quat_to_matrix(parents[:, columns.QUAT])

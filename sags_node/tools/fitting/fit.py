@@ -143,7 +143,7 @@ class Fit:
 
     @property
     def is_coarse(self) -> bool:
-        """The current stage uses pictures of half the size."""
+        """Tell whether the current stage uses pictures of half the size."""
         return self.coarse > 0 and self.iteration < self.warm_up + self.coarse
 
     @property

@@ -23,7 +23,7 @@ from sags_node.tools.importing.folder import override
 from sags_node.types import U8
 
 LOOKED_AT = 4  # pictures, spread over the video
-MOST_LATE = 900  # pictures: the latest start of an eye that is looked for
+MOST_LATE = 900  # pictures: the largest delay of an eye's start that is tried
 LEAST_ALONG = 0.8  # share of the matches whose rows agree, of two eyes
 ROWS = 1 / 40  # of the width: as far as rows of eyes that are not rectified differ
 ONE_EYE = "one eye is shown, or both in a way that was not recognised"
