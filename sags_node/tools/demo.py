@@ -73,7 +73,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
                 if stop.is_set():
                     raise KeyboardInterrupt
             except BaseException:
-                end(overlay, grace=OVERLAY_STOP)  # it closes its video, and is not waited for until its end
+                end(overlay, grace=OVERLAY_STOP)  # time to close its files, and no more
                 raise
             finally:
                 node.stop()
@@ -111,7 +111,7 @@ class Shown:
 
 
 def _start_overlay(config: LaunchConfig, layers: Path) -> subprocess.Popen[str]:
-    """The consumer is a process of its own, as it would be in a theatre; it waits for a slow start."""
+    """Start the consumer in a process of its own, as in an operating theatre; it waits for the node."""
     command = [sys.executable, "-m", "sags_node", "overlay", "--ns", config.ns, "--repin"]
     command += ["--run-dir", str(config.publish.run_dir or default_run_dir())]
     command += ["--layers", str(layers), "--json"]
@@ -119,7 +119,7 @@ def _start_overlay(config: LaunchConfig, layers: Path) -> subprocess.Popen[str]:
 
 
 def _await_overlay(config: LaunchConfig, overlay: subprocess.Popen[str], stop: threading.Event) -> None:
-    """Wait until it listens: a short demo would be over before.
+    """Wait until the overlay listens: a short demo would be over before.
 
     Raises:
         SagsError: it does not come up in time.

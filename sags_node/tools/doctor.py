@@ -48,16 +48,16 @@ from sags_node.sources.robot import hand_eye_file
 from sags_node.tools.importing.check import played
 from sags_node.vision.onnx_session import OnnxSession
 
-ROOT = Path("/")  # of the small files that are read; tests have another folder
+ROOT = Path("/")  # of the system files that are read; tests use another folder
 
 Look = tuple[str, Finding]  # what was looked at, and what was found
 REQUIRED = (
     "numpy torch opencv-contrib-python-headless pyzmq open3d onnxruntime numba rosbags mcap msgspec "
     "pydantic pyyaml click rich"
 ).split()
-CORES = 2  # for the rate of a camera
+CORES = 2  # that a camera's frame rate needs
 ENOUGH_MEMORY = 2e9  # bytes: about twice what a node takes
-UNLIMITED = 1 << 62  # bytes: so much control groups of version 1 say where there is no limit
+UNLIMITED = 1 << 62  # bytes: what control groups of version 1 state where there is no limit
 TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
 MAX_ERROR = struct.Struct("@I3l")  # modes, offset, frequency and largest error (us) of its `timex`
 TIME_KEEPERS = {"chronyd", "ntpd", "phc2sys", "ptp4l", "systemd-timesyn"}  # as far as /proc tells names
@@ -98,7 +98,7 @@ def as_rows(looks: Iterable[Look]) -> list[dict[str, str]]:
 
 
 def _launched(config: LaunchConfig) -> list[Look]:
-    """Return what the launch file names: pictures, calibration, the robot, networks."""
+    """Check what the launch file names: pictures, calibration, the robot, networks."""
     source, robot, vision = config.source, config.robot, config.vision
     looks: list[Look] = []
     if isinstance(source, RecordedSource) and not isinstance(source, PhantomSource):
@@ -120,7 +120,7 @@ def _launched(config: LaunchConfig) -> list[Look]:
     comes_with_pictures = isinstance(source, Ros2Source) and config.rig is None
     judged = any(name == "calibration" for name, _ in looks)
     uncalibrated = False
-    with suppress(SagsError):  # a recording that cannot be read was said
+    with suppress(SagsError):  # a recording that cannot be read was reported
         uncalibrated = not isinstance(source, PhantomSource) and lacks_rig(config)
     if uncalibrated:
         fix = "depth has no unit without one; sags calib stereo makes one, then set rig"
@@ -139,7 +139,7 @@ def _launched(config: LaunchConfig) -> list[Look]:
         looks.append(("tissue masks", _tried(lambda: MaskSubscriber(*address).close(), "can be received")))
     if config.rig is not None and isinstance(source, LiveSource):
         made = _tried(lambda: Pipeline(config, rig_of(config), lambda stamp_ns: None), "can be made")
-        if made.what not in [each.what for _, each in looks]:  # else that was said
+        if made.what not in [each.what for _, each in looks]:  # else that was reported
             looks.append(("pipeline", made))
     return looks
 
@@ -245,7 +245,7 @@ def check_memory(root: Path = ROOT) -> Finding:
 
 
 def check_gpu(config: LaunchConfig) -> Finding:
-    """Tell whether Warp can draw there. A machine without one is no worse for it, unless one is wanted."""
+    """Tell whether Warp can draw on a GPU. To have none is a fault only where `device` asks for one."""
     if config.device == "cpu":
         return Finding("ok", f"not used: device is {config.device}")
     found = find_gpu()
@@ -296,7 +296,7 @@ def _keys(key: Path, allow: Sequence[Path]) -> Finding:
 
 def _clock() -> Finding:
     """Tell whether anything sets this machine's clock right. Clients on other machines ask the node for its
-    clock, so one that nobody keeps is no fault."""
+    clock, so one that is not synchronised is no fault."""
     by = ", ".join(sorted(_running() & TIME_KEEPERS)) or "no program here"
     timex = ctypes.create_string_buffer(256)  # of which the kernel writes 208 bytes
     if ctypes.CDLL(None).adjtimex(timex) in (-1, TIME_ERROR):
@@ -307,7 +307,7 @@ def _clock() -> Finding:
 
 
 def _running() -> set[str]:
-    """Names of the processes here."""
+    """The names of the processes on this machine."""
     names = set()
     for comm in Path("/proc").glob("[0-9]*/comm"):
         with suppress(OSError):  # it has ended meanwhile
@@ -316,7 +316,7 @@ def _running() -> set[str]:
 
 
 def _gstreamer(config: LaunchConfig) -> Finding:
-    """Which elements are there; it starts GStreamer, in a process of its own."""
+    """Tell which elements are there; this starts GStreamer, in a process of its own."""
     wanted: Level = "error" if isinstance(config.source, GstSource) else "ok"
     if ctypes.util.find_library("gstapp-1.0") is None:
         packages = " ".join(sorted(name for name in set(ELEMENTS.values()) if " " not in name))
@@ -344,9 +344,9 @@ def _recordings() -> Finding:
 
 
 def core_quota(root: Path = ROOT) -> float | None:
-    """The cores whose time control groups grant, of this one and those above it; None: no limit is known.
+    """The cores whose time this process's control groups grant; None: no limit is known.
 
-    Versions 2 and 1 (https://docs.kernel.org/admin-guide/cgroup-v2.html).
+    Groups above it count, too; versions 2 and 1 (https://docs.kernel.org/admin-guide/cgroup-v2.html).
     """
     granted = []
     for group in _control_groups("cpu", root):
@@ -359,8 +359,8 @@ def core_quota(root: Path = ROOT) -> float | None:
 
 
 def memory_quota(root: Path = ROOT) -> int | None:
-    """The memory that control groups still grant, as `core_quota`, bytes. Files that are kept in it in case
-    that they are read again give way."""
+    """The memory that control groups still grant, bytes; None: no limit is known. Their cache of inactive
+    files counts as free."""
     granted = []
     for group in _control_groups("memory", root):
         stat = dict(line.split() for line in _read(group / "memory.stat").splitlines())
@@ -388,8 +388,8 @@ def _control_groups(controller: str, root: Path) -> Iterator[Path]:
 
 
 def governors(root: Path = ROOT) -> set[str]:
-    """Return what decides the clock rates of the cores; empty where the machine does not tell, as in most
-    guests.
+    """The frequency governors of the cores; empty where the machine does not tell, as in most virtual
+    machines.
 
     `powersave` of a processor that chooses its rate itself (`intel_pstate`, `amd-pstate-epp`) is not the
     lowest rate, and is called `balanced` here.

@@ -10,7 +10,7 @@ from sags_node.errors import UsageError
 from sags_node.types import F32, I64, U8
 
 FEWEST_CORNERS = 8  # of one view, in both eyes
-REFINE = 0.3  # of the distance between corners, to either side
+REFINE = 0.3  # half the window of cornerSubPix, as a share of the distance between corners
 REFINE_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 PREFIX = "DICT_"
 
@@ -41,7 +41,7 @@ class Board(Protocol):
         """The corners in a picture [H, W]; None where the board is not seen."""
 
     def explain(self, gray: U8) -> str:
-        """Return what is in a picture [H, W] instead of this board, as far as one can tell; or nothing."""
+        """Return in words what a picture [H, W] shows instead of this board; empty: that is not known."""
 
 
 class Chessboard:
@@ -136,7 +136,7 @@ def find_in_both(board: Board, name: str, left: U8, right: U8) -> StereoView | N
 
 
 def turned_like(corners: F32, others: F32) -> F32:
-    """The corners [n, 2] of a chessboard seen whole, counted from that end from which the others are: it may
+    """The corners [n, 2] of a chessboard seen whole, reversed where they run against `others`: the board may
     look the same upside down."""
     alike = float((corners[-1] - corners[0]) @ (others[-1] - others[0])) > 0
     return corners if alike else corners[::-1]

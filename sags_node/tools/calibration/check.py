@@ -37,8 +37,8 @@ from sags_node.vision.pyramid import gray_pyramid
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import FULL_SIZE_BELOW
 
-FEWEST_KNOWN = 0.1  # of the patches
-FOUND_BACK = 0.7  # px
+FEWEST_KNOWN = 0.1  # share of the patches that must match
+FOUND_BACK = 0.7  # px: largest distance at which a patch is matched back to itself
 
 Progress = Callable[[int, int], None]
 Launched = Callable[[Path, Sequence[str]], LaunchConfig]
@@ -93,7 +93,7 @@ def check_calibration(
 def read_calibration(
     path: Path, size: tuple[int, int] | None, metres: float | None, launched: Launched = load_launch
 ) -> StereoRig:
-    """`read_rig`, also of the calibration that a session uses."""
+    """Read a calibration by `read_rig`, or the one that a session uses."""
     known = find_form(path) is not None
     return read_rig(path, size, metres) if known else _rig_of(_launched(path, (), launched), size, metres)
 
@@ -143,7 +143,7 @@ def rectified_before(config: LaunchConfig) -> bool:
         if config.rectified is not None or not rectifies(rig):
             return False
         matches = [match_eyes(*pair) for pair in first_pairs(config.source, FIRST_PAIRS)[2]]
-    except SagsError:  # whoever plays it says so
+    except SagsError:  # that is reported when it is played
         return False
     return bool(matches) and bool(judge_rectified(rig, np.concatenate(matches)))
 
@@ -172,7 +172,7 @@ def _rig_of(config: LaunchConfig, size: tuple[int, int] | None, metres: float | 
 
 
 def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
-    """Dense rows of the rectified pictures: finer than those of matched points, where these fit roughly."""
+    """A finding on dense row errors: more exact than matched points, which must fit roughly already."""
     rectifier = Rectifier(rig, rig.left.width, rig.left.height)
     smallest, largest = np.percentile(rows.disparities, [2, 98])
     measured = []
@@ -190,7 +190,7 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
     if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
         return Finding("ok", what, "", figures)
     fix = "depth suffers: calibrate again, with the scope as it is used"
-    if rows.scale_differs:  # that is said next, and what is left is no turn
+    if rows.scale_differs:  # that is reported next, and what is left is no rotation
         return Finding("warning", what, fix, figures)
     pitch, roll = rows.turn
     lower = float(np.median(rows.errors))
@@ -203,7 +203,7 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
 
 
 class RowError(NamedTuple):
-    """Distances between rows of a rectified pair, px of the full pictures."""
+    """The row errors of a rectified pair, px of the full pictures."""
 
     median: float
     p90: float
@@ -211,9 +211,9 @@ class RowError(NamedTuple):
 
 
 def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowError | None:
-    """Row errors all over a rectified pair [H, W, 3] (RGB); None where next to nothing matches.
+    """Measure row errors all over a rectified pair [H, W, 3] (RGB); None where next to nothing matches.
 
-    Measured with care and without hurry.
+    A patch counts only where its match is matched back to it.
 
     Args:
         smallest, largest: disparities to search, px.
@@ -231,7 +231,7 @@ def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowErr
 
 
 def _found_back(found: Patches, mirrored: Patches) -> Bool:
-    """Find where the match of a left patch is matched back to it: anything is matched to something."""
+    """Where a left patch's match is matched back to it: each patch has some match, also a wrong one."""
     flow = at_pixels(mirrored.left, mirrored.right, mirrored.stride, mirrored.field)
     back = np.ascontiguousarray(flow[:, ::-1])  # to the right in the mirror is to the left
     columns, rows = centres(found.left, found.stride)

@@ -13,7 +13,7 @@ from sags_node.sources.source import open_source
 from sags_node.types import U8, StereoFrame
 
 WIDEST = 960  # px of an eye in the picture
-LINES = 8  # across both eyes: the same tissue lies near the same one
+LINES = 8  # drawn across both eyes: the same tissue must lie near the same line
 SILENT_S = 20.0  # a source may give no frame for so long
 LINE, TEXT, SHADE = (255, 220, 0), (255, 255, 255), (0, 0, 0)  # RGB
 

@@ -61,7 +61,7 @@ def calibrate_hand_eye(
 
 
 def summarise_hand_eye(solution: HandEyeSolution) -> dict[str, Any]:
-    """Everything that there is to say, for programs."""
+    """All figures of a solution, as a dictionary for programs."""
     T = solution.hand_eye.T_hand_cam
     worst = np.argsort(-solution.errors)[:3]
     return {
@@ -77,7 +77,7 @@ def summarise_hand_eye(solution: HandEyeSolution) -> dict[str, Any]:
 
 
 def hand_eye_table(summary: dict[str, Any]) -> Table:
-    """The summary for people."""
+    """The summary as a table for people."""
     made = text.table()
     made.add_row("views", f"{summary['views']} of the board with a pose of the robot")
     made.add_row("error", f"{summary['error_px']:.3f} px (root mean square, both eyes)")

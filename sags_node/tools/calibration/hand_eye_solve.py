@@ -1,8 +1,8 @@
 """Hand-eye calibration from views of a board that lies still, with the offset of the two clocks.
 
-First the rotations (Park and Martin, T-RA 1994), for each offset that is possible: the one at which the turns
-of the robot and of the camera agree best. Then everything together: the camera on the hand, the board in the
-base, and the offset, so that the corners of all views fall on those that both eyes saw.
+First the rotations alone (Park and Martin, T-RA 1994), for every possible offset: the one at which those of
+the robot and of the camera agree best is taken. Then the camera on the hand, the board in the base, and the
+offset together, by the reprojection errors of all corners in both eyes.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ FEWEST_VIEWS = 10
 LARGEST_OFFSET_NS = 500_000_000
 OFFSET_STEP_NS = 10_000_000
 MOST_PAIRS = 400  # of views, whose relative turns are compared
-# Of a numeric derivative: m and rad; and s, between two poses motion is straight.
+# Of the numeric derivative: rad and m for two poses, and s for the offset (motion is linear between poses).
 STEPS = np.array([1e-6] * 12 + [1e-3])
-SCALED = np.append(STEPS, 1e-4)  # and how many times longer the robot's ways are taken to be
-LARGEST_SCALE = 0.02  # robots are off by less, and a page that is printed to fit by more
-BETTER = 0.95  # of the residuals' spread: so much is not by chance
-ROUNDS = 30
-WEIGHINGS = 2  # of views: the first by a linear solution, whose own error counts as the robot's
+SCALED = np.append(STEPS, 1e-4)  # and one for the scale of the robot's translations
+LARGEST_SCALE = 0.02  # robots err by less, and a board that was printed to fit the page by more
+BETTER = 0.95  # ratio of the residuals' spreads: a gain that large is not by chance
+ROUNDS = 30  # iterations of least squares, at most
+WEIGHINGS = 2  # times that views are weighted; the linear solution's error counts as the robot's at first
 STILL = np.zeros(6)  # no slip
-SIZES = (0.0, *np.geomspace(1e-6, 3e-2, 19))  # rad or m, of a robot's error
-UNSURE = (0.005, np.radians(1.0))  # m, rad: beyond it the motion does not tell enough
-LEAST_TURN = np.radians(0.5)  # root mean square: a board's turn is seen to a tenth of it
+SIZES = (0.0, *np.geomspace(1e-6, 3e-2, 19))  # rad or m: the sizes of the robot's error that are tried
+UNSURE = (0.005, np.radians(1.0))  # m, rad: a solution with larger standard deviations is refused
+LEAST_TURN = np.radians(0.5)  # rad, root mean square: a board's rotation is measured to a tenth of it
 _TURN = "turn the scope about two different axes, by 20 degrees and more"
 LARGEST_ERROR = 5.0  # px: beyond it the poses are not those of this camera
 
@@ -107,12 +107,12 @@ def solve_hand_eye(
 
 
 def _needed(views: int) -> int:
-    """So many of them must have a pose: with few, any offset that knows only these might seem to agree."""
+    """The number of views that must have a pose: with few, a wrong offset may seem to agree."""
     return max(FEWEST_VIEWS, -(-views // 2))
 
 
 def _too_few(views: Sequence[StereoView], problems: Sequence[str | None], count: int) -> SagsError:
-    """The error that so few views have a pose; why, is told of the middle one that has none."""
+    """The error that too few views have a pose; it says why for the middle one of those without."""
     told = [(view.name, why) for view, why in zip(views, problems, strict=True) if why is not None]
     fix = "; give a larger --views, or record for longer"
     if told:
@@ -124,7 +124,7 @@ def _too_few(views: Sequence[StereoView], problems: Sequence[str | None], count:
 
 
 def _turned_enough(turns: F64) -> None:
-    """Turns [P, 3] must go about two axes: about one alone nothing tells how far the camera sits along it."""
+    """Check that rotations [P, 3] go about two axes: with one, the camera's place along it is unknown."""
     second = np.linalg.svd(turns, compute_uv=False)[1] / np.sqrt(len(turns))
     if second < LEAST_TURN:
         raise SagsError(
@@ -136,13 +136,13 @@ def _turned_enough(turns: F64) -> None:
 def _check_scale(residuals: _Residuals) -> None:
     """
     Raises:
-        SagsError: the robot's ways and those in the pictures differ in length: all fits better then. About
-            one point alone a scope turns alike at any length.
+        SagsError: all fits clearly better with the robot's translations scaled. Where the scope only turns
+            about one point, this cannot be seen.
     """
     parameters = _least_squares(residuals, SCALED)[0]
     if abs(parameters[-1]) <= LARGEST_SCALE:
         return
-    # What other lengths explain was taken for the robot's error.
+    # What the scale explains was counted as the robot's error: weight the views anew.
     residuals = replace(residuals, weights=_weights(residuals, parameters))
     (parameters, _, scaled), (_, _, spread) = (_least_squares(residuals, steps) for steps in (SCALED, STEPS))
     if abs(parameters[-1]) > LARGEST_SCALE and scaled < BETTER * spread:
@@ -161,7 +161,7 @@ def _known_pose(pose_at: PoseAt, t_ns: int) -> F64 | None:
 
 
 def _problem(pose_at: PoseAt, t_ns: int) -> str | None:
-    """Why the pose is not known, also for the steps of the search; None: it is."""
+    """Why the pose at a time is unknown, or two steps of the search beside it; None: it is known."""
     reach = 2 * OFFSET_STEP_NS
     try:
         for step in (0, -reach, reach):
@@ -181,8 +181,8 @@ def _board_pose(view: StereoView, points: F32, rig: StereoRig) -> F64:
 
 
 def _coarse_offset(boards: F64, stamps: Sequence[int], pose_at: KnownPose) -> tuple[int | None, int]:
-    """The offset at which the turns of robot and camera agree best, ns, and how many views have a pose at
-    most; None: at no offset enough of them have one."""
+    """The offset at which the rotations of robot and camera agree best, ns, and the largest number of views
+    that have a pose at any offset. None: at no offset enough views have one."""
     best, least, most = None, np.inf, 0
     for offset in range(-LARGEST_OFFSET_NS, LARGEST_OFFSET_NS + 1, OFFSET_STEP_NS):
         poses = {i: pose for i, stamp in enumerate(stamps) if (pose := pose_at(stamp + offset)) is not None}
@@ -235,10 +235,10 @@ def _linear(hands: F64, boards: F64) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class _Residuals:
-    """How far each view is from where the parameters put it, [6 V] in standard deviations.
+    """The residuals of all views for given parameters, [6 V], in standard deviations.
 
     Parameters [13]: a small motion of the camera on the hand (turn, place), one of the board, and the
-    offset's difference from the first one, s; [14]: also by how much longer the robot's ways are.
+    offset's difference from the first one, s; [14]: also the scale of the robot's translations, less 1.
     """
 
     views: Sequence[StereoView]
@@ -257,12 +257,12 @@ class _Residuals:
 
     def __call__(self, parameters: F64) -> F64:
         parts = self.of_corners(parameters)
-        if not parts:  # the search has left what is known: no place for it
+        if not parts:  # a pose is unknown at this offset: the search turns back
             return np.full(6 * len(self.views), 1e3)
         return np.concatenate([weight @ part for weight, part in zip(self.weights, parts, strict=True)])
 
     def of_corners(self, parameters: F64, slip: F64 = STILL) -> list[F64]:
-        """The residuals of each view's corners [4 N], px, left eye and right eye; none: a pose is not known.
+        """The residuals of each view's corners [4 N], px, left eye and right eye; empty: a pose is unknown.
 
         `slip` [6]: turn and place by which the hand is elsewhere than the robot says, in its own axes.
         """
@@ -288,11 +288,11 @@ class _Residuals:
 
 
 def _weights(residuals: _Residuals, parameters: F64) -> list[F64]:
-    """Find what makes of each view's corners six residuals, of where its hand is, with a variance of 1.
+    """The matrices [6, 4 N] from each view's corner residuals to six of its hand's pose, of variance 1.
 
-    Such a place is off by the corners' noise, which all of them average, and by the robot's own error, which
-    they share: it has the sizes, of turns and of places, that make the residuals most probable. Taken for
-    noise of the corners it would count some ten times too little.
+    A hand's pose is off by the noise of the corners, which averages out, and by the robot's own error, which
+    all corners of a view share. The robot's error, in rotation and in translation, is that of maximum
+    likelihood. Counted as noise of the corners, it would weigh some ten times too little.
     """
 
     def moved(way: float) -> list[F64]:
@@ -318,7 +318,7 @@ def _weights(residuals: _Residuals, parameters: F64) -> list[F64]:
 
 
 def _least_squares(residuals: _Residuals, steps: F64) -> tuple[F64, F64, float]:
-    """Levenberg and Marquardt: parameters [P], their covariance for residuals of 1, residuals' spread."""
+    """Levenberg-Marquardt: parameters [P], their covariance at a variance of 1, and the residuals' spread."""
     parameters, damping = np.zeros(len(steps)), 1e-3
     now = residuals(parameters)
     for _ in range(ROUNDS):
@@ -345,5 +345,5 @@ def _least_squares(residuals: _Residuals, steps: F64) -> tuple[F64, F64, float]:
 
 
 def _rigid(parameters: F64) -> F64:
-    """[4, 4] of a rotation vector and a translation [6]."""
+    """The pose [4, 4] of a rotation vector and a translation [6]."""
     return rigid(cv2.Rodrigues(parameters[:3])[0], parameters[3:6])

@@ -14,7 +14,7 @@ from sags_node.tools.calibration.boards import Board, StereoView, find_in_both
 from sags_node.types import F32, U8
 
 NEW_AT = 0.06  # of the diagonal: how far common corners must have moved from every view taken before
-STILL_AT = 0.004  # of the diagonal, since the frame before
+STILL_AT = 0.004  # of the diagonal: how far they may have moved since the frame before
 
 
 def grab_views(
@@ -38,7 +38,7 @@ def grab_views(
         SagsError: no view was taken, or the source fails.
     """
     sides = folder / "left", folder / "right"
-    if any(file.is_file() for file in folder.rglob("*")):  # not the folders of an attempt without a view
+    if any(file.is_file() for file in folder.rglob("*")):  # empty folders of an earlier attempt may stay
         raise UsageError(f"{folder} is not empty; name a new folder, or calibrate from the pictures in it")
     with writing(folder):
         for side in sides:
@@ -69,7 +69,7 @@ def grab_views(
 def _advice(
     view: StereoView | None, before: StereoView | None, taken: list[StereoView], diagonal: float
 ) -> str:
-    """Return what keeps this frame from being a new view; empty: nothing."""
+    """Return what to do so that the frame becomes a new view; empty: it is one."""
     if view is None:
         return "show the whole board to both eyes"
     if before is None or _moved(view, before) > STILL_AT * diagonal:

@@ -6,7 +6,7 @@ import numpy as np
 from sags_node.types import F64, U8, Bool
 
 FEATURES = 3000  # of each picture
-CONTRAST = 0.01  # tissue has little
+CONTRAST = 0.01  # least contrast of a SIFT feature: tissue has little
 LARGEST_RATIO = 0.8  # best to second best descriptor distance (Lowe, IJCV 2004, section 7.1)
 HIGHLIGHT = 245  # grey level
 HIGHLIGHT_MARGIN = 9  # px: a highlight lies at another depth than the tissue it shines on
@@ -15,10 +15,10 @@ LEAST = 16  # matches for an epipolar geometry worth the name
 
 
 def match_eyes(left: U8, right: U8) -> F64:
-    """Pixels of the same points in both pictures, [M, 4]: x, y in the left one, x, y in the right one.
+    """The pixels of the same points in both pictures, [M, 4]: x, y in the left one, x, y in the right one.
 
-    SIFT features away from highlights, each other's best match, that agree with one epipolar geometry,
-    whatever it is: what is left is rigid stereo, so disagreement with a calibration is the calibration's.
+    These are SIFT features away from highlights that are each other's best match and fit one epipolar
+    geometry, whichever it is. Where they disagree with a calibration, the calibration is wrong.
 
     Args:
         left, right: [H, W, 3] RGB, raw.
@@ -37,14 +37,14 @@ def match_eyes(left: U8, right: U8) -> F64:
 
 
 def _dull(gray: U8) -> Bool:
-    """Find where nothing shines, [H, W]."""
+    """A mask [H, W] of the pixels away from highlights."""
     window = np.ones((2 * HIGHLIGHT_MARGIN + 1,) * 2, np.uint8)
     dull: Bool = cv2.dilate(gray, window) < HIGHLIGHT
     return dull
 
 
 def _nearest(said: np.ndarray, other: np.ndarray) -> dict[int, int]:
-    """Find for each descriptor the one that is clearly the most similar, where there is one."""
+    """For each descriptor that has one, the index of the clearly most similar of the others (ratio test)."""
     two = cv2.BFMatcher(cv2.NORM_L2).knnMatch(said, other, k=2)
     return {a.queryIdx: a.trainIdx for a, b in two if a.distance < LARGEST_RATIO * b.distance}
 

@@ -12,13 +12,13 @@ from sags_node.sources.source import open_source
 from sags_node.types import F32, U8
 
 Pair = tuple[U8, U8]  # left, right: [H, W, 3] RGB, raw
-PAIRS = 8  # spread over what there is
+PAIRS = 8  # spread over all files, or over the recording
 REFERENCE_EVERY = 10  # frames: recordings often know the depth of every tenth one only
-LIVE_STRIDE = 15  # frames of cameras, which go on and on
+LIVE_STRIDE = 15  # frames from one pair of live cameras to the next
 
 
 def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
-    """Pictures of pairs of files, or of pairs of folders.
+    """Read the pictures of pairs of files, or of pairs of folders.
 
     Raises:
         UsageError: there are none, left and right are not equally many, or one is a video.
@@ -45,8 +45,8 @@ def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
 def pairs_of_session(
     config: LaunchConfig, progress: Callable[[int, int], None] | None = None
 ) -> tuple[list[Pair], list[F32 | None]]:
-    """Some frames, spread over a recording, and the depth [H, W] m that it knows of each, if any; of cameras,
-    one every half second.
+    """Read some frames, spread over a recording, and the depth [H, W] m that it has of each, or None; from
+    cameras, one frame every half second.
 
     Raises:
         UsageError: the session has no right eye, or a wrong path.
@@ -75,10 +75,10 @@ def spread(
     multiple: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Recording | PhantomSource:
-    """Return what plays `count` frames or more, spread over those that `source` plays, and none beside them.
+    """Return a source that plays `count` frames or more, spread over those that `source` plays.
 
     Args:
-        multiple: of frames from one to the next, where there are so many.
+        multiple: the stride is a multiple of this, where there are enough frames.
         progress: called while a phantom session is rendered.
 
     Raises:

@@ -15,7 +15,7 @@ from sags_node.checks import Finding
 from sags_node.tools.calibration.rows import FEWEST_MATCHES, fit_without_outliers, rectified_rows
 from sags_node.types import F32, F64, StereoRig
 
-NOTICED = 0.1  # px of the full picture: what reference depths and matches are good for
+NOTICED = 0.1  # px of the full picture: reference depths and matches are no more exact
 SLOPE = 0.03  # of the depth, over `AROUND`: more is an edge, and its depth belongs to either side
 AROUND = 9  # px
 OUTLIER = 3.0 * 1.4826  # times the median distance: 3 sigma

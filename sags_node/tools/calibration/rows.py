@@ -20,17 +20,17 @@ from sags_node.types import F64, Bool, Eye, StereoRig
 
 FEWEST_MATCHES = 30
 LARGEST_ROW_ERROR = 1 / 180  # of the width, median: beyond it stereo finds no match
-IN_FRONT = 0.8  # of the matches: fewer are no scene seen by two eyes
-CLEARLY = 1.5  # times the row error, and
-CLEARLY_PX = 0.3  # px: a reading that is worse by more does not fit
+IN_FRONT = 0.8  # share of the matches: with fewer this is no stereo pair
+CLEARLY = 1.5  # times the best row error, and
+CLEARLY_PX = 0.3  # px above it: a reading that is worse than both does not fit
 WRONG_MATCH = 4.0  # times the median distance from the median row error
-LEAST_SCALE = 0.004  # between the eyes: beyond it depth leans by more than matching errs
+LEAST_SCALE = 0.004  # difference of the eyes' scales: beyond it depth leans by more than matching errs
 SURE_SCALE = 4.0  # times its standard error
 EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale fixes depth
-ROUNDS = 10
+ROUNDS = 10  # of fitting and leaving out outliers
 TINY = 1e-12  # so that an exact fit keeps all
-ALIGNED = (0.35, 1.0)  # px of a picture 640 px wide, or smaller, median and 90 %: rows that were rectified
-WORSE = 2.0  # times: rows of these after they were rectified once more
+ALIGNED = (0.35, 1.0)  # px at a width of 640 px or less, median and 90 %: row errors of rectified pictures
+WORSE = 2.0  # times larger: the row errors of these after they are rectified once more
 RECTIFIED = "rectified:=true"
 PICTURES_EXCHANGED = "the pictures are exchanged: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
@@ -44,7 +44,7 @@ class Rows(NamedTuple):
     in_front: float  # share of points in front of both eyes
     median: float  # px, of the errors without their sign
     p90: float
-    turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best, with
+    turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best; with them:
     scale: float  # by how much larger the right picture is than its calibration says, 0.01: 1 %
     scale_error: float  # standard error of that
     left_over: float  # px, RMS of the errors that turn and scale leave
@@ -57,7 +57,7 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One way in which calibration and pictures may belong together."""
+    """A hypothesis of how calibration and pictures belong together."""
 
     rows: Rows
     what: str
@@ -65,7 +65,7 @@ class Reading:
 
 
 def rectified_rows(rig: StereoRig, matches: F64) -> Rows:
-    """Row errors and disparities of matches [M, 4], raw pixels, as `match_eyes` gives them."""
+    """The row errors and disparities of matches [M, 4], raw pixels, as `match_eyes` gives them."""
     left, right = _undistorted(rig.left, matches[:, :2]), _undistorted(rig.right, matches[:, 2:])
     K = rig.left.P[:, :3]
     errors = K[1, 1] * (right[:, 1] - left[:, 1])
@@ -106,8 +106,8 @@ def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
 
 
 def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
-    """A warning where rows agree in the pictures as they are, and less after rectification: these were
-    rectified before they came. Matches [M, 4] as in `judge_matches`."""
+    """Warn where rows agree in the pictures as they are, and less after rectification: they are rectified
+    already. Matches [M, 4] as in `judge_matches`."""
     if len(matches) < FEWEST_MATCHES or not rectifies(rig):
         return []
     before, after = rectified_rows(already_rectified(rig), matches), rectified_rows(rig, matches)
@@ -124,7 +124,7 @@ def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
 
 
 def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
-    """As it is, then all that users get wrong; of two that fit alike the first is meant."""
+    """The calibration as it is, then without each usual mistake; of two that fit alike the first counts."""
     rows = rectified_rows(rig, matches)
     exchanged = rectified_rows(replace(rig, left=rig.right, right=rig.left), matches)
     exchanged_files = Reading(
@@ -163,7 +163,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
 
 
 def _other_directions(rig: StereoRig, matches: F64) -> Iterator[Reading]:
-    """Return what becomes of R and T, from left to right camera, on their way between programs."""
+    """R and T (left to right camera) as other programs write them: transposed, or from right to left."""
     R, T = rig.T_right_left[:3, :3], rig.T_right_left[:3, 3]
     if not T.any():
         return
@@ -183,7 +183,7 @@ def _other_directions(rig: StereoRig, matches: F64) -> Iterator[Reading]:
 
 
 def _exchanged_or_shifted(rows: Rows) -> Finding:
-    """Rows fit either way, as in rectified pictures: points behind the eyes then have two causes."""
+    """The error where rows fit either way, as in rectified pictures, and points lie behind the eyes."""
     shift = float(np.percentile(-rows.disparities, 98))
     what = (
         f"{PICTURES_EXCHANGED}; or their principal points differ by at least {shift:.0f} px more than the "
@@ -257,7 +257,7 @@ def _scale_said(rows: Rows) -> str:
 
 
 def _rows_differ(rows: Rows) -> Finding:
-    """Rows that no reading explains; the nearest turn and scale of one eye say by how much."""
+    """The error that no reading explains the rows; it gives the turn and scale of one eye that fit best."""
     pitch, roll = rows.turn
     what = (
         f"rows differ by {rows.median:.2f} px (median), {rows.p90:.2f} px (90 %): as if one eye were turned "
@@ -272,8 +272,8 @@ def _rows_differ(rows: Rows) -> Finding:
 
 
 def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float, float]:
-    """Pitch and roll (degrees), scale and its standard error, and the RMS that these leave, of row errors [M]
-    of points `left` [M, 2] of the left picture, all at distance 1; wrong matches left out."""
+    """Fit row errors [M] of points `left` [M, 2] of the left picture, all at distance 1, without wrong
+    matches: pitch and roll (degrees), scale and its standard error, and the RMS that these leave."""
     design = np.column_stack([np.ones(len(errors)), left])
     found, kept = fit_without_outliers(design, errors, WRONG_MATCH)
     inner = design[kept]
@@ -285,10 +285,10 @@ def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float, fl
 
 
 def fit_without_outliers(design: F64, values: F64, farthest: float) -> tuple[F64, Bool]:
-    """Fit values [M] = design [M, K] @ x by least squares, again without what lies far from the rest.
+    """Fit values [M] = design [M, K] @ x by least squares, repeatedly without outliers.
 
     Args:
-        farthest: that is kept, in median distances.
+        farthest: largest distance that is kept, in median distances.
 
     Returns:
         x [K], and which values were kept [M].

@@ -16,7 +16,7 @@ OUTLIER = 3.0  # times the median error of all views
 OUTLIER_PX = 0.3  # px above it: where all views are very good, none is an outlier
 ROUNDS = 5
 LARGEST_ERROR = 2.0  # px, of all views together: beyond it the board is another one
-FLAGS = {2: cv2.CALIB_FIX_K3, 3: 0, 6: cv2.CALIB_RATIONAL_MODEL}  # by radial coefficients
+FLAGS = {2: cv2.CALIB_FIX_K3, 3: 0, 6: cv2.CALIB_RATIONAL_MODEL}  # by the number of radial coefficients
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
 
 
@@ -32,12 +32,12 @@ class Solution:
 
     @property
     def error(self) -> float:
-        """Root mean square over all views, px."""
+        """The root mean square error over all views, px."""
         return float(np.sqrt(np.mean(np.square(self.errors))))
 
     @property
     def matches(self) -> F64:
-        """Corners of all views, [M, 4], as `match_eyes` gives points."""
+        """The corners of all views, [M, 4], as `match_eyes` gives points."""
         return np.concatenate([np.hstack([view.left, view.right]) for view in self.views]).astype(np.float64)
 
 

@@ -23,7 +23,7 @@ GRID = 3  # cells along each side of the picture
 FEWEST_IN_CELL = 10  # corners, over all views
 GOOD_VIEWS = 15
 TILT_SPAN = 25.0  # degrees between the extremes: with less, focal length and distance cannot be told apart
-DISTANCE_SPAN = 1.25  # farthest by nearest
+DISTANCE_SPAN = 1.25  # farthest distance divided by the nearest
 ROW_NAMES, COLUMN_NAMES = ("top", "middle", "bottom"), ("left", "centre", "right")
 
 LOOKED_AT = 5  # pictures to tell what is seen instead of the board
@@ -74,7 +74,7 @@ def calibrate_folders(
 
 
 def summarise(calibrated: Calibrated) -> dict[str, Any]:
-    """Everything that there is to say, for programs."""
+    """All figures of a calibration, as a dictionary for programs."""
     solution = calibrated.solution
     rig, rows = solution.rig, rectified_rows(solution.rig, solution.matches)
     return {
@@ -103,7 +103,7 @@ def summarise(calibrated: Calibrated) -> dict[str, Any]:
 
 
 def report_table(summary: dict[str, Any]) -> Table:
-    """The summary for people."""
+    """The summary as a table for people."""
     made = text.table()
     unseen = f", {len(summary['unseen'])} without the whole board" if summary["unseen"] else ""
     made.add_row("views", f"{summary['views']} of {summary['pairs']} pairs{unseen}")
@@ -134,7 +134,7 @@ def _eyes(solution: Solution) -> Any:
 
 
 def _instead(board: Board, pictures: FolderPairs) -> str:
-    """Return what most of some pictures show instead of the board."""
+    """Return in words what most of the first pictures show instead of the board."""
     said: Counter[str] = Counter()
     for index in range(min(LOOKED_AT, pictures.count)):
         pair = pictures.at(index)

@@ -1,4 +1,4 @@
-"""What views from aside are worth, beside the exact truth, which only a made scene has."""
+"""Views from the side, compared with the exact truth, which only a synthetic scene has."""
 
 from collections.abc import Callable
 
@@ -39,7 +39,7 @@ class Aside:
         self._next = frames // TIMES // 2
 
     def due(self, shown: MappedFrame) -> bool:
-        """Tell whether a frame is one of those that are looked at: it needs a measured depth."""
+        """Tell whether this frame is to be measured: the next of `TIMES` that has a measured depth."""
         number = shown.snapshot.frame_id
         if number < self._next or not shown.measured_depth.any():
             return False
@@ -47,9 +47,9 @@ class Aside:
         return True
 
     def __call__(self, shown: MappedFrame, number: int, left: U8, draw: Draw) -> dict[str, dict[str, float]]:
-        """`view_2` to `view_20`, by the distance in mm: dB after a fit of gain and offset, where the left eye
-        sees the place too. `psnr` of what is shown, `model_psnr` of the model alone, `warp_psnr` of the left
-        picture, warped by the frame's own stereo depth.
+        """Measure `view_2` to `view_20`, named by their distance in mm: dB after a fit of gain and offset,
+        where the left eye sees the place too. `psnr` of what is shown, `model_psnr` of the model alone,
+        `warp_psnr` of the left picture, warped by the frame's own stereo depth.
 
         Args:
             number: of the frame in the recording.

@@ -9,15 +9,15 @@ import numpy as np
 from sags_node.confidence import error_of
 from sags_node.types import F32, F64, I64, Bool
 
-# Edges of the groups; 3: confidence 0.5.
+# mm: edges of the groups of predicted errors; 3 mm is confidence 0.5.
 PREDICTED_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 18.1)
-STEP_MM, MOST_MM = 0.05, 40.0  # of the real errors, which are counted and not kept
+STEP_MM, MOST_MM = 0.05, 40.0  # bin width and end of the histogram of real errors
 LEAST_SHARE = 5e-3  # of all pixels: the percentiles of a smaller group say nothing
-SURE_GROUPS = PREDICTED_MM.index(3.0)  # below it: confidence of at least `SURE`
+SURE_GROUPS = PREDICTED_MM.index(3.0)  # the groups below this index have a confidence of at least `SURE`
 
 
 def tally(depth: F32, confidence: F32, truth: F32, tissue: Bool) -> I64:
-    """Pixels of one frame, counted by their predicted and their real error [groups, steps + 1].
+    """Count the pixels of one frame by predicted and by real error, [groups, steps + 1].
 
     Args:
         depth, truth: [H, W] m, 0 unknown.
@@ -34,9 +34,9 @@ def tally(depth: F32, confidence: F32, truth: F32, tissue: Bool) -> I64:
 
 
 def figures(tallies: Sequence[I64]) -> dict[str, Any]:
-    """The figures of all frames: how much is sure (confidence of at least 0.5, so 3 mm) and how right that
-    is, and for each group of predicted errors its share and the real ones. A group below `LEAST_SHARE` counts
-    as empty."""
+    """The figures of all frames: the share that is sure (confidence of at least 0.5, so 3 mm) and its error;
+    for each group of predicted errors its share and the real errors. A group below `LEAST_SHARE` counts as
+    empty."""
     counts = np.sum(tallies, axis=0)
     total = max(int(counts.sum()), 1)
     sure = counts[:SURE_GROUPS].sum(0)
@@ -56,8 +56,8 @@ def figures(tallies: Sequence[I64]) -> dict[str, Any]:
 
 
 def points(tallies: Sequence[I64], share: float) -> list[tuple[float, float]]:
-    """Find for each group, the middle of its predicted errors and what that share of its real ones stays
-    below, mm."""
+    """The points of a plot: for each group the middle of its predicted errors, and the quantile `share` of
+    its real ones, mm."""
     if not tallies:
         return []
     middles = [(low + high) / 2 for low, high in pairwise(PREDICTED_MM)]
@@ -66,7 +66,7 @@ def points(tallies: Sequence[I64], share: float) -> list[tuple[float, float]]:
 
 
 def _percentile(counts: I64, share: float) -> float | None:
-    """The upper edge of the step that holds it; None of nothing."""
+    """The quantile `share` of the real errors, mm: its step's upper edge; None where nothing was counted."""
     if counts.sum() == 0:
         return None
     running: F64 = np.cumsum(counts) / counts.sum()

@@ -13,7 +13,7 @@ Flat = Mapping[str, Any]
 
 
 def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """All numbers and words of nested figures in one row, named by their way: `online.psnr`."""
+    """All numbers and words of nested figures in one row, named by their path: `online.psnr`."""
     row: dict[str, Any] = {}
     for key, value in figures.items():
         if isinstance(value, Mapping):
@@ -24,13 +24,13 @@ def flat(figures: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def below(figures: Flat, prefix: str) -> dict[str, Any]:
-    """The figures below a key, named by the rest of their way: counts by reason, by rung, by warning."""
+    """The figures below a key, named by the rest of their path: counts by reason, by rung, by warning."""
     return {key[len(prefix) + 1 :]: value for key, value in figures.items() if key.startswith(prefix + ".")}
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One figure; a key that ends in `.*` is one for each key below it."""
+    """A figure; a key that ends in `.*` stands for one for each key below it."""
 
     what: str
     key: str
@@ -166,7 +166,7 @@ TABLE: dict[str, list[Figure]] = {
     ],
 }
 
-# Over points and frames; the other groups are means over frames.
+# Groups pooled over points and frames; the others are means over frames.
 POOLED = ("depth_confidence", "track", "pose", "forth_back")
 
 
@@ -192,8 +192,8 @@ def headings(summary: Mapping[str, Any]) -> list[str]:
 
 
 def groups(summary: Mapping[str, Any]) -> dict[str, list[Row]]:
-    """Rows of each group; a row has a value of the whole run and one of each segment. What is not known in
-    any has no row, nor have counts and times of what did not happen; a group without rows is left out."""
+    """The rows of each group. A row has a value for the whole run and one for each segment. A figure without
+    values has no row, nor have counts and times of what did not happen. A group without rows is left out."""
     figures = flat(summary)
     segments = list(summary.get("segments") or {})
     made = {group: _rows(figures, each, segments) for group, each in TABLE.items()}
@@ -235,7 +235,7 @@ AGAINST = {  # `settings.depth_reference`
 
 
 def verdict(figures: Flat) -> list[tuple[str, str]]:
-    """What, and how good, what an overlay needs first: a line each.
+    """The run in words: a name and a line each; what an overlay needs comes first.
 
     Args:
         figures: of `summarise`, and of an overlay under `overlay`, made `flat`. What is missing or None is
@@ -266,14 +266,14 @@ def verdict(figures: Flat) -> list[tuple[str, str]]:
 
 
 def _said(figures: Flat, *pieces: tuple[str, str]) -> str:
-    """Pieces of text with their figures, of those that are known; nothing where the first is not."""
+    """The pieces of text whose figures are known, joined; empty where the first is not known."""
     if figures.get(pieces[0][0]) is None:
         return ""
     return "".join(text.format(figures[key]) for key, text in pieces if figures.get(key) is not None)
 
 
 def _overlay(figures: Flat) -> str:
-    """The age is that of the camera's frame when the overlay of it is sent."""
+    """The line on the overlay; its age is from the camera's stamp of a frame until its overlay is sent."""
     came = figures.get("overlay.frames")
     share = f" ({figures['overlay.overlay'] / came:.0%})" if came else ""
     on = _said(figures, ("overlay.overlay", "on {}"), ("overlay.frames", f" of {{}} frames{share}"))
@@ -283,7 +283,7 @@ def _overlay(figures: Flat) -> str:
 
 
 def _points(figures: Flat) -> str:
-    """Beside true points, else by those that were followed forth and back."""
+    """The line on points: their errors against true points, else those of following forth and back."""
     for group, more in (("track", ()), ("forth_back", _RETURNED)):
         lost = f"{group}.lost"
         gone = lost, "; {:.0%} lost with their Gaussians (anchors take new ones)"
@@ -321,8 +321,8 @@ def _latency(figures: Flat) -> str:
 
 
 def _picture(figures: Flat) -> str:
-    """Return what a view shows of the next frame, as the left render of a frame is mostly its own picture; of
-    a live run, whose views are not known, that render."""
+    """The line on the picture: how good a view of the next frame is, as a frame's left render is mostly its
+    own picture. Of a live run, whose views are not known, it is on that render."""
     shown = {
         "predict.psnr": "of the next frame",
         "shown.psnr": "of the frame itself, mostly its own picture",
@@ -339,7 +339,7 @@ def _picture(figures: Flat) -> str:
 
 
 def _depth(figures: Flat) -> str:
-    """Against a reference, else beside the frame's own stereo, from which the model learns."""
+    """The line on depth: against a reference, else against the frame's own stereo."""
     reference = AGAINST.get(str(figures.get("settings.depth_reference")), "the recording's")
     covered = "depth.coverage", ", on {:.0%} of the tissue"
     if said := _said(figures, *_off("depth"), covered):

@@ -10,11 +10,11 @@ from sags_node.types import F32, U8, Bool
 FRAMES = 30  # in a row
 BLOCK = 8  # px: camera noise of 4 grey levels has half a level left in the mean of a block
 STILL = 1.0  # grey level: standard deviation in time of a block's mean, up to which nothing moves there
-LEAST = 0.2  # of the picture; where less of it is still tissue, it moves, and what seems still is plain
+LEAST = 0.2  # share of the picture: with less still tissue the scene moves, and what seems still is plain
 
 
 class Flicker:
-    """Takes frames in turn; says something after every thirtieth.
+    """Takes frames in turn; gives figures after every thirtieth.
 
     A pixel counts where the input stands still around it, and where all of the frames show tissue there.
     """
@@ -96,7 +96,7 @@ class _Spread:
         self._count += 1
 
     def deviation(self) -> F32:
-        """The deviation of the values so far, not of what they were drawn from."""
+        """The standard deviation of the values so far (divided by N, not by N - 1)."""
         mean = self._sum / np.float32(self._count)
         found: F32 = np.sqrt(np.maximum(self._squares / np.float32(self._count) - mean * mean, 0))
         return found

@@ -1,4 +1,4 @@
-"""What is shown of tissue that is hidden: boxes of a recording are taken from the node for a while."""
+"""How well hidden tissue is shown: boxes of a recording's pictures are hidden from the node for a while."""
 
 from collections.abc import Callable
 
@@ -14,11 +14,11 @@ from sags_node.vision.tissue import TissueMask
 
 PLACES = ((0.3, 0.3), (0.5, 0.65), (0.7, 0.35))  # of width and height: the middles of the boxes
 SIZE = (0.19, 0.2)  # of width and height
-TIMES = ((0.15, 0.5), (0.35, 2.0))  # when boxes are hidden: share of the recording before, s
+TIMES = ((0.15, 0.5), (0.35, 2.0))  # when boxes are hidden: from which share of the recording, for how many s
 
 
 class Curtain(TissueMask):
-    """A tissue mask with boxes taken out while it is `drawn`."""
+    """A tissue mask without the boxes of `drawn`, while that is set."""
 
     drawn: Bool | None = None  # [h, w] the boxes
 
@@ -30,7 +30,7 @@ class Curtain(TissueMask):
 def measure_hidden(
     config: LaunchConfig, rig: StereoRig, source: Source, frames: int, progress: Callable[[str, int], None]
 ) -> dict[int, dict[str, float]]:
-    """Play a recording with boxes of it hidden; figures of those pixels by frame number.
+    """Play a recording with boxes hidden; return the figures of their pixels by frame number.
 
     `psnr` of what is shown there, `model_psnr` of the model alone, `copy_psnr` of the last picture in which
     they were seen, shown again; dB, each the mean over the boxes.
@@ -86,6 +86,6 @@ def _boxes(width: int, height: int) -> list[Bool]:
 
 
 def _small(view: RenderedView) -> U8:
-    """Return what consumers are shown of a view, in the size that is worked at."""
+    """The picture that consumers are shown of a view, at the working size."""
     size = view.camera.width, view.camera.height
     return view.rgb if view.shown is None else cv2.resize(view.shown.rgb, size, interpolation=cv2.INTER_AREA)

@@ -1,7 +1,7 @@
 """A live run, seen from outside: the node in a process of its own, as users run it, and a reader of its
 sockets that only copies.
 
-What the node alone knows of a frame, such as its Gaussians, is measured in steps (`session.run_step`).
+What the node alone knows of a frame, such as its Gaussians, is measured frame by frame (`steps.run_step`).
 """
 
 import json
@@ -20,7 +20,7 @@ from sags_node.processes import end
 from sags_node.tools.evaluation.measure import Progress
 from sags_node.tools.evaluation.run import TOPICS, Run
 
-WAITING = 256  # messages that may wait for the reader; a node that overtakes it counts as the node's loss
+WAITING = 256  # messages that may wait for the reader; what is lost beyond that counts as lost by the node
 STARTING = 120.0  # s until the node listens; kernels were compiled before
 ENDING = 15.0  # s until it has ended after its last frame
 
@@ -75,7 +75,7 @@ def _copy(
     process: subprocess.Popen[bytes], node: NodeAddress, run: Run, progress: Progress,
     topics: Sequence[str],
 ) -> None:  # fmt: skip
-    """All that it publishes until it ends."""
+    """Copy all that the node publishes until it ends."""
     assert node.run_dir is not None
     listening, deadline = connection_path(node.run_dir, node.ns), time.monotonic() + STARTING
     while not listening.exists() and process.poll() is None:

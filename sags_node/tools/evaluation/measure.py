@@ -58,7 +58,7 @@ class MeasureOptions:
     hidden: bool = False  # a second run, in which boxes of tissue are hidden, see `measure_hidden`
     aside: bool = False  # views of the phantom from places that no eye of it has, see `Aside`
     second: bool = False  # two more runs for what this one cannot tell, see `measure_second`
-    unseen: bool = False  # of these runs: depth beside the frame's own stereo, and nothing predicted
+    unseen: bool = False  # in these runs: depth against the frame's own stereo, and no predictions
 
     def __post_init__(self) -> None:
         if self.hold_out < 0 or self.every < 1:
@@ -67,7 +67,7 @@ class MeasureOptions:
             raise UsageError(f"there is no file of LPIPS weights at {self.lpips_weights}; check the path")
 
     def holds_out(self, frame_id: int) -> bool:
-        """The literature's test split, by frame number."""
+        """Tell whether a frame, by its number, is in the literature's test split."""
         return self.hold_out > 0 and frame_id > 0 and (frame_id - 1) % self.hold_out == 0
 
 
@@ -109,17 +109,17 @@ class _Mapped:
 
     recorded: _Recorded
     shown: MappedFrame
-    lent: SeenFrame  # as views have its detail
+    lent: SeenFrame  # as it lends its detail to views
 
     def seen(self, weight: float) -> Seen:
-        """As a part of the mean of several, with a share of `weight`."""
+        """The frame as one of those whose mean `carried` takes, with a share of `weight`."""
         snapshot = self.shown.snapshot
         return Seen(snapshot.gaussians, snapshot.camera, self.recorded.truth, self.shown.tissue, weight)
 
 
 @dataclass(frozen=True, slots=True)
 class _HeldOut:
-    """A frame that was not mapped, until the next one was."""
+    """A held-out frame, kept until the next frame is mapped."""
 
     row: FrameRow
     camera: Camera
@@ -152,7 +152,7 @@ class Measurer:
             config: what was run.
             receipt: takes note of what is compared.
             on_picture: called with each frame of the recording.
-            aside: measures views from there.
+            aside: measures views from the side.
         """
         self.rows: list[FrameRow] = []
         self.gallery = Gallery(len(run))
@@ -207,11 +207,11 @@ class Measurer:
         return FrameRow(now.frame.frame_id, now.seconds, {})
 
     def _measures_held_out(self, frame: StereoFrame) -> bool:
-        """Not where the robot does not tell from where it was seen."""
+        """Whether a frame is held out, and the pose of its camera is known."""
         return self._options.holds_out(frame.frame_id) and frame.pose_problem is None
 
     def _shown(self, now: _Recorded, shown: ShownFrame) -> FrameRow:
-        """The shown of what consumers got; the model's own figures where it is known."""
+        """The row of a shown frame: figures of what consumers got, and of the model where it is known."""
         frame, left, place = now.frame, now.pair.left, next(self._places)
         self._receipt.add(frame, shown.tissue)
         costly = place % self._options.every == 0
@@ -273,11 +273,11 @@ class Measurer:
         return Poses(frame.T_world_cam, shown.snapshot.camera.T_world_cam, rigid)
 
     def _in_world_of_run(self, given: Camera, shown: MappedFrame) -> F64:
-        """[4, 4] from the session's world to the run's, where one frame's camera is the same in both."""
+        """The transform [4, 4] from the session's world to the run's, by one frame's camera in both."""
         return shown.snapshot.camera.T_world_cam @ given.viewmat
 
     def _camera_of_run(self, given: Camera, before: _Mapped) -> Camera:
-        """The camera of a frame that the run never saw: since the frame before it has moved as given."""
+        """The run's camera of a frame that it never saw: it moved from `before` on as the session says."""
         if self._pose == "session":
             return given
         if self._pose == "fixed":
@@ -286,7 +286,7 @@ class Measurer:
         return replace(given, T_world_cam=world @ given.T_world_cam)
 
     def _learn(self, now: _Mapped) -> None:
-        """As a node that draws views learns from a frame."""
+        """Let the detail learn from a frame, as a node that draws views does."""
         if self._detail is None:
             return
         right = now.recorded.pair.right
@@ -311,8 +311,8 @@ class Measurer:
         return replace(lent, whole=whole)
 
     def _predict(self, before: _Mapped, shown: MappedFrame, now: _Recorded, frames: int) -> Figures:
-        """`psnr` of what is shown of a moment some frames ahead; of the model alone, and of the picture then,
-        shown again."""
+        """`psnr` of the view predicted for a moment some frames ahead, `model_psnr` of the model alone in it,
+        and `copy_psnr` of the picture of `before`, shown again."""
         expected = extrapolated(before.shown.snapshot, now.seconds - before.recorded.seconds)
         guess, model = self._view(before, expected, shown.snapshot.camera, frames)
         pictures = {"psnr": guess, "model_psnr": model, "copy_psnr": before.recorded.truth}
@@ -343,8 +343,8 @@ class Measurer:
         return row
 
     def _between(self, before: _Mapped, held: _HeldOut, after: _Mapped) -> Figures:
-        """A held-out frame, drawn when the next one is known; beside it both pictures carried there, and the
-        mean of both as they are."""
+        """The PSNR of a held-out frame drawn once the next one is known, of both pictures carried there, and
+        of the mean of both as they are."""
         (start, first), (end, last) = (
             (each.recorded.seconds, each.recorded.truth) for each in (before, after)
         )
@@ -371,7 +371,7 @@ class Measurer:
         return figures
 
     def _bare(self, frame: StereoFrame, tissue: Bool) -> Bool:
-        """The mask as the recording gives it, without the margin of `tissue`; that where it gives none."""
+        """The mask as recorded, without the margin of `tissue`; `tissue` where the recording has none."""
         if self._config.vision.tissue.method != "session" or frame.tissue is None:
             return tissue
         return self._rectifier.mask(frame.tissue) & self._tissue_of.usable
@@ -399,7 +399,7 @@ class Measurer:
 
 
 def _enlarged(shown: ShownFrame, camera: Camera) -> ShownFrame:
-    """At the size that is compared. The right view comes at that which is published."""
+    """A shown frame at the size at which it is compared. The right view comes at the published size."""
     size = camera.width, camera.height
     if isinstance(shown, MappedFrame) and shown.right_rgb is not None:
         right = cv2.resize(shown.right_rgb, size, interpolation=cv2.INTER_AREA)

@@ -14,13 +14,13 @@ from sags_node.types import F32, I64, Bool, Camera, Gaussians, Snapshot
 
 VELOCITY_SHARE = 0.8  # tissue slows down: less than the last velocity predicts best (0.3 to 0.7 dB over none)
 ROUNDING = 1e-3  # s, of stamps
-INSIDE = 0.99  # of a carried mask: below, the place is at the edge of an instrument
-COVERED = 0.01  # of a pixel; below, the model does not say where it went
+INSIDE = 0.99  # least value of a carried mask: below, the place is at the edge of an instrument
+COVERED = 0.01  # least coverage of a pixel: below, the model does not say where it went
 
 
 def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
-    """The Gaussians `seconds` after the snapshot: by the motion field where motion comes again and that has
-    skill so far ahead, else by 0.8 times their last observed velocity."""
+    """The Gaussians `seconds` after the snapshot: by the motion field where motion is periodic and the field
+    has skill so far ahead, else by 0.8 times their last observed velocity."""
     comes_again = snapshot.forecast is not None and snapshot.forecast.state.period is not None
     if comes_again and 0 < seconds <= reached(snapshot, seconds) + ROUNDING:
         return gaussians_ahead(snapshot, seconds)
@@ -29,9 +29,9 @@ def extrapolated(snapshot: Snapshot, seconds: float) -> Gaussians:
 
 
 def between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
-    """The Gaussians of a moment that was not mapped, once the next one was: places and colours lie on the
-    line between the two, `share` of the way from the earlier to the later, 0..1. What the earlier one has
-    not yet is as in the later one."""
+    """The Gaussians of a moment between two mapped frames: means and colours are interpolated linearly,
+    `share` (0..1) of the way from the earlier to the later. Gaussians that the earlier one lacks are as in
+    the later one."""
     places, shared = _found(before, after)
     left = np.where(shared, np.float32(1 - share), np.float32(0))[:, None]
     return replace(
@@ -85,8 +85,8 @@ def carried(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, around: S
 
 
 def _displaced(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, seen: Seen) -> F32:
-    """Find where each pixel's tissue is in a picture, [H, W, 2] px: the mean over the Gaussians that show
-    there of how far each is from there. One that was not known there stays where it is."""
+    """Where each pixel's tissue is in the picture of `seen`, [H, W, 2] px: displaced by the mean displacement
+    of the Gaussians drawn at the pixel. A Gaussian that is unknown in `seen` counts as not displaced."""
     pixels, _ = project(camera, middle.means)
     displacement = np.zeros_like(middle.colors)
     rows, shared = _found(seen.gaussians, middle)

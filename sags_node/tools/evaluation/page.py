@@ -1,4 +1,4 @@
-"""A page that opens anywhere: its pictures and plots are in it."""
+"""An HTML page that opens anywhere: its pictures and plots are embedded."""
 
 import base64
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ figure { margin: 0 } figcaption { color: #666; font-size: 13px } img { width: 10
 
 
 def page(title: str, parts: Sequence[str]) -> str:
-    """HTML of a title and parts in HTML."""
+    """The HTML page of a title and of parts in HTML."""
     return "\n".join(
         [
             f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
@@ -53,7 +53,7 @@ def picture_uri(tile: U8) -> str:
 
 
 def plot_grid(plots: Sequence[str]) -> str:
-    """HTML of SVG files side by side; those without text are left out."""
+    """The HTML of SVG files side by side; empty ones are left out."""
     uris = ["data:image/svg+xml;base64," + base64.b64encode(plot.encode()).decode() for plot in plots if plot]
     shown = [f'<img alt="plot" src="{uri}">' for uri in uris]
     return f'<div class="plots">{"".join(shown)}</div>'

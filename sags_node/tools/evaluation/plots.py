@@ -38,7 +38,7 @@ def has_plots() -> bool:
 
 
 def check_plots() -> None:
-    """To be asked before long work whose result is a plot.
+    """Check that matplotlib is installed, before long work whose result is a plot.
 
     Raises:
         UsageError: matplotlib is not installed.
@@ -49,7 +49,7 @@ def check_plots() -> None:
 
 @contextmanager
 def new_figure(width: float, height: float) -> Iterator[Figure]:
-    """An empty figure of a size in px, to be filled and written within. `check_plots` says what it raises."""
+    """Make an empty figure, size in px; fill and write it in the `with` block. Raises as `check_plots`."""
     check_plots()
     import matplotlib
     from matplotlib.figure import Figure
@@ -74,7 +74,7 @@ def as_png(figure: Figure) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Points (frame, or what else lies across, and value) in order; NaN breaks the line."""
+    """A line through points (x, mostly the frame, and value) in order; NaN breaks it."""
 
     label: str
     colour: str
@@ -94,9 +94,9 @@ def line_plot(
 
     Args:
         spans: first and last frame of what is shaded and named, unless it is half of all or more.
-        across: what lies across; empty: the title says it.
+        across: label of the x axis; empty: the title says it.
         gaps: frames that are shaded grey.
-        up: what its height is; empty: the title says it.
+        up: label of the y axis; empty: the title says it.
     """
     series = [each for each in series if any(math.isfinite(value) for _, value in each.points)]
     if not series:

@@ -19,7 +19,7 @@ PROGRAMS = {"sags_node": "sags", "benchmarks": "python -m benchmarks"}  # by the
 
 
 def provenance() -> dict[str, Any]:
-    """`revision` of the sources, `date` (UTC), `machine`, its `peak` at this moment (see
+    """The `revision` of the sources, `date` (UTC), `machine`, its `peak` at this moment (see
     `sags_node.kernels.peak`; once a process), and `command`: with the defaults of that revision it says all
     settings."""
     program = Path(sys.argv[0])

@@ -1,4 +1,4 @@
-"""What figures were computed from, so that others can tell whether theirs compare."""
+"""What figures were computed from, so that others can tell whether their figures are comparable."""
 
 import hashlib
 from itertools import pairwise
@@ -30,14 +30,14 @@ class Receipt:
         self._counted = 0
 
     def add(self, frame: StereoFrame, tissue: Bool) -> None:
-        """A frame was compared, where `tissue` [H, W] is True."""
+        """Take note of a frame that was compared where `tissue` [H, W] is True."""
         self._ids.append(frame.frame_id)
         self._pictures.update(frame.left.tobytes())
         self._masks.update(np.packbits(tissue).tobytes())
         self._counted += int(np.count_nonzero(tissue))
 
     def as_json(self) -> dict[str, Any]:
-        """Digests are the first sixteen hex digits of SHA-256."""
+        """Return all notes; digests are the first sixteen hex digits of SHA-256."""
         width, height = self._size
         return {
             "frames": {"count": len(self._ids), "ids": _spans(self._ids), "digest": _short(self._pictures)},
@@ -77,7 +77,7 @@ def _short(found: Any) -> str:
 
 
 def _spans(ids: list[int]) -> str:
-    """`0-3, 5` of 0, 1, 2, 3, 5."""
+    """Frame numbers as text: `0-3, 5` for 0, 1, 2, 3, 5."""
     if not ids:
         return ""
     breaks = [i for i, (a, b) in enumerate(pairwise(ids), 1) if b != a + 1]

@@ -23,7 +23,7 @@ COLUMNS = ("camera", "model", "depth", "error")
 
 
 def check_report(folder: Path, *more: str) -> None:
-    """Before any work: may a report be written into this folder, and `more` files beside it?
+    """Check, before any work, that a report and `more` files can be written into this folder.
 
     Raises:
         UsageError: other files of those names are there.
@@ -199,7 +199,7 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
 
 
 def _figure_groups(summary: Mapping[str, Any]) -> str:
-    """Return a table for each group, side by side where the window is wide; of segments those it has."""
+    """Return a table for each group, side by side where the window is wide; each with the segments it has."""
     names = headings(summary)
     tables = []
     for group, rows in groups(summary).items():

@@ -49,7 +49,7 @@ class ShownFrame:
 
     facts: RunFacts
     rgb: U8  # [H, W, 3] the left view, drawn after this frame's update
-    depth: F32 | None  # [H, W] m, the same, 0 unknown; None: it did not come
+    depth: F32 | None  # [H, W] m, of the same view, 0 unknown; None: it did not come
     tissue: Bool  # [H, W]
 
 
@@ -148,7 +148,7 @@ class Run:
             self.frame_ids.append(message.meta.frame_id)
 
     def keep(self, frame: StereoFrame) -> None:
-        """Keep what was recorded, without its truth.
+        """Keep a recorded frame, without its ground truth.
 
         Raises:
             SagsError: the disk is full.
@@ -156,12 +156,12 @@ class Run:
         self._keep(frame.frame_id, _RECORDED, replace(frame, reference=None))
 
     def frame(self, frame_id: int) -> StereoFrame:
-        """What was recorded of a frame that `keep` was given."""
+        """Read a recorded frame that `keep` was given."""
         frame: StereoFrame = _RECORDS.decode(self._file(frame_id, _RECORDED).read_bytes())
         return frame
 
     def size(self) -> tuple[int, int]:
-        """Width and height of what consumers got, px.
+        """The width and height of what consumers got, px.
 
         Raises:
             SagsError: nothing was shown.
@@ -190,8 +190,8 @@ class Run:
         )
 
     def _facts(self, image: Meta) -> RunFacts:
-        """The facts of the frame itself: its stamps. The rest by the status that came before, or the first
-        one."""
+        """The facts of a live node's frame: its own stamps, and the rest from the last status before it, or
+        from the first one."""
         published_ns = image.publish_ns
         told = [status for at_ns, status in self._statuses if at_ns <= published_ns]
         status = told[-1] if told else self._statuses[0][1] if self._statuses else {}

@@ -1,4 +1,4 @@
-"""What a subscriber does not see, or a recording has no truth of, by two more runs frame by frame.
+"""Two more runs, frame by frame, for what a subscriber does not see or has no ground truth.
 
 These are the right eye and hidden tissue, and how far depth is from the frame's own stereo. Where no true
 points are known, some are followed to the last frame that is played, and back to the first one, where the
@@ -25,7 +25,7 @@ from sags_node.types import F64, FrameResult, StereoFrame
 from sags_node.vision.rectify import Rectifier
 
 MOST = 150  # frames of the recording that are played: five seconds, so that long ones can be measured too
-GROUPS = ("right", "novel", "stereo")  # figures of a frame that the first of them has
+GROUPS = ("right", "novel", "stereo")  # groups of a frame's figures that come from the first of these runs
 STEPS = 16  # places of points along each side of the picture
 
 
@@ -114,7 +114,7 @@ def _forth_and_back(
 
 
 def _mirrored(frame: StereoFrame, last: StereoFrame) -> StereoFrame:
-    """As much after the last frame as it was before."""
+    """A frame with time and number mirrored: as far after the last frame as it was before it."""
     left = 2 * last.t_capture_ns - frame.t_capture_ns
     right = left + frame.t_capture_right_ns - frame.t_capture_ns
     number = 2 * last.frame_id - frame.frame_id
@@ -137,7 +137,7 @@ def _points(first: MappedFrame) -> F64:
 
 
 def _errors(tracks: PointTracks, points: F64, shown: MappedFrame | FrameResult) -> TrackErrors:
-    """Return how far points are from where they were in the first picture, seen from the camera."""
+    """The errors of points against their places in the first frame, in the camera's coordinates."""
     snapshot = shown.snapshot
     there = np.asarray(transform(snapshot.camera.T_world_cam, points), np.float64)
     return tracks.update(snapshot.gaussians, there, np.ones(len(points), np.bool_), snapshot.camera)

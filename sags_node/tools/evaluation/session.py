@@ -108,7 +108,7 @@ def completed(
     options: MeasureOptions,
     progress: Callable[[str, int, int | None], None],
 ) -> Evaluation:
-    """What was measured, and if asked for (`options.second`) what two more runs tell of what it could not.
+    """Add, if asked for (`options.second`), what only two more runs can measure.
 
     Args:
         session: as the node plays it, at its size.
@@ -133,7 +133,7 @@ def completed(
 
 
 def _at_usual_rung(session: Session, summary: dict[str, Any]) -> Session:
-    """The session at the rung that most frames had: the load of the moment changes nothing then."""
+    """The session fixed at the rung that most frames had: the machine's load then changes nothing."""
     if not summary["rungs"]:
         return session
     rung = max(summary["rungs"], key=summary["rungs"].__getitem__)

@@ -1,4 +1,4 @@
-"""A recording frame by frame: every one in turn, none lost."""
+"""Plays a recording frame by frame: every one in turn, none lost."""
 
 import time
 
@@ -14,7 +14,7 @@ from sags_node.tools.evaluation.run import Run
 def run_step(
     session: Session, options: MeasureOptions, run: Run, progress: Progress, skips: Skips = ALL_SKIPS
 ) -> Pipeline:
-    """Every frame in turn, none lost; only the pipeline's own work is timed. Returns it as it is then."""
+    """Process every frame in turn but those held out; time only the pipeline's work. Return the pipeline."""
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig, skips=skips)
     budget = pipeline.make_budget()
@@ -33,6 +33,6 @@ def run_step(
 
 
 def again(session: Session) -> Source:
-    """The recording once more, every frame, with its truth."""
+    """Open the recording once more: every frame, with its ground truth."""
     played = session.config.source.model_copy(update={"pace": "step"})
     return open_posed(session.config.model_copy(update={"source": played}), session.rig)

@@ -65,7 +65,7 @@ def summarise(
 def quality(
     rows: Sequence[FrameRow], options: MeasureOptions, segments: Mapping[str, tuple[int, int]]
 ) -> dict[str, dict[str, Any] | None]:
-    """Groups of figures of quality, each of all frames and of each segment; None: there is none."""
+    """The groups of quality figures, over all frames and over each segment; None: no frame has any."""
     groups = _quality(rows, options)
     for name, (first, last) in segments.items():
         inside = [row for row in rows if first <= row.frame_id <= last]
@@ -94,7 +94,7 @@ def _timings(facts: Sequence[RunFacts]) -> dict[str, Any]:
 
 
 def _rate(facts: Sequence[RunFacts]) -> float | None:
-    """Published frames per second; of a run that publishes nothing, what its frames after the first allow."""
+    """Published frames per second; if nothing is published, 1 / mean time of the frames after the first."""
     if len(facts) < 2:
         return None
     if facts[0].latency_ms is None:
@@ -148,7 +148,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def rounded(value: Any) -> Any:
-    """Four decimals: beyond them is noise, and the text stays readable."""
+    """Round all numbers to four decimals: beyond them is noise, and the text stays readable."""
     if isinstance(value, dict):
         return {key: rounded(part) for key, part in value.items()}
     if isinstance(value, float):

@@ -1,4 +1,4 @@
-"""How well the model's Gaussians stay on the surface points they were born on."""
+"""How well the model's Gaussians stay on the surface points on which they started."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ _SOFT = 1e-4  # m: neighbours nearer than this weigh the same
 
 @dataclass(frozen=True, slots=True)
 class TrackErrors:
-    """The visible points of one frame."""
+    """The tracking errors of the visible points of one frame."""
 
     errors_mm: F64  # [F] of the points that were followed
     errors_px: F64  # [F] the same, in the left picture
@@ -70,7 +70,7 @@ class PointTracks:
         )
 
     def _estimates(self, gaussians: Gaussians) -> tuple[F64, Bool]:
-        """Find where the points are according to the model, [P, 3], and for which of them it knows, [P]."""
+        """The points' places according to the model, [P, 3], and for which of them it knows one, [P]."""
         if len(gaussians) == 0:
             return self._start, np.zeros(len(self._start), bool)
         order = np.argsort(gaussians.ids)

@@ -9,12 +9,12 @@ from sags_node.types import F32, F64, U8, Bool, Camera
 CORNERS = 500
 CORNER_QUALITY = 0.005
 CORNER_DISTANCE = 8  # px
-REPROJECTION = 2.0  # px
+REPROJECTION = 2.0  # px, of an inlier in RANSAC
 LEAST_POINTS = 12
 
 
 def trajectory_errors(estimated: F64, known: F64) -> dict[str, float]:
-    """Errors of poses `T_world_cam` [T, 4, 4], both.
+    """Compare estimated with known poses `T_world_cam` [T, 4, 4].
 
     The worlds are aligned at the first frame, without scale. ATE is the root mean square distance of the
     camera's places; RPE that of the motions from one frame to the next, in mm and in degrees.
@@ -42,7 +42,7 @@ def _rms(values: F64) -> float:
 
 class RigidOdometry:
     """The baseline: corners followed from frame to frame (Lucas-Kanade), their depths, and the pose that
-    most of them agree with (perspective from points in RANSAC). It has no model and nothing to return to."""
+    most of them agree with (PnP with RANSAC). It has no model and nothing to return to."""
 
     def __init__(self) -> None:
         self._pose = np.eye(4)

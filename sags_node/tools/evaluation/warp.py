@@ -79,7 +79,7 @@ def right_figures(
 
 
 def right_pixels(rectifier: Rectifier, frame: StereoFrame, exclude: Sequence[Box]) -> Bool:
-    """Find where the rectified right picture shows the raw one outside the boxes, [H, W]."""
+    """A mask [H, W] of rectified right pixels that show the raw picture outside the boxes of `exclude`."""
     white = np.full_like(frame.left, 255)
     for x, y, width, height in exclude:
         white[y : y + height, x : x + width] = 0

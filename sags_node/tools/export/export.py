@@ -32,7 +32,7 @@ class Orbit:
 
 
 def check_targets(targets: Mapping[str, Path], force: bool) -> None:
-    """Before any work: can each kind of `KINDS` be written to its file?
+    """Check, before any work, that each kind of `KINDS` can be written to its file.
 
     Raises:
         UsageError: none is asked for, an ending does not fit, two are the same file, there is no such folder,
@@ -55,7 +55,7 @@ def check_targets(targets: Mapping[str, Path], force: bool) -> None:
 
 
 def export(scene: Scene, targets: Mapping[str, Path], orbit: Orbit, advance: Advance) -> list[dict[str, Any]]:
-    """Write what `check_targets` found good.
+    """Write the files that `check_targets` accepted.
 
     Returns:
         For each: `file`, `kind`, `holds` (Gaussians, points, triangles or pictures) and `bytes`.

@@ -32,7 +32,7 @@ def orbit(camera: Camera, distance: float, degrees: float, count: int) -> Iterat
 
 
 def picture_of(rasterizer: Rasterizer, gaussians: Gaussians, eye: Camera) -> tuple[U8, F32]:
-    """Gaussians as a camera sees them, RGB [H, W, 3], and their depth [H, W] m."""
+    """The Gaussians as a camera sees them, RGB [H, W, 3], and their depth [H, W] m."""
     view = to_view(rasterizer.forward(gaussians, eye), eye, 0, 0)
     alpha = view.alpha[..., None]
     rgb = view.rgb * alpha + np.float32(255 * BACKGROUND) * (1 - alpha)

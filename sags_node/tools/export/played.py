@@ -28,10 +28,10 @@ class Product(Protocol):
     """Takes one frame after the other. Both methods may raise `OSError`."""
 
     def add(self, number: int, result: FrameResult, anchors: AnchorStates) -> None:
-        """`number`: `StereoFrame.recorded_number`."""
+        """Take a frame; `number`: `StereoFrame.recorded_number`."""
 
     def finish(self) -> int:
-        """Complete the file or folder; how much is in it."""
+        """Complete the file or folder; return how much is in it."""
 
 
 class Kind(NamedTuple):
@@ -42,8 +42,8 @@ class Kind(NamedTuple):
 
 
 def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance) -> list[dict[str, Any]]:
-    """Play a recording, every frame in turn, and give all of them what the node knows of it. Frames of the
-    warm-up are played, not given.
+    """Play a recording, every frame in turn, and write what the node knows of each. Frames of the warm-up are
+    played, but not written.
 
     Points to be followed are pinned on a grid, in the first frame after the warm-up that has depth.
 
@@ -86,7 +86,7 @@ def _size(path: Path) -> int:
 
 
 def _played(session: Session) -> Iterator[tuple[int, FrameResult, AnchorStates]]:
-    """Numbers of frames in the recording, as `Product.add` takes them, and what came of them."""
+    """The arguments of `Product.add` for each frame of the recording but those of its warm-up."""
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
     budget = pipeline.make_budget()
@@ -103,7 +103,7 @@ def _played(session: Session) -> Iterator[tuple[int, FrameResult, AnchorStates]]
 
 
 def _pin(pipeline: Pipeline, result: FrameResult) -> None:
-    """On a grid over the picture; where there is no tissue or no depth, nothing is pinned."""
+    """Pin points on a grid over the picture, but none where there is no tissue or no depth."""
     view = result.views["left"]
     height, width = view.depth.shape
     side = round(TRACKS**0.5)
@@ -118,13 +118,13 @@ def _pin(pipeline: Pipeline, result: FrameResult) -> None:
 
 def depth_of(result: FrameResult) -> F32:
     """The model's depth [H, W], m, as published; 0 where it is not known, and everywhere in a frame that was
-    not taken in: the model is that of an older one."""
+    not taken in, as the model is then that of an older frame."""
     depth = published.nearest(result.pair, result.views["left"].depth)
     return np.zeros_like(depth) if result.held else depth
 
 
 def points_of(result: FrameResult, anchors: AnchorStates) -> tuple[F32, F32]:
-    """World points [TRACKS, 3] (m, NaN: lost, or never pinned) and visibility [TRACKS]; none in a frame
+    """The world points [TRACKS, 3] (m, NaN: lost, or never pinned) and visibility [TRACKS]; none in a frame
     that was not taken in."""
     points = np.full((TRACKS, 3), np.nan, np.float32)
     visibility = np.zeros(TRACKS, np.float32)
@@ -198,7 +198,7 @@ class Renders:
 
 
 def new_folder(folder: Path) -> None:
-    """Make it.
+    """Make a folder, if there is none.
 
     Raises:
         UsageError: it holds something.

@@ -31,7 +31,7 @@ SPLATS = TopicName("splats", ReceivedCloud)
 INFO = TopicName("left/camera_info", ReceivedCameraInfo)
 POSE = TopicName("tf", ReceivedRos)
 PATIENCE = 5.0  # s for a fresh frame of the node
-WAIT_FOR_REST = 0.2  # s for what belongs to the splats
+WAIT_FOR_REST = 0.2  # s for the other topics of the splats' frame
 
 Advance = Callable[[int, int | None, str], None]  # done, of, what
 
@@ -50,7 +50,7 @@ class Scene:
 
 
 def from_node(node: NodeAddress) -> Scene:
-    """The newest fresh frame of a running node.
+    """Receive the newest fresh frame of a running node.
 
     Raises:
         SagsError: there is no node, or nothing fresh came from it within `PATIENCE`.

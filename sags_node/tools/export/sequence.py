@@ -33,8 +33,8 @@ QUALITY = 98  # of the pictures kept for the way back, JPEG
 
 
 def state_of(session: Session, fit: Path | None) -> dict[str, str | None]:
-    """Digests of what the frames are made from, a file whose path is the same may hold something else now;
-    and the version that makes them.
+    """The version, and digests of what the frames are made from: a file of the same path may hold something
+    else now.
 
     Raises:
         UsageError: `fit` is no folder of a finished `sags fit`.
@@ -48,11 +48,11 @@ def state_of(session: Session, fit: Path | None) -> dict[str, str | None]:
 
 
 def check_sequence(folder: Path, about: dict[str, Any], force: bool) -> None:
-    """Before any work: is the folder new, or that of the same export?
+    """Check, before any work, that the folder is new or that of the same export.
 
     Args:
-        about: what is exported, as JSON; `state_of` it, too.
-        force: begin anew: files of an earlier export are removed.
+        about: what is exported, as JSON, with its `state_of`.
+        force: begin anew, and remove the files of an earlier export.
 
     Raises:
         UsageError: the folder holds something else.
@@ -87,7 +87,7 @@ def write_sequence(
     and back.
 
     Args:
-        rate: pictures per second, where stamps begin anew.
+        rate: pictures per second, used where stamps start again from an earlier time.
         count: how many scenes there will be, where that is known.
 
     Returns:

@@ -1,9 +1,9 @@
 """The surface of the model: as the points that the left camera sees, and as a mesh that closes no hole.
 
 The mesh is a fusion (Curless and Levoy, 1996, by Open3D) of the depth drawn from the left camera and from
-others around it. A pixel counts only where the mean depth of its ray is also the depth at which half of the
-light is gone: rays that meet two surfaces, or none, say nothing. Nor does depth
-that is a guess (`sags_node.confidence`).
+others around it. A pixel counts only where the mean depth of its ray agrees with its median depth, at which
+half of the light is gone: rays that meet two surfaces, or none, do not count. Nor does depth that is a guess
+(`sags_node.confidence`).
 
 On the phantom at its lift, median, p90 and p99:
 
@@ -35,8 +35,8 @@ from sags_node.types import F32, U8, Camera
 EYES, TILT = 8, 10.0  # other cameras, and degrees they are tilted: enough to see the sides of folds
 VOXEL_PX = 4.0  # size of a voxel; half of it is noisy, twice as much loses detail
 AGREEMENT_PX = 8.0  # between both depths of a ray
-REACH = 4.0  # voxels from a surface that it has a say in
-SMALLEST_PIECE = 0.005  # of all triangles; what is smaller floats about
+REACH = 4.0  # voxels: truncation distance of the TSDF
+SMALLEST_PIECE = 0.005  # share of all triangles: smaller pieces float about, and are removed
 
 
 def write_points(path: Path, scene: Scene) -> int:
@@ -122,7 +122,7 @@ def _fused(scene: Scene, cameras: list[Camera], voxel: float) -> Any:
 
 
 def _bytes_of(colors: F32) -> U8:
-    """Colours 0 to 1; fusion goes a little beyond."""
+    """Colours 0 to 1 as bytes, clipped: fusion goes a little beyond."""
     return np.round(np.clip(colors, 0, 1) * 255).astype(np.uint8)
 
 

@@ -81,5 +81,5 @@ def _lines(lines: Sequence[str]) -> bytes:
 
 
 def _side_by_side(columns: Sequence[F32 | U8]) -> bytes:
-    """The rows of all, each in its own type."""
+    """The bytes of all columns, row by row, each in its own type."""
     return np.hstack([np.ascontiguousarray(each).view(np.uint8) for each in columns]).tobytes()

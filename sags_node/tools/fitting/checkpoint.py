@@ -18,9 +18,9 @@ from sags_node.tools.fitting.fit import Fit
 from sags_node.types import F32, F64, U8
 
 VERSION = 7
-CELLS = 8  # across and down: means of so many parts of a picture tell one recording from another
-# What a clip is known by, see `_known`, and how far a frame's may differ in the mean: decoders and processors
-# round in their own ways.
+CELLS = 8  # across and down: the mean colours of these cells tell one recording from another
+# What identifies a clip, see `_known`, and the mean difference up to which a frame counts as the same:
+# decoders and processors round differently.
 SAME: dict[str, tuple[str, float]] = {
     "clip.looks": ("pictures", 4.0),  # levels of 255
     "clip.times": ("times", 1e-4),  # s
@@ -32,7 +32,7 @@ SAME: dict[str, tuple[str, float]] = {
 
 
 def save(fit: Fit, path: Path) -> None:
-    """Write a checkpoint; the one that stood there stays whole until the new one is.
+    """Write a checkpoint. It replaces an older file only once it is complete.
 
     Raises:
         SagsError: it cannot be written.
@@ -51,7 +51,7 @@ def save(fit: Fit, path: Path) -> None:
 
 
 def load(fit: Fit, path: Path) -> None:
-    """Go on where the checkpoint stopped. `fit` is one of the same clip and settings, not started yet.
+    """Restore a fit from a checkpoint. `fit` must have the same clip and settings, and not be started yet.
 
     Raises:
         SagsError: the file cannot be read or is damaged.
@@ -95,8 +95,8 @@ def load(fit: Fit, path: Path) -> None:
 
 
 def _known(clip: Clip) -> dict[str, F32 | F64]:
-    """What training frames are known by, keys of `SAME`, [F, ...] each: colours of parts of the picture and
-    shares of tissue in them; seconds since the first; camera; logarithm of the median depth in m."""
+    """What identifies the training frames, by the keys of `SAME`, [F, ...] each: mean colour and share of
+    tissue of each cell; seconds since the first frame; camera; logarithm of the median depth in m."""
     frames = clip.train
 
     def small(planes: Iterable[U8 | F32]) -> F32:

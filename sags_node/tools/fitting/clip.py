@@ -20,9 +20,9 @@ from sags_node.vision.observe import resized
 
 log = logging.getLogger(__name__)
 
-OnFrame = Callable[[StereoFrame, Bool], None]  # as it was recorded; [H, W] its tissue
+OnFrame = Callable[[StereoFrame, Bool], None]  # the frame as it was recorded, and its tissue mask [H, W]
 
-MEMORY_SHARE = 0.5  # of what is free: the fit itself needs the rest
+MEMORY_SHARE = 0.5  # of the free memory: the fit itself needs the rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class ClipFrame:
     camera: Camera
     image: U8  # [H, W, 3] RGB
     tissue: Bool  # [H, W]
-    bare: Bool  # [H, W] the same without its margin around instruments, for `paper_psnr` alone
+    bare: Bool  # [H, W] the same mask without its margin around instruments, only for `paper_psnr`
     depth: F32  # [H, W] m, 0 unknown
     reference: Reference | None
 
@@ -52,7 +52,7 @@ class ClipFrame:
         )
 
     def halved(self) -> ClipFrame:
-        """The frame at half its size, without what it knows to be true."""
+        """The frame at half its size, without its ground truth."""
         small = resized(self.observation(), 0.5)
         return ClipFrame(
             self.frame_id, self.t_capture_ns, small.camera, small.image, small.tissue, small.tissue,
@@ -68,7 +68,7 @@ class Clip:
     test: Sequence[ClipFrame]
 
     def around(self, t_ns: int) -> tuple[ClipFrame, ClipFrame] | None:
-        """The training frames around a time; None: it is that of one, or there is none before or after."""
+        """The training frames before and after a time; None: one has that very time, or a side has none."""
         place = bisect_left(self.train, t_ns, key=lambda frame: frame.t_capture_ns)
         if place in {0, len(self.train)} or self.train[place].t_capture_ns == t_ns:
             return None
@@ -78,15 +78,15 @@ class Clip:
 def play(
     session: Session, references: bool, on_frame: OnFrame = lambda frame, tissue: None
 ) -> Iterator[ClipFrame]:
-    """Frames of a session, which is opened anew, through the node's own front end.
+    """Yield the frames of a session, opened anew, as the node's own front end makes them.
 
-    Those whose pose the robot does not tell are left out: nobody knows from where they were seen. So are
-    those of the warm-up: there is no model yet that would settle. With `vision.pose` fixed the world is the
-    camera's, that of true points too.
+    Frames without a pose from the robot are left out: nobody knows where the camera was. So are those of the
+    warm-up: a fit has no model that must settle first. With `vision.pose` fixed, the world frame is that of
+    the camera, also for true points.
 
     Args:
         session: it is played from its start.
-        references: also deliver what it knows to be true.
+        references: also deliver its ground truth.
         on_frame: called with each frame that is delivered.
 
     Raises:
@@ -133,7 +133,7 @@ def read_clip(
     """Play a session once through the node's own front end and keep every frame.
 
     Args:
-        session: it is opened anew, with what it knows to be true.
+        session: it is opened anew, with its ground truth.
         held_out: whether the frame of that number is for testing only.
         progress: called with the frames done.
         on_frame: called with each frame.
@@ -157,10 +157,10 @@ def read_clip(
 
 
 def check_memory(frame: ClipFrame, count: int | None) -> None:
-    """Look whether so many frames of this size have room; None: nobody knows how many there are.
+    """Check that `count` frames of this size fit into memory; None: it is unknown, and nothing is checked.
 
     Raises:
-        SagsError: they have none.
+        SagsError: they do not.
     """
     kept = frame.image, frame.tissue, frame.bare, frame.depth
     needed = (count or 0) * sum(array.nbytes for array in kept)

@@ -10,27 +10,27 @@ from sags_node.model import columns
 from sags_node.types import F32
 
 MIN_OPACITY_LOGIT = float(np.log(0.005 / 0.995))
-SHRINK = 1.6  # a Gaussian's scale against that of the two it is split into
+SHRINK = 1.6  # how many times smaller the two are that a Gaussian is split into
 
 
 class Density:
-    """Collects how hard the pictures pull at each Gaussian; now and then splits those pulled hardest."""
+    """Collects each Gaussian's position gradient (its pull); now and then splits those pulled hardest."""
 
     def __init__(self, model: DeformableModel, cap: int, share: float) -> None:
-        """At most `cap` Gaussians, of which at most this share is split at a time."""
+        """Allow at most `cap` Gaussians, and split at most this share of them at a time."""
         self._model = model
         self._share = share
         self._cap = cap
         self._forget()
 
     def observe(self, v_means: Tensor, contribution: Tensor) -> None:
-        """Count one iteration's pull at the drawn means, and who was seen, [N, 3] and [N]."""
+        """Add one iteration's gradient by the drawn means [N, 3], and the Gaussians' contribution [N]."""
         x, y, z = v_means.square().unbind(1)
         self.pull += (x + y + z).double().sqrt().float()  # torch's root of a float32 is an ulp off
         self.seen += contribution > 0
 
     def adapt(self, rng: np.random.Generator) -> tuple[int, int]:
-        """Prune what is transparent, split what is pulled hardest while there is room; both counts."""
+        """Prune transparent Gaussians, and split those pulled hardest up to the cap; return both counts."""
         model, rows = self._model, self._model.table
         kept = rows[:, columns.LOGIT] > MIN_OPACITY_LOGIT
         kept &= np.isfinite(rows).all(1)
@@ -56,7 +56,7 @@ class Density:
 
 
 def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
-    """Return what becomes of rows [M, 14]: smaller ones, shifted along their longest axis to either side."""
+    """Split each of the rows [M, 14] into two smaller ones, shifted along its longest axis to either side."""
     every = np.arange(len(parents))
     longest = parents[:, columns.LOG_SCALE].argmax(1)
     along = quat_to_matrix(parents[:, columns.QUAT])[every, :, longest]
@@ -71,8 +71,8 @@ def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
 
 
 def quarter(model: DeformableModel) -> None:
-    """Make four of each Gaussian, side by side and half as large across its plane, for pictures of twice the
-    size. Each has the colour that its parent had in its middle."""
+    """Replace each Gaussian by four, side by side and half as large in its plane, for pictures of twice the
+    size. The colour of each is that of the old one at the new centre."""
     every, parents = np.arange(len(model)), model.table.copy()
     scales = np.exp(parents[:, columns.LOG_SCALE])
     axes = quat_to_matrix(parents[:, columns.QUAT])

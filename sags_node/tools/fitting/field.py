@@ -12,7 +12,7 @@ from sags_node.tools.fitting.settings import PARTS, Part, RowRates, Units
 from sags_node.types import F32, F64
 
 NODES = 512
-BOX_QUANTILE = 1e-3  # of the Gaussians beyond the field's box on either side: strays must not blow it up
+BOX_QUANTILE = 1e-3  # share of Gaussians outside the field's box on either side: outliers must not enlarge it
 MIN_SIDE = 1e-3  # m, of that box
 
 OF_PART: dict[Part, slice] = {
@@ -25,17 +25,17 @@ OF_PART: dict[Part, slice] = {
 
 
 def row_rates(rates: RowRates, pixel: float) -> F32:
-    """Learning rates [14] of canonical rows, where a pixel is as wide as `pixel` m."""
+    """The learning rates [14] of canonical rows; `pixel`: the width of a pixel at the tissue, m."""
     return _row((rates.mean_px * pixel, rates.log_scale, rates.quat, rates.color, rates.logit))
 
 
 def unit_row(units: Units) -> F32:
-    """[14] what an output of 1 of the decoder means."""
+    """The change [14] of a row that a decoder output of 1 stands for."""
     return _row((units.mean, units.log_scale, units.quat, units.color, units.logit))
 
 
 def _row(values: Sequence[float]) -> F32:
-    """[14] one value for each of `PARTS`."""
+    """A row [14] with one value for each of `PARTS`."""
     found = np.empty(columns.COUNT, np.float32)
     for part, value in zip(PARTS, values, strict=True):
         found[OF_PART[part]] = value
@@ -43,12 +43,12 @@ def _row(values: Sequence[float]) -> F32:
 
 
 def marked(parts: Sequence[Part]) -> F32:
-    """[14] 1 in the columns of some parts, 0 in the rest."""
+    """A row [14] with 1 in the columns of these parts and 0 in the rest."""
     return _row([float(part in parts) for part in PARTS])
 
 
 def make_box(means: F32) -> F64:
-    """Lowest and highest corner [2, 3] m of a field over canonical means [N, 3] m."""
+    """The lowest and highest corner [2, 3] m of a field over canonical means [N, 3] m."""
     low, high = np.quantile(means, [BOX_QUANTILE, 1 - BOX_QUANTILE], axis=0)
     return np.array([low, np.maximum(high, low + MIN_SIDE)])
 

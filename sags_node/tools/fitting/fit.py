@@ -48,7 +48,7 @@ from sags_node.types import F32, Gaussians
 REFINE_RATES = LearningRates()  # the mapper's, gentle: the start is good
 REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from nothing
 REFINE_RELAXATION = 1.6  # of the colour step: a frame is seen again after many others
-REFINE_DECAY = 0.1
+REFINE_DECAY = 0.1  # share of their first lengths to which the steps fall
 RELAXATION = 0.9  # of the colour step of the paper's schedule; it falls with the rates, so frames average out
 
 
@@ -60,7 +60,7 @@ class Fit:
         Args:
             clip: what it learns from.
             settings: of the fit.
-            device: on which Warp draws and torch keeps all that is learnt, and the pictures; not for
+            device: where Warp draws, and where torch keeps the model and the pictures; not for
                 schedule = online. None: the kernels of the CPU.
         """
         seen = np.any([frame.tissue for frame in clip.train], axis=0)
@@ -86,7 +86,7 @@ class Fit:
         self._look()
 
     def _look(self) -> None:
-        """Take up the pictures that this stage looks at."""
+        """Prepare the pictures and the learning rates of the current stage."""
         settings, frames = self.settings, list(self._learnt)
         self._cap = settings.max_gaussians
         if self.is_coarse:
@@ -95,9 +95,9 @@ class Fit:
         self._rates = row_rates(settings.rates, self._pictures.pixel)
         self._refine_rates = self._rates.copy()
         if settings.slopes:
-            self._rates[columns.COLOR] = 0  # which has its closed form
+            self._rates[columns.COLOR] = 0  # colours have a closed-form step
         self._refine_rates[columns.QUAT] = REFINE_RATES.quat
-        self._refine_rates[columns.COLOR] = 0  # which has its closed form
+        self._refine_rates[columns.COLOR] = 0  # colours have a closed-form step
         self._refine_rates[columns.LOGIT] = REFINE_RATES.opacity_logit
 
     def start(self, progress: Progress) -> None:
@@ -127,23 +127,23 @@ class Fit:
 
     @property
     def residual(self) -> float:
-        """How much colours differed in the last iteration, as its loss counts it. Waits for the device."""
+        """The colour term of the last iteration's loss. Reading it waits for the device."""
         return float(self._residual)
 
     @property
     def warm_up(self) -> int:
-        """Iterations without deformation."""
+        """The number of iterations without deformation."""
         return self.settings.warm_up if self.settings.schedule == "paper" else 0
 
     @property
     def coarse(self) -> int:
-        """Iterations with deformation on pictures of half the size."""
+        """The number of iterations with deformation on pictures of half the size."""
         share = self.settings.coarse if self.settings.schedule == "paper" else 0.0
         return round(share * self.settings.iterations)
 
     @property
     def is_coarse(self) -> bool:
-        """Whether it looks at pictures of half the size now."""
+        """Tell whether the current stage uses pictures of half the size."""
         return self.coarse > 0 and self.iteration < self.warm_up + self.coarse
 
     @property
@@ -152,11 +152,11 @@ class Fit:
 
     @property
     def total(self) -> int:
-        """Iterations in all."""
+        """The number of iterations in all."""
         return self.warm_up + self.coarse + self.settings.iterations
 
     def iterate(self) -> None:
-        """One step on one training frame."""
+        """Do one step on one training frame, or on `batch_size` of them."""
         started = time.perf_counter()
         if isinstance(self.model, RefinedModel):
             self._refine(self.model)
@@ -165,7 +165,7 @@ class Fit:
         self.seconds += time.perf_counter() - started
 
     def seconds_left(self) -> float:
-        """About how long the iterations that are left take here: one of each kind is begun, and not ended."""
+        """Estimate the seconds for the remaining iterations: time the drawing and gradients of each kind."""
         rest = self.total - self.iteration
         fine = min(rest, self.settings.iterations)
         plain = max(0, self.warm_up - self.iteration)
@@ -173,7 +173,7 @@ class Fit:
         seconds = 0.0
         for with_field, count in ((False, plain), (True, deformed)):
             took = []
-            for _ in range(3 if count else 0):  # the first may compile kernels, and be given memory
+            for _ in range(3 if count else 0):  # the first may compile kernels and allocate memory
                 started = time.perf_counter()
                 self._differentiated(self._pictures.frames[: self._batch if with_field else 1], with_field)
                 float(self._residual)  # waits for the device
@@ -183,7 +183,7 @@ class Fit:
         return seconds
 
     def _differentiated(self, frames: Sequence[ClipFrame], deformed: bool) -> list[Drawing]:
-        """Training frames, drawn and compared; all that is learnt has the gradients of that."""
+        """Draw training frames and compare them; all that is learnt then holds its gradients."""
         if isinstance(self.model, RefinedModel):
             (frame,) = frames
             drawing = self.model.draw_to_refine(self.rasterizer, frame.t_capture_ns, frame.camera)
@@ -205,7 +205,7 @@ class Fit:
     def _compared(
         self, drawer: Rasterizer | Canvas, frame: ClipFrame, deformed: bool
     ) -> tuple[Drawing, Sequence[Tensor | None], Tensor]:
-        """A drawing, the gradients of its loss by the model's leaves, and how much colours differ in it."""
+        """A drawing, the gradients of its loss by the model's leaves, and the loss's colour term."""
         drawing = self.model.draw(drawer, frame.t_capture_ns, frame.camera, deformed)
         found = self._pictures.compare(drawing.planes, frame)
         gain = float(self.model.exposure.at(frame.t_capture_ns).mean())
@@ -309,7 +309,7 @@ class Fit:
         }
 
     def restore(self, state: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-        """Go on from there, instead of `start`: the same bits as without the interruption."""
+        """Continue from a stored state, instead of `start`; bit for bit as if never interrupted."""
         self._start_means, rows = arrays["start"], arrays["rows"]
         field, exposure, smooth = (
             self._make_field(self._start_means),
@@ -363,7 +363,7 @@ class Fit:
 
     @property
     def stage(self) -> tuple[int, int]:
-        """Iterations of the stage that are done, and all it has."""
+        """The iterations done in the current stage, and how many it has."""
         before = 0
         for length in (self.warm_up, self.coarse):
             if self.iteration < before + length:
@@ -372,7 +372,7 @@ class Fit:
         return self.iteration - before, self.settings.iterations
 
     def _next_frame(self) -> ClipFrame:
-        """All that is learnt once, in random order, then again."""
+        """The next frame to learn: each comes once in random order, then each comes again."""
         if not self._order:
             self._order = self._rng.permutation(len(self._learnt)).tolist()
         return self._pictures.frames[self._order.pop()]

@@ -11,15 +11,15 @@ from sags_node.geometry import rigid
 from sags_node.tools.fitting.clip import ClipFrame, check_memory
 from sags_node.types import F64
 
-SMOOTH = 1.5  # px of standard deviation, of the flow: OpenCV's is restless from patch to patch
+SMOOTH = 1.5  # px, standard deviation of the blur of the flow: OpenCV's jumps from patch to patch
 
 
 def midway_frames(frames: Sequence[ClipFrame]) -> list[ClipFrame]:
-    """A frame for each two that follow each other, at the time in their middle.
+    """Make a frame between every two consecutive ones, at the mean of their times.
 
-    Its colours and depth are the means of what both show of the same tissue, which moves in a straight line.
-    Optical flow finds it (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016, as in
-    OpenCV). Where one of both shows no tissue, there is none.
+    Its colours and depth are the means of both at the same tissue, which is taken to move in a straight line.
+    Optical flow matches it (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016, as in
+    OpenCV). Where one of both shows no tissue, it has none.
 
     Raises:
         SagsError: they do not fit into memory.
@@ -35,7 +35,7 @@ def _midway(before: ClipFrame, after: ClipFrame, flow: cv2.DISOpticalFlow) -> Cl
     grays = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (before, after)]
     images, tissue, depths = [], np.ones((height, width), np.bool_), []
     for near, grey, other in zip((before, after), grays, grays[::-1], strict=True):
-        # The flow of the other picture to this one begins in the other: half of it, a little beside.
+        # The flow to this picture is defined in the other one's pixels, so half of it lies a little beside.
         there = here + cv2.GaussianBlur(flow.calc(other, grey, None), (0, 0), SMOOTH) / 2
         images.append(cv2.remap(near.image, there, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
         tissue &= cv2.remap(near.tissue.view(np.uint8), there, None, cv2.INTER_NEAREST) > 0
@@ -54,7 +54,7 @@ def _midway(before: ClipFrame, after: ClipFrame, flow: cv2.DISOpticalFlow) -> Cl
 
 
 def _pose_midway(before: F64, after: F64) -> F64:
-    """The pose half way, [4, 4]: half the turn, half the way."""
+    """The pose half way, [4, 4]: half the rotation, half the translation."""
     turn, _ = cv2.Rodrigues(before[:3, :3].T @ after[:3, :3])
     half, _ = cv2.Rodrigues(turn / 2)
     return rigid(before[:3, :3] @ half, (before[:3, 3] + after[:3, 3]) / 2)

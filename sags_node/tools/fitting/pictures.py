@@ -1,4 +1,4 @@
-"""The training frames at one size, with what draws them: all that a fit looks at."""
+"""The training frames at one size, with the rasterizers that draw them."""
 
 from collections.abc import Sequence
 
@@ -18,13 +18,13 @@ class Pictures:
     """Frames of one size on a device.
 
     Attributes:
-        frames: all that are learnt, the first one of them first.
-        drawers: draw pictures of their size, one for each picture of an iteration.
-        pixel: m, how wide one is at the tissue's median depth in the first frame.
+        frames: all that are learnt; the first training frame comes first.
+        drawers: rasterizers of their size, one for each picture of an iteration.
+        pixel: width of a pixel at the tissue's median depth in the first frame, m.
     """
 
     def __init__(self, frames: Sequence[ClipFrame], settings: FitSettings, device: str | None) -> None:
-        """`device`: as of `Fit`."""
+        """Prepare them on `device`, as in `Fit`."""
         self.frames, self._settings, self._device = frames, settings, torch.device(device or "cpu")
         first = frames[0]
         height, width = first.tissue.shape
@@ -38,7 +38,7 @@ class Pictures:
         self.pixel = float(np.median(known)) / float(first.camera.K[0, 0]) if known.size else 1e-4
         unseen = ~np.any([frame.tissue for frame in frames], axis=0) | settings.smooth_everywhere
         self._unseen = unseen if device is None else self._tensor(unseen)
-        self._shown: dict[int, tuple[Tensor, ...]] = {}  # by their times, those on the device already
+        self._shown: dict[int, tuple[Tensor, ...]] = {}  # frames already on the device, by their times
 
     def compare(self, planes: Tensor, frame: ClipFrame) -> Compared:
         """The loss of a frame that was drawn as these planes [5, H, W]."""

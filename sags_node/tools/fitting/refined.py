@@ -1,4 +1,4 @@
-"""The model after an online start: what single Gaussians do beyond the field is added to it."""
+"""The model after an online start: the field, plus residuals of single Gaussians."""
 
 import numpy as np
 import torch
@@ -28,8 +28,7 @@ class RefinedModel(DeformableModel):
         return super().rows_at(t_ns, deformed) + torch.from_numpy(self.residuals.at(t_ns))
 
     def draw_to_refine(self, rasterizer: Rasterizer, t_ns: int, camera: Camera) -> Drawing:
-        """The model at one time, drawn to `refine` it. The field is not moved by colours: those are the
-        residuals'."""
+        """Draw the model at one time, for `refine`. Colour gradients go to the residuals, not the field."""
         self._t_ns = t_ns
         self._own = torch.from_numpy(self.residuals.at(t_ns)).requires_grad_()
         rows = self.field.deform(self.rows.detach(), t_ns)
@@ -38,12 +37,12 @@ class RefinedModel(DeformableModel):
         return self._drawn(rasterizer, still + self._own, t_ns, camera)
 
     def refine(self, drawing: Drawing, rates: F32, relaxation: float, field_rates: FieldRates) -> None:
-        """One step on residuals, slopes and field, against the gradients that the drawing was given: of half
-        the squared colour residuals, weighted for SIRT.
+        """Do one step on residuals, slopes and field, down the gradients of the drawing's loss: half the
+        squared colour residuals, weighted for SIRT.
 
         Args:
             drawing: of `draw_to_refine`.
-            rates: [14] lengths of the residuals' steps; none for colours.
+            rates: [14] lengths of the residuals' steps; 0 for colours.
             relaxation: of the step on colours; on slopes it is half as much (`mapping.optimiser.Optimiser`).
             field_rates: of the field.
         """

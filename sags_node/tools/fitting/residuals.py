@@ -1,8 +1,8 @@
-"""What single Gaussians do beyond the field: a row of deltas for each at some times, linear in between.
+"""Residuals of single Gaussians beyond the field: deltas for each at some times, linear in between.
 
 The field is smooth in space, so it carries what neighbours share. What a Gaussian does alone (a texture that
 does not quite follow, a colour that turns as light moves over wet tissue, tissue that appears) stands here.
-Not part of SAGS; curves of one's own for each Gaussian are known from Deform3DGS (MICCAI 2024).
+Not part of SAGS; Deform3DGS (MICCAI 2024) also gives each Gaussian curves of its own.
 """
 
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from sags_node.kernels.jit import aligned
 from sags_node.model import columns
 from sags_node.types import F32, I64
 
-BETAS = (0.5, 0.99)  # low momentum: a slot is visited now and then, from other frames each time
-LEAST_CONTRIBUTION = 1e-3  # px: what was seen less is not touched
+BETAS = (0.5, 0.99)  # low momentum: a slot is stepped on rarely, and by another frame each time
+LEAST_CONTRIBUTION = 1e-3  # px: Gaussians that contribute less are left unchanged
 EPS = 1e-12
 COLOR_DAMPING = 0.3  # px: a barely seen Gaussian changes its colour slowly
 MAX_BYTES = 1 << 29  # of the values; their optimiser's state takes twice as much again
 
 
 def room(times: int) -> int:
-    """How many Gaussians may have residuals at so many times."""
+    """The number of Gaussians that may have residuals at `times` times."""
     return MAX_BYTES // (times * columns.COUNT * 4)
 
 
@@ -40,8 +40,8 @@ def check_size(times: int, count: int) -> None:
 
 
 def slots_around(times_ns: I64, t_ns: int) -> list[tuple[int, float]]:
-    """Which of the times [K], ascending, a time lies between, and their shares in a linear blend; one slot
-    where the other's share is 0, also before the first time and after the last."""
+    """The indices of the ascending times [K] around a time, with their weights in linear interpolation. One
+    of weight 0 is left out; before the first time and after the last there is one slot."""
     after = int(np.searchsorted(times_ns, t_ns, side="right"))
     if after in {0, len(times_ns)}:
         return [(max(after - 1, 0), 1.0)]
@@ -52,24 +52,24 @@ def slots_around(times_ns: I64, t_ns: int) -> list[tuple[int, float]]:
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Lengths of one improvement."""
+    """The step lengths of one `Residuals.refine`."""
 
     geometry: F32  # [14] of Adam; 0 for colours
-    colors: F32  # [3] of SIRT, by the colours without exposure; 0 to 2 over the gain converges
+    colors: F32  # [3] of SIRT, for colours before exposure; converges from 0 to 2 / gain
 
 
 class Residuals:
-    """`values` [K, N, 14] (`columns`) at `times_ns` [K], and what their optimiser remembers."""
+    """The deltas `values` [K, N, 14] (`columns`) at `times_ns` [K], and their optimiser's state."""
 
     def __init__(self, times_ns: I64, count: int) -> None:
-        """All zero, for `count` Gaussians.
+        """Set all to zero, for `count` Gaussians.
 
         Args:
-            times_ns: [K] ascending; beyond the first and the last the values stay as they are there.
+            times_ns: [K] ascending; outside of them the nearest one's values hold.
             count: N.
 
         Raises:
-            SagsError: they are larger than the memory they may take.
+            SagsError: they take more memory than they may.
         """
         check_size(len(times_ns), count)
         self.times_ns = times_ns
@@ -77,7 +77,7 @@ class Residuals:
         self.adam = [AdamState.new(count, columns.COUNT) for _ in times_ns]
 
     def at(self, t_ns: int) -> F32:
-        """Deltas [N, 14] at one time."""
+        """The deltas [N, 14] at one time."""
         (slot, share), *rest = slots_around(self.times_ns, t_ns)
         deltas: F32 = np.float32(share) * self.values[slot]
         for slot, share in rest:

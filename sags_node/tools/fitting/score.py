@@ -1,4 +1,4 @@
-"""How good a fit is on frames it never saw, in the literature's figures and in honest ones."""
+"""How good a fit is on frames it never saw: PSNR as papers count it, and figures over tissue alone."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
@@ -31,12 +31,12 @@ PUBLISHED_WAY = 8, (640, 512)  # hold-out, size
 
 
 def published(folder: Path | None, frames: int, hold_out: int, size: tuple[int, int]) -> dict[str, float]:
-    """Figures published for a clip, dB by the method's name; none for any other, or measured another way.
+    """The PSNR published for a clip, dB by method; empty for another clip or way of measuring.
 
     Args:
         folder: of the recording in EndoNeRF's layout; None: it has another one.
-        frames: that were read of it.
-        hold_out: every so many frames are.
+        frames: how many were read of it.
+        hold_out: every how many frames one is held out.
         size: width and height of the pictures that are compared, px.
     """
     if folder is None or (hold_out, size) != PUBLISHED_WAY:
@@ -87,7 +87,7 @@ def score(
 def score_between(
     fit: Fit, frames: Iterable[ClipFrame], segments: Segments, lpips: Lpips | None = None
 ) -> dict[str, Any] | None:
-    """Return what the two training pictures around a frame say of it.
+    """Compare frames with what the two training pictures around each of them predict.
 
     Args:
         fit: started.
@@ -122,8 +122,8 @@ def score_between(
 
 
 def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> dict[str, Any] | None:
-    """Depth of the model against the session's reference, `metrics.DepthErrors`, means over those frames
-    that have one and `frames`, their number; the same for each segment. None without a reference."""
+    """Compare the model's depth with the session's reference: means of `metrics.DepthErrors` over the frames
+    that have one, their number `frames`, and the same for each segment. None without a reference."""
     rows = []
     for frame in frames:
         if frame.reference is None or frame.reference.depth is None:
@@ -138,7 +138,7 @@ def score_depth(fit: Fit, frames: Iterable[ClipFrame], segments: Segments) -> di
 
 
 def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None:
-    """How well the model's Gaussians stay on true surface points, median over points and frames.
+    """Measure how well the model's Gaussians stay on true surface points, over points and frames.
 
     Args:
         fit: started.
@@ -146,7 +146,7 @@ def score_tracks(fit: Fit, frames: Iterable[ClipFrame]) -> dict[str, Any] | None
 
     Returns:
         `median_mm`, `p90_mm`, `median_px` and `lost`, points without a Gaussian to follow, summed over
-        frames; None if no frame knows such points.
+        frames; None if no such point could be followed.
     """
     tracks: PointTracks | None = None
     found: list[TrackErrors] = []

@@ -23,16 +23,16 @@ Part = Literal["means", "log_scales", "quats", "colors", "logits"]  # of a Gauss
 PARTS: tuple[Part, ...] = ("means", "log_scales", "quats", "colors", "logits")
 
 
-LEAST = 60_000  # Gaussians: small pictures, of which these are quickly drawn, gain by more for each pixel
+LEAST = 60_000  # Gaussians at least: small pictures gain from more per pixel, and are drawn quickly
 PATH_EVERY = 3  # training frames from one time of the paths to the next
 STEREO = LossWeights(coverage=0.1)
-MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # of these weights: depth up to scale and shift
+MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # weights for depth up to scale and shift
 
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """What an output of 1 of the decoder is. A step of Adam has a fixed length in these, so they say how
-    fast each part is learnt, and how restless it is. 0: that part is not deformed."""
+    """The change that a decoder output of 1 stands for. Adam's steps have a fixed length in these units, so
+    they set how fast each part is learnt, and how much it jitters. 0: that part is not deformed."""
 
     mean: float = 0.01  # m
     log_scale: float = 1.0
@@ -43,13 +43,13 @@ class Units:
 
 @dataclass(frozen=True, slots=True)
 class FieldShape:
-    """The shape of the HexPlane and of what its decoder says."""
+    """The shape of the HexPlane, and the units of its decoder's output."""
 
     levels: int = 2
     cells: int = 64  # along each axis, coarsest level
     channels: int = 32  # of each level
-    # How many of the clip's frames from one slot of time to the next. Each slot has two of the times of
-    # `path_frames`, as one without any is left to chance.
+    # Frames of the clip per slot of time. By default each slot has two of the times of `path_frames`: nothing
+    # would constrain a slot without any.
     frames_per_slot: float = 7.0
     most_slots: int | None = None  # however long the clip is
     first_values: tuple[float, float] = (0.7, 1.3)  # of the planes in space, at random between these
@@ -57,7 +57,7 @@ class FieldShape:
     xavier: bool = False  # whether the last layers start at random, rather than at 0
 
     def slots(self, frames: int) -> int:
-        """Slots of time for a clip of so many frames."""
+        """The number of time slots for a clip of `frames` frames."""
         slots = max(2, math.ceil(frames / self.frames_per_slot) + 1)
         return slots if self.most_slots is None else min(slots, self.most_slots)
 
@@ -69,20 +69,20 @@ class RowRates:
     mean_px: float = 0.08  # in px at the tissue's median depth
     log_scale: float = 5e-3
     quat: float = 1e-3
-    color: float = 2.5e-3  # of RGB 0..1; without slopes, beside which colours have a closed form
+    color: float = 2.5e-3  # of RGB 0..1; not used with slopes: colours then have a closed form
     logit: float = 0.05
-    decaying: tuple[Part, ...] = PARTS  # those that fall with the field's; the others stay
+    decaying: tuple[Part, ...] = PARTS  # parts whose rates fall with the field's; the others stay
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """How the canonical Gaussians begin and become more; only with schedule = paper."""
+    """The start and the densification of canonical Gaussians; only with schedule = paper."""
 
     first: int | None = 30_000  # Gaussians to begin with; None: as many as there may be
     opacity: float = 0.1  # of those
     scale: float = 1.0  # of those, in distances to their neighbours
-    every: int = 300  # iterations
-    until: float = 0.5  # of a stage's iterations
+    every: int = 300  # iterations from one densification to the next
+    until: float = 0.5  # share of a stage's iterations after which it ends
     share: float = 0.1  # of the Gaussians that are split at a time, at most
 
 
@@ -93,8 +93,8 @@ class FitSettings:
     schedule: Schedule = "online"  # how it starts: see `fitting.start`
     warm_up: int = 1000  # iterations on the first frame without deformation; only with schedule = paper
     iterations: int = 2000  # on all training frames, with deformation
-    # For each of these, so many before them on pictures of half the size, with a quarter of the Gaussians;
-    # the warm-up then looks at such a picture too. Only with schedule = paper; 0: all are on whole pictures.
+    # Iterations before these on pictures of half the size, as a multiple of `iterations`, with a quarter of
+    # the Gaussians; the warm-up then uses such a picture, too. Only with schedule = paper; 0: none.
     coarse: float = 0.0
     tokens: Tokens = "nodes"
     block: Block = "adaptive"  # what stands before the decoder's heads
@@ -108,10 +108,10 @@ class FitSettings:
     rates: RowRates = RowRates()  # after an online start only mean_px and log_scale
     field_rates: FieldRates = field(default_factory=FieldRates)
     decay: float = 0.01  # rates that decay fall to this share of their first values
-    # In so many iterations of a stage; None: in all. Only with schedule = paper, and without `stable`.
+    # Iterations in which they fall so far; None: a stage's. Only with schedule = paper, and without `stable`.
     decay_over: int | None = None
-    # Only with schedule = paper: share of a stage after which they fall, in a straight line (Hu et al. 2024,
-    # MiniCPM, section 4); None: all along, by the same factor.
+    # Only with schedule = paper: share of a stage after which they fall linearly (Hu et al. 2024, MiniCPM,
+    # section 4); None: they fall exponentially from the start.
     stable: float | None = None
     growth: Growth = Growth()
     midway: bool = False  # also learn pictures half way between training frames, see `fitting.midway`
@@ -121,7 +121,7 @@ class FitSettings:
     # Whether Gaussians have slopes of luminance (`types.Gaussians`), which are learnt with canonical colours
     # in closed form; only with schedule = paper. An online start always has them.
     slopes: bool = False
-    # False: the two kinds of smoothness are for what no frame shows; only with schedule = paper.
+    # False: both smoothness losses only count where no frame shows tissue; only with schedule = paper.
     smooth_everywhere: bool = False
 
     def __post_init__(self) -> None:
@@ -145,8 +145,8 @@ class FitSettings:
             raise UsageError("slopes need a color_softness and a weights.color above 0, or set slopes=false")
 
     def of_clip(self, pixels: int, frames: int) -> FitSettings:
-        """These settings with as many Gaussians as suit a clip of so many training frames, of which so many
-        pixels show tissue."""
+        """The settings with a number of Gaussians that suits a clip of `frames` training frames;
+        `pixels`: how many pixels show tissue in any of them."""
         if not self.pixels_each:
             return self
         most = min(self.max_gaussians, max(LEAST, math.ceil(pixels / self.pixels_each)))
@@ -155,7 +155,7 @@ class FitSettings:
         return replace(self, max_gaussians=most)
 
     def rate_share(self, done: int, of: int) -> float:
-        """The rate share of rates that decay: the share that is left after `done` of a stage's iterations."""
+        """The share of their first values that decaying rates have after `done` of a stage's iterations."""
         if self.stable is None:
             falling: float = self.decay ** (done / (self.decay_over or max(1, of)))
             return falling
@@ -187,7 +187,7 @@ RELEASED = FitSettings(
     schedule="paper",
     tokens="self",
     iterations=3000,
-    max_gaussians=960_000,  # doubled five times
+    max_gaussians=960_000,  # 30,000, doubled five times
     pixels_each=0.0,
     shape=FieldShape(
         levels=4,
@@ -211,15 +211,15 @@ ONLY_PAPER = (
 
 
 def path_frames(frames: int) -> list[int]:
-    """The ones of so many training frames at whose times the field is told where Gaussians are."""
+    """The indices of the training frames at whose times the field is told where Gaussians are."""
     return sorted({*range(0, frames, PATH_EVERY), max(0, frames - 1)})
 
 
 def with_changes(settings: FitSettings, changes: Sequence[str]) -> FitSettings:
-    """Settings with some values of one's own.
+    """Return settings with some values changed.
 
     Args:
-        settings: that all else is taken from.
+        settings: all other values are taken from here.
         changes: each a key, with dots between the names, "=", and a value as in YAML: "shape.levels=4".
 
     Raises:
@@ -246,10 +246,10 @@ def with_changes(settings: FitSettings, changes: Sequence[str]) -> FitSettings:
 
 
 def check_used(settings: FitSettings, preset: FitSettings) -> None:
-    """Look whether all that is set otherwise than in a preset has an effect.
+    """Check that every value that differs from the preset's has an effect.
 
     Raises:
-        UsageError: it has none.
+        UsageError: one has none.
     """
     online, stable, slopes = settings.schedule == "online", settings.stable is not None, settings.slopes
     idle = {
@@ -263,7 +263,7 @@ def check_used(settings: FitSettings, preset: FitSettings) -> None:
 
 
 def _keys(tree: dict[str, Any], before: str = "") -> list[str]:
-    """All that can be set, as `with_changes` takes it."""
+    """All keys that `with_changes` takes."""
     found = []
     for name, value in tree.items():
         found += _keys(value, f"{before}{name}.") if isinstance(value, dict) else [before + name]

@@ -35,16 +35,16 @@ ONLINE_STEPS = 2  # of the mapper per frame
 CUT = 0.08  # mean difference of two frames, 0..1; a beating heart stays below half of it
 PATH_POINTS = 8192  # Gaussians per step of the regression
 PATH_STEPS = 1500
-CARRIERS = 8  # Gaussians that tell a new one where it lay before
-NEIGHBOURS_AT_A_TIME = 2048  # points whose distances to all others a GPU holds
-HIDDEN = -5.0  # of an opacity logit
+CARRIERS = 8  # nearest Gaussians whose mean motion tells where a new one was in the first frame
+NEIGHBOURS_AT_A_TIME = 2048  # points whose distances to all others fit on a GPU
+HIDDEN = -5.0  # added to an opacity logit
 
 Progress = Callable[[str, int, int], None]  # what, done, of
 
 
 @dataclass(frozen=True, slots=True)
 class Paths:
-    """How the online mapper saw each Gaussian at some times."""
+    """The state of each Gaussian in the online mapper at some times."""
 
     times_ns: I64  # [K]
     states: F32  # [K, N, 14], see `columns`
@@ -54,8 +54,8 @@ class Paths:
 def pooled_rows(
     clip: Clip, exposure: Exposure, settings: FitSettings, device: torch.device | None = None
 ) -> F32:
-    """Canonical rows [N, 14], without exposure, from random pixels of all training frames. `device`: which
-    finds their neighbours; None: Open3D does.
+    """The canonical rows [N, 14], without exposure, from random pixels of all training frames. `device`:
+    where torch finds their neighbours; None: Open3D does.
 
     Raises:
         SagsError: no frame has a depth.
@@ -188,7 +188,7 @@ class _Places:
         self._known = np.zeros(0, np.bool_)
 
     def add(self, ids: I64, means: F32) -> None:
-        """Find where they are in the next frame: ids [N], means [N, 3] m."""
+        """Take in the next frame's Gaussians, ids [N] and means [N, 3] m, and place the new ones."""
         more = max(int(ids.max(initial=-1)) + 1 - len(self._known), 0)
         self._places = np.pad(self._places, ((0, more), (0, 0)))
         self._known = np.pad(self._known, (0, more))
@@ -201,12 +201,12 @@ class _Places:
         self._places[ids[~known]], self._known[ids[~known]] = new, True
 
     def of(self, ids: I64) -> F32:
-        """Places [N, 3] m of Gaussians that were added."""
+        """The places [N, 3] m in the first frame of Gaussians that were added."""
         return self._places[ids]
 
 
 def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, progress: Progress) -> None:
-    """Let the field learn the paths: mean absolute errors of positions, at random times."""
+    """Train the field on the paths: minimise mean absolute errors of positions, at random times."""
     rng = np.random.default_rng(settings.seed)
     field.follow(rows[:, columns.MEAN])
     for step in range(PATH_STEPS if len(paths.times_ns) > 1 else 0):  # one picture shows no motion
@@ -223,8 +223,8 @@ def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, pr
 
 
 def remainder(field: Field, rows: F32, paths: Paths) -> Residuals:
-    """Return what the paths are beyond the field. Where the mapper did not know a Gaussian, it does as at the
-    nearest time it was known, but hides."""
+    """Return what the field leaves of the paths. Where the mapper did not know a Gaussian, its residual is
+    that of the nearest time at which it did, with an opacity that hides it."""
     residuals = Residuals(paths.times_ns, len(rows))
     for slot, t_ns in enumerate(paths.times_ns.tolist()):
         with torch.no_grad():

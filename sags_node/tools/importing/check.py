@@ -71,7 +71,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
         launch.extend([*overrides_of(folder), *overrides])
         config = load_launch(folder, launch)
         plays = played(config)
-        apart = any("clocks_differ_ms" in each.figures for each in plays)  # then rows tell of the clocks
+        apart = any("clocks_differ_ms" in each.figures for each in plays)  # then rows differ by that
         judged = [] if apart else calibrated(config, folder)
         return plays + (judged if is_wrong(plays) else as_warnings(judged))
 
@@ -83,15 +83,15 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
 
 
 def _quoted(word: Path | str) -> str:
-    """As a shell takes it; brackets stay, as no file is named like the lists in which they stand."""
+    """Quote a word for a shell. Brackets alone need no quotes: no file is named like the lists in them."""
     return shlex.quote(str(word)) if shlex.quote(re.sub(r"[\[\]]", "", str(word)))[0] == "'" else str(word)
 
 
 def overrides_of(path: Path) -> list[str]:
-    """`key:=value` that play what a folder holds, or a video; none where it is played as it is.
+    """The overrides `key:=value` that play a folder or a video; none where it is played as it is.
 
     Raises:
-        UsageError: nothing can be made of it.
+        UsageError: it cannot be played.
         SagsError: a video cannot be read.
     """
     contents = recognise(path)
@@ -108,7 +108,7 @@ def overrides_of(path: Path) -> list[str]:
 
 
 def once(found: list[Finding]) -> list[Finding]:
-    """Return what is wrong is met by several who look; the first says it."""
+    """Leave out findings that repeat an earlier one: several checks may meet the same fault."""
     said: list[str] = []
     kept = []
     for finding in found:
@@ -120,7 +120,7 @@ def once(found: list[Finding]) -> list[Finding]:
 
 
 def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
-    """Return what some pictures show, before anything plays them."""
+    """Findings on some of the pictures, before anything plays them."""
     if contents.right is None and contents.config is None:
         return _tried("pictures", lambda: _in_one_folder(left_folder))
 
@@ -143,7 +143,7 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
 
 
 def _in_one_folder(folder: Path) -> list[Finding]:
-    """Find where the names tell the eyes both are looked at, else what there is."""
+    """Findings on one folder: on both eyes, if file names tell them apart, else on all pictures as one."""
     apart = both_eyes(folder)
     if not apart:
         return pictures.check_eye("pictures", _some(folder))
@@ -156,8 +156,8 @@ def _some(folder: Path) -> list[U8]:
 
 
 def played(config: LaunchConfig) -> list[Finding]:
-    """Tell whether frames come as `sags run` reads them, by the same code: all of both eyes, both at one
-    time, and of the calibration's size. What that says in the log is a finding, too."""
+    """Check, with the code of `sags run`, that all frames of both eyes come, both at one time and of the
+    calibration's size. What that code logs is a finding, too."""
     source = config.source
     if not isinstance(source, RecordedSource):
         return [
@@ -172,7 +172,7 @@ def played(config: LaunchConfig) -> list[Finding]:
 
 
 def _frames(source: Recording | PhantomSource) -> list[Finding]:
-    """The first frame, and those in the middle: do masks mark something, are the eyes of one time?"""
+    """Check the first frame and those in the middle: do masks mark something, are the eyes of one time?"""
     with open_source(source, references=False) as opened:
         count, rate, first = opened.frame_count or 0, opened.rate, next(iter(opened), None)
         said, stamped, assumed = list[Finding](), False, ""
@@ -197,7 +197,7 @@ def _frames(source: Recording | PhantomSource) -> list[Finding]:
 
 
 def _fits(config: LaunchConfig) -> list[Finding]:
-    """Nothing, where a node can be made, and a frame and the robot's poses are of the calibration."""
+    """Make a pipeline and rectify one frame with its pose: no findings, or the error of what does not fit."""
     rig = rig_to_play(config, guess=guess_rig)
     with open_posed(config, rig, references=False) as opened:
         pipeline = Pipeline(config, rig, lambda stamp_ns: None, rate=opened.rate)
@@ -207,7 +207,7 @@ def _fits(config: LaunchConfig) -> list[Finding]:
 
 
 def calibrated(config: LaunchConfig, path: Path) -> list[Finding]:
-    """The calibration with which it is played, against its pictures, which lie in or at `path`."""
+    """Compare the calibration that is used with the recording's pictures, which lie in or at `path`."""
 
     def compare() -> list[Finding]:
         source = config.source
@@ -236,7 +236,7 @@ def _none_used(folder: Path) -> Finding:
 
 
 def _within_reach(judged: list[Finding], config: LaunchConfig) -> list[Finding]:
-    """The same where lengths may be right with how far depth is matched: as far as the launch says."""
+    """The findings with depth judged by `vision.stereo.max_depth`, unless the lengths' unit is wrong."""
     reach = config.vision.stereo.max_depth
     found = next((each for each in judged if "depth_median_m" in each.figures), None)
     if found is None or (found.level == "error" and found.fix != RECALIBRATE):  # another unit fits
@@ -250,7 +250,7 @@ def _within_reach(judged: list[Finding], config: LaunchConfig) -> list[Finding]:
 
 
 def _tried(what: str, look: Callable[[], list[Finding]]) -> list[Finding]:
-    """Return what is found, what is said in the log meanwhile, and an error as a finding."""
+    """Run a check: return its findings, with logged warnings and an error as findings, too."""
     log, said = logging.getLogger("sags_node"), BufferingHandler(MOST_SAID)
     said.setLevel(logging.WARNING)
     log.addHandler(said)

@@ -132,7 +132,7 @@ def _plain(folder: Path) -> Contents:
 
 
 def _eye_folders(folder: Path) -> tuple[Path, Path] | None:
-    """By the usual names, else by names that differ in the eye only, as `cam_left` and `cam_right`."""
+    """The folders of both eyes, by usual names, else by names that differ only in the eye, as `cam_left`."""
     for left_name, right_name in (*EYES, *HAMLYN_EYES, *KITTI_EYES):
         left, right = _first(folder, (left_name,)), _first(folder, (right_name,))
         if left is not None and right is not None:
@@ -143,7 +143,7 @@ def _eye_folders(folder: Path) -> tuple[Path, Path] | None:
 
 
 def _eye_videos(videos: list[Path]) -> tuple[Path, ...]:
-    """Left and right one, by their names if these say it; else all."""
+    """The left and the right video, if the names tell which they are; else all."""
     by_name = {file.stem: file for file in videos}
     named = [(by_name[left], by_name[right]) for left, right in _pairs(by_name)]
     return named[0] if len(named) == 1 else tuple(videos)
@@ -170,7 +170,7 @@ def _pairs(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def calibration_of(folder: Path) -> Path | None:
-    """Return what lies beside the pictures, in a folder of a usual name or with them."""
+    """Find the calibration beside the pictures, in a folder of a usual name or with them."""
     places = [place for name in CALIBRATIONS if (place := folder / name).is_dir()]
     known = next((place for place in places if find_form(place) is not None), None)
     files = [file for place in places for file in place.glob(SHOWN) if is_opencv(file)]
@@ -186,12 +186,12 @@ def seem_calibrations(folder: Path) -> list[Path]:
 
 
 def is_video(file: Path) -> bool:
-    """Tell whether it is called like one."""
+    """Tell whether this is a file with the suffix of a video."""
     return file.suffix.lower() in VIDEO_SUFFIXES and file.is_file()
 
 
 def override(key: str, path: Path | str) -> str:
-    """`key:=path` as it is read back, whatever YAML would make of the path."""
+    """The override `key:=path`, quoted where YAML would read the path as something else."""
     plain = f"{key}:={path}"
     with suppress(UsageError):
         if parse_yaml(str(path), plain) == str(path):
@@ -200,7 +200,7 @@ def override(key: str, path: Path | str) -> str:
 
 
 _KNOWN: tuple[tuple[tuple[tuple[str, ...], ...], str, str], ...] = (
-    # Data sets that are not played as they are: of each group of patterns one is there.
+    # Data sets that are not played as they are. A folder is one if a pattern of each group matches.
     (
         (("track_pts.*",),),
         "a sequence of StereoMIS-Tracking",

@@ -16,7 +16,7 @@ from sags_node.types import U8, Bool
 
 LOOKED_AT = 8  # pictures, spread over the folder
 COMB_STEP = 12  # grey levels that a row must differ from both neighbours, alike
-COMB_SHARE = 0.02  # of the pixels, and
+COMB_SHARE = 0.02  # least share of the pixels that show combs, and
 COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direction
 DARK = 12  # grey level of a border
 NARROWEST_BORDER = 4  # px
@@ -28,7 +28,7 @@ Box = tuple[int, int, int, int]  # x, y, width, height, px
 
 
 def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path, U8]:
-    """Read pictures spread over the files, also the last and the smallest one: there copies break off.
+    """Read pictures spread over the files. Also try the last and the smallest one: there copies break off.
 
     Raises:
         SagsError: one cannot be read.
@@ -46,7 +46,7 @@ def check_eye(what: str, pictures: Collection[U8], keep: Box | None = None) -> l
     """Look at one eye's pictures [H, W, 3] RGB: sizes, black borders, interlacing.
 
     Args:
-        keep: what is to be kept where there are borders; None: what is lit of this eye.
+        keep: the box to keep where there are borders; None: what is lit of this eye.
     """
     sizes = {picture.shape[1::-1] for picture in pictures}
     if len(sizes) > 1:
@@ -76,15 +76,15 @@ def check_eye(what: str, pictures: Collection[U8], keep: Box | None = None) -> l
 
 
 def combing(gray: U8) -> float:
-    """Share of pixels of [H, W] that differ from the rows above and below alike: two fields in motion."""
+    """The share of pixels of [H, W] that differ from the rows above and below alike: two fields in motion."""
     middle = gray[1:-1].astype(np.int16)
     above, below = middle - gray[:-2], middle - gray[2:]
     return float(np.mean((np.minimum(above, below) > COMB_STEP) | (np.maximum(above, below) < -COMB_STEP)))
 
 
 def lit_in_both(left: Collection[U8], right: Collection[U8], geometry: GeometryConfig | None) -> Box | None:
-    """The box of each eye's picture, before `geometry` cut and turned it, that no black border of either eye
-    reaches into; None: their sizes differ, or there is none."""
+    """The box without black borders of either eye, in each eye's picture before `geometry` cuts and flips it.
+    None: the pictures' sizes differ, or there is none."""
     if len({picture.shape for picture in (*left, *right)}) != 1:
         return None
     boxes = [
@@ -108,7 +108,7 @@ def lit_in_both(left: Collection[U8], right: Collection[U8], geometry: GeometryC
 
 
 def lit_box(brightest: U8) -> Box:
-    """x, y, width and height of what is not a black border; all of it where all is dark."""
+    """The box within the black borders; the whole picture where all is dark."""
     columns, rows = (np.flatnonzero(np.percentile(brightest, 99, axis=axis) > DARK) for axis in (0, 1))
     height, width = brightest.shape
     if not len(columns) or not len(rows):
@@ -145,14 +145,14 @@ def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
 def check_both(
     left: Collection[U8], right: Collection[U8], *, geometry: GeometryConfig | None = None
 ) -> list[Finding]:
-    """Look at each eye, and at how they belong together; `geometry`: by which the pictures came."""
+    """Look at each eye, and at how they belong together; `geometry`: how the pictures were cut."""
     keep = lit_in_both(left, right, geometry)
     return [*check_eye("left", left, keep), *check_eye("right", right, keep), *check_eyes(left, right)]
 
 
 def check_shares(shares: Sequence[float]) -> list[Finding]:
-    """Return what masks say of frames: the share of each that is instrument."""
-    if not any(shares):  # of those spread over the recording the source says so
+    """A finding on masks, from the share of each frame that is instrument."""
+    if not any(shares):  # the source reports masks that mark nothing
         return []
     return [Finding("ok", f"masks: {np.median(shares):.0%} of the picture is instrument")]
 
@@ -160,7 +160,7 @@ def check_shares(shares: Sequence[float]) -> list[Finding]:
 def check_depth(
     folder: Path, size: tuple[int, int], unit: float | None = None, stated: bool = False
 ) -> list[Finding]:
-    """Kind, size and unit (m per count) of depth pictures; `stated`: whoever made them says that unit."""
+    """Check kind, size and unit (m per count) of depth pictures; `stated`: their author states that unit."""
     medians = []
     for file, depth in read_some(list_pictures(folder), cv2.IMREAD_UNCHANGED).items():
         if (wrong := _no_depth(file, depth, size)) is not None:
@@ -198,7 +198,7 @@ def check_depth(
 
 
 def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
-    """Why a picture cannot be depth."""
+    """Why a picture cannot be depth; None: it can."""
     export = "export depth as grey PNG of 16 bit, e.g. in 1e-5 m"
     if depth.ndim != 2:
         what = f"depth: {file.name} has {depth.shape[2]} channels: it is coloured for people"

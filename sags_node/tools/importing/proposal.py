@@ -36,7 +36,7 @@ class Proposal:
 
 
 def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
-    """Try a recording or cameras, and set what makes them well.
+    """Try a recording or cameras, and set what fixes their faults.
 
     Args:
         named: a folder, a video or a device; or two videos, folders or devices, the left eye first.
@@ -53,7 +53,7 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
         return Proposal(launch, found)
     looked = [] if isinstance(config.source, EndoNerfSource) else _looked_at(config)
     fixes = list(dict.fromkeys(fix for finding in looked for fix in finding.launch))
-    if isinstance(config.source, FoldersSource):  # which know no geometry
+    if isinstance(config.source, FoldersSource):  # folders have no geometry
         fixes = [fix for fix in fixes if fix == pictures.RIGHT_FIRST]
     if fixes:
         launch, done = _with(launch, fixes)
@@ -110,7 +110,7 @@ def _opened(config: LaunchConfig) -> list[Finding]:
 
 
 def _looked_at(config: LaunchConfig) -> list[Finding]:
-    """Return what some of its pictures show, spread over it."""
+    """Findings on some pictures, spread over the recording."""
     pairs, _ = pairs_of_session(config)
     left, right = zip(*pairs, strict=True)
     geometry: GeometryConfig | None = getattr(config.source, "geometry", None)
@@ -120,7 +120,7 @@ def _looked_at(config: LaunchConfig) -> list[Finding]:
 
 
 def _needs_borders(config: LaunchConfig, geometry: GeometryConfig | None, size: tuple[int, int]) -> str:
-    """Why black borders of pictures that are so large must stay; "": they need not."""
+    """Why black borders of pictures of this size must stay; "": they need not."""
     if geometry is not None and geometry.crop_right is not None:
         return "each eye has a box of its own"
     if lacks_rig(config):
@@ -144,7 +144,7 @@ def _with(launch: list[str], fixes: Sequence[str]) -> tuple[list[str], dict[str,
         (one, other) for one, other in EACH_EYE if keys.get(other) not in (None, "null") and one in keys
     ]
     apart = keys.get(videos.LAYOUT.removesuffix(":="), "separate") in ("separate", "panes")
-    if pictures.RIGHT_FIRST in done and apart and each_eye:  # no `first` says which of these is whose
+    if pictures.RIGHT_FIRST in done and apart and each_eye:  # `first` does not apply to these
         for one, other in each_eye:
             keys[one], keys[other] = keys[other], keys[one]
         done[pictures.RIGHT_FIRST] = "left and right are exchanged"

@@ -13,11 +13,11 @@ from sags_node.checks import Finding
 from sags_node.types import F32, U8
 
 LOOKED_AT = 120  # frames, one after the other
-FEWEST = 30  # frames that tell
-ROWS = 32
-MOST = 10  # frames that an eye is looked for to be late
+FEWEST = 30  # frames: with fewer nothing can be told
+ROWS = 32  # bands of rows whose brightness is compared
+MOST = 10  # frames: the largest delay that is tried
 LEAST = 0.4  # correlation of eyes that see the same move
-CLEARLY = 0.2  # beyond that of no delay
+CLEARLY = 0.2  # by which it must exceed that of no delay
 
 
 class Timing:
@@ -32,7 +32,7 @@ class Timing:
         self._rows: tuple[list[F32], list[F32]] = [], []
 
     def add(self, left: U8, right: U8) -> None:
-        """A pair [H, W, 3] RGB."""
+        """Take in a pair [H, W, 3] RGB."""
         for rows, picture in zip(self._rows, (left, right), strict=True):
             gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32)
             rows.append(cv2.resize(gray, (1, ROWS), interpolation=cv2.INTER_AREA)[:, 0])
@@ -62,7 +62,7 @@ class Timing:
 
 
 def _alike(left: F32, right: F32, late: int) -> float:
-    """Correlation of the changes, where the right eye's come so many frames later."""
+    """Correlation of the changes, where the right eye's come `late` frames later."""
     count = len(left)
     a, b = left[max(0, -late) : count - max(0, late)], right[max(0, late) : count - max(0, -late)]
     return float(np.sum(a * b) / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-9))

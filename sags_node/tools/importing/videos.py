@@ -23,7 +23,7 @@ from sags_node.tools.importing.folder import override
 from sags_node.types import U8
 
 LOOKED_AT = 4  # pictures, spread over the video
-MOST_LATE = 900  # pictures that an eye is looked for to have been begun late
+MOST_LATE = 900  # pictures: the largest delay of an eye's start that is tried
 LEAST_ALONG = 0.8  # share of the matches whose rows agree, of two eyes
 ROWS = 1 / 40  # of the width: as far as rows of eyes that are not rectified differ
 ONE_EYE = "one eye is shown, or both in a way that was not recognised"
@@ -59,7 +59,7 @@ def _fields(picture: U8) -> tuple[U8, U8]:
     return np.ascontiguousarray(picture[0:rows:2]), np.ascontiguousarray(picture[1:rows:2])
 
 
-_WAYS = (  # a part before the whole: what is found in the one is found in the other, too
+_WAYS = (  # parts before wholes: pictures of two of four panes also match as side by side
     Way("in the upper two of four panes", "panes", lambda picture: _quarters(picture)[0]),
     Way("side by side", "side_by_side", _halves),
     Way("one above the other", "over_under", lambda picture: _halves(picture, 0)),
@@ -68,7 +68,7 @@ _WAYS = (  # a part before the whole: what is found in the one is found in the o
 
 
 def _packed(start: int, rows: int) -> Way:
-    """The right eye's picture, of so many rows, begins in row `start`."""
+    """The way of frame packing: the right eye's picture, `rows` rows high, begins in row `start`."""
 
     def eyes(picture: U8) -> tuple[U8, U8]:
         return picture[:rows], picture[start : start + rows]
@@ -77,8 +77,8 @@ def _packed(start: int, rows: int) -> Way:
 
 
 def look(files: tuple[Path, ...]) -> list[Finding]:
-    """Return what some pictures show, of the videos of the left and the right eye, or of one of both. They
-    are played as `launch_of` says.
+    """Look at some pictures of the videos of the left and the right eye, or of one video of both. They are
+    played as `launch_of` says.
 
     Raises:
         SagsError: they cannot be read.
@@ -92,7 +92,7 @@ def look(files: tuple[Path, ...]) -> list[Finding]:
 
 
 def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
-    """`key:=value` that play the videos of the left and the right eye, or one of both.
+    """The overrides `key:=value` that play the videos of the left and the right eye, or one of both.
 
     Raises:
         SagsError: it cannot be read.
@@ -130,7 +130,7 @@ def way_of(shown: Sequence[U8]) -> Way | None:
 
 
 def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
-    """`key:=value` that take these pictures apart, the left eye first."""
+    """The overrides `key:=value` that take these pictures apart, the left eye first."""
     eyes = zip(*map(way.eyes, shown), strict=True)
     fixes = [fix for finding in pictures.check_eyes(*eyes) for fix in finding.launch]
     if way.right is None:
@@ -156,13 +156,13 @@ def _some(file: Path) -> list[U8]:
         for number in _spread(video.count):
             with suppress(LostPictureError):  # it is left out while playing, too
                 picture = video.read(number)
-                if picture is not None:  # else it is said where the video ends, as while it is played
+                if picture is not None:  # else the video ends early, which is logged as when it is played
                     found.append(picture)
         return found
 
 
 def _some_pairs(pairs: VideoPairs) -> list[Pair]:
-    """Spread over two videos, as far as both reach."""
+    """Pairs spread over two videos, as far as both reach."""
     found = []
     both = min(pairs.count, pairs.right.count) if pairs.right is not None and pairs.by_number else pairs.count
     for index in _spread(both):
@@ -174,7 +174,7 @@ def _some_pairs(pairs: VideoPairs) -> list[Pair]:
 
 
 def _late(pairs: VideoPairs) -> list[Finding]:
-    """Which eye was begun later, of two videos of other lengths that are paired by number."""
+    """A finding on which eye began later, of two videos of different lengths that are paired by number."""
     if pairs.right is None or not pairs.by_number or pairs.left.count == pairs.right.count:
         return []
     longer = abs(pairs.left.count - pairs.right.count)
@@ -198,7 +198,7 @@ def _one(file: Path, shown: list[U8]) -> list[Finding]:
         found = Finding("error", f"{size} px: {ONE_EYE}", _both_needed(file))
         return [found, *pictures.check_eye("video", shown)]
     looked = pictures.check_both(*zip(*map(way.eyes, shown), strict=True))
-    if way.layout == "row_interleaved":  # of every other row of a picture the rows lie far apart: as a comb
+    if way.layout == "row_interleaved":  # an eye's rows lie two rows apart, which looks like a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
     # `layout_of` exchanges them.
     said = "points lie farther to the right in the second picture, which is taken for the left eye's"
