@@ -46,7 +46,7 @@ class BagMessage:
     sequence: int  # 0 where the format has none
     data: bytes | memoryview  # CDR
     relative: bool = False  # its lengths have no unit: it is of a node without calibration
-    ahead_ns: int = 0  # it shows what is predicted for so long after its stamp
+    ahead_ns: int = 0  # how far its content is predicted ahead of its stamp
     session: str = ""  # of the node that was recorded; empty: not in the bag
     epoch: int = 0  # of that node
 
@@ -200,7 +200,7 @@ def _stem(stem: str) -> str:
 
 
 def _whole(digits: str) -> int:
-    """The number that these digits write; 0 if it is none, or has ten digits or more."""
+    """The number in these digits; 0 if there is none, or if it has ten digits or more."""
     return int(digits) if digits.isdecimal() and len(digits) < 10 else 0
 
 

@@ -61,7 +61,7 @@ class LostPictureError(SagsError):
 
 @dataclass(frozen=True, slots=True)
 class _Index:
-    """What the packets of a file say, in ticks."""
+    """The contents of a file by its packets; times in ticks."""
 
     count: int
     pts: I64 | None  # [count] rising; None: the packets have no usable stamps
@@ -410,7 +410,7 @@ def _upright(picture: U8, matrix: NDArray[np.int32]) -> U8:
 
 
 def _bits_used(frame: av.VideoFrame) -> int | None:
-    """The bits that a picture's 16 bit grey samples use; None if it is not 16 bit grey, or uses about all."""
+    """The number of bits that 16 bit grey samples use, if it is 8 to 14; None otherwise."""
     if frame.format.name != "gray16le":
         return None
     bits = int(frame.to_ndarray().max()).bit_length()

@@ -242,7 +242,7 @@ class Graph:
         self._said.write(body, time.time_ns())
 
     def wait(self, seconds: float) -> None:
-        """Wait until a reader has a message, at most so many seconds."""
+        """Wait until a reader has a message, at most `seconds`."""
         from cyclonedds.util import duration
 
         self._waiting.wait(duration(milliseconds=round(seconds * 1e3)))

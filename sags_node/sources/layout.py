@@ -11,7 +11,7 @@ from sags_node.types import U8, Bool, Samples, Side
 
 _FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}  # OpenCV's codes
 FIELD_ROWS = {"top": 0, "bottom": 1}
-# How many eyes a picture shows (beside, above) each other; (1, 1) in other layouts.
+# How many eyes a picture shows (side by side, one above the other); (1, 1) in other layouts.
 EYES = {"side_by_side": (2, 1), "over_under": (1, 2), "row_interleaved": (1, 2)}
 WIDEST = 2.2  # width over height of one eye's picture; the widest usual one is 1.9 (17:9)
 

@@ -24,7 +24,7 @@ BASE, HAND = "base", "hand"  # names of the two frames if a topic holds the pose
 # ns between two samples. A hand accelerates a scope by about 1 m/s^2, so that over this time a straight line
 # is wrong by less than 2 mm (a t^2 / 8).
 LARGEST_GAP_NS = 120_000_000
-IN_VAIN_NS = 4 * LARGEST_GAP_NS  # ns: poses that are later than this are not waited for
+IN_VAIN_NS = 4 * LARGEST_GAP_NS  # ns: if the newest pose is older than this, no newer one is waited for
 FASTEST = 1.0  # m/s: faster is a jump; a person pulls a scope out of a trocar more slowly
 FASTEST_TURN = 2 * np.pi  # rad/s
 SMALLEST_JUMP = 0.002  # m, and 1 degree: smaller steps are jitter, not jumps
