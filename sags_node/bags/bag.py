@@ -1,7 +1,7 @@
-"""Messages out of any bag: rosbag2 folders (MCAP, db3), single .mcap and .db3 files, ROS 1 .bag files.
+"""Reads messages from any bag: rosbag2 folders (MCAP, db3), single .mcap and .db3 files, ROS 1 .bag files.
 
-Whatever the file, a message is ROS 2 CDR. MCAP is read by `mcap_file`, record by record, so that neither a
-false length nor an index that lies can take memory; db3 and ROS 1 files are read by `rosbags`.
+Whatever the file, a message is ROS 2 CDR. MCAP is read by `mcap_file`, record by record, so that no false
+length or index can make it take too much memory. db3 and ROS 1 files are read by `rosbags`.
 """
 
 import logging
@@ -29,10 +29,10 @@ _warn = cache(logging.getLogger(__name__).warning)  # once: a bag is looked at s
 
 MAX_METADATA_BYTES = 4 << 20
 METADATA = "metadata.yaml"
-DATE = 6  # digits at least: a number of so many counts no files
-RECORDED = "sags"  # metadata of a bag that says which node was recorded from here on
+DATE = 6  # digits: a number in a file's name with as many or more is a date, not a count of files
+RECORDED = "sags"  # name of the metadata record that tells which node is recorded from there on
 RELATIVE = {"sags_units": "relative"}  # metadata of a channel whose lengths have no unit
-AHEAD = "sags_ahead_ms"  # metadata of a channel whose content is predicted: how far ahead of the stamp
+AHEAD = "sags_ahead_ms"  # metadata of a channel with predicted content: ms ahead of the stamp
 
 Wanted = Callable[[str, str], bool]  # by topic and type
 
@@ -40,14 +40,14 @@ Wanted = Callable[[str, str], bool]  # by topic and type
 @dataclass(frozen=True, slots=True)
 class BagMessage:
     topic: str  # as written, usually with a leading slash
-    type: str  # ROS 2 name, e.g. sensor_msgs/msg/Image; of `cdr.OTHER_IN_ROS1` that of ROS 1
+    type: str  # ROS 2 name, e.g. sensor_msgs/msg/Image; ROS 1 name for types in `cdr.OTHER_IN_ROS1`
     log_ns: int  # when it was recorded
     publish_ns: int
     sequence: int  # 0 where the format has none
     data: bytes | memoryview  # CDR
-    relative: bool = False  # its lengths have no unit: it is of a node that nobody has calibrated
-    ahead_ns: int = 0  # it shows what is expected so long after its stamp
-    session: str = ""  # of the node that was recorded; empty: the bag does not say it
+    relative: bool = False  # its lengths have no unit: it is of a node without calibration
+    ahead_ns: int = 0  # how far its content is predicted ahead of its stamp
+    session: str = ""  # of the node that was recorded; empty: not in the bag
     epoch: int = 0  # of that node
 
 
@@ -57,17 +57,17 @@ def read_messages(
     start_ns: int = 0,
     wanted: Wanted | None = None,
 ) -> Iterator[BagMessage]:
-    """The messages of a bag in the order of the file.
+    """Yield the messages of a bag in the order of the file.
 
     Args:
         topics: only these; None: all.
         start_ns: leave out what was recorded before.
-        wanted: by topic and type, whose data is used; None: all. Other data stays as it is, also of another
-            encoding than CDR, as JSON.
+        wanted: tells by topic and type whose data is used; None: all. Other data is not converted, and its
+            encoding is not checked (it may be JSON).
 
     Raises:
-        UsageError: there is no bag at `path`, or it is of a form that is not read.
-        SagsError: it is damaged; says where and how to fix it.
+        UsageError: there is no bag at `path`, or its format is not supported.
+        SagsError: it is damaged; the message says where and how to fix it.
     """
     files, unpack = storage_files(path)
     for file in files:
@@ -81,8 +81,8 @@ def read_messages(
 
 
 def recorded_namespace(path: Path) -> str | None:
-    """The namespace of the node that was recorded; None where the bag does not say it: it is of another
-    recorder, or no MCAP.
+    """Return the namespace of the recorded node; None if the bag does not hold it: another program recorded
+    it, or it is not MCAP.
 
     Raises:
         UsageError, SagsError: as `read_messages`.
@@ -91,14 +91,14 @@ def recorded_namespace(path: Path) -> str | None:
         with _explained(file), open_file(file) as opened:
             for head in mcap_file.heads(opened, file.stat().st_size, len(MAGIC)):
                 if head.opcode in (Opcode.CHUNK, Opcode.MESSAGE):
-                    break  # it stands before the first message
+                    break  # that record comes before the first message
                 if (said := _recorded_node(opened, head)) is not None:
                     return said.get("ns")
     return None
 
 
 def recorded_topics(path: Path) -> set[str]:
-    """The topics of a bag by the ends of its files; empty where one says nothing: it is cut off, or no MCAP.
+    """Return the topics in the summaries of a bag's files; empty if one has none (cut off, or not MCAP).
 
     Raises:
         UsageError, SagsError: as `read_messages`.
@@ -116,7 +116,7 @@ def recorded_topics(path: Path) -> set[str]:
 
 
 def _recorded_node(file: BinaryIO, head: Head) -> dict[str, str] | None:
-    """What a record of the file says of the node that was recorded; None: it is about something else."""
+    """The metadata of the recorded node, if this record holds it; else None."""
     if head.opcode != Opcode.METADATA or head.length > MAX_METADATA_BYTES:
         return None
     said = mcap_file.read_metadata(mcap_file.read_content(file, head))
@@ -124,7 +124,7 @@ def _recorded_node(file: BinaryIO, head: Head) -> dict[str, str] | None:
 
 
 def storage_files(path: Path) -> tuple[list[Path], bool]:
-    """The files of a bag in order, and whether each message in them is compressed (zstd).
+    """Return the files of a bag in order, and whether their messages are compressed one by one (zstd).
 
     Raises:
         UsageError: there is no bag, its metadata cannot be read, or whole files are compressed.
@@ -166,7 +166,7 @@ def storage_files(path: Path) -> tuple[list[Path], bool]:
 
 
 def check_one(folder: Path) -> None:
-    """Tell whether the files in a folder are of one recording, by their names.
+    """Check by their names that the files in a folder are of one recording.
 
     Raises:
         UsageError: they are of several.
@@ -180,13 +180,13 @@ def check_one(folder: Path) -> None:
 
 
 def files_in(folder: Path, suffix: str) -> list[Path]:
-    """The files in a folder with a suffix in the order of their numbers: case_2 before case_10."""
+    """Return a folder's files with this suffix, ordered by their numbers: case_2 before case_10."""
     found = folder.glob(f"{SHOWN}{suffix}")
     return sorted(found, key=lambda file: (_whole(file.stem.rpartition("_")[2]), file.name))
 
 
 def missing_files(files: Sequence[Path]) -> int:
-    """Count the files of a recording that are missing before its last; they are numbered from 0: case_0."""
+    """Count the files that are missing before the last one; they are numbered from 0: case_0, case_1."""
     parts = [file.stem.rpartition("_")[2] for file in files]
     if not all(part.isdecimal() and len(part) < DATE for part in parts):
         return 0
@@ -194,13 +194,13 @@ def missing_files(files: Sequence[Path]) -> int:
 
 
 def _stem(stem: str) -> str:
-    """The name of a recording whose files are numbered: case_0, case_1."""
+    """The name of a recording without the number of its file: case for case_0."""
     name, _, digits = stem.rpartition("_")
     return name if digits.isdecimal() else stem
 
 
 def _whole(digits: str) -> int:
-    """The number that is written there; 0 where none is, or one that nobody means."""
+    """The number in these digits; 0 if there is none, or if it has ten digits or more."""
     return int(digits) if digits.isdecimal() and len(digits) < 10 else 0
 
 
@@ -214,7 +214,7 @@ def _metadata(file: Path) -> dict[str, Any]:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Say which file, and how to fix it."""
+    """Turn errors about a file into a `SagsError` that names it and says how to fix it."""
     try:
         yield
     except OSError as error:
@@ -239,7 +239,7 @@ def _read_mcap(
             raise DamagedError(0, "it does not begin as an MCAP file")
         for head in mcap_file.heads(opened, size, len(MAGIC)):
             if head.opcode == Opcode.CHUNK and mcap_file.chunk_times(opened, head)[1] < start_ns:
-                # Its channels may be needed later: they stand only where they are first used.
+                # Its channels may be needed later: a channel is described only before its first message.
                 channels.missed.append(head)
                 continue
             if (said := _recorded_node(opened, head)) is not None:
@@ -273,15 +273,15 @@ def _read_mcap(
 
 
 def marks_of(channel: Channel) -> dict[str, str]:
-    """What the metadata of a channel says of its messages that ROS has no word for."""
+    """Return the metadata of a channel that ROS messages cannot hold: `RELATIVE` and `AHEAD`."""
     return {key: said for key, said in channel.metadata.items() if key in (*RELATIVE, AHEAD)}
 
 
 def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
-    """Schemas, channels and messages of one record of the file, which may be a chunk of them.
+    """Yield the schemas, channels and messages in a record of the file. It may be a chunk, which holds many.
 
     Raises:
-        DamagedError: it is not what it says.
+        DamagedError: the record is damaged.
     """
     if head.opcode == Opcode.CHUNK:
         data = mcap_file.unpack_chunk(mcap_file.read_content(file, head), head.position)
@@ -293,7 +293,7 @@ def records_of(file: BinaryIO, head: Head) -> Iterator[Inner]:
 
 
 def summary(file: BinaryIO, size: int) -> Iterator[Schema | Channel]:
-    """Schemas and channels that the end of an MCAP file repeats, if it is there."""
+    """Yield the schemas and channels in the summary of an MCAP file; none if it is damaged or missing."""
     try:
         for head in mcap_file.heads(file, size, mcap_file.summary_start(file, size)):
             if head.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -305,12 +305,12 @@ def summary(file: BinaryIO, size: int) -> Iterator[Schema | Channel]:
 
 
 class Channels:
-    """What the messages of an MCAP file belong to."""
+    """The channels and schemas of an MCAP file, as far as it was read."""
 
     def __init__(self) -> None:
         self.missed: list[Head] = []  # chunks that were passed over unread
         self._channels: dict[int, Channel] = {}
-        self._schemas = {0: Schema(0, b"", "", "")}  # of a channel without one, as of JSON
+        self._schemas = {0: Schema(0, b"", "", "")}  # 0: a channel without schema, e.g. JSON
 
     def add(self, record: Schema | Channel) -> None:
         if isinstance(record, Schema):
@@ -326,13 +326,13 @@ class Channels:
         self.missed.clear()
 
     def describe(self, channel_id: int) -> bool:
-        """Tell whether channel and schema are known; a schema stands only where the first of its channels
-        does."""
+        """Tell whether a channel and its schema are known. A schema is written only once, before the first
+        of its channels."""
         channel = self._channels.get(channel_id)
         return channel is not None and channel.schema_id in self._schemas
 
     def of(self, entry: Entry, position: int) -> tuple[Channel, Schema]:
-        """Channel and schema of a message.
+        """Return the channel and the schema of a message.
 
         Raises:
             DamagedError: the file does not describe them.
@@ -373,13 +373,13 @@ def _read_with_rosbags(
             turned = ros1 and (wanted is None or wanted(connection.topic, connection.msgtype))
             data, kind = cdr.from_ros1(raw, connection.msgtype) if turned else raw, connection.msgtype
             if ros1 and kind in cdr.OTHER_IN_ROS1:
-                kind = kind.replace("/msg/", "/")  # its name in ROS 1: that of ROS 2 says another form
+                kind = kind.replace("/msg/", "/")  # the ROS 1 name: in ROS 2 this type has other fields
             yield BagMessage(connection.topic, kind, log_ns, log_ns, 0, data)
 
 
 @contextmanager
 def _damage_as_one_error() -> Iterator[None]:
-    """Damaged bytes meet asserts, look-ups and unpacking in `rosbags`: any exception there is about them."""
+    """Turn any exception of `rosbags` into a `DamagedError`: damaged bytes make it raise many kinds."""
     try:
         yield
     except (SagsError, OSError):
@@ -390,7 +390,7 @@ def _damage_as_one_error() -> Iterator[None]:
 
 
 def _unpacked(message: BagMessage) -> BagMessage:
-    """The message of a bag whose messages are compressed one by one."""
+    """The message, decompressed."""
     data = mcap_file.unpack(message.data, b"zstd", MAX_RECORD_BYTES, 0)
     if len(data) > MAX_RECORD_BYTES:
         raise DamagedError(0, f"a message on {message.topic} unpacks to more than 256 MB")

@@ -1,4 +1,4 @@
-"""What cameras say of their calibration in ROS (`CameraInfo`, REP 104), now and over a recording."""
+"""The calibration that cameras publish in ROS (`CameraInfo`, REP 104), also as it changes over time."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,23 +11,23 @@ from sags_node.messaging.topics import CAMERA_INFO
 from sags_node.rig import MODELS, fit_distortion, part_of_sensor
 from sags_node.types import I64, Eye
 
-SAME = 1e-4  # of a number: less is rounding
+SAME = 1e-4  # relative: smaller differences are rounding
 
 
 class Said(NamedTuple):
-    """A calibration, and since when it holds."""
+    """A calibration and the time from which it holds."""
 
     since_ns: int
     eye: Eye
 
 
 def read_eye(data: bytes | memoryview, where: str) -> Eye | None:
-    """The calibration in a `CameraInfo`, of pictures as they are sent: of the region that is read out, and
-    binned; None: it says that the camera is not calibrated.
+    """Read the calibration in a `CameraInfo`, for pictures as they are sent: with its region of interest and
+    binning. None: the message says that the camera is not calibrated.
 
     Raises:
         SagsError: the message is damaged.
-        UsageError: a distortion model that is not supported, or a region that is none.
+        UsageError: the distortion model is not supported, or the region is invalid.
     """
     message = decode_message(data, CAMERA_INFO, where)
     if message.k[0] == 0:
@@ -51,12 +51,12 @@ def read_eye(data: bytes | memoryview, where: str) -> Eye | None:
 
 
 def topic_of(pictures: str) -> str:
-    """The topic on which a camera says it, beside that of its pictures."""
+    """Return the camera_info topic that belongs to a topic of pictures."""
     return pictures.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
 
 
 def changes(said: Sequence[Said]) -> list[Said]:
-    """Return what is said, in order of time, without what says the same again."""
+    """Return the calibrations in order of time, without those that equal the one before."""
     kept: list[Said] = []
     for each in sorted(said, key=lambda one: one.since_ns):
         if not kept or not same(kept[-1].eye, each.eye):
@@ -65,13 +65,13 @@ def changes(said: Sequence[Said]) -> list[Said]:
 
 
 def in_force(said: Sequence[Said], stamps: I64) -> I64:
-    """Which of the `changes` each picture was taken with, [N]; before the first one, that."""
+    """Return for each picture the index in `changes` of its calibration [N]; before the first, 0."""
     since = np.array([each.since_ns for each in said], np.int64)
     return np.maximum(np.searchsorted(since, stamps, "right") - 1, 0)
 
 
 def same(one: Eye, other: Eye) -> bool:
-    """Tell whether two calibrations are equal but for rounding."""
+    """Tell whether two calibrations are equal up to rounding."""
     a, b = (
         np.concatenate([[eye.width, eye.height], *map(np.ravel, (eye.K, eye.R, eye.P, eye.distortion))])
         for eye in (one, other)

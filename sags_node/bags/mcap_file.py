@@ -1,4 +1,4 @@
-"""MCAP records from a file that nobody vouches for: every length is checked before memory is taken.
+"""Reads MCAP records from an untrusted file: every length is checked before memory is allocated.
 
 Format: https://mcap.dev/spec. A file is magic, records, magic; a record is an opcode (1 byte), a length
 (8 bytes) and its content. Messages lie in chunks, which may be compressed and carry a checksum.
@@ -26,17 +26,17 @@ MAX_RECORD_BYTES = 256 << 20
 MAX_CHUNK_BYTES = 256 << 20  # unpacked
 HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_FOOTER = struct.Struct("<BQQQI")  # head, start of the summary and of its offsets, CRC
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, start of its offsets, CRC
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, unpacked size, CRC, length of the next string
-# What mcap raises for content it cannot read.
+# What the package `mcap` raises for content that it cannot read.
 _BAD_BYTES = (McapError, struct.error, UnicodeError, ValueError)
 
 
 class DamagedError(SagsError):
-    """A file is not what its records say.
+    """A file is damaged.
 
     Attributes:
-        position: byte of the file from which on nothing is certain.
+        position: byte of the file from which on it cannot be trusted.
     """
 
     def __init__(self, position: int, what: str) -> None:
@@ -46,7 +46,7 @@ class DamagedError(SagsError):
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """Where one record is."""
+    """The opcode, position and length of one record."""
 
     opcode: int
     position: int  # of the head
@@ -64,7 +64,7 @@ class Head:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One message as it lies in the file."""
+    """One message as the file holds it."""
 
     channel_id: int
     sequence: int
@@ -77,7 +77,7 @@ Inner: TypeAlias = Schema | Channel | Entry
 
 
 def heads(file: BinaryIO, size: int, position: int) -> Iterator[Head]:
-    """The records from `position` on, up to the footer.
+    """Yield the heads of the records from `position` on, up to the footer.
 
     Args:
         size: of the file, bytes.
@@ -113,7 +113,7 @@ def read_content(file: BinaryIO, head: Head) -> bytes:
 
 
 def chunk_times(file: BinaryIO, head: Head) -> tuple[int, int]:
-    """First and last log time of a chunk, ns, as its head claims."""
+    """Return the first and the last log time of a chunk, ns, as it claims."""
     file.seek(head.start)
     claimed = file.read(16)
     if len(claimed) < 16:
@@ -123,7 +123,7 @@ def chunk_times(file: BinaryIO, head: Head) -> tuple[int, int]:
 
 
 def summary_start(file: BinaryIO, size: int) -> int:
-    """Find where the summary begins, as the footer says.
+    """Return the position of the summary, as the footer gives it.
 
     Raises:
         DamagedError: there is no footer, or no summary.
@@ -138,7 +138,7 @@ def summary_start(file: BinaryIO, size: int) -> int:
 
 
 def read_attachment(content: bytes) -> Attachment | None:
-    """An attachment; None if it is damaged."""
+    """Read an attachment; None if it is damaged."""
     crc = int.from_bytes(content[-4:], "little")
     if crc and zlib.crc32(content[:-4]) != crc:
         return None
@@ -149,7 +149,7 @@ def read_attachment(content: bytes) -> Attachment | None:
 
 
 def read_metadata(content: bytes) -> Metadata | None:
-    """Key-value metadata with its name; None if it is damaged."""
+    """Read a metadata record (name, keys and values); None if it is damaged."""
     try:
         return Metadata.read(ReadDataStream(BytesIO(content)))
     except _BAD_BYTES:
@@ -168,14 +168,14 @@ def chunk_is_consistent(content: bytes | memoryview) -> bool:
 
 
 def unpack(packed: bytes | memoryview, compression: bytes, size: int, position: int) -> bytes:
-    """The data of a chunk, and at most one byte more than the `size` that it says.
+    """Decompress the data of a chunk: at most one byte more than the `size` that it claims.
 
     Args:
         compression: lz4, zstd, bz2 (of ROS 1), or nothing.
         position: of the chunk in the file, for messages.
 
     Raises:
-        DamagedError: it says more than any chunk may hold, or cannot be unpacked.
+        DamagedError: it claims more than a chunk may hold, or cannot be decompressed.
     """
     if size > MAX_CHUNK_BYTES:
         raise DamagedError(position, f"a chunk says that it unpacks to {size} bytes; at most 256 MB is read")
@@ -195,14 +195,14 @@ def unpack(packed: bytes | memoryview, compression: bytes, size: int, position: 
 
 
 def unpack_chunk(content: bytes, position: int, whole: bool = True) -> bytes:
-    """The records of a chunk, decompressed and checked.
+    """Decompress and check the records of a chunk.
 
     Args:
         position: of the chunk in the file, for messages.
-        whole: False for a chunk that the file cuts off: what is there is unpacked, and not checked.
+        whole: False for a chunk that is cut off: what is there is decompressed, and not checked.
 
     Raises:
-        DamagedError: lengths or checksum are wrong, or it unpacks to more than it says or may.
+        DamagedError: lengths or checksum are wrong, or it decompresses to more than it claims or may hold.
     """
     if (whole and not chunk_is_consistent(content)) or len(content) < _CHUNK.size + 12:
         raise DamagedError(position, "the lengths in a chunk do not add up")
@@ -218,10 +218,10 @@ def unpack_chunk(content: bytes, position: int, whole: bool = True) -> bytes:
 
 
 def inner_records(data: bytes, position: int) -> Iterator[Inner]:
-    """Schemas, channels and messages of an unpacked chunk; other records are passed over.
+    """Yield the schemas, channels and messages of a decompressed chunk; other records are skipped.
 
     Raises:
-        DamagedError: a record leaves the chunk.
+        DamagedError: a record reaches past the end of the chunk.
     """
     view, at = memoryview(data), 0
     while at < len(data):
@@ -238,7 +238,7 @@ def inner_records(data: bytes, position: int) -> Iterator[Inner]:
 
 
 def parse(opcode: int, content: memoryview, position: int) -> Inner | None:
-    """A schema, channel or message; None for any other record.
+    """Parse a schema, channel or message; None for any other record.
 
     Raises:
         DamagedError: the content does not follow the format.

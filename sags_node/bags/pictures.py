@@ -1,4 +1,4 @@
-"""What cameras say in ROS: pictures, raw and compressed, checked and decoded."""
+"""Checks and decodes the pictures in ROS messages, raw and compressed; encodes compressed ones."""
 
 import re
 import struct
@@ -28,10 +28,10 @@ _TO_FILE = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}
 
 
 class Encoding(NamedTuple):
-    """How one of ROS's picture encodings becomes RGB."""
+    """The conversion of one of ROS's picture encodings to RGB."""
 
     bytes_per_pixel: int
-    to_rgb: int | None  # OpenCV's conversion
+    to_rgb: int | None  # OpenCV's code of the conversion; None: it is RGB
 
 
 ENCODINGS = {
@@ -55,10 +55,10 @@ ENCODINGS = {
 
 
 def header_stamp(data: bytes | memoryview) -> int:
-    """The stamp (ns) of a CDR message that begins with a `std_msgs/Header`.
+    """Read the stamp (ns) of a CDR message that begins with a `std_msgs/Header`.
 
     Raises:
-        SagsError: it is too short to have one.
+        SagsError: it is too short for a header.
     """
     if len(data) < 12:
         raise SagsError(f"a message of {len(data)} bytes has no header")
@@ -67,14 +67,14 @@ def header_stamp(data: bytes | memoryview) -> int:
 
 
 def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
-    """The RGB picture [H, W, 3] in an `Image` or `CompressedImage`; a new array.
+    """Decode the RGB picture [H, W, 3] in an `Image` or `CompressedImage`; a new array.
 
     Args:
         kind: ROS type of the message.
-        where: what to call it in messages.
+        where: name of the picture in error messages.
 
     Raises:
-        SagsError: the message is damaged, or of an encoding that is not read.
+        SagsError: the message is damaged, or its encoding is not supported.
     """
     message = decode_message(data, kind, where)
     if kind != cdr.COMPRESSED:
@@ -86,9 +86,9 @@ def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
 
 
 def decompressed(message: Any, where: str) -> tuple[U8, str]:
-    """The picture in a `CompressedImage`, and its encoding: mono8 [H, W], rgb8 or rgba8 [H, W, C].
+    """Decode a `CompressedImage`, and return its encoding, too: mono8 [H, W], rgb8 or rgba8 [H, W, C].
 
-    It is what its file is. `format` says only how grey was a mosaic: each recorder has its own words there.
+    The file decides. `format` only tells the Bayer pattern of a grey file: recorders fill it differently.
 
     Raises:
         SagsError: as `decode_picture`.
@@ -110,8 +110,8 @@ def decompressed(message: Any, where: str) -> tuple[U8, str]:
 
 
 def _mosaic(said: str) -> int | None:
-    """OpenCV's conversion of a grey file that is a Bayer mosaic, by the `format` of its message; None: it is
-    none. Who took the mosaic apart names what it became, as in `bayer_rggb8; jpeg compressed mono8`."""
+    """OpenCV's code to demosaic a grey file, by the `format` of its message; None: it is no mosaic. If it was
+    demosaiced before, the new encoding comes last, as in `bayer_rggb8; jpeg compressed mono8`."""
     before, _, made = said.lower().partition(";")
     pattern = _BAYER.match(before.strip())
     target = made.split()[-1:]
@@ -143,10 +143,10 @@ def _raw_to_rgb(message: Any, where: str) -> U8:
 
 
 def decode_file(file: U8, where: str) -> U8:
-    """A picture file in a message as OpenCV decodes it: [H, W] or BGR(A) [H, W, C].
+    """Decode the picture file in a message with OpenCV: [H, W] or BGR(A) [H, W, C].
 
     Raises:
-        SagsError: it is none, damaged, too large, or not of 8 bit.
+        SagsError: it is no picture file, damaged, too large, or not 8 bit.
     """
     decoded = decode(file, cv2.IMREAD_UNCHANGED, f"{where}: a compressed picture", "record it again")
     if decoded.dtype != np.uint8:
@@ -155,13 +155,13 @@ def decode_file(file: U8, where: str) -> U8:
 
 
 def encode_file(picture: NDArray[Any], encoding: str, form: str, options: Sequence[int]) -> bytes:
-    """A JPEG or PNG file (`form`) of a picture [H, W] or [H, W, C] in one of ROS's encodings.
+    """Encode a picture [H, W] or [H, W, C], in one of ROS's encodings, as a JPEG or PNG file (`form`).
 
     Args:
         options: of `cv2.imencode`.
 
     Raises:
-        SagsError: it cannot be made, as of a picture without pixels.
+        SagsError: it cannot be encoded, e.g. because it has no pixels.
     """
     code = _TO_FILE.get(encoding)
     try:
@@ -175,10 +175,10 @@ def encode_file(picture: NDArray[Any], encoding: str, form: str, options: Sequen
 
 
 def decode_message(data: bytes | memoryview, kind: str, where: str) -> Any:
-    """A message of ROS type `kind`.
+    """Decode a message of ROS type `kind`.
 
     Raises:
-        SagsError: it is damaged; `where` it stands is said.
+        SagsError: it is damaged; the error begins with `where`.
     """
     try:
         return cdr.decode(data, kind)

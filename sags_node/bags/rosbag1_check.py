@@ -1,4 +1,4 @@
-"""A look over a ROS 1 bag before it is opened: every length fits, every chunk unpacks to little.
+"""Checks a ROS 1 bag before it is opened: all lengths fit, and no chunk decompresses to too much.
 
 Format: http://wiki.ros.org/Bags/Format/2.0. A record is header length, header fields, data length, data.
 """
@@ -19,10 +19,10 @@ _LENGTH = struct.Struct("<I")
 
 @lru_cache(maxsize=1)  # a bag is opened again for every loop, and unpacking all of it takes seconds
 def chunk_positions(file: Path, size: int, mtime_ns: int) -> frozenset[int]:
-    """Find where the chunks of a bag begin, which is told from an older one by its size (bytes) and time.
+    """Find the positions of a bag's chunks. Size (bytes) and time tell the cache that the file changed.
 
     Raises:
-        DamagedError: it is no ROS 1 bag, a length does not fit, or a chunk unpacks to too much.
+        DamagedError: it is no ROS 1 bag, a length does not fit, or a chunk decompresses to too much.
     """
     positions = set()
     with open_file(file) as bag:
@@ -66,7 +66,7 @@ def _fields(header: bytes, position: int) -> dict[bytes, bytes]:
 
 
 def check_chunk(bag: BinaryIO, length: int, fields: dict[bytes, bytes], position: int) -> None:
-    """The packed data is unpacked once here, with a limit that the reader itself does not have."""
+    """Decompress a chunk once with a limit on its size, which `rosbags` does not have."""
     said, compression = fields.get(b"size", b""), fields.get(b"compression", b"")
     if len(said) != _LENGTH.size:
         raise DamagedError(position, "a chunk does not say its size")

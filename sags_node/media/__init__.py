@@ -1,4 +1,4 @@
-"""Files of pictures and videos, read and written with the limits that a stranger's file needs.
+"""Reads and writes picture and video files, with the limits that foreign files need.
 
 Imports no other folder.
 """

@@ -1,7 +1,7 @@
-"""Whether a video file must have been longer, by the units in which its container writes.
+"""Tells whether a video file is cut off, by the units in which its container writes.
 
-FFmpeg does not say it: streams hold neither length nor index, and the lengths that other containers hold may
-be a second off.
+FFmpeg does not tell: streams hold neither length nor index, and the lengths in other containers may be a
+second off.
 """
 
 import struct
@@ -9,11 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-PACKET = 188  # bytes of MPEG's transport streams, to which recorders add times or check sums: 192 or 204
-SECTOR = 2048  # bytes of a DVD
-HEAD = 1 << 16  # bytes of a file, within which its header is
-TAIL = 1 << 18  # bytes of a stream, within which a unit begins and ends
-LONGEST_NAME = 4  # bytes, of Matroska
+PACKET = 188  # bytes of an MPEG transport stream's packet; 192 with a time, 204 with a checksum added
+SECTOR = 2048  # bytes of a DVD's sector
+HEAD = 1 << 16  # bytes at the beginning of a file; its header lies within them
+TAIL = 1 << 18  # bytes at the end of a stream; at least one unit begins within them
+LONGEST_NAME = 4  # bytes of a Matroska element's ID
 _SEGMENT, _CLUSTER = bytes.fromhex("18538067"), bytes.fromhex("1f43b675")
 _PACK, _STREAM_END = b"\0\0\1\xba", b"\xb9"  # of a program stream, ISO/IEC 13818-1
 _BOXES = {b"moov", b"moof", b"mdat"}  # ISO/IEC 14496-12: what players need
@@ -22,10 +22,10 @@ _ASF_FILE = bytes.fromhex("a1dcab8c47a9cf118ee400c00c205365")  # the File Proper
 
 
 def ends_in_a_packet(path: Path, size: int, container: str) -> bool:
-    """Tell whether the last packet or sector is not whole, of files of `size` bytes that have such.
+    """Tell whether a file of `size` bytes ends inside a packet or sector; False for other containers.
 
     Args:
-        container: FFmpeg's name of it.
+        container: FFmpeg's name of the container.
     """
     if path.suffix.lower() == ".vob":
         return size % SECTOR != 0
@@ -35,15 +35,15 @@ def ends_in_a_packet(path: Path, size: int, container: str) -> bool:
         head = file.read(HEAD)
     for width in (PACKET, 192, 204):
         for at in range(width):
-            if head[at::width][:4] == b"GGGG":  # each packet begins with a G; the time lies before it
+            if head[at::width][:4] == b"GGGG":  # each packet begins with a G; an added time lies before it
                 return (size - at) % width not in (0, PACKET)
     return False
 
 
 def lacks_its_end(path: Path, size: int, container: str) -> bool:
-    """Tell whether a file of `size` bytes says that it is longer, or ends within a unit of its container.
+    """Tell whether a file of `size` bytes says that it is longer, or ends inside a unit of its container.
 
-    One that was never ended, and stops behind a unit, does not.
+    False for a file that was never closed, but stops right behind a unit.
     """
     reader = next((each for name, each in _READERS.items() if name in container.split(",")), None)
     if reader is None:
@@ -53,7 +53,7 @@ def lacks_its_end(path: Path, size: int, container: str) -> bool:
 
 
 def _matroska(file: BinaryIO, size: int) -> bool:
-    """RFC 8794 and 9559. Elements of unknown length, as live ones have, are told by those inside."""
+    """By RFC 8794 and 9559. Elements of unknown length, as in live recordings, are read through."""
     at = 0
     while at < size:
         file.seek(at)
@@ -69,13 +69,13 @@ def _matroska(file: BinaryIO, size: int) -> bool:
             at += length
             if name == _SEGMENT:  # nothing follows
                 break
-        elif name not in (_SEGMENT, _CLUSTER):  # nothing that is known
+        elif name not in (_SEGMENT, _CLUSTER):  # only these two may have an unknown length
             return False
     return at > size
 
 
 def _flv(file: BinaryIO, size: int) -> bool:
-    """Its size, where it is said, and the last tag, whose length follows it."""
+    """By the file size in the metadata, if any, and by the last tag, whose length is written behind it."""
     said = file.read(HEAD).partition(b"\0\x08filesize\0")[2][:8]
     if len(said) == 8 and struct.unpack(">d", said)[0] > size:
         return True
@@ -86,7 +86,7 @@ def _flv(file: BinaryIO, size: int) -> bool:
 
 
 def _mxf(file: BinaryIO, size: int) -> bool:
-    """A partition at its head says where that of its foot begins; 0: it was never written."""
+    """By the header partition: it says where the footer partition begins. 0: that was never written."""
     head = file.read(HEAD)
     at = head.find(_PARTITION)
     if at < 0:
@@ -97,7 +97,7 @@ def _mxf(file: BinaryIO, size: int) -> bool:
 
 
 def _asf(file: BinaryIO, size: int) -> bool:
-    """Its size, unless it was sent as it was made."""
+    """By the file size in the header, which does not hold for a broadcast (flag 1)."""
     said = file.read(HEAD).partition(_ASF_FILE)[2][24:80]
     if len(said) < 56:
         return False
@@ -106,7 +106,7 @@ def _asf(file: BinaryIO, size: int) -> bool:
 
 
 def _mp4(file: BinaryIO, size: int) -> bool:
-    """The box that leads over its end; a length of 0 goes to the end."""
+    """By the box that reaches past the end of the file. A box of length 0 goes up to the end."""
     at = 0
     while at + 8 <= size:
         file.seek(at)
@@ -119,7 +119,7 @@ def _mp4(file: BinaryIO, size: int) -> bool:
 
 
 def _program_stream(file: BinaryIO, size: int) -> bool:
-    """The packets from a pack near its end on."""
+    """By the packets behind a pack header near the end of the file."""
     file.seek(max(0, size - TAIL))
     tail = file.read(TAIL)
     at = tail.find(_PACK)

@@ -1,7 +1,7 @@
-"""Picture files of others: looked at before they are decoded, and decoded without noise; how PNG is written.
+"""Decodes foreign picture files after a check of their headers, and holds the options for writing PNG.
 
-Decoders take the memory that a header asks for, fill what is missing of a cut-off picture with grey and say
-nothing of it, and print what they think of a file beside our own message, without the file's name.
+Decoders take the memory that a header asks for. They fill the missing part of a cut-off picture with grey,
+and do not tell. They print their own messages about a file, without its name.
 """
 
 import logging
@@ -38,19 +38,19 @@ _READERS: dict[bytes, Callable[[BytesIO], ImageFile]] = {  # by how a file begin
     b"RIFF": WebPImagePlugin.WebPImageFile,
 }
 _ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND\xaeB`\x82"}  # marks of a picture's end
-_JPEG_MARK = re.compile(rb"\xff+([^\0\xff\xd0-\xd7])")  # but for those that stand within pixels
+_JPEG_MARK = re.compile(rb"\xff+([^\0\xff\xd0-\xd7])")  # but those inside pixel data
 warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # of damaged files; they are refused
-_LONGEST_PADDING = 512  # bytes after the end of a picture, within which its mark is looked for first
+_LONGEST_PADDING = 512  # bytes at the end of a file in which the end mark is looked for first
 _TIFF_PARTS = (Tiff.STRIPOFFSETS, Tiff.STRIPBYTECOUNTS), (Tiff.TILEOFFSETS, Tiff.TILEBYTECOUNTS)
 MAX_PIXELS = 64 << 20
 _MOST_KINDS = 32
-_FILTER, _PAETH = 19, 128  # cv2.IMWRITE_PNG_FILTER, which older versions have not and pass over
+_FILTER, _PAETH = 19, 128  # cv2.IMWRITE_PNG_FILTER: older versions lack and ignore it
 _RLE = cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
-# Options of `cv2.imencode` for pictures of a camera, masks and depth: one filter for all rows, and runs
-# alone. OpenCV with a level but no filter tries all of them in each row: a third to two thirds more time.
+# Options of `cv2.imencode` for camera pictures, masks and depth: one filter for all rows, and run-length
+# encoding. With a level but no filter, OpenCV tries all filters in each row: 1/3 to 2/3 more time.
 PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, *_RLE, _FILTER, _PAETH)
 STDERR = 2
-MOST_BYTES = 1 << 16  # of what is kept; a library can say the same for every row of a picture
+MOST_BYTES = 1 << 16  # kept of what is printed; a library may repeat a message for every row
 _LIBRARY = re.compile(
     rb"libpng (error|warning): |RPly: |\[[\w,]+ @ 0x[0-9a-f]+\] |\[ ?[A-Z]+:\d+@[\d.]+\] |OpenCV\([\d.]+\) "
     # libjpeg's warnings have no common beginning
@@ -61,17 +61,17 @@ _lock = threading.RLock()  # the descriptor is the whole process's
 
 
 def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) -> NDArray[Any]:
-    """A picture as OpenCV decodes it.
+    """Decode a picture with OpenCV.
 
-    What the decoder says of a picture that it could read goes to the log, with `where`.
+    The decoder's warnings about a picture that it could read go to the log, with `where`.
 
     Args:
         flags: of `cv2.imdecode`.
-        where: what to call it in messages.
-        fix: what to do where it is damaged.
+        where: name of the picture in messages.
+        fix: what the user can do if it is damaged.
 
     Raises:
-        SagsError: it is of another kind, damaged, or says that it is larger than `MAX_PIXELS`.
+        SagsError: it is not one of `KINDS`, is damaged, or claims more than `MAX_PIXELS`.
     """
     array = np.frombuffer(data, np.uint8)
     size = claimed_size(array.data)
@@ -95,7 +95,7 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) ->
 
 
 class Complaints:
-    """What decoders say, once of each kind: all pictures of a recording often have the same flaw."""
+    """Logs decoders' messages, each kind once: all pictures of a recording often have the same flaw."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -119,7 +119,7 @@ complaints = Complaints()
 
 
 def claimed_size(data: memoryview) -> tuple[int, int] | None:
-    """Width and height that a file claims; None where it is of no kind that is read, or claims nothing."""
+    """Width and height in a file's header, px; None if it has none or is of a kind that is not read."""
     try:
         if _is_tiff(data):
             tags = _tiff_tags(data)
@@ -131,8 +131,8 @@ def claimed_size(data: memoryview) -> tuple[int, int] | None:
 
 
 def pages(data: memoryview) -> int:
-    """How many pictures as large as the first a file holds, such as a stack of ImageJ; its thumbnails are
-    smaller. 1 where it does not say it."""
+    """Count the pictures of the first one's size in a file, such as a stack of ImageJ. Smaller ones are
+    thumbnails. 1 where the file does not tell."""
     try:
         if not _is_tiff(data):
             with closing(_opened(data)) as picture:
@@ -149,7 +149,7 @@ def pages(data: memoryview) -> int:
 
 
 def is_whole(data: memoryview) -> bool:
-    """Tell whether the end of a picture is there: its mark, or, where a kind has none, all of its pixels."""
+    """Tell whether a picture is complete: it has its end mark or, in formats without one, all pixels."""
     begin = next((begin for begin in _ENDS if bytes(data[: len(begin)]) == begin), None)
     if begin is not None:
         near = _ENDS[begin] in bytes(data[-_LONGEST_PADDING:])
@@ -167,7 +167,7 @@ def is_whole(data: memoryview) -> bool:
 
 
 def _jpeg_ends(data: memoryview) -> bool:
-    """Tell whether its segments and scans lead to an end; drivers hand over buffers that are longer."""
+    """Tell whether the segments and scans lead to an end mark. Drivers' buffers may go on behind it."""
     at = 2
     while (found := _JPEG_MARK.search(data, at)) is not None and found[1] != b"\xd9":
         length = int.from_bytes(data[found.end() : found.end() + 2], "big")
@@ -180,8 +180,8 @@ def _is_tiff(data: memoryview) -> bool:
 
 
 def _tiff_tags(data: memoryview, at: int | None = None) -> Tiff.ImageFileDirectory_v2:
-    """The tiff tags of the first picture, or of the one at that byte. Pillow has no mode for some that OpenCV
-    reads, such as three floats a pixel."""
+    """The TIFF tags of the first picture, or of the one at byte `at`. Pillow itself cannot open some
+    that OpenCV reads, such as three floats per pixel."""
     tags = Tiff.ImageFileDirectory_v2(bytes(data[:8]))
     file = BytesIO(data)
     file.seek(tags.next if at is None else at)
@@ -190,7 +190,7 @@ def _tiff_tags(data: memoryview, at: int | None = None) -> Tiff.ImageFileDirecto
 
 
 def _opened(data: memoryview) -> ImageFile:
-    """With its header read. Not by `Image.open`, which looks for other kinds and warns of large pictures."""
+    """A picture whose header is read. `Image.open` would try other kinds, and warn of large pictures."""
     start = bytes(data[:8])
     return next(reader for begin, reader in _READERS.items() if start.startswith(begin))(BytesIO(data))
 
@@ -200,9 +200,9 @@ def _opened(data: memoryview) -> ImageFile:
 
 @contextmanager
 def native_output() -> Iterator[list[str]]:
-    """Keep the lines that libraries write meanwhile; they are in the list when the block has ended.
+    """Keep what C libraries write to stderr within the block; the list holds their lines after it.
 
-    Everything else that is written there, by other threads, goes where it should, a moment later.
+    Whatever else other threads write to stderr is passed on when the block ends.
     """
     lines: list[str] = []
     with _lock:
@@ -211,7 +211,7 @@ def native_output() -> Iterator[list[str]]:
         kept = os.memfd_create("stderr", os.MFD_CLOEXEC)
         try:
             terminal = os.dup(STDERR)
-        except OSError:  # this process has no stderr: nothing to keep from it
+        except OSError:  # this process has no stderr
             os.close(kept)
             yield lines
             return

@@ -1,7 +1,7 @@
 """A video file: its pictures by number, and the stamps that the file gives them. Read by FFmpeg (PyAV).
 
-Headers are not believed: how many pictures there are, when they are shown, and where decoding can begin is
-read from the packets, once for each file. What an edit list hides is no picture.
+Headers are not believed. The number of pictures, their stamps and the key frames are read from the packets,
+once for each file. Pictures that an edit list hides do not count.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_PIXELS = 64 << 20
-ONE_THREAD = 2_500_000  # px: full HD takes one thread a quarter of its time; more threads cost more in all
+ONE_THREAD = 2_500_000  # px: up to here one thread decodes, at less CPU; full HD takes 1/4 of its time
 THREADS = min(4, os.cpu_count() or 1)
-REORDERED = 32  # pictures that a codec may hold back to show others first
+REORDERED = 32  # pictures by which order of decoding and of display may differ
 LONGEST_PAUSE = 600.0  # s between two pictures; beyond, the stamps are of different clocks
-LARGE = 1 << 22  # bytes of a picture from which on NumPy's pages cost more than FFmpeg's
-SAME = 1_000_000  # ns: stamps of most containers are whole milliseconds
-FAR = 8  # pictures; what is nearer is decoded, not sought
-SHORT = 1.0  # s that a file may end before its header says so
-# Sizes of HD television, which is BT.709. Untagged pictures of any other size are BT.601: old television, and
-# what FFmpeg and OpenCV make of RGB pictures whatever their size.
+LARGE = 1 << 22  # bytes of a picture: from here on, a copy into new NumPy memory costs more than it saves
+SAME = 1_000_000  # ns of rounding: stamps of most containers are whole milliseconds
+FAR = 8  # pictures ahead; nearer ones are reached by decoding, not by a seek
+SHORT = 1.0  # s that a file may be shorter than its header says
+# Sizes of HD television, px. Untagged videos of these sizes are BT.709, all others BT.601: that is the matrix
+# of old television, and the one by which FFmpeg and OpenCV encode RGB pictures of any size.
 HD = {(1280, 720), (1440, 1080), (1920, 1080), (2048, 1080), (3840, 2160), (4096, 2160)}
-BROKEN = (av.FFmpegError, IndexError)  # where a file breaks off; where another stream begins in it: PyAV
+BROKEN = (av.FFmpegError, IndexError)  # a file breaks off; PyAV, where another stream begins in it
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
-_MATRICES = {0, 1, 4, 5, 6, 7, 9}  # that FFmpeg converts
+_MATRICES = {0, 1, 4, 5, 6, 7, 9}  # those of ISO/IEC 23091-2 that FFmpeg converts
 DEEP = 16  # bits of a sample
 NO_TIMES = 0x80  # AVFMT_NOTIMESTAMPS of FFmpeg
 HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ISO/IEC 23091-2
@@ -61,13 +61,13 @@ class LostPictureError(SagsError):
 
 @dataclass(frozen=True, slots=True)
 class _Index:
-    """What the packets of a file say, in ticks."""
+    """The contents of a file by its packets; times in ticks."""
 
     count: int
-    pts: I64 | None  # [count] rising; None: they do not say when pictures are shown
+    pts: I64 | None  # [count] rising; None: the packets have no usable stamps
     keys: I64  # [K, 3] pts, dts and size (bytes), rising, of the packets at which decoding can begin
     unused: str = ""  # why the stamps are not used
-    cut_off: str = ""  # as of `Video`
+    cut_off: str = ""  # see `Video`
 
 
 class Video:
@@ -75,15 +75,15 @@ class Video:
 
     Attributes:
         size: width and height of a picture, px.
-        count: how many there are.
+        count: number of pictures.
         stamps: [count] when each is shown, ns, rising; None where the file does not say it.
-        rate: Hz, while none is missing; None: not known.
-        is_even: stamps say no more than the rate.
+        rate: Hz, where no picture is missing; None: not known.
+        is_even: the stamps are those that the rate gives, or there are none.
         pixel_aspect: width of a pixel over its height.
-        cut_off: why the file must have been longer, with a remedy after a semicolon; "": it is whole.
-        tracks: how many there are; the first is read.
-        is_interlaced: the file says so of its first picture.
-        oddities: what is to be said of the file, each with a remedy after a semicolon.
+        cut_off: what is missing of the file, with a remedy after a semicolon; "": nothing.
+        tracks: number of video tracks; the first is read.
+        is_interlaced: the file says that its first picture is interlaced.
+        oddities: warnings about the file, each with a remedy after a semicolon.
 
     Raises:
         UsageError: the file is missing or is not a video.
@@ -120,7 +120,7 @@ class Video:
         self._untagged = Colorspace.ITU709 if _is_hd(*self.size) else Colorspace.ITU601
         self.stamps: I64 | None = None
         if self._pts is not None and first.pts is not None:
-            # What comes before the first picture that can be decoded began before the file did.
+            # Pictures before the first one that can be decoded depend on some that the file lacks.
             self._pts = self._pts[self._pts >= first.pts]
             base = self._stream.time_base or Fraction(1, 1)
             self.stamps = np.array([round(int(ticks) * base * 10**9) for ticks in self._pts], np.int64)
@@ -158,7 +158,7 @@ class Video:
 
     @property
     def split(self) -> str:
-        """How two tracks become two files."""
+        """The advice how to split two tracks into two files."""
         tracks = " ".join(f"-map 0:v:{eye} -c copy {side}.mkv" for eye, side in enumerate(("left", "right")))
         return f"if each is an eye: ffmpeg -i {self._name} {tracks}"
 
@@ -168,14 +168,14 @@ class Video:
 
     @property
     def gaps(self) -> list[tuple[int, int]]:
-        """Number of the picture before each gap in the stamps, and how many are missing there."""
+        """The number of the picture before each gap in the stamps, and how many pictures the gap lacks."""
         if self.stamps is None or self.rate is None or self.is_even:
             return []
         steps = np.rint(np.diff(self.stamps) * self.rate * 1e-9).astype(int)
         return [(int(number), int(steps[number]) - 1) for number in np.flatnonzero(steps > 1)]
 
     def read(self, number: int) -> U8 | None:
-        """A picture, RGB [H, W, 3], None behind the end. One after the other is fastest.
+        """Read a picture, RGB [H, W, 3]; None past the end. Reading in order is fastest.
 
         Raises:
             LostPictureError: this one cannot be decoded.
@@ -205,7 +205,7 @@ class Video:
         self._container.close()
 
     def _find_rate(self) -> tuple[float | None, bool]:
-        """The rate, and whether every picture comes when it says."""
+        """The rate in Hz, and whether all stamps are those that it gives."""
         told = [float(rate) for rate in (self._stream.average_rate, self._stream.guessed_rate) if rate]
         if self.stamps is None or len(self.stamps) < 2:
             return (told[0] if told else None), True
@@ -219,7 +219,7 @@ class Video:
         return next((rate for rate in reversed(told) if abs(rate - usual) < 0.01 * usual), usual), False
 
     def _restart(self) -> av.VideoFrame | None:
-        """From the beginning; the first picture, decoded."""
+        """Open the file anew and decode its first picture."""
         self._container, self._stream = _opened(self.path)
         self._stream.thread_type = "AUTO"
         small = self._stream.width * self._stream.height <= ONE_THREAD
@@ -227,13 +227,13 @@ class Video:
         return self._begin(is_sought=False)
 
     def _begin(self, is_sought: bool) -> av.VideoFrame | None:
-        """The first picture from where the container is."""
+        """Decode the first picture from the position of the container on."""
         self._frames = self._pictures(is_sought)
         self._at = -1
         return self._decode()
 
     def _jump(self, number: int) -> None:
-        """To where this picture is decoded next, or one before it."""
+        """Seek so that this picture, or one before it, has just been decoded."""
         if self._pts is not None and len(self._keys):
             at = int(np.searchsorted(self._keys[:, 0], self._pts[number], "right")) - 1
             with suppress(av.FFmpegError):  # from containers that cannot seek
@@ -243,14 +243,14 @@ class Video:
         self._restart()
 
     def _key_of(self, number: int) -> int:
-        """Number of the last picture not behind this one at which decoding can begin."""
+        """The number of the last key frame up to this picture."""
         if self._pts is None or not len(self._keys):
             return 0
         at = int(np.searchsorted(self._keys[:, 0], self._pts[number], "right")) - 1
         return int(np.searchsorted(self._pts, self._keys[max(at, 0), 0]))
 
     def _decode(self) -> av.VideoFrame | None:
-        """The next picture, None at the end."""
+        """Decode the next picture; None at the end."""
         self._frame = None  # its memory is used again
         for frame in self._frames:
             number = self._number_of(frame)
@@ -260,7 +260,7 @@ class Video:
         return None
 
     def _number_of(self, frame: av.VideoFrame) -> int:
-        """-1: it is none of those that are shown."""
+        """The number of a picture by its stamp; -1: it is not shown."""
         if self._pts is None:
             return self._at + 1
         if frame.pts is None:
@@ -269,7 +269,7 @@ class Video:
         return number if number < len(self._pts) and self._pts[number] == frame.pts else -1
 
     def _pictures(self, is_sought: bool) -> Iterator[av.VideoFrame]:
-        """Decode forward. What is damaged is passed over, and where a seek leads what lacks its beginning."""
+        """Decode forward. Damaged packets are skipped, and after a seek those before the first key frame."""
         packets = self._container.demux(self._stream)
         begun = not is_sought
         while True:
@@ -306,7 +306,7 @@ class Video:
 
 
 def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
-    """A file and its pictures; nothing else of it is read.
+    """Open a file and its first video track; packets of other tracks are discarded.
 
     Raises:
         UsageError: it is no video.
@@ -331,20 +331,20 @@ def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
 
 
 def _tracks(container: InputContainer) -> list[av.VideoStream]:
-    """All but covers."""
+    """The video tracks that are not cover pictures."""
     return [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
 
 
 @lru_cache(maxsize=16)
 def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
-    """One pass over the packets of a file, which is told from an older one by its size (bytes) and time."""
+    """Read all packets of a file once. Size (bytes) and time are in the key: a changed file is read anew."""
     container, stream = _opened(path)
     with container:
         base = stream.time_base or Fraction(1, 1)
         named = len(stream.index_entries)
         shown: list[int | None] = []
         keys: list[tuple[int, int, int]] = []
-        ticks: list[int] = []  # when packets are decoded
+        ticks: list[int] = []  # decoding times (dts)
         total, latest, is_broken = 0, 0, False
         with suppress(*BROKEN):
             for packet in container.demux(stream):
@@ -361,7 +361,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         if (is_broken or is_short) and shown:
             shown.pop()  # a part of a picture
         known = np.array([pts for pts in shown if pts is not None], np.int64)
-        # AVI knows no order but that of decoding: FFmpeg guesses, and some codecs hold pictures back.
+        # AVI holds the decoding order only. FFmpeg guesses the stamps, which fails with codecs that reorder.
         is_guessed = container.format.name == "avi" and stream.codec_context.has_b_frames
         are_few = 2 * len(known) <= len(shown) or (is_guessed and (np.diff(known) > 0).all())
         unused = "" if are_few else _why_unused(path, known, base)
@@ -369,7 +369,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         pts = np.unique(known) if is_used else None
         ends = 0.0 if not ticks else float((latest + np.diff(ticks).max(initial=0)) * base)
         missing = 0.0  # s
-        if container.format.name == "avi":  # counts its beats, and writes one for each
+        if container.format.name == "avi":  # its header counts frame periods, each of which has an entry
             missing = float(stream.frames * base) - ends
         elif len(container.streams) == 1 and container.duration is not None:
             missing = container.duration * 1e-6 - ends - SHORT
@@ -385,8 +385,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
 
 
 def _why_unused(path: Path, pts: I64, base: Fraction) -> str:
-    """Return what is wrong with the stamps of pictures in the order in which they are decoded; nothing:
-    ""."""
+    """Return what is wrong with the stamps of pictures, given in decoding order; "": nothing."""
     order = np.argsort(pts, kind="stable")
     moved = np.abs(order - np.arange(len(pts)))
     steps = np.diff(pts[order]) * float(base)
@@ -402,7 +401,7 @@ def _why_unused(path: Path, pts: I64, base: Fraction) -> str:
 
 
 def _upright(picture: U8, matrix: NDArray[np.int32]) -> U8:
-    """Turned and mirrored as a display matrix [3, 3] (ISO/IEC 14496-12) says, by quarters."""
+    """The picture, mirrored and turned by quarters as a display matrix [3, 3] (ISO/IEC 14496-12) says."""
     across, down = matrix[0, 0], matrix[1, 1]
     if across == 0:
         picture = cv2.transpose(picture)
@@ -411,7 +410,7 @@ def _upright(picture: U8, matrix: NDArray[np.int32]) -> U8:
 
 
 def _bits_used(frame: av.VideoFrame) -> int | None:
-    """How many bits of deep grey samples a picture uses; None where white is surely that of all of them."""
+    """The number of bits that 16 bit grey samples use, if it is 8 to 14; None otherwise."""
     if frame.format.name != "gray16le":
         return None
     bits = int(frame.to_ndarray().max()).bit_length()

@@ -1,4 +1,4 @@
-"""A video that is written picture by picture: H.264 in MP4, which every browser plays."""
+"""Writes a video picture by picture: H.264 in MP4, which every browser plays."""
 
 import errno
 import logging
@@ -13,16 +13,16 @@ from sags_node.types import U8
 
 log = logging.getLogger(__name__)
 
-TICKS = 90_000  # a second: usual rates are whole multiples of one
-LONGEST_STEP = 60 * TICKS  # between two pictures; a longer one is another recording
-RATES = (1.0, 240.0)  # Hz that players can do
+TICKS = 90_000  # per second: the period of usual rates is a whole number of ticks
+LONGEST_STEP = 60 * TICKS  # between two pictures; a longer pause is left out
+RATES = (1.0, 240.0)  # Hz: the range that players can play
 
 
 class VideoFile:
-    """Write it where `files.whole` says: only after `finish` all of it is there.
+    """A video file being written. Use it within `files.whole`: the file is complete only after `finish`.
 
     Args:
-        rate: pictures per second, where they come without a stamp.
+        rate: Hz, for pictures without a stamp.
         size: width and height of the pictures, px; odd ones lose a column or row.
 
     Raises:
@@ -38,20 +38,20 @@ class VideoFile:
         self._stream.pix_fmt = "yuv420p"
         codec = self._stream.codec_context
         codec.time_base, codec.thread_count = Fraction(1, TICKS), 1
-        codec.colorspace = Colorspace.ITU601  # said, as players take HD that says nothing for BT.709
+        codec.colorspace = Colorspace.ITU601  # tagged, as players take untagged HD for BT.709
         self._stream.options = {"preset": "ultrafast", "crf": "22"}  # beside a node that needs the cores
         self._shape = size[::-1]
         self._period = TICKS / rate
         self._first_ns: int | None = None
-        self._shift = 0.0  # ticks that stamps are late, where they began anew
+        self._shift = 0.0  # ticks that are added to stamps, as they began anew or a pause was left out
         self._at = -self._period  # ticks, of the newest picture
 
     def add(self, picture: U8, stamp_ns: int | None = None) -> None:
-        """One more picture, RGB [H, W, 3]; one of another size is scaled.
+        """Add a picture, RGB [H, W, 3]; one of another size is scaled.
 
         Args:
-            stamp_ns: when it was captured: as long after the one before it is shown. Where stamps begin anew
-                it follows the one before; so it does after a minute, which is said. None: at the rate.
+            stamp_ns: capture time: sets the interval to the picture before. If stamps begin anew, the picture
+                follows at the rate; so it does after a minute's pause, which is logged. None: at the rate.
 
         Raises:
             OSError: it cannot be written.
@@ -82,10 +82,10 @@ class VideoFile:
         self._write(frame)
 
     def finish(self) -> None:
-        """Write the rest.
+        """Encode the last pictures and close the file.
 
         Raises:
-            OSError: not all of it is there.
+            OSError: it cannot be written.
         """
         self._write(None)
         self._file.close()

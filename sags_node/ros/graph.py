@@ -1,7 +1,7 @@
-"""A ROS 2 graph, joined by DDS with the `cyclonedds` package: raw messages (CDR), which are not looked into.
+"""A ROS 2 graph, joined by DDS with the `cyclonedds` package. Messages are raw CDR, which it does not parse.
 
 ROS 2 is DDS with conventions: a topic `/a` is called `rt/a`, a type `pkg/msg/Name` is called
-`pkg::msg::dds_::Name_`, and the type's hash stands in the user data. So no message is defined here.
+`pkg::msg::dds_::Name_`, and the type's hash is in the user data. So no message type needs to be defined here.
 """
 
 import logging
@@ -20,12 +20,12 @@ from sags_node.messaging import cdr
 log = logging.getLogger(__name__)
 
 MOST_AT_ONCE = 16  # messages taken in one go
-BLOCKED = 100_000_000  # ns, at most; a history that keeps the newest few is never full
+BLOCKED = 100_000_000  # ns that a write may block; it never does, as the history keeps the newest only
 RECEIVE_BUFFER = 16 << 20  # bytes asked for; the kernel gives no more than net.core.rmem_max
-ANNOUNCED = 0.5  # s between announcements of this process: so soon a node that comes up is found
+ANNOUNCED = 0.5  # s between announcements of this process, so that new nodes find it soon
 PARTICIPANTS = 32  # DDS processes on this machine that are looked for
 ALIVE = 16  # DDS' instance state
-NODES = "ros_discovery_info"  # the topic on which processes say which nodes are theirs
+NODES = "ros_discovery_info"  # the topic on which processes tell their nodes
 _CONFIG = """<CycloneDDS><Domain Id="any">
 <General><Interfaces><NetworkInterface name="{interface}"/></Interfaces>{general}</General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
@@ -33,20 +33,20 @@ _CONFIG = """<CycloneDDS><Domain Id="any">
 <SPDPInterval>{announced} s</SPDPInterval>{discovery}</Discovery>
 <Internal><SocketReceiveBufferSize max="{buffer} B"/></Internal>
 <Compatibility><IgnoreTypeInformation>1.1,1.3,1.15,1.16</IgnoreTypeInformation></Compatibility>
-</Domain></CycloneDDS>"""  # the last one: newer Fast DDS would list our readers and never match them
+</Domain></CycloneDDS>"""  # Compatibility: else newer Fast DDS lists our readers, but never matches them
 _LOCAL = "<AllowMulticast>false</AllowMulticast>", '<Peers><Peer Address="127.0.0.1"/></Peers>'
 
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """How messages of a topic reach their readers: ROS' quality of service.
+    """The quality of service (QoS) of a topic, as in ROS.
 
     Attributes:
-        reliable: what is lost on the way is sent again. Else best effort: only readers that ask for no more
+        reliable: lost messages are sent again. Else best effort, which only readers that ask for best effort
             can read.
-        kept: who comes later gets what was sent last ("transient local"); for reliable ones.
-        depth: newest messages that wait: of a reader to be taken, of a reliable writer to be sent again.
-        lifespan: s from the stamp of a message on, after which nobody gets it any more.
+        kept: late readers get the last messages, too ("transient local"); needs `reliable`.
+        depth: number of newest messages kept: by a reader until taken, by a reliable writer to send again.
+        lifespan: s after its stamp during which a message is delivered; None: without limit.
     """
 
     reliable: bool = False
@@ -59,7 +59,7 @@ BEST_EFFORT = Delivery()
 
 
 class Reader:
-    """The raw messages of one topic."""
+    """Receives the raw messages of one topic."""
 
     def __init__(self, participant: Any, topic: str, kind: str, delivery: Delivery) -> None:
         from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
@@ -76,8 +76,8 @@ class Reader:
         return bytes(self._reader.guid.bytes)
 
     def take(self) -> Iterator[bytes]:
-        """The messages that have come, oldest first, as CDR."""
-        from cyclonedds._clayer import ddspy_take  # the only way to bytes; so the package's version is fixed
+        """Take up to `MOST_AT_ONCE` of the messages that have come, oldest first, as CDR."""
+        from cyclonedds._clayer import ddspy_take  # the only way to bytes; so the package's version is pinned
 
         for data, info in ddspy_take(self._reader._ref, self._any, MOST_AT_ONCE):
             if info.valid_data:
@@ -100,23 +100,23 @@ class Writer:
 
     @property
     def readers(self) -> int:
-        """How many read it now."""
+        """The number of readers that are connected now."""
         return int(self._writer.get_publication_matched_status().current_count)
 
     @property
     def refused(self) -> int:
-        """How many have asked for more than is delivered, and get nothing."""
+        """The number of readers so far that asked for a stricter QoS, and so get nothing."""
         return int(self._writer.get_offered_incompatible_qos_status().total_count)
 
     def write(self, data: bytes, stamp_ns: int) -> None:
-        """Send a message (CDR) without waiting for anybody.
+        """Send a message (CDR) without waiting for readers.
 
         Raises:
             SagsError: DDS cannot send it.
         """
         from cyclonedds._clayer import ddspy_write_ts  # see `Reader.take`
 
-        whole = data + bytes(-len(data) % 4)  # DDS sends words, and would fill the last one from elsewhere
+        whole = data + bytes(-len(data) % 4)  # DDS sends words of 4 bytes, and would pad with arbitrary ones
         code = ddspy_write_ts(self._writer._ref, whole, stamp_ns)
         if code < 0:
             raise SagsError(f"cannot send {self._topic.name} into the ROS 2 graph: DDS error {code}")
@@ -148,7 +148,7 @@ _types: dict[str, Any] = {}
 
 
 def raw_type(kind: str) -> Any:
-    """A DDS type without fields under the name of a ROS type: CDR goes in and out as it is."""
+    """Make a DDS type without fields that has the name of a ROS type: CDR passes through it unchanged."""
     if kind not in _types:
         from cyclonedds.idl import IdlStruct
         from cyclonedds.idl.annotations import final
@@ -166,17 +166,17 @@ def raw_type(kind: str) -> Any:
 
 
 def ros_type(name: str) -> str:
-    """`pkg::msg::dds_::Name_` as ROS says it."""
+    """Return the ROS name of a DDS type: `pkg/msg/Name` for `pkg::msg::dds_::Name_`."""
     package, _, last = name.partition("::")
     return f"{package}/msg/{last.rpartition('::')[2].removesuffix('_')}"
 
 
 class Graph:
-    """A process of its own in a ROS 2 graph. What it reads is used by one thread.
+    """This process as a participant in a ROS 2 graph. Only one thread may read from it.
 
     Raises:
         UsageError: `cyclonedds` is not installed, or there is no such network interface.
-        SagsError: DDS cannot be started, or this process is in another graph of this domain already.
+        SagsError: DDS cannot be started, or this process has joined this domain on another interface.
     """
 
     def __init__(self, config: RosGraph) -> None:
@@ -195,12 +195,12 @@ class Graph:
             raise SagsError(f"cannot join ROS 2 domain {self.domain}: {error.msg}") from None
         self._read: list[bytes] = []  # by GUID
         self._written: list[bytes] = []
-        self._said: Writer | None = None  # that says which node this is
-        self._announced: Any = None  # what others publish; nobody may ever ask
-        self._publications: dict[Any, tuple[str, str]] = {}  # by writer: topic and type, in ROS' words
+        self._said: Writer | None = None  # tells the graph which node this is
+        self._announced: Any = None  # reads what others publish; opened when first asked
+        self._publications: dict[Any, tuple[str, str]] = {}  # by writer: topic and type, as ROS names them
 
     def publications(self) -> dict[str, set[str]]:
-        """The topics that somebody else publishes now, and their types."""
+        """Return the topics that others publish now, and their types."""
         if self._announced is None:
             from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
@@ -219,20 +219,20 @@ class Graph:
         return found
 
     def reader(self, topic: str, kind: str, delivery: Delivery = BEST_EFFORT) -> Reader:
-        """A reader of a topic, named as in ROS, e.g. `/a/image_raw`. Best effort fits every writer."""
+        """Open a reader of a topic, named as in ROS: `/a/image_raw`. Best effort matches every writer."""
         reader = Reader(self.participant, topic, kind, delivery)
         self._waiting.attach(reader.condition)
         self._read.append(reader.guid)
         return reader
 
     def writer(self, topic: str, kind: str, delivery: Delivery = BEST_EFFORT) -> Writer:
-        """A writer of a topic, named as in ROS."""
+        """Open a writer of a topic, named as in ROS."""
         writer = Writer(self.participant, topic, kind, delivery)
         self._written.append(writer.guid)
         return writer
 
     def call_it(self, node: str) -> None:
-        """Let the graph show what is read and written so far as a node of this name, e.g. `/sags`."""
+        """Announce the readers and writers so far as a node of this name, e.g. `/sags`."""
         if self._said is None:
             newest = Delivery(reliable=True, kept=True, depth=1)
             self._said = Writer(self.participant, NODES, cdr.NODES, newest)
@@ -242,26 +242,26 @@ class Graph:
         self._said.write(body, time.time_ns())
 
     def wait(self, seconds: float) -> None:
-        """Until something can be taken from one of the readers, or the time is over."""
+        """Wait until a reader has a message, at most `seconds`."""
         from cyclonedds.util import duration
 
         self._waiting.wait(duration(milliseconds=round(seconds * 1e3)))
 
     def where(self) -> str:
-        """Which graph this is, for messages."""
+        """Name this graph, for messages."""
         return where(self.domain, self.interface)
 
 
 def where(domain: int, interface: str) -> str:
-    """A graph, for messages."""
+    """Name a graph, for messages."""
     return f"ROS 2 domain {domain}, interface {interface}"
 
 
 def domain_of(config: RosGraph) -> int:
-    """The domain that was asked for, by the launch file or by ROS' own variable.
+    """Return the domain that the launch file names, or else `ROS_DOMAIN_ID`, or 0.
 
     Raises:
-        UsageError: the variable holds no number.
+        UsageError: the variable is not a number from 0 to 232.
     """
     if config.domain is not None:
         return config.domain
@@ -272,19 +272,18 @@ def domain_of(config: RosGraph) -> int:
 
 
 def receive_buffer() -> int:
-    """The receive buffer that the kernel grants us, bytes."""
+    """Return the receive buffer that the kernel grants us, bytes."""
     return min(RECEIVE_BUFFER, kernel_buffer("max") or RECEIVE_BUFFER)
 
 
 def kernel_buffer(which: Literal["default", "max"]) -> int | None:
-    """The receive buffer, in bytes, of a process of this machine that asks for none, or the largest that it
-    may ask for; None: the kernel does not say."""
+    """Return the kernel's default or largest receive buffer of a socket, bytes; None: it does not tell."""
     said = Path(f"/proc/sys/net/core/rmem_{which}")
     return int(said.read_text()) if said.exists() else None
 
 
 _lock = threading.Lock()
-_domains: dict[int, tuple[str, Any]] = {}  # DDS configures a domain once in a process
+_domains: dict[int, tuple[str, Any]] = {}  # DDS configures a domain only once in a process
 
 
 def _domain(number: int, interface: str) -> Any:

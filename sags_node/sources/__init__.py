@@ -1,4 +1,4 @@
-"""Where frames come from: recordings, cameras, data sets, network streams.
+"""The sources of frames: recordings, cameras, data sets, network streams.
 
 Imports bags, config, kernels, media, messaging, phantom, rig and ros.
 """

@@ -1,4 +1,4 @@
-"""Which messages of a bag's two eyes are pairs, by their stamps, and whether these can be believed."""
+"""Pairs the messages of a bag's two eyes by their stamps, and checks whether the stamps can be trusted."""
 
 from collections.abc import Sequence
 
@@ -10,14 +10,14 @@ from sags_node.errors import UsageError
 from sags_node.sources.pairing import nearest, pair
 from sags_node.types import I64
 
-Key = tuple[int, int]  # when a message was recorded and its own stamp, ns: names it within its topic
+Key = tuple[int, int]  # log time and header stamp of a message, ns: identify it within its topic
 
-REPEATED = 0.3  # distinct stamps of all: messages that were recorded twice or thrice have more
-FEW_PAIRS = 0.9  # of the left pictures; fewer are worth a warning
-SYNCHRONISED_MS = 5.0  # between the eyes of a pair: as live pictures are paired
-LATE_STEPS = 1.5  # from one picture to the next: one eye's way to the recorder is not so much longer
-LONG = 3.0  # usual steps between pictures, and
-OFTEN = 0.1  # of all steps: so many that long ones are no pauses
+REPEATED = 0.3  # share of distinct stamps; less is not trusted (messages recorded three times leave 1/3)
+FEW_PAIRS = 0.9  # share of the left pictures; fewer pairs are worth a warning
+SYNCHRONISED_MS = 5.0  # ms between the eyes of a pair: the tolerance of live pairs, too
+LATE_STEPS = 1.5  # periods: the delays of both eyes to the recorder do not differ by more
+LONG = 3.0  # times the usual step between pictures: longer ones are gaps
+OFTEN = 0.1  # share of all steps: more gaps than that are no pauses
 DIFFER_FIX = (
     "set source.clocks:=two, which sets one by the other by when pictures were recorded; better, set both "
     "machines' clocks (chrony, PTP) before recording"
@@ -27,13 +27,13 @@ DIFFER_FIX = (
 def pair_messages(
     config: BagSource, left: Sequence[Key], right: Sequence[Key]
 ) -> tuple[list[tuple[Key, Key]], I64]:
-    """The messages of each pair, and their stamps [N, 2] ns, by one clock.
+    """Pair the messages; return the keys of each pair, and their stamps [N, 2] ns on one clock.
 
     Raises:
-        UsageError: nothing pairs.
+        UsageError: there is no pair.
     """
     stamps, others = map(taken, (left, right))
-    ahead = came_later(right) - came_later(left)  # the left eye's clock, of the right one's
+    ahead = came_later(right) - came_later(left)  # by which the left clock is ahead of the right one, ns
     if config.clocks == "two":
         others = others + ahead
     pairs = pair(stamps, others, config.tolerance)
@@ -51,8 +51,8 @@ def pair_messages(
 
 
 def taken(keys: Sequence[Key]) -> I64:
-    """When pictures were taken, ns: their stamps, or when they were recorded where most stamps are repeated:
-    then nobody stamped them one by one."""
+    """Return when pictures were taken, ns: their header stamps, or their log times if most header stamps
+    repeat: then the driver did not stamp each picture."""
     both: I64 = np.array(keys, np.int64)
     came, stamps = both[:, 0], both[:, 1]
     distinct = len(np.unique(stamps))
@@ -60,7 +60,7 @@ def taken(keys: Sequence[Key]) -> I64:
 
 
 def came_later(keys: Sequence[Key]) -> int:
-    """How much later than their stamps say messages were recorded, ns, the median."""
+    """Return the median delay from capture to recording, ns."""
     return int(np.median([log_ns for log_ns, _ in keys] - taken(keys)))
 
 
@@ -70,8 +70,8 @@ def judge_stamps(
     rate: float | None,
     eyes: tuple[Sequence[Key], Sequence[Key]],
 ) -> tuple[Finding, ...]:
-    """Return what is odd about pairs of both `eyes`' pictures: few, of clocks that differ, or not of one
-    moment."""
+    """Return warnings about the pairs of both `eyes`' pictures: too few, or not of one clock or one moment;
+    repeated or uneven stamps."""
     found = []
     for eye, pictures in zip(("left", "right"), eyes, strict=True):
         stamped = [stamp for _, stamp in pictures]
@@ -109,7 +109,7 @@ def judge_stamps(
 
 
 def judge_skew(stamps: I64) -> tuple[Finding, ...]:
-    """Return what is odd about pairs of these stamps [N, 2], ns: they are not of one moment."""
+    """Return a warning if the stamps [N, 2] (ns) of pairs differ too much: the eyes are not synchronised."""
     skew = float(np.median(stamps @ [-1, 1])) * 1e-6
     if abs(skew) <= SYNCHRONISED_MS:
         return ()

@@ -1,6 +1,6 @@
 """Stereo pairs and calibration from ROS recordings.
 
-A bag is read through once when it is opened: that finds every damage, the stamps that pair the eyes, and the
+A bag is read through once when it is opened. That finds all damage, the stamps that pair the eyes, and the
 calibration. Playing reads it forward again.
 """
 
@@ -25,21 +25,21 @@ from sags_node.sources.layout import Layout, refuse_turned
 from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64, U8, Eye, StereoRig
 
-# What drivers and this node call an eye's picture, the most usual first; "/compressed" may follow.
+# Names that drivers and this node give to picture topics, the usual first; "/compressed" may follow.
 PICTURE_NAMES = ("image_raw", "image_rect_color", "image_color", "image_rect", "image", "image_mono")
 COMPRESSED = "/compressed"
-MAX_WAITING = 64  # pictures read ahead of their partner
-STAMP_END = 12  # bytes: encoding and stamp of a message with a header
-MOST_INFOS = 10_000  # of one topic that differ: a zoom that moves all the time says enough
+MAX_WAITING = 64  # pictures that may wait for their partner
+STAMP_END = 12  # bytes of a message up to the end of its stamp: CDR encapsulation and stamp
+MOST_INFOS = 10_000  # camera_info of one topic that are kept; a moving zoom makes each differ
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What one reading of a bag found."""
+    """The contents of a bag, from one pass over it."""
 
-    types: dict[str, str]  # every topic
-    pictures: dict[str, list[Key]]  # of each topic
-    infos: dict[str, list[tuple[int, bytes]]]  # of each topic the camera_info that differ from those before
+    types: dict[str, str]  # by topic, of all topics
+    pictures: dict[str, list[Key]]  # by topic
+    infos: dict[str, list[tuple[int, bytes]]]  # stamp and camera_info by topic, where it changed
 
 
 class Eyes(NamedTuple):
@@ -50,7 +50,7 @@ class Eyes(NamedTuple):
 
 
 def read_contents(path: Path) -> Contents:
-    """Topics, stamps and calibration of a bag; the last one read is remembered.
+    """Read topics, stamps and calibration of a bag. The last bag is cached.
 
     Raises:
         UsageError: there is no bag.
@@ -80,7 +80,7 @@ def _read_contents(path: Path, changed: int) -> Contents:
 
 
 def _stamp(path: Path, message: BagMessage) -> int:
-    """The capture stamp; when it was recorded where a driver left it zero."""
+    """The header stamp, ns; the log time where the driver left the stamp zero."""
     try:
         return header_stamp(message.data) or message.log_ns
     except SagsError as error:
@@ -88,11 +88,11 @@ def _stamp(path: Path, message: BagMessage) -> int:
 
 
 class BagPairs(Pairs):
-    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough. Going back
-    begins to read it anew.
+    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough. To go back,
+    it reads the bag anew.
 
     Raises:
-        UsageError: there is no bag, its topics are not clear, or nothing pairs.
+        UsageError: there is no bag, its topics are ambiguous, or there is no pair.
         SagsError: it is damaged.
     """
 
@@ -138,7 +138,7 @@ class BagPairs(Pairs):
         self._messages = None
 
     def _picture_size(self) -> tuple[int, int]:
-        """Width and height of a picture as it was sent, px."""
+        """The width and height of a picture as it was sent, px."""
         self.at(0)
         assert self._size is not None  # it was just read
         return self._size
@@ -163,7 +163,7 @@ class BagPairs(Pairs):
         return all((np.diff([key[0] for key in topics[eye]]) >= 0).all() for eye in self._eyes)
 
     def _find(self, eye: int, key: Key) -> BagMessage:
-        """Read forward to one message; those of later pairs wait in memory."""
+        """Read forward to one message. Messages of later pairs are kept in memory."""
         assert self._messages is not None
         if (eye, key) in self._waiting:
             return self._waiting.pop((eye, key))
@@ -186,10 +186,10 @@ class BagPairs(Pairs):
 
 
 def find_eyes(config: BagSource, contents: Contents) -> Eyes:
-    """The picture topics that are named, or the only ones that look like a stereo pair.
+    """Return the picture topics that are named, or else the only ones that look like a stereo pair.
 
     Raises:
-        UsageError: a named topic is missing or holds no pictures, or none or several pairs are there.
+        UsageError: a named topic is missing or holds no pictures, or there is no such pair or several.
     """
     if config.geometry.layout != "separate":
         named = [config.left] if config.left is not None else sorted(contents.pictures)
@@ -232,7 +232,7 @@ def _counterpart(left: str) -> str | None:
 
 
 def _rank(left: str) -> int | None:
-    """How usual a name is; None for pictures that no camera made (render, depth, masks)."""
+    """The rank of a name, 0: most usual; None for pictures not of a camera (render, depth, masks)."""
     compressed = left.endswith(COMPRESSED)
     parts = left.removesuffix(COMPRESSED).split("/")
     if parts[-1] not in PICTURE_NAMES or "render" in parts:
@@ -241,7 +241,7 @@ def _rank(left: str) -> int | None:
 
 
 def _named(config: BagSource, contents: Contents, key: str, name: str) -> str:
-    """A topic as the bag spells it: with or without leading slash, raw or compressed."""
+    """The bag's name of a picture topic, which may have a leading slash or /compressed added."""
     for candidate in (name, f"/{name}", name.lstrip("/")):
         for full in (candidate, candidate + COMPRESSED):
             if full in contents.pictures:
@@ -259,7 +259,7 @@ def _named(config: BagSource, contents: Contents, key: str, name: str) -> str:
 
 
 def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
-    """The calibration in the bag's camera_info topics; None where both are missing or say nothing.
+    """Read the calibration from the bag's camera_info topics; None if both are missing or uncalibrated.
 
     Raises:
         UsageError: a named topic is missing, only one eye is calibrated, the pictures are turned, or the
@@ -288,7 +288,7 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
 
 
 def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:
-    """Stamps [N, 2] of the pairs that are played, ns."""
+    """The stamps [N, 2] of the pairs that are played, ns."""
     left, right = (contents.pictures[name] for name in eyes)
     stamps = pair_messages(config, left, right)[1][:: config.stride]
     first = int(np.searchsorted(stamps[:, 0], stamps[0, 0] + round(config.start * 1e9)))
@@ -296,7 +296,7 @@ def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:
 
 
 def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> Eye | None:
-    """Return what a camera_info topic says of the pictures with these stamps; None: nothing.
+    """The calibration in a camera_info topic for pictures with these stamps; None: not calibrated.
 
     Raises:
         UsageError: it changes while they are played.
@@ -309,7 +309,7 @@ def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> E
     turns = np.flatnonzero(np.diff(counts))
     if len(turns):
         before, after = (said[counts[turns[0] + k]].eye.K[0, 0] for k in (0, 1))
-        # cut off, not rounded: a little before a picture playing begins with it
+        # rounded down: playing begins with the first picture at or after `start`
         start = int(round(config.start * 1e4) + (played[turns[0] + 1] - played[0]) // 100_000) / 1e4
         raise UsageError(
             f"{config.path}: {topic} changes while it is played ({len(turns)} times), first {start:g} s from "

@@ -1,4 +1,4 @@
-"""Eight bits of picture files that have more, or hold floating numbers."""
+"""Converts pictures of more than 8 bits, or of floating-point numbers, to 8 bits."""
 
 import logging
 from collections.abc import Iterable
@@ -18,11 +18,11 @@ WHITES = (255, 1023, 4095, 16383, 65535)  # the brightest values of 8, 10, 12, 1
 
 
 class EightBits:
-    """Makes pictures [H, W, 3] of one type eight bit.
+    """Converts pictures [H, W, 3] of one type to 8 bits.
 
-    Files do not say which value is white. It is the brightest one of the fewest bits that hold all of `some`
-    pictures, or 1 of floating numbers. With `levels` it is the brightest value of the type, but of floating
-    numbers.
+    Files do not tell which value is white. It is taken for the largest value of 8, 10, 12, 14 or 16 bits: the
+    fewest that hold `some` pictures. For floating-point numbers it is 1, if that holds them. With `levels`,
+    white is the largest value of an integer type.
     """
 
     def __init__(self, some: Iterable[NDArray[Any]], levels: Levels | None = None) -> None:
@@ -39,12 +39,12 @@ class EightBits:
         self._levels = levels or (0.0, 1.0 if is_float else self.white / self._full)
 
     def __call__(self, picture: NDArray[Any], file: Path) -> U8:
-        """A new picture.
+        """Return the picture in 8 bits, a new array.
 
         Raises:
-            SagsError: it is brighter than what was taken for white.
+            SagsError: it is brighter than the value taken for white.
         """
-        from sags_node.sources.pixels import spread  # a kernel: other pictures need no place for one
+        from sags_node.sources.pixels import spread  # a kernel; other pictures do not need it loaded
 
         if picture.max() > self.white:
             raise SagsError(
@@ -56,7 +56,7 @@ class EightBits:
         return spread(picture, self._levels)
 
     def tell(self, folder: Path) -> None:
-        """Say in the log what was taken for white, where that is not the brightest value of the type."""
+        """Log the value taken for white, unless it is the largest one of the type."""
         if self.dtype == np.float32 or self.white != self._full:
             bits = "floating numbers" if self.dtype == np.float32 else f"{self.white.bit_length()} of 16 bits"
             share = 1.0 if self.dtype == np.float32 else self.white / self._full

@@ -1,8 +1,8 @@
-"""Sessions of dVRK's `record` (dvrk_data): a side-by-side MP4 and a sidecar JSON with the stamps of frames.
+"""Reads sessions of dVRK's `record` (dvrk_data): a side-by-side MP4 and a sidecar JSON with frame stamps.
 
-The sidecar follows `dvrk_data:video_sidecar@1.0.0`. Its frames are those that reached the recorder; where
-the encoder kept another number of them, each frame of the video takes the stamps of the nearest presentation
-time.
+The sidecar follows `dvrk_data:video_sidecar@1.0.0`. It lists the frames that reached the recorder. If the
+video holds another number of frames, each of its frames takes the stamps of the sidecar's frame with the
+nearest presentation time.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ from sags_node.sources.videos import OneVideoPairs
 from sags_node.types import I64
 
 ALONE = "alone with source.kind:=videos source.geometry.layout:=side_by_side"
-MAX_SIDECAR_BYTES = 512 << 20  # hours at 60 Hz
+MAX_SIDECAR_BYTES = 512 << 20  # enough for hours at 60 Hz
 
 Stamp = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
@@ -47,7 +47,7 @@ class _Frame(msgspec.Struct):
     gst: _Gst = msgspec.field(default_factory=_Gst)
 
     def stamps(self) -> tuple[int, int]:
-        """Capture of the left and the right picture, ns; of what knows them best."""
+        """Return the capture times of the left and the right picture, ns, from the best clock listed."""
         seen = self.cpu.realtime
         fallback = seen.stereo_output_ns or seen.recorder_reception_ns
         left, right = seen.left_source_ns, seen.right_source_ns
@@ -55,7 +55,7 @@ class _Frame(msgspec.Struct):
 
 
 class Sidecar(msgspec.Struct):
-    """What is read of the file; other keys are ignored."""
+    """The keys of the file that are used; others are ignored."""
 
     type: str
     video_file: str
@@ -81,7 +81,7 @@ class DvrkPairs(OneVideoPairs):
         video = Video(file.parent / Path(sidecar.video_file).name)  # a name cannot lead out of the folder
         first = GeometryConfig(layout="side_by_side", first="left" if order == "LR" else "right")
         super().__init__(video, Layout(first))
-        self.pixel_aspect = 1.0  # the sidecar knows better how the video was made
+        self.pixel_aspect = 1.0  # the sidecar says how both eyes share the picture: no need to guess
         try:
             self.stamps, self.oddities = _stamps(file, sidecar, video)
         except UsageError:
@@ -92,7 +92,7 @@ class DvrkPairs(OneVideoPairs):
 
 
 def find_sidecar(path: Path) -> Path:
-    """The sidecar at `path`, or the only stereo one in that folder.
+    """Find the sidecar at `path`, or the only stereo one in that folder.
 
     Raises:
         UsageError: there is none, or several.
@@ -135,7 +135,7 @@ def read_sidecar(file: Path) -> Sidecar:
 
 
 def _stamps(file: Path, sidecar: Sidecar, video: Video) -> tuple[I64, list[str]]:
-    """Return the stamps [N, 2] of the video's frames, ns, and what is odd about them."""
+    """The stamps [N, 2] of the video's frames, ns, and warnings about them."""
     stamps, oddities = np.array([frame.stamps() for frame in sidecar.frames], np.int64), []
     if len(stamps) != video.count:
         found, longer = _nearest_frames(file, sidecar, video)
@@ -156,8 +156,8 @@ def _stamps(file: Path, sidecar: Sidecar, video: Video) -> tuple[I64, list[str]]
 
 
 def _nearest_frames(file: Path, sidecar: Sidecar, video: Video) -> tuple[I64, int]:
-    """Find for each frame of the video the one of the sidecar at the same presentation time; and how much
-    longer than the video the sidecar is, ns, 0 if not by half a period."""
+    """For each frame of the video, the sidecar's frame with the nearest presentation time. Also how much
+    longer the sidecar is than the video, ns (0 if less than half a period)."""
     pts = [frame.gst.pts_ns for frame in sidecar.frames]
     known = np.array([-1 if at is None else at for at in pts], np.int64)
     if (known < 0).any() or video.stamps is None or (np.diff(known) < 0).any():

@@ -1,8 +1,8 @@
-"""Clips in the layout of EndoNeRF (Wang et al., MICCAI 2022).
+"""Reads clips in the layout of EndoNeRF (Wang et al., MICCAI 2022).
 
-`images/` are left pictures, `masks/` instruments, `depth/` what a stereo network made of the pair, and
-`poses_bounds.npy` is the camera in LLFF form. What the files do not say (rate, units, polarity of the masks)
-is a source option; docs/recordings.md explains the defaults.
+`images/` holds left pictures, `masks/` instruments, `depth/` a stereo network's depth, and `poses_bounds.npy`
+the camera in LLFF form. What the files do not tell (rate, units, polarity of the masks) is a source option;
+docs/recordings.md explains the defaults.
 """
 
 from pathlib import Path
@@ -21,33 +21,33 @@ from sags_node.sources.pose_axes import READINGS, Seen, reading_that_fits
 from sags_node.sources.truth import UNKNOWN, load_npy
 from sags_node.types import F32, F64, StereoRig
 
-# Of a frame's known depths: what lies outside is drawn to them, as EndoGaussian's loader does.
+# Percentiles of a frame's known depths to which all depths are clipped, as in EndoGaussian's loader.
 DEPTH_PERCENTILES = (3.0, 99.8)
-ENDOSCOPE_DEPTH = (0.01, 0.3)  # m, the median of a frame: in an endoscope's view
-FARTHEST_DEPTH = 1.0  # m: what is said to lie farther away is refused
+ENDOSCOPE_DEPTH = (0.01, 0.3)  # m: plausible median depth of an endoscope's frame
+FARTHEST_DEPTH = 1.0  # m: a larger median depth is refused
 DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0, 1e-3 / 256)  # m per count, the usual ones first; SERV-CT's last
 PUBLISHED = (640, 512, 569.4682)  # px: width, height and focal length of the clips of EndoNeRF
-PUBLISHED_BASELINE = 4.324e-3  # m, which their author states
-NOMINAL_BASELINE = 0.005  # m; without a right picture nothing depends on it
+PUBLISHED_BASELINE = 4.324e-3  # m, as their author states
+NOMINAL_BASELINE = 0.005  # m, if there is no right picture: then nothing depends on it
 
 
 class Llff(NamedTuple):
-    """What `poses_bounds.npy` says."""
+    """The camera in `poses_bounds.npy`."""
 
     width: int  # px
     height: int
     focal: float  # px
-    T_world_cam: F64  # [N, 4, 4] m, or its inverse, with whatever axes the file has
+    T_world_cam: F64  # [N, 4, 4] m, or its inverse; axes as in the file
 
     @property
     def K(self) -> F64:
-        """[3, 3] px; principal point in the picture's middle: the centre of the first pixel is (0, 0)."""
+        """The matrix [3, 3] px. Principal point: the picture's middle; the first pixel's centre is (0, 0)."""
         x, y = (self.width - 1) / 2, (self.height - 1) / 2
         return np.array([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]])
 
 
 class EndoNerfPairs(FolderPairs):
-    """The frames of a clip, in order of the files' names (numbers in names sort as numbers).
+    """The frames of a clip, ordered by file name (numbers in names sort as numbers).
 
     Raises:
         UsageError: files are missing or do not fit each other, or the units or the masks cannot be right.
@@ -75,7 +75,7 @@ class EndoNerfPairs(FolderPairs):
         self._read_axes(config.pose_axes)
 
     def _read_axes(self, said: str) -> None:
-        """Read the poses as it is said, or as they explain the pictures."""
+        """Interpret the poses as the launch file says, or by the reading that explains the pictures."""
         poses, axes = self._llff.T_world_cam, said
         if said == "auto":
             has_depth = self._depth_files is not None
@@ -100,7 +100,7 @@ class EndoNerfPairs(FolderPairs):
         return pair._replace(depth=depth, T_world_cam=self._T_world_cam[index])
 
     def _read_depth(self, file: Path) -> F32:
-        """Depth [H, W] m; a count of 0 is unknown, as is the last one of 16 bit."""
+        """Depth [H, W] m, clipped to `DEPTH_PERCENTILES`; 0 where unknown (counts of 0 and 65535)."""
         counts = read_picture(file, cv2.IMREAD_UNCHANGED)
         if counts.ndim != 2:
             raise SagsError(
@@ -160,7 +160,7 @@ class EndoNerfPairs(FolderPairs):
 
 
 def fitting_units(counts: float) -> list[float]:
-    """Units, m per count, in which so many counts (median) are a distance in an endoscope's view."""
+    """Return the units (m per count) in which this median count is a plausible distance for an endoscope."""
     return [unit for unit in DEPTH_UNITS if ENDOSCOPE_DEPTH[0] <= counts * unit <= ENDOSCOPE_DEPTH[1]]
 
 
@@ -172,8 +172,8 @@ def _units_that_fit(counts: float) -> str:
 def read_llff(config: EndoNerfSource) -> Llff:
     """Read `poses_bounds.npy`: [N, 17], per row a 3x5 matrix and two depth bounds.
 
-    The matrix is [R | t | (height, width, focal length)]; see `pose_axes` for what it maps. Lengths are in
-    the unit of `depth/`; the bounds are not needed.
+    The matrix is [R | t | (height, width, focal length)]; see `pose_axes` for axes and direction.
+    Translations are in the unit of `depth/`; the bounds are not used.
 
     Raises:
         UsageError: the file is missing, damaged, of another form, or its camera is implausible.
@@ -201,7 +201,7 @@ def read_llff(config: EndoNerfSource) -> Llff:
 
 
 def read_rig(config: EndoNerfSource) -> StereoRig:
-    """The clip's calibration: one focal length, principal point in the middle.
+    """Return the clip's calibration: one focal length, principal point in the middle.
 
     Raises:
         UsageError: as `read_llff`.
@@ -211,7 +211,7 @@ def read_rig(config: EndoNerfSource) -> StereoRig:
 
 
 def baseline_of(config: EndoNerfSource) -> float | None:
-    """m between the eyes; None: nobody says it, and right pictures are of no use.
+    """Return the baseline, m; None: it is unknown, and right pictures are not used.
 
     Raises:
         UsageError: as `read_llff`.
@@ -222,7 +222,7 @@ def baseline_of(config: EndoNerfSource) -> float | None:
 
 
 def is_published(config: EndoNerfSource) -> bool:
-    """Tell whether a clip is one of EndoNeRF's own, whose author states unit and baseline; by its camera.
+    """Tell by its camera whether a clip is one of EndoNeRF's own, whose unit and baseline are published.
 
     Raises:
         UsageError: as `read_llff`.

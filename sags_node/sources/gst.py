@@ -1,8 +1,8 @@
-"""Live stereo from GStreamer: the user's launch strings, run in a process of its own.
+"""Live stereo from GStreamer: runs the user's launch string in a process of its own.
 
-A pipeline has one clock and one base time for all its pictures. The stamp that a source gives a picture on
-that clock, whichever it is, is taken to the wall clock: it is the time of capture. Live pipelines drop what
-is late, at each step; files are played at their own rate, to their end.
+A pipeline has one clock and one base time for all its pictures. The source stamps each picture on that clock.
+The stamp, converted to the wall clock, is the capture time. Live pipelines drop late pictures at each step;
+files are played at their own rate, to their end.
 """
 
 import logging
@@ -24,11 +24,11 @@ from sags_node.types import Samples, Side
 
 log = logging.getLogger(__name__)
 
-DEFAULT_RATE = 30.0  # of pipelines that do not say theirs
-OLD_NS = 1_000_000_000  # an age that is worth a warning: consumers refuse such pictures
+DEFAULT_RATE = 30.0  # Hz, of pipelines that do not tell theirs
+OLD_NS = 1_000_000_000  # ns: consumers refuse older pictures, so they are worth a warning
 POLL_S = 0.1
-# `queue` converts each eye in a thread of its own; `videoconvert` knows all formats and colour spaces, and
-# does nothing where the launch string ends in this format already.
+# `queue` gives each eye a thread of its own. `videoconvert` converts from all formats and colour spaces, and
+# does nothing if the launch string ends in this format already.
 TAIL = (
     "queue name={name} max-size-buffers=3 max-size-bytes=0 max-size-time=0 ! "
     "videoconvert n-threads=1 dither=none ! video/x-raw,format={format} ! "
@@ -53,8 +53,8 @@ def open_pipeline(config: GstSource, size: tuple[int, int] | None = None) -> Liv
 
 
 def whole_launch(config: GstSource) -> tuple[str, list[str]]:
-    """The launch string with its sinks, and their names: left and right, or both."""
-    # More than eight bits help only where levels choose among them.
+    """Return the launch string with sinks appended, and their names: left and right, or both."""
+    # More than 8 bits help only where `levels` selects a range of them.
     wanted = RGB if config.geometry.levels == (0.0, 1.0) else DEEP
     left, right, both = (TAIL.format(name=name, format=wanted) for name in SIDES)
     if config.launch is None:
@@ -65,7 +65,7 @@ def whole_launch(config: GstSource) -> tuple[str, list[str]]:
 
 
 class Pipeline:
-    """A running pipeline, as a device that delivers either eye's pictures, or both in one.
+    """A running pipeline as a capture device: delivers single pictures of either eye, or of both in one.
 
     Raises:
         SagsError: GStreamer is not installed, the pipeline is wrong, or no picture comes in time.
@@ -111,11 +111,11 @@ class Pipeline:
             )
 
     def read(self, timeout: float) -> Shot | None:
-        """The next picture; None when none comes within `timeout` seconds.
+        """Return the next picture; None when none comes within `timeout` seconds.
 
         Raises:
             SagsError: the pipeline failed, or one eye's pictures have ceased.
-            EndedError: a file has been played.
+            EndedError: a file was played to its end.
         """
         if not self._plays:
             self._process.start()
@@ -130,7 +130,7 @@ class Pipeline:
         return self._arrived.popleft() if self._arrived else None
 
     def _take_in(self, timeout: float) -> None:
-        """One message of the process."""
+        """Handle one message of the process, if one comes in time."""
         heard = self._process.hear(timeout)
         if heard is None:
             return
@@ -153,17 +153,17 @@ class Pipeline:
 
 
 class Sink:
-    """The pictures of one sink, in memory that the process writes to."""
+    """The pictures of one sink, in memory shared with the process."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.seen = time.monotonic()  # when the last picture came
-        self.running_ns = -1  # its stamp in the pipeline
+        self.running_ns = -1  # its stamp on the pipeline's clock
         self.has_begun = False
         self._warned_old = self._warned_still = False
 
     def begin(self, said: dict[str, Any], descriptor: int) -> None:
-        """Return what kind of pictures come, and where."""
+        """Take in the format of the pictures, and map their shared memory."""
         self.has_begun = True
         self.size = said["width"], said["height"]
         self.rate, self.interlaced, self.live = said["rate"], said["interlaced"], said["live"]
@@ -174,7 +174,7 @@ class Sink:
         os.close(descriptor)
 
     def take(self, said: dict[str, Any]) -> Shot | None:
-        """A picture, copied because its place is written again; None where its stamp is not new."""
+        """Copy a picture out of its slot, which is written again; None if its stamp is not newer."""
         if said["running_ns"] <= self.running_ns:
             if not self._warned_still:
                 log.warning(

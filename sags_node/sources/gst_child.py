@@ -1,4 +1,4 @@
-"""The process that runs a GStreamer pipeline and puts its newest pictures into shared memory.
+"""A child process that runs a GStreamer pipeline and puts its newest pictures into shared memory.
 
     python -m sags_node.sources.gst_child '{"launch": ..., "sinks": ["left", "right"]}' FD
     python -m sags_node.sources.gst_child '{"elements": ["rtspsrc", ...]}' FD
@@ -6,9 +6,9 @@
 
 FD is a SOCK_SEQPACKET socket. Each message to the parent is JSON: `{"sink", "width", ...}` with the memory's
 descriptor before the first picture of a sink, `{"sink", "slot", "t_ns", ...}` for a picture, `{"ended"}`,
-`{"error", "debug"}`; `{"parsed"}` of a launch string that is right. The parent gives slots back: two bytes,
-the sink's index and the slot. START plays a file, which is paused at first. The process ends when the parent
-does. It is one of its own because plugins and drivers may crash or hang.
+`{"error", "debug"}`; `{"parsed"}` for a valid launch string. The parent gives slots back by two bytes: the
+sink's index and the slot. START plays a file, which is paused at first. The process ends when the parent
+does. It is a separate process because plugins and drivers may crash or hang.
 """
 
 import ctypes
@@ -27,18 +27,18 @@ from typing import Any, NamedTuple
 from sags_node.wall_clock import DRIFT_NS, WallClock
 
 START = b"\xff\xff"
-SLOTS = 4  # pictures of a sink that may be on their way
+SLOTS = 4  # pictures of a sink in shared memory
 POLL_NS = 100_000_000
-LAST_S = 2.0  # for the parent to take the last pictures of a file
-BYTES = {"RGB": 3, "ARGB64_LE": 8}  # of a pixel
+LAST_S = 2.0  # s for the parent to take the last pictures of a file
+BYTES = {"RGB": 3, "ARGB64_LE": 8}  # per pixel
 
-NONE = 2**64 - 1  # a time that is not known
+NONE = 2**64 - 1  # GST_CLOCK_TIME_NONE: unknown
 PAUSED, PLAYING = 3, 4
-FAILED, DONE, ASYNC, LIVE = 0, 1, 2, 3  # what a change of state answers; LIVE: no picture while paused
-ENDED, ERROR = 1 << 0, 1 << 1  # messages
+FAILED, DONE, ASYNC, LIVE = 0, 1, 2, 3  # results of a state change; LIVE: no picture while paused
+ENDED, ERROR = 1 << 0, 1 << 1  # types of messages
 TIME = 3  # the format of segments that count time
-# Places of public fields, bytes: behind GstMiniObject (64 on 64 bit) lies the type of a GstMessage, and in a
-# GstBuffer its pool (8), then its stamp.
+# Offsets of public fields, bytes. Behind GstMiniObject (64 on 64 bit) a GstMessage has its type, and a
+# GstBuffer its pool (8) and then its stamp.
 TYPE, PTS = 64, 72
 
 
@@ -47,10 +47,10 @@ class _Error(ctypes.Structure):
 
 
 class GstError(Exception):
-    """What GStreamer says.
+    """An error that GStreamer reports.
 
     Attributes:
-        debug: where, for its developers.
+        debug: its detailed text: the place in the source, the element.
     """
 
     def __init__(self, message: str, debug: str = "") -> None:
@@ -59,14 +59,14 @@ class GstError(Exception):
 
 
 class Picture(NamedTuple):
-    """What is known of a buffer."""
+    """Stamp and size of a buffer."""
 
-    running: int  # ns since the pipeline's base time, `NONE` where it has no stamp or that cannot be said
+    running: int  # running time, ns; `NONE`: not known
     bytes: int
 
 
 class Caps(NamedTuple):
-    """What kind of pictures come."""
+    """The format of the pictures."""
 
     format: str
     width: int
@@ -112,11 +112,11 @@ _APP: dict[str, tuple[Any, ...]] = {
 
 
 class Gst:
-    """GStreamer, initialised: the few functions of its C library that are needed, by ctypes, as no bindings
-    are installed. It promises that these and the public fields of its structures stay the same in all of 1.x.
+    """The functions of GStreamer's C library that are needed, by ctypes, as no bindings are installed.
+    They and the public structures are stable in all of 1.x.
 
     Raises:
-        GstError: it is not installed or does not start.
+        GstError: GStreamer is not installed or does not start.
     """
 
     def __init__(self) -> None:
@@ -138,15 +138,15 @@ class Gst:
 
     @property
     def version(self) -> str:
-        """E.g. GStreamer 1.22.0."""
+        """The version, e.g. GStreamer 1.22.0."""
         return ctypes.string_at(self.version_string()).decode()
 
     def has(self, element: str) -> bool:
-        """Tell whether a plugin is installed that brings this element."""
+        """Tell whether this element is installed."""
         return bool(self.element_factory_find(element.encode()))
 
     def parse(self, launch: str) -> int:
-        """A pipeline from its launch string.
+        """Make a pipeline from its launch string.
 
         Raises:
             GstError: the string is wrong, or an element is missing.
@@ -162,10 +162,10 @@ class Gst:
             self.util_set_object_arg(element, name.replace("_", "-").encode(), value.encode())
 
     def has_ended(self, bus: int, wait_ns: int = 0) -> bool:
-        """Tell whether the bus says so, waited for at most so long.
+        """Tell whether the pipeline has ended; wait at most `wait_ns` for the message.
 
         Raises:
-            GstError: it tells of an error instead.
+            GstError: the bus reports an error instead.
         """
         message = self.bus_timed_pop_filtered(bus, wait_ns, ENDED | ERROR)
         if not message:
@@ -204,7 +204,7 @@ def _text(error: Any) -> str:
 
 
 class Sink:
-    """Hands the newest pictures of one appsink over, in a thread of its own."""
+    """Hands the newest pictures of one appsink to the parent; `run` has a thread of its own."""
 
     def __init__(
         self, gst: Gst, pipeline: int, wall: WallClock, name: str, index: int, there: socket.socket
@@ -227,7 +227,7 @@ class Sink:
     def run(self, live: bool) -> None:
         try:
             while True:
-                slot = self.free.get()  # the newest picture is taken after there is room for it
+                slot = self.free.get()  # first a free slot, then the picture that is newest by then
                 while not (sample := self._gst.app_sink_try_pull_sample(self.element, POLL_NS)):
                     if self._gst.app_sink_is_eos(self.element):
                         return
@@ -251,7 +251,7 @@ class Sink:
         self._look(sample, picture, live)
         now -= gst.element_get_base_time(self._pipeline)
         t_ns = self._wall.at_zero((before_ns + after_ns) // 2 - now, after_ns - before_ns) + picture.running
-        if t_ns > after_ns + DRIFT_NS:  # no picture is taken after it arrived
+        if t_ns > after_ns + DRIFT_NS:  # a picture cannot be taken after it arrived
             t_ns = after_ns
         address = self._address + slot * self._slot_bytes
         gst.buffer_extract(gst.sample_get_buffer(sample), 0, address, self._slot_bytes)
@@ -260,10 +260,10 @@ class Sink:
         tell(self._there, said)
 
     def show_first(self) -> None:
-        """Say of a paused file what kind of pictures come; none is taken away.
+        """Tell the parent the format of a paused file's pictures, without consuming one.
 
         Raises:
-            GstError: they are not of a kind that can be handed over.
+            GstError: their format cannot be handed over.
         """
         sample = self._gst.app_sink_try_pull_preroll(self.element, POLL_NS)
         if sample:
@@ -271,7 +271,7 @@ class Sink:
             self._gst.mini_object_unref(sample)
 
     def _look(self, sample: int, picture: Picture, live: bool) -> None:
-        """Refuse what cannot be handed over; of the first picture, say what kind it is."""
+        """Check that a picture can be handed over; for the first one, tell the parent its format."""
         if picture.running == NONE:
             raise GstError(
                 f"the pictures of {self.name} carry no time stamp",
@@ -309,13 +309,13 @@ def tell(there: socket.socket, said: dict[str, Any], descriptor: int | None = No
 
 
 def fail(there: socket.socket, error: GstError) -> None:
-    """Say it and end at once: a pipeline that failed may not let itself be closed."""
+    """Report the error and exit at once: a pipeline that failed may hang when it is closed."""
     tell(there, {"error": str(error), "debug": error.debug})
     os._exit(1)
 
 
 def listen(there: socket.socket, sinks: list[Sink], wanted: threading.Event) -> None:
-    """Take slots back, until the parent is gone."""
+    """Take back free slots and the START command, until the parent is gone."""
     while given := there.recv(2):
         if given == START:
             wanted.set()
@@ -345,11 +345,11 @@ def play(request: dict[str, Any], there: socket.socket) -> None:
     if state == FAILED:
         gst.has_ended(bus, POLL_NS)
         raise GstError("the pipeline does not start")
-    if state == LIVE:  # the newest picture counts, and what is late is left out
+    if state == LIVE:  # only the newest picture counts; late ones are dropped
         for sink in sinks:
             gst.set(sink.queue, leaky="downstream")
             gst.set(sink.element, drop="true", sync="false", max_buffers="2")
-    else:  # a file does not run away while the node gets ready
+    else:  # a file stays paused until the node is ready
         for sink in sinks:
             sink.show_first()
         while not wanted.wait(POLL_NS * 1e-9):
@@ -360,7 +360,7 @@ def play(request: dict[str, Any], there: socket.socket) -> None:
         thread.start()
     while not gst.has_ended(bus, POLL_NS):
         pass
-    for thread in threads:  # the last pictures
+    for thread in threads:  # let them hand over the last pictures
         thread.join(LAST_S)
     tell(there, {"ended": True})
 

@@ -1,4 +1,4 @@
-"""The parent's end of `gst_child`: starts it, hears it, and says in words why it failed."""
+"""The parent's end of `gst_child`: starts it, receives its messages, and explains why it failed."""
 
 import json
 import os
@@ -14,12 +14,12 @@ from sags_node.errors import SagsError
 from sags_node.processes import end
 from sags_node.sources.gst_child import START
 
-ASK_S = 30.0  # for the list of elements: the first time, GStreamer looks through all its plugins
-GRACE_S = 1.0  # for the process to end by itself
+ASK_S = 30.0  # s to list the elements: the first time, GStreamer scans all its plugins
+GRACE_S = 1.0  # s for the process to end by itself
 LONGEST_MESSAGE = 1 << 16  # bytes
-KEPT = 2000  # bytes of what plugins print
+KEPT = 2000  # bytes kept of what plugins print
 PLAIN, GOOD, BAD = (f"gstreamer1.0-plugins-{name}" for name in ("base", "good", "bad"))
-ELEMENTS = {  # what the launch files use, and the Debian package that brings it
+ELEMENTS = {  # that the launch files use, and the Debian package of each
     "appsink": PLAIN,
     "rawvideoparse": PLAIN,
     "videoconvert": PLAIN,
@@ -36,7 +36,7 @@ ELEMENTS = {  # what the launch files use, and the Debian package that brings it
 }
 SEE_PLACE = "check the path, address or device in the launch string"
 SEE_STRING = "try the string with gst-launch-1.0; gst-inspect-1.0 ELEMENT lists what an element takes"
-FIXES = (  # what GStreamer says, and what helps
+FIXES = (  # pattern in GStreamer's error, and what helps
     (r"no element \"(\w+)\"", "install {package}"),
     (r"not-negotiated|could not link|can't handle caps", "neighbours do not agree on format, size or rate"),
     (r"busy|in use", "another program uses it"),
@@ -50,8 +50,8 @@ class GstProcess:
     """A child and its socket.
 
     Args:
-        request: what it is to do, see `gst_child`.
-        keep: descriptors that it names, which the child gets too.
+        request: the job, see `gst_child`.
+        keep: file descriptors named in `request`, which the child inherits.
     """
 
     def __init__(self, request: dict[str, Any], keep: Sequence[int] = ()) -> None:
@@ -65,7 +65,7 @@ class GstProcess:
                 pass_fds=[there.fileno(), *keep],
                 stdin=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
-                process_group=0,  # a Ctrl-C in the terminal is the node's, which then ends it
+                process_group=0,  # Ctrl-C in the terminal reaches the node only, which then ends it
                 env={"GST_DEBUG": "1", **os.environ, "GST_DEBUG_NO_COLOR": "1"},  # 1: errors
             )
         finally:
@@ -78,10 +78,10 @@ class GstProcess:
         self._events.register(self._stderr, select.POLLIN)
 
     def hear(self, seconds: float) -> tuple[dict[str, Any], list[int]] | None:
-        """The next message and the descriptors with it; None when none comes in time.
+        """Receive the next message and its file descriptors; None when none comes in time.
 
         Raises:
-            SagsError: it has failed.
+            SagsError: the child has failed.
         """
         for descriptor, _ in self._events.poll(seconds * 1e3):
             if descriptor == self._stderr:
@@ -100,16 +100,16 @@ class GstProcess:
     def _receive(self) -> tuple[bytes, list[int]]:
         try:
             message, descriptors, _, _ = socket.recv_fds(self._here, LONGEST_MESSAGE, 1)
-        except ConnectionResetError:  # it ended before it read all; what it said comes next
+        except ConnectionResetError:  # it ended before it read all; its own message comes next
             message, descriptors, _, _ = socket.recv_fds(self._here, LONGEST_MESSAGE, 1)
         return message, descriptors
 
     def start(self) -> None:
-        """Play a file from its first picture on; live pipelines play anyway."""
+        """Start to play a file, which waits at its first picture. Live pipelines play anyway."""
         self._tell(START)
 
     def release(self, sink: int, slot: int) -> None:
-        """Give a slot back whose picture was copied."""
+        """Give a slot back after its picture was copied."""
         self._tell(bytes((sink, slot)))
 
     def _tell(self, message: bytes) -> None:
@@ -125,7 +125,7 @@ class GstProcess:
         self._process.stderr.close()
 
     def _keep(self) -> None:
-        """Return what plugins print: a pipe that is full would stop them."""
+        """Read and keep what plugins print: a full pipe would block them."""
         try:
             printed = os.read(self._stderr, LONGEST_MESSAGE)
         except BlockingIOError:
@@ -135,12 +135,12 @@ class GstProcess:
         self._printed = (self._printed + printed)[-KEPT:]
 
     def _logged(self) -> str:
-        """The last error in its log, for elements that tell nobody else; empty where there is none."""
+        """The last error in the child's log, as some elements report only there; empty if there is none."""
         found = re.findall(r" ERROR .*?:<(\S+)> (.*)", self._printed.decode(errors="replace"))
         return ": ".join(found[-1]) if found else ""
 
     def _last_words(self) -> str:
-        """The last words of a child that ended without a message."""
+        """An error text for a child that ended without a message: its last line of output."""
         ended = end(self._process, GRACE_S)
         self._keep()
         lines = self._printed.decode(errors="replace").strip().splitlines()
@@ -151,11 +151,11 @@ class GstProcess:
 
 
 def in_words(message: str, debug: str) -> str:
-    """One line for a person: what failed, in which element, and what helps.
+    """Return one line for the user: what failed, in which element, and what helps.
 
     Args:
         message: the text of the error.
-        debug: its further text: where in the source, the element's path, and lines of detail.
+        debug: its debug text: place in the source, the element's path, and details.
     """
     path = re.search(r"/GstPipeline:\S*?:(\w+):?\s*$", debug, re.MULTILINE)
     detail = debug.strip().splitlines()[-1].strip() if debug.strip() else ""
@@ -173,7 +173,7 @@ def in_words(message: str, debug: str) -> str:
 
 
 def installed() -> tuple[str, dict[str, str]]:
-    """GStreamer's version, and those of `ELEMENTS` that are missing with the packages that bring them.
+    """Return GStreamer's version, and those of `ELEMENTS` that are missing, with their packages.
 
     Raises:
         SagsError: GStreamer is not installed, or does not answer.
@@ -183,7 +183,7 @@ def installed() -> tuple[str, dict[str, str]]:
 
 
 def check_launch(launch: str) -> None:
-    """Tell whether GStreamer takes this launch string; nothing is played.
+    """Check that GStreamer accepts this launch string; nothing is played.
 
     Raises:
         SagsError: an element is missing, or the string is wrong.

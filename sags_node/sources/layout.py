@@ -1,4 +1,4 @@
-"""From pictures as a device or file gives them to those of the two eyes, as `source.geometry` says."""
+"""Turns the pictures of a device or file into those of the two eyes, as `source.geometry` says."""
 
 from pathlib import Path
 
@@ -11,13 +11,13 @@ from sags_node.types import U8, Bool, Samples, Side
 
 _FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}  # OpenCV's codes
 FIELD_ROWS = {"top": 0, "bottom": 1}
-# How many eyes a picture shows beside and above each other; else one.
+# How many eyes a picture shows (side by side, one above the other); (1, 1) in other layouts.
 EYES = {"side_by_side": (2, 1), "over_under": (1, 2), "row_interleaved": (1, 2)}
-WIDEST = 2.2  # times as wide as high: one eye is at most 1.9 (17:9)
+WIDEST = 2.2  # width over height of one eye's picture; the widest usual one is 1.9 (17:9)
 
 
 class Layout:
-    """Takes both eyes of a picture apart, then keeps one field, crops and turns each eye; leaves eight bits.
+    """Splits a picture into both eyes, then keeps one field, crops and flips each eye, and makes it 8 bit.
 
     Args:
         config: `source.geometry`.
@@ -34,7 +34,7 @@ class Layout:
         self.order: tuple[Side, Side] = ("right", "left") if config.first == "right" else ("left", "right")
 
     def size(self, width: int, height: int, name: str) -> tuple[int, int]:
-        """Width and height of an eye's picture, from those of what `name` delivers, px.
+        """Return width and height of an eye's picture (px), given those of the pictures that `name` delivers.
 
         Raises:
             UsageError: it cannot be split or cropped as asked.
@@ -60,14 +60,14 @@ class Layout:
         return sizes[0]
 
     def pixel_aspect(self, width: int, height: int, told: float) -> float:
-        """Width of an eye's pixel over its height.
+        """Return the width of an eye's pixel over its height.
 
-        Where a file says that its pixels are square, eyes that are narrower than high, or more than twice as
-        wide, were squeezed to fit beside or above each other.
+        A file may say that its pixels are square although its eyes were squeezed to fit beside or above each
+        other. Then an eye is narrower than high, or more than 2.2 times as wide.
 
         Args:
-            width, height: of what is delivered, px.
-            told: what the file says of its pixels.
+            width, height: of the delivered pictures, px.
+            told: the pixel aspect that the file gives.
         """
         match self._config.layout:
             case "row_interleaved":
@@ -80,30 +80,30 @@ class Layout:
                 return told
 
     def eye(self, picture: Samples, side: Side) -> U8:
-        """The picture [H, W, 3] of one eye; the argument itself where there is nothing to do."""
+        """Return one eye's picture [H, W, 3]; the argument itself if there is nothing to do."""
         return self._finish(picture, 0, self._crops[side])
 
     def tissue(self, picture: Samples, left: U8) -> Bool | None:
-        """[H, W] True where the pane of the tools shows the left eye's picture; None: there is no pane."""
+        """Return the tissue mask [H, W]: True where the tools' pane shows no paint. None: no such pane."""
         if self._tools is None:
             return None
-        from sags_node.sources.pixels import unpainted  # a kernel: other videos need no place for one
+        from sags_node.sources.pixels import unpainted  # a kernel; other videos do not need it loaded
 
         return unpainted(self._finish(picture, 0, self._tools), left)
 
     def eyes(self, picture: Samples) -> tuple[U8, U8]:
-        """Left and right of a picture [H, W, 3] that shows both; views of it where that does."""
+        """Return the left and the right eye of a picture [H, W, 3] that shows both; views if possible."""
         of = dict(zip(self.order, self._apart(picture), strict=True))
         left, right = (self._finish(*of[side], self._crops[side]) for side in ("left", "right"))
         return left, right
 
     def in_turn(self, first: Samples, second: Samples) -> tuple[U8, U8]:
-        """Left and right of two pictures [H, W, 3] of eyes that come one after the other."""
+        """Return the left and the right eye of two successive pictures [H, W, 3] that show one eye each."""
         of = dict(zip(self.order, (first, second), strict=True))
         return self.eye(of["left"], "left"), self.eye(of["right"], "right")
 
     def _apart(self, picture: Samples) -> tuple[tuple[Samples, int], tuple[Samples, int]]:
-        """First and second eye, as views, and in which row of the picture each begins."""
+        """The first and the second eye as views, each with the row of the picture in which it begins."""
         height, width = picture.shape[:2]
         match self._config.layout:
             case "side_by_side":
@@ -129,16 +129,16 @@ class Layout:
     def _eight_bits(self, picture: Samples) -> U8:
         if picture.dtype == np.uint8 and self._config.levels == (0.0, 1.0):
             return np.ascontiguousarray(picture, np.uint8)
-        from sags_node.sources.pixels import spread  # a kernel: other pictures need no place for one
+        from sags_node.sources.pixels import spread  # a kernel; other pictures do not need it loaded
 
         return spread(picture, self._config.levels)
 
 
 def refuse_turned(geometry: GeometryConfig, where: Path | str) -> None:
-    """Refuse a calibration that comes with the pictures where these are turned: it is of them as they come.
+    """Refuse a calibration that comes with the pictures if they are flipped: it holds before the flip only.
 
     Raises:
-        UsageError: they are; `where` the calibration is said.
+        UsageError: they are flipped; the error begins with `where`.
     """
     if geometry.flip != "none":
         raise UsageError(
@@ -160,7 +160,7 @@ def _cropped(width: int, height: int, crop: Box | None, name: str) -> tuple[int,
 
 
 def _one_field(picture: Samples, first_row: int) -> Samples:
-    """Every other row, and between them the mean of both neighbours; at the edge, the only neighbour."""
+    """Deinterlace: keep every other row, and replace the rest by the mean of the rows above and below."""
     field = picture[first_row::2]
     whole = np.empty_like(picture)
     whole[first_row::2] = field

@@ -1,6 +1,6 @@
-"""Live stereo: keeps what delivers pictures open, takes the eyes apart, and pairs them by their stamps.
+"""Live stereo: keeps capture devices open, splits their pictures into eyes, and pairs these by stamps.
 
-Cameras come and go: what fails or falls silent is closed and opened again, until `stop`.
+A device that fails or falls silent is closed and opened again, until `stop`.
 """
 
 import logging
@@ -19,20 +19,20 @@ from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.1  # how soon a reading thread notices `stop`
-CLOSE_S = 5.0  # a driver may take to give a reading thread back
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 5.0  # between attempts to open a device again
+POLL_S = 0.1  # s until a reading thread notices `stop`
+CLOSE_S = 5.0  # s that a driver may block a reading thread
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 5.0  # s between attempts to open a device again
 
 
 class EndedError(Exception):
-    """There are no more pictures, and there is nothing to wait for: a file was played to its end."""
+    """A file was played to its end: no more pictures will come."""
 
 
 class CaptureDevice(Protocol):
-    """What delivers pictures.
+    """A device that delivers pictures.
 
     Attributes:
-        rate: pictures per second.
+        rate: Hz.
         size: of a picture, width and height, px.
     """
 
@@ -40,11 +40,11 @@ class CaptureDevice(Protocol):
     size: tuple[int, int]
 
     def read(self, timeout: float) -> Shot | None:
-        """The next picture; None when none comes within `timeout` seconds.
+        """Return the next picture; None when none comes within `timeout` seconds.
 
         Raises:
-            SagsError: it is lost, and should be opened again.
-            EndedError: it was a file.
+            SagsError: the device is lost, and should be opened again.
+            EndedError: it was a file, and has ended.
         """
 
     def close(self) -> None: ...
@@ -54,7 +54,7 @@ class Input(NamedTuple):
     """One device of a live source."""
 
     name: str
-    side: Side | None  # whose pictures it delivers; None: both eyes'
+    side: Side | None  # the eye whose pictures it delivers; None: both
     open: Callable[[], CaptureDevice]
     deadline: float  # s without a picture before it is opened again
 
@@ -66,9 +66,9 @@ class LiveStereo(LivePairs):
         pixel_aspect: width of a pixel over its height.
 
     Args:
-        inputs: one that delivers both eyes, or one for each.
-        config: how pictures become those of the eyes, and which are pairs.
-        size: width and height that an eye's pictures must have, px; None: as they come.
+        inputs: one device for both eyes, or one for each.
+        config: geometry of the pictures, and tolerance of pairs.
+        size: width and height that an eye's pictures must have, px; None: any.
 
     Raises:
         UsageError: the pictures do not fit the geometry or `size`.
@@ -103,7 +103,7 @@ class LiveStereo(LivePairs):
 
     @property
     def dropped(self) -> int:
-        """Pictures of either eye that found no partner."""
+        """The number of pictures without a partner, and of pairs that are no newer than the one before."""
         return super().dropped + (self._alternation.alone if self._alternation else 0)
 
     def start(self) -> None:
@@ -115,7 +115,7 @@ class LiveStereo(LivePairs):
             reader.close()
 
     def _checked(self, one: Input) -> CaptureDevice:
-        """Open a device whose pictures have the right size: those of the rig, or as they were at first."""
+        """Open a device, and check that its pictures have the size of the rig or of the first pictures."""
         device = one.open()
         try:
             size = self._layout.size(*device.size, one.name)
@@ -150,12 +150,12 @@ class LiveStereo(LivePairs):
 
 
 def _of(shot: Shot, image: U8) -> Picture:
-    """One eye's picture of what a device delivered."""
+    """One eye's picture, with the stamps of the delivered one."""
     return Picture(shot.t_ns, image, shot.device_ns or 0, shot.arrival_ns)
 
 
 class DeviceReader:
-    """Keeps one device read in a thread of its own, and opens it again whenever it is lost."""
+    """Reads one device in a thread of its own, and opens it again whenever it is lost."""
 
     def __init__(
         self,
@@ -170,7 +170,7 @@ class DeviceReader:
         self._device: CaptureDevice | None = device
         self._put = put
         self._stopped = stopped
-        self._pause = FIRST_PAUSE_S  # before the next attempt to open it
+        self._pause = FIRST_PAUSE_S  # s before the next attempt to open it
         turn = self._read, stopped, one.name
         self._thread = threading.Thread(target=go_on, args=turn, name=f"read {one.name}", daemon=True)
         self.rate = device.rate
@@ -179,10 +179,10 @@ class DeviceReader:
         self._thread.start()
 
     def close(self) -> None:
-        """Wait for the thread, which `stopped` ends, and close the device."""
+        """Wait until the thread has noticed `stopped`, and close the device."""
         if self._thread.ident is not None:
             self._thread.join(CLOSE_S)
-        if self._thread.is_alive():  # to close a device under its reader would crash
+        if self._thread.is_alive():  # closing a device while it is read would crash
             log.warning(
                 "%s: its driver does not answer; it is left open until this process ends", self._input.name
             )
@@ -195,7 +195,7 @@ class DeviceReader:
             device.close()
 
     def _read(self) -> bool:
-        """Open the device if it was lost, and read it until it is; False: there is nothing more to come."""
+        """Open the device if needed, and read it until it is lost; False: no more pictures will come."""
         try:
             if self._device is None:
                 self._device = self._open_device(self._input)
@@ -215,7 +215,7 @@ class DeviceReader:
         return True
 
     def _read_until_lost(self, device: CaptureDevice) -> int:
-        """Hand on pictures until the device fails or falls silent, or `stopped`; how many there were."""
+        """Pass pictures on until the device fails, falls silent, or `stopped` is set; return their number."""
         count, name, deadline = 0, self._input.name, self._input.deadline
         last = time.monotonic()
         while not self._stopped.is_set():

@@ -1,4 +1,4 @@
-"""Which values of a recording's instrument masks are instruments."""
+"""Finds out which values of a recording's masks are instruments, and which are tissue."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -12,14 +12,14 @@ from sags_node.config.schema import Instruments
 from sags_node.errors import UsageError
 from sags_node.types import U8, Bool
 
-HALF = 128  # what is as bright is white
-MOST = 0.5  # share of a picture: instruments cover less
-AREAS = 0.25  # share of pixels between dark and bright whose neighbours are equal: of soft edges fewer are
+HALF = 128  # grey level from which on a value is white
+MOST = 0.5  # share of a picture that instruments cover at most
+AREAS = 0.25  # share of in-between pixels with equal neighbours: in soft edges it is smaller
 LOSSY = (".jpg", ".jpeg", ".webp")
-NEAR = 8  # grey levels: as far as these change a value
-ENDS = 16  # grey levels: so near to black or white a value of these is that; of any, to white
-LABELS = 30  # beside labels below, 255 marks what nobody looked at
-SMALLEST_AREA = 1e-4  # of a coloured mask
+NEAR = 8  # grey levels by which lossy files change a value
+ENDS = 16  # grey levels: this near to white is white; in lossy files, this near to black is black
+LABELS = 30  # if labels are smaller, a 255 beside them marks unlabelled pixels
+SMALLEST_AREA = 1e-4  # share of a coloured mask from which on a colour counts
 SHOWN = 12  # values in a message
 _BETWEEN = np.array([0, *[1] * 254, 0], np.uint8)
 # https://endovissub2018-roboticscenesegmentation.grand-challenge.org: instruments, threads and clamps; tissue
@@ -30,18 +30,18 @@ ENDOVIS_TISSUE = ("#000000", "#ff3700", "#18377d", "#7c9b05")
 class Masks:
     """Finds the tissue in masks as OpenCV reads them: grey [H, W], or BGR(A) [H, W, C].
 
-    One dark and one bright value tell instruments from tissue, and so do the colours of EndoVis 2018. All
-    else is asked about: `instruments` then lists the values that are instruments, and the others are tissue.
-    What lies between areas, at soft edges, is no value.
+    One dark and one bright value are understood, and so are the colours of EndoVis 2018. All other masks need
+    `instruments`: it lists the values that are instruments; the others are tissue. Values at soft edges,
+    between areas, do not count.
 
     Attributes:
-        oddities: what is to be said of them, each with a remedy after a semicolon.
+        oddities: warnings about the masks, each with a remedy after a semicolon.
 
     Args:
         some: masks spread over the recording.
 
     Raises:
-        UsageError: their values do not tell, or instruments would be most of the picture.
+        UsageError: the values are ambiguous, or instruments would cover most of the picture.
     """
 
     def __init__(
@@ -49,12 +49,12 @@ class Masks:
     ) -> None:
         self._instruments = instruments
         listed = [] if isinstance(instruments, str) else [*map(_colour_of, instruments)]
-        # White is a colour too: where a mask has no other one it is read as grey.
+        # A listed grey such as #ffffff counts as a grey value, too: masks without colour are read as grey.
         self._greys = [int(name[1:3], 16) for name in listed if 3 * name[1:3] == name[1:]]
         self._colours = [] if all(isinstance(value, int) for value in instruments) else listed
         self._values: set[int] = set()
         looked_at = [(file, _eight_bits(mask, file)) for file, mask in some]
-        # What an opaque mask of one colour is, others tell: all of it can be seen, or none is an instrument.
+        # An opaque mask of one colour is ambiguous. Others tell whether the alpha channel holds the mask.
         self._is_alpha = any(_shows_in_alpha(mask) for _, mask in looked_at)
         shares = [float(np.mean(~self.tissue(mask, file))) for file, mask in looked_at]
         share = float(np.median(shares))
@@ -72,10 +72,10 @@ class Masks:
             )
 
     def tissue(self, mask: NDArray[Any], file: Path) -> Bool:
-        """[H, W] True where there is no instrument.
+        """Return the tissue mask [H, W]: True where there is no instrument.
 
         Raises:
-            UsageError: the values, with those of the masks before, do not tell.
+            UsageError: the values, together with those of earlier masks, are ambiguous.
         """
         lossy = file.suffix.lower() in LOSSY
         mask = _eight_bits(mask, file)
@@ -93,7 +93,7 @@ class Masks:
         return tissue
 
     def _look(self, mask: U8, file: Path, lossy: bool) -> None:
-        """Be sure that there are one dark and one bright value at most."""
+        """Check that this mask and those before have at most one dark and one bright value."""
         if cv2.countNonZero(cv2.LUT(mask, _BETWEEN)):
             table = np.arange(256, dtype=np.uint8)
             table[: ENDS * lossy], table[-ENDS:] = 0, 255
@@ -107,7 +107,7 @@ class Masks:
             raise _question(file, known, [v for v in known if v and not (labels and v == 255)], labels)
 
     def _of_colours(self, mask: U8, file: Path) -> Bool:
-        """The same of a mask [H, W, 3]."""
+        """Do as `tissue` for a coloured mask [H, W, 3] BGR."""
         blue, green, red = (plane.astype(np.int32) for plane in cv2.split(mask))
         codes = blue + (green << 8) + (red << 16)
         listed = self._colours
@@ -150,7 +150,7 @@ def _eight_bits(mask: NDArray[Any], file: Path) -> U8:
 
 
 def _is_of_one_colour(mask: U8) -> bool:
-    """Tell whether what differs in a mask [H, W, 4], if anything does, is how far it can be seen through."""
+    """Tell whether a mask is [H, W, 4] and of one colour, so that only its alpha can vary."""
     return mask.ndim == 3 and mask.shape[2] == 4 and not np.ptp(mask[..., :3], axis=(0, 1)).any()
 
 
@@ -159,7 +159,7 @@ def _shows_in_alpha(mask: U8) -> bool:
 
 
 def _as_grey(mask: U8, near: int) -> U8:
-    """[H, W]; [H, W, 3] BGR where there are colours."""
+    """The mask as grey [H, W], or as BGR [H, W, 3] if it has colours."""
     if mask.ndim == 2:
         return mask
     planes: list[U8] = [np.asarray(plane, np.uint8) for plane in cv2.split(mask)]
@@ -168,8 +168,8 @@ def _as_grey(mask: U8, near: int) -> U8:
 
 
 def _areas(mask: U8, near: int) -> set[int]:
-    """The values of the darkest and the brightest area of [H, W], and of those between unless these are soft
-    edges; values that are as near as `near` to each other are one."""
+    """The values of a mask's [H, W] areas: the darkest, the brightest and, unless they are soft edges, those
+    in between. Values that differ by at most `near` count as one."""
     values, counts = np.unique(mask[_alike(mask)], return_counts=True)
     if not len(values):
         return set()
@@ -182,6 +182,6 @@ def _areas(mask: U8, near: int) -> set[int]:
 
 
 def _alike(values: NDArray[Any]) -> Bool:
-    """[H, W] True where all neighbours have the same value."""
+    """The pixels [H, W] whose neighbours all have the same value."""
     steps = cv2.morphologyEx(values.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     return np.asarray(steps == 0)

@@ -1,4 +1,4 @@
-"""What the names of pictures say: their order, and which pictures of several folders belong together."""
+"""Reads from pictures' names their order, their times, and which ones of several folders belong together."""
 
 import logging
 import re
@@ -13,20 +13,20 @@ from sags_node.types import I64
 log = logging.getLogger(__name__)
 
 EYE = re.compile(r"(?<![a-z])(left|right|l|r)(?![a-z])", re.IGNORECASE)
-_LAST = re.compile(r"(\d+)(?:\.(\d+))?(?=\D*$)")  # the last number of a name, and what may be its fraction
+_LAST = re.compile(r"(\d+)(?:\.(\d+))?(?=\D*$)")  # the last number of a name, and possibly its fraction
 # Hours, minutes, seconds.
 _CLOCK = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_:h]?)([0-5]\d)[-_:m]?([0-5]\d)(?!\d)")
 HALF_DAY = 12 * 3600  # s
-CLEARLY = 2.0  # times as uneven as the other order
-EPOCH = 10**9, 2 * 10**9  # s since 1970: a time from 2001 to 2033; dates as 20260101120000 are none
-GAP = 1.5  # times the usual step from number to number
+CLEARLY = 2.0  # ratio of unevenness from which on the more even order is certain
+EPOCH = 10**9, 2 * 10**9  # s since 1970: 2001 to 2033; no date such as 20260101120000 falls between
+GAP = 1.5  # times the usual step of the numbers: a larger step is a gap
 
 
 def in_order(files: Sequence[Path]) -> list[Path]:
-    """Files by their names, numbers compared as numbers.
+    """Sort files by name, with numbers compared as numbers.
 
-    Where the length of a fraction changes, as in 0.067 and 0.1, it may be the digits of one number or a whole
-    number by itself (sec.nsec without zeros in front). That order of both counts whose steps are more even.
+    If the length of fractions varies, as in 0.067 and 0.1, they may be decimals or whole numbers (sec.nsec
+    without leading zeros). Of the two orders, the one with more even steps is taken.
     """
     longest = _longest(files)
     plain, times = (sorted(files, key=lambda file: (_natural(file.stem, pad), file)) for pad in (0, longest))
@@ -43,8 +43,8 @@ def in_order(files: Sequence[Path]) -> list[Path]:
 
 
 def _over_midnight(files: list[Path]) -> list[Path]:
-    """Files that are named by the time of day, after midnight last. A name that holds a date begins otherwise
-    then."""
+    """Files that are named by the time of day, with those after midnight last. Names with a date are not
+    affected: it changes at midnight."""
     clocks = [found for file in files if (found := _CLOCK.search(file.stem)) is not None]
     if len(clocks) < max(len(files), 3) or len({found.string[: found.start()] for found in clocks}) > 1:
         return files
@@ -61,8 +61,8 @@ def _over_midnight(files: list[Path]) -> list[Path]:
 
 
 def numbers(files: Sequence[Path]) -> list[int]:
-    """The last number in each name of files in order, times in units of their last digit; empty where a name
-    has none."""
+    """Return the last number in each name of sorted files, fractions in units of their last digit; empty if a
+    name has none."""
     longest = _longest(files)
     times, plain = ([_number(file, longest, pad) for file in files] for pad in (longest, 0))
     found = [number for number in times if number is not None]
@@ -72,9 +72,9 @@ def numbers(files: Sequence[Path]) -> list[int]:
 
 
 def times_in(files: Sequence[Path]) -> I64 | None:
-    """When pictures of these names, in order, were taken, ns since 1970; None: the names do not say it."""
+    """Return the capture times that the names of sorted files tell, ns since 1970; None: they tell none."""
     counts, unit = numbers(files), 10 ** _longest(files)
-    for each in (unit, unit * 10**3, unit * 10**6, unit * 10**9):  # a second: names are of s, ms, us or ns
+    for each in (unit, unit * 10**3, unit * 10**6, unit * 10**9):  # per second: names are in s, ms, us or ns
         if counts and all(EPOCH[0] * each <= count < EPOCH[1] * each for count in counts):
             times = np.array([count * 10**9 // each for count in counts], np.int64)
             return times if (np.diff(times) > 0).all() else None
@@ -82,10 +82,10 @@ def times_in(files: Sequence[Path]) -> I64 | None:
 
 
 def gaps_in(files: Sequence[Path], are_times: bool) -> list[str]:
-    """What is to be said of files in order whose numbers, or times, jump; empty: nothing."""
+    """Return a warning if the numbers, or times, of sorted files have gaps; else an empty list."""
     steps = np.diff(np.array(numbers(files), np.float64))
     odd = np.flatnonzero(steps > GAP * np.median(steps)) if len(steps) else steps
-    if not 0 < 3 * len(odd) <= len(steps):  # so many are none: times of day go from 59 to 100
+    if not 0 < 3 * len(odd) <= len(steps):  # so many are no gaps: times of day step from 59 to 100
         return []
     where = f"{files[odd[0]].name} and {files[odd[0] + 1].name}"
     fix = "frames are played evenly: fill the gap or split the recording there"
@@ -95,8 +95,8 @@ def gaps_in(files: Sequence[Path], are_times: bool) -> list[str]:
 
 
 def together(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
-    """Files of several folders whose names agree but for the eye (and the kind of file), in the order of the
-    first folder; none where most have no such partner."""
+    """Match files of several folders by names that differ only in the eye and the suffix, in the order of the
+    first folder; empty if most have no partner."""
     named = [{EYE.sub("*", file.stem): file for file in files} for files in folders]
     shared = set(named[0]).intersection(*named)
     twice = any(len(names) < len(files) for names, files in zip(named, folders, strict=True))
@@ -106,13 +106,13 @@ def together(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
 
 
 def _longest(files: Sequence[Path]) -> int:
-    """Digits of the longest fraction."""
+    """The number of digits of the longest fraction."""
     return max((len(found[2] or "") for file in files if (found := _LAST.search(file.stem))), default=0)
 
 
 def _natural(name: str, pad: int) -> list[str | int]:
     """'a10b' -> ['a', 10, 'b']: text and numbers alternate, so any two names compare. The fraction of the
-    last number gets so many digits."""
+    last number is padded to `pad` digits."""
     found = _LAST.search(name)
     if pad and found is not None:
         name = f"{name[: found.end(1)]}.{(found[2] or '').ljust(pad, '0')}{name[found.end() :]}"
@@ -125,7 +125,7 @@ def _number(file: Path, longest: int, pad: int) -> int | None:
 
 
 def _unevenness(files: Sequence[Path], longest: int, pad: int) -> float:
-    """Standard deviation, by the mean, of the steps between files whose names begin alike."""
+    """The steps' standard deviation over their mean, for files whose names begin alike."""
     begins = [_LAST.split(file.stem)[0] for file in files]
     counts = [_number(file, longest, pad) or 0 for file in files]
     each = zip(pairwise(begins), pairwise(counts), strict=True)

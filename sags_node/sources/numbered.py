@@ -1,4 +1,4 @@
-"""Files of one kind, one per frame, in a folder or in a `.tar.gz`: found by the number in their names."""
+"""Reads files of one kind, one per frame, from a folder or a `.tar.gz`, by the number in their names."""
 
 import re
 import tarfile
@@ -14,7 +14,7 @@ class NumberedFiles:
 
     Args:
         suffix: of the files, with the dot.
-        largest: bytes one file may have.
+        largest: largest size of a file, bytes.
     """
 
     def __init__(self, folder: Path, suffix: str, largest: int) -> None:
@@ -22,7 +22,7 @@ class NumberedFiles:
         self._files = {_number(file.name, suffix): file for file in folder.iterdir()}
 
     def read(self, number: int) -> bytes | None:
-        """The content of one file, None when there is none of this number.
+        """Return the content of the file with this number, None if there is none.
 
         Raises:
             SagsError: it cannot be read, or is too large to be right.
@@ -50,7 +50,7 @@ def open_numbered(path: Path, suffix: str, largest: int) -> NumberedFiles | None
 
 
 class _Packed(NumberedFiles):
-    """Reads forward as far as it is asked to; going back unpacks from the start again."""
+    """Files in an archive: reads forward as far as needed; to go back, it unpacks from the start again."""
 
     def __init__(self, archive: Path, suffix: str, largest: int) -> None:
         self._archive = archive
@@ -91,6 +91,6 @@ class _Packed(NumberedFiles):
 
 
 def _number(name: str, suffix: str) -> int | None:
-    """The last number in the name of a file; None of other files, hidden ones too."""
+    """The last number in the name of a file; None for other suffixes and hidden files."""
     found = re.search(rf"(\d+){re.escape(suffix)}$", name)
     return int(found[1]) if found and not name.startswith(".") else None

@@ -1,4 +1,4 @@
-"""Which pictures of both eyes are of one moment: live, as they come, and in recordings, by their stamps."""
+"""Pairs the pictures of both eyes that are of one moment, by their stamps: live and in recordings."""
 
 import logging
 import threading
@@ -15,9 +15,9 @@ log = logging.getLogger(__name__)
 
 QUEUE_LENGTH = 4  # pictures of one eye that wait for their partner
 REPORT_EVERY = 100  # unpaired pictures between two warnings
-POLL_S = 0.1  # how soon a waiting taker notices `stop`, if nobody tells it
-NEAR = 0.6  # of a period, from a picture to its partner: free-running eyes are up to half of one apart
-SETTLING_NS = 300_000_000  # stamps that go back by less: their clock is better known now (`sources.clock`)
+POLL_S = 0.1  # s between looks while waiting for a pair
+NEAR = 0.6  # periods between partners, at most: free-running eyes are up to half a period apart
+SETTLING_NS = 300_000_000  # ns: stamps that go back by less are a better clock estimate (`sources.clock`)
 
 
 class Picture(NamedTuple):
@@ -25,40 +25,40 @@ class Picture(NamedTuple):
 
     t_ns: int  # wall clock
     image: U8  # [H, W, 3] RGB
-    device_ns: int = 0  # by the clock of what took or sent it; 0: it gave none
+    device_ns: int = 0  # stamp on the clock of the device or sender; 0: none
     arrival_ns: int = 0  # wall clock; 0: not known
 
 
 class Shot(NamedTuple):
-    """What a device delivers."""
+    """One picture as a device delivers it: of one eye, or of both."""
 
     t_ns: int  # wall clock
     image: Samples  # [H, W, 3] RGB
-    side: Side | None = None  # whose it is, where one device delivers either eye's
-    device_ns: int | None = None  # by the clock of the device, which may begin at 0; None: it gave none
+    side: Side | None = None  # the eye, if one device delivers single pictures of both
+    device_ns: int | None = None  # stamp on the device's clock, which may begin at 0; None: none
     arrival_ns: int = 0  # wall clock; 0: not known
 
 
 class LivePairs:
-    """A `Source` of live stereo frames: pictures in, from any threads; pairs out, until `stop` or `end`.
+    """A `Source` of live stereo frames: any thread puts pictures in; pairs come out, until `stop` or `end`.
 
-    Pictures are paired by their stamps. `frame_id` counts the left eye's, so a left picture that found no
-    partner leaves a gap. `epoch` grows when the clock is set back. Where stamps go back by less than
-    `SETTLING_NS`, pairs are left out until they have caught up; so is a pair with the stamp of the one
-    before, which was sent twice.
+    Pictures are paired by their stamps. `frame_id` counts left pictures, so a left picture without a partner
+    leaves a gap. `epoch` grows when the clock is set back. If stamps go back by less than `SETTLING_NS`,
+    pairs are left out until the stamps have caught up. A pair with the same stamp as the one before was sent
+    twice, and is left out, too.
 
     Args:
-        tolerance_ms: how far the stamps of a pair may lie apart.
-        latency_ms: from the exposure to the stamp; taken off the capture times.
+        tolerance_ms: largest difference of the stamps of a pair.
+        latency_ms: from exposure to stamp; subtracted from the capture times.
     """
 
     frame_count: int | None = None
-    rate: float  # frames per second, nominal
+    rate: float  # Hz, nominal
 
     def __init__(self, tolerance_ms: float, latency_ms: float = 0.0) -> None:
         self._tolerance_ns = round(tolerance_ms * 1e6)
         self._latency_ns = round(latency_ms * 1e6)
-        # With each picture the count of those of its eye before it.
+        # Each picture with the number of pictures of its eye before it.
         self._waiting: dict[Side, deque[tuple[int, Picture]]] = {"left": deque(), "right": deque()}
         self._pairs: deque[tuple[int, Picture, Picture]] = deque()
         self._counts: dict[Side, int] = {"left": 0, "right": 0}
@@ -69,14 +69,14 @@ class LivePairs:
 
     @property
     def dropped(self) -> int:
-        """Pictures of either eye that found no partner, and pairs no newer than the one before."""
+        """The number of pictures without a partner, and of pairs that are no newer than the one before."""
         return self._unpaired + self._outdated
 
     def start(self) -> None:
         """Begin to receive pictures."""
 
     def close(self) -> None:
-        """Release what delivers them."""
+        """Release the devices or sockets."""
 
     def __enter__(self) -> Self:
         self.start()
@@ -87,7 +87,7 @@ class LivePairs:
         self.close()
 
     def add(self, side: Side, picture: Picture) -> None:
-        """Take one eye's picture in."""
+        """Put in one eye's picture."""
         with self._arrived:
             waiting = self._waiting[side]
             if len(waiting) == QUEUE_LENGTH:
@@ -97,7 +97,7 @@ class LivePairs:
             self._arrived.notify_all()
 
     def add_both(self, left: Picture, right: Picture) -> None:
-        """Take two in that belong together, whatever their stamps."""
+        """Put in two pictures that are a pair, whatever their stamps."""
         with self._arrived:
             if len(self._pairs) == QUEUE_LENGTH:
                 self._pairs.popleft()
@@ -107,7 +107,7 @@ class LivePairs:
             self._arrived.notify_all()
 
     def end(self) -> None:
-        """No more pictures will be put in."""
+        """Say that no more pictures will be put in."""
         with self._arrived:
             self._ended = True
             self._arrived.notify_all()
@@ -119,7 +119,7 @@ class LivePairs:
             self._arrived.notify_all()
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        """Pairs as they arrive; silent while no pictures come."""
+        """Yield pairs as they arrive; wait while no pictures come."""
         epoch, last_ns = 0, -1
         while True:
             with self._arrived:
@@ -145,9 +145,9 @@ class LivePairs:
             )
 
     def _take(self) -> tuple[int, Picture, Picture] | None:
-        """The oldest pair: count of left pictures before it, left, right. None until there is one.
+        """Take the oldest pair: number of left pictures before it, left, right. None if there is none yet.
 
-        The older of two pictures is dropped when they are too far apart, or when its successor is nearer.
+        Of two pictures that are too far apart the older one is dropped; also if its successor is nearer.
         """
         if self._pairs:
             return self._pairs.popleft()
@@ -177,26 +177,26 @@ class LivePairs:
 
 
 class Alternation:
-    """Joins the pictures of one camera that shows the eyes in turn. Not safe for threads by itself.
+    """Joins the pictures of one camera that shows the eyes in turn. Not thread-safe.
 
-    How much time has passed since the picture before tells which eye one shows, so a picture that is lost
-    does not exchange the eyes. It passes on the device's clock, or else on one that nobody sets.
+    The time since the picture before tells which eye a picture shows, so that a lost picture does not swap
+    the eyes. It is measured on the device's clock, or else on a monotonic one.
 
     Args:
         period_ns: from picture to picture.
-        clock_ns: that nobody sets.
+        clock_ns: monotonic.
     """
 
     def __init__(self, period_ns: float, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock_ns = clock_ns
         self._period_ns = period_ns
         self._before: Shot | None = None
-        self._arrived_ns = 0  # when that came
-        self._turn = -1  # of the picture before; even: the first eye's
+        self._arrived_ns = 0  # arrival of the picture before
+        self._turn = -1  # number of the picture before, lost ones counted; even: the first eye
         self.alone = 0
 
     def add(self, picture: Shot) -> tuple[Shot, Shot] | None:
-        """The first and the second eye's pictures when this one completes a pair."""
+        """Take a picture in; return the pictures of the first and the second eye if it completes a pair."""
         before, turn = self._before, self._turn
         self._turn, self._before = turn + self._steps(before, picture), picture
         is_second = self._turn % 2 == 1
@@ -216,11 +216,11 @@ class Alternation:
 
 
 def pair(left: I64, right: I64, tolerance: float) -> I64:
-    """Rows (index of the left, index of the right picture) [N, 2] of stamps that are each other's nearest.
+    """Pair stamps that are each other's nearest: rows [N, 2] of left index, right index, by left stamp.
 
     Args:
         left, right: capture stamps [L], [R], ns, in any order.
-        tolerance: s.
+        tolerance: largest difference, s.
     """
     to_right, to_left = nearest(left, right), nearest(right, left)
     mutual = to_left[to_right] == np.arange(len(left))
@@ -231,7 +231,7 @@ def pair(left: I64, right: I64, tolerance: float) -> I64:
 
 
 def nearest(stamps: I64, others: I64) -> I64:
-    """Find for each of `stamps` [N] the index of the nearest of `others` [M], M > 0."""
+    """Return for each of `stamps` [N] the index of the nearest of `others` [M], M > 0."""
     order = np.argsort(others, kind="stable")
     ordered = others[order]
     after = np.searchsorted(ordered, stamps).clip(0, len(others) - 1)

@@ -24,10 +24,10 @@ from sags_node.types import F32, F64, I64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
 
-LARGEST_FILE = 256 << 20  # bytes: more than the largest picture that is decoded can need
+LARGEST_FILE = 256 << 20  # bytes: more than the largest allowed picture can need
 MEND = "replace or remove the pair"
-NOT_SQUARE = 0.01
-LOOKED_AT = 9  # pictures, spread over a recording, that tell which value is white
+NOT_SQUARE = 0.01  # difference of the pixel aspect from 1
+LOOKED_AT = 9  # pictures or masks, spread over a recording, to find out which value is white
 STORED = cv2.IMREAD_UNCHANGED
 
 F = TypeVar("F")
@@ -35,12 +35,12 @@ F = TypeVar("F")
 
 @lru_cache(maxsize=256)
 def say(oddity: str) -> None:
-    """Once for each session, however often its recording is opened (`open_session` begins anew)."""
+    """Log a warning once per session, however often its recording is opened (`open_session` clears this)."""
     log.warning(oddity)
 
 
 class RawPair(NamedTuple):
-    """One moment of a recording, before it gets its stamps; the fields are those of `StereoFrame`."""
+    """A pair of a recording, before it gets its stamps; for the fields see `StereoFrame`."""
 
     left: U8  # [H, W, 3] RGB
     right: U8 | None  # [H, W, 3] RGB
@@ -54,17 +54,17 @@ class Pairs:
     """A reader of a recording.
 
     Attributes:
-        count: pairs as announced; a video may end earlier.
-        rate: the recording's own; None: it does not know it.
-        stamps: [count, 2] ns, of the left and the right picture; None: they are even.
-        later: how much later the right picture of an even pair was taken, periods.
-        pixel_aspect: width of a pixel over its height, as far as the recording says it.
-        oddities: what is to be said of its files, each with a remedy after a semicolon.
+        count: number of pairs as announced; a video may end earlier.
+        rate: the recording's own, Hz; None: not known.
+        stamps: [count, 2] ns, of the left and the right picture; None: evenly spaced.
+        later: delay of the right picture in an evenly spaced recording, periods.
+        pixel_aspect: width of a pixel over its height, as far as the recording tells.
+        oddities: warnings about its files, each with a remedy after a semicolon.
         cut_off: why pairs are missing at its end, with a remedy after a semicolon; "": none are.
-        reach: how many pairs are there, also of the right eye, where some are missing.
-        judged: what is odd about its stamps or poses.
-        left_count: pictures of the left eye, also those without a partner; None: all have one.
-        left_numbers: [count] of each pair's left picture among these: poses and references go by them.
+        reach: number of complete pairs, if it is cut off.
+        judged: findings about its stamps or poses.
+        left_count: number of left pictures, also those without a partner; None: all have one.
+        left_numbers: [count] index of each pair's left picture among these; poses and references use it.
     """
 
     count: int
@@ -82,30 +82,30 @@ class Pairs:
 
     @property
     def findings(self) -> list[Finding]:
-        """All that is to be said of it before it plays: `sags run` and `sags import --check` say the same."""
+        """All findings before it plays; `sags run` and `sags import --check` show the same ones."""
         said = (parted("warning", each) for each in self.oddities)
         return [*said, *self.judged, *judge_pixels(self.pixel_aspect)]
 
     def at(self, index: int) -> RawPair | None:
-        """The pair of this number, None behind the end. Those that follow each other are read fastest.
+        """Read the pair with this number; None past the end. Reading in order is fastest.
 
         Raises:
-            LostPictureError: it cannot be read; those behind it may be.
-            SagsError: it is damaged, or does not fit those before.
+            LostPictureError: it cannot be read, but later ones may be.
+            SagsError: it is damaged, or does not match those before.
         """
         raise NotImplementedError
 
     def read(self) -> RawPair | None:
-        """The next pair, from the first on: for who wants all. As `at`."""
+        """Read the next pair, from the first on; see `at`."""
         self._next += 1
         return self.at(self._next - 1)
 
     def close(self) -> None:
-        """Release the files, where they stay open between pairs."""
+        """Close files that stay open between pairs."""
 
 
 def judge_pixels(aspect: float) -> tuple[Finding, ...]:
-    """Return what is odd about pixels so many times as wide as high."""
+    """Return a warning if pixels are not square; `aspect` is their width over their height."""
     if abs(aspect - 1) < NOT_SQUARE:
         return ()
     what = f"pixels are {aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
@@ -114,8 +114,8 @@ def judge_pixels(aspect: float) -> tuple[Finding, ...]:
 
 
 class FolderPairs(Pairs):
-    """Pictures of two folders, paired by sorted name (numbers in names sort as numbers), or of the left one.
-    Names that are times since 1970 stamp them.
+    """Pictures of two folders, paired by `pair_files`, or of the left one alone. Names that are times since
+    1970 give the stamps.
 
     Attributes:
         files: the left pictures in order.
@@ -123,7 +123,7 @@ class FolderPairs(Pairs):
         oddities: see `Pairs`.
 
     Raises:
-        UsageError: a folder is missing or empty, or the folders do not fit each other.
+        UsageError: a folder is missing or empty, or the folders do not match.
     """
 
     oddities: list[str]
@@ -159,13 +159,13 @@ class FolderPairs(Pairs):
         self.count = len(self.files)
         first = read_samples(self.files[0])
         self.size, self._type = _size(first), first.dtype
-        self._eight_bits: EightBits | None = None  # there is nothing to do
+        self._eight_bits: EightBits | None = None  # None: they have 8 bits
         if first.dtype != np.uint8 or levels is not None:
             eyes = [file for files in self._files for file in files[: 1 + self._has_right]]
             self._eight_bits = EightBits(map(self._samples, _spread(eyes)), levels)
             if levels is None:
                 self._eight_bits.tell(left)
-        self.at(0)  # the first pair shows whether the eyes fit each other
+        self.at(0)  # checks that the eyes match, by the first pair
 
     def at(self, index: int) -> RawPair | None:
         if index >= self.count:
@@ -184,14 +184,14 @@ class FolderPairs(Pairs):
         return samples if self._eight_bits is None else self._eight_bits(samples, file)
 
     def _samples(self, file: Path) -> NDArray[Any]:
-        """Of one type."""
+        """The picture, if its type is that of the first one."""
         samples = self._checked(read_samples(file), file)
         if samples.dtype != self._type:
             raise SagsError(f"{file} holds {samples.dtype}, others {self._type}; save all pictures alike")
         return samples
 
     def _checked(self, picture: NDArray[Any], file: Path) -> NDArray[Any]:
-        """Of one size."""
+        """The picture, if its size is that of the first one."""
         if _size(picture) != self.size:
             raise SagsError(
                 f"{file} is {size_text(*_size(picture))} px but {self.files[0]} is {size_text(*self.size)}; "
@@ -201,10 +201,10 @@ class FolderPairs(Pairs):
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """Picture files of a folder in order of their names, numbers compared as numbers.
+    """List the picture files of a folder, sorted by name, with numbers compared as numbers.
 
     Raises:
-        UsageError: the folder is missing or holds no picture, or what only has a picture's name.
+        UsageError: the folder is missing or holds no picture, or something else has a picture's name.
     """
     if not folder.is_dir():
         reason = "is not a folder" if folder.exists() else "does not exist"
@@ -221,10 +221,10 @@ def list_pictures(folder: Path) -> list[Path]:
 def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
     """Decode one picture: RGB of 8 bit for `IMREAD_COLOR`, else as OpenCV's flags say.
 
-    OpenCV fills what is missing of a cut-off picture with grey and says nothing, so its end is checked first.
+    OpenCV silently fills the missing part of a cut-off picture with grey, so its end is checked first.
 
     Raises:
-        SagsError: the file is missing, no plain file, cut off, damaged or too large, or holds several.
+        SagsError: the file is missing, no plain file, cut off, damaged, too large, or holds several.
     """
     if flags == cv2.IMREAD_COLOR:
         samples = read_samples(file)
@@ -244,10 +244,10 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
 
 
 def read_samples(file: Path) -> NDArray[Any]:
-    """Decode one picture: RGB [H, W, 3] as deep as it is.
+    """Decode one picture as RGB [H, W, 3] of its own depth: uint8, uint16 or float32.
 
     Raises:
-        SagsError: as `read_picture`, or its numbers are of another kind.
+        SagsError: as `read_picture`, or its samples have another type.
     """
     picture = read_picture(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if picture.dtype.kind == "f":
@@ -260,16 +260,16 @@ def read_samples(file: Path) -> NDArray[Any]:
 
 
 def size_text(width: int, height: int) -> str:
-    """As people write a picture size: 640x480."""
+    """Format a picture size: 640x480."""
     return f"{width}x{height}"
 
 
 def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Path, ...]]:
-    """The pictures of several folders that belong together: by their names, where most are in all folders, by
-    the times that these say, or else by order. What is left out, and odd pairs, are said in the log.
+    """Match the pictures of several folders: by name, if most are in all folders; by the times in names; or
+    else by order. Pictures that are left out, and odd pairs, are logged.
 
     Args:
-        numbered: something else counts on their number, so that none may be left out.
+        numbered: other data (poses, depth) goes by number, so that no picture may be left out.
 
     Raises:
         UsageError: a folder cannot be read, or they cannot be paired.
@@ -302,8 +302,8 @@ def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Pa
 
 
 def _at_one_time(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
-    """Files whose names are times that are near each other, in the order of the first folder; none where most
-    have no such partner."""
+    """Match files by the times in their names, in the order of the first folder; empty if most have no
+    partner."""
     times = [found for files in folders if (found := times_in(files)) is not None and len(found) > 1]
     if len(times) < len(folders):
         return []
@@ -333,7 +333,7 @@ def _size(picture: NDArray[Any]) -> tuple[int, int]:
 
 
 def _warn_of_gaps(left: Sequence[Path], right: Sequence[Path]) -> None:
-    """Equal counts may still hide one missing picture on each side; the names' numbers tell."""
+    """Warn if numbers in names show a missing picture: equal counts may hide one on each side."""
     one, other = (np.array(numbers(each), np.float64) for each in (left, right))
     if len(one) != len(other) or len(one) < 2:
         return

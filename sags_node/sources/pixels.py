@@ -1,4 +1,4 @@
-"""Kernels for pictures on their way in: eight bits of those that have more, and instruments painted green."""
+"""Kernels for input pictures: conversion of 16 to 8 bits by levels, and detection of green-painted tools."""
 
 from functools import lru_cache
 
@@ -8,15 +8,15 @@ import numpy as np
 from sags_node.kernels.jit import kernel
 from sags_node.types import U8, Bool, Samples
 
-# The paint is blended at 30 %: painted pixels gain about 70 counts of green against the mean of blue and red,
-# and the dimming of the others takes the same share from every channel. Half of the gain separates them.
-PAINTED_ABOVE = 73  # counts, of twice that gain
+# The paint is blended at 30 %. Painted pixels gain about 70 counts of green against the mean of blue and red;
+# dimming takes the same share from every channel. Half of the gain is the threshold.
+PAINTED_ABOVE = 73  # counts of twice the gain (2 green - blue - red)
 OPEN = np.ones((3, 3), np.uint8)  # removes codec specks
 CLOSE = np.ones((5, 5), np.uint8)  # fills dots inside instruments
 
 
 def spread(picture: Samples, levels: tuple[float, float]) -> U8:
-    """A new picture [H, W, 3] of one [H, W, 3] of any strides, with black to white as 0 to 255, rounded.
+    """Map black and white to 0 and 255, rounded: a new picture [H, W, 3] of one [H, W, 3] of any strides.
 
     Args:
         levels: black and white, in units of the brightest value of the picture's type.
@@ -36,7 +36,7 @@ def _table(levels: tuple[float, float], dtype: np.dtype[np.uint8] | np.dtype[np.
 
 @kernel
 def _look_up(picture: Samples, table: U8, found: U8) -> None:
-    """In one pass: OpenCV has no table for 16 bit, and its passes take three times as long."""
+    """Look up each sample in one pass. OpenCV has no table for 16 bit, and takes three times as long."""
     for y in range(picture.shape[0]):
         for x in range(picture.shape[1]):
             for channel in range(3):
@@ -44,7 +44,7 @@ def _look_up(picture: Samples, table: U8, found: U8) -> None:
 
 
 def unpainted(pane: U8, left: U8) -> Bool:
-    """The tissue mask: True where `pane` shows `left` without green paint.
+    """Return the tissue mask [H, W]: True where `pane` shows `left` without green paint.
 
     Args:
         pane: [H, W, 3] RGB, the left picture with semi-transparent green instruments.
@@ -60,7 +60,7 @@ def unpainted(pane: U8, left: U8) -> Bool:
 
 @kernel
 def _find_paint(pane: U8, left: U8, painted: U8) -> None:
-    """Write 1 where green was gained, else 0; in one pass, since pictures in between cost four times that."""
+    """Write 1 where green was gained, else 0. One pass: intermediate pictures cost four times the time."""
     for y in range(painted.shape[0]):
         for x in range(painted.shape[1]):
             red, green, blue = (

@@ -1,6 +1,6 @@
-"""How the poses of a clip are meant: of two frames with depth one reading explains what is seen where.
+"""Finds the axes and the direction of a clip's poses: the reading that warps frames with depth best wins.
 
-Tools disagree on axes and on direction, and their files do not say which they took.
+Tools disagree on axes and direction, and their files do not tell which ones they use.
 """
 
 from collections.abc import Callable
@@ -11,11 +11,11 @@ import numpy as np
 
 from sags_node.types import F32, F64, U8, Bool
 
-MOVES = (2.0, 0.15)  # px, and share of the width: motion between two frames that tells
-CLEARLY = 0.8  # of the difference that the usual reading leaves, and of that of a camera that stands still
-LEAST_SEEN = 0.3  # share of the pixels with depth that both frames show
-STEP = 4  # px: every so many pixels are looked at
-SOFT = 2.0  # px: differences are taken between blurred pictures, so that small errors tell little
+MOVES = (2.0, 0.15)  # px, and share of the width: smallest and largest useful motion between frames
+CLEARLY = 0.8  # largest ratio of the best difference to those of a still camera and of other readings
+LEAST_SEEN = 0.3  # share of the pixels with depth that both frames must show
+STEP = 4  # px between compared pixels
+SOFT = 2.0  # px, sigma of the blur before pictures are compared, so that small errors matter little
 
 
 class Seen(NamedTuple):
@@ -26,7 +26,7 @@ class Seen(NamedTuple):
     tissue: Bool  # [H, W]
 
 
-READINGS: dict[str, Callable[[F64], F64]] = {  # to camera to world [N, 4, 4] with axes right, down, forward
+READINGS: dict[str, Callable[[F64], F64]] = {  # each converts poses [N, 4, 4] to T_world_cam, OpenCV axes
     "opencv": lambda poses: poses,
     "llff": lambda poses: poses[..., [1, 0, 2, 3]] * [1, 1, -1, 1],  # down, right, back: imgs2poses
     "opengl": lambda poses: poses * [1, -1, -1, 1],  # right, up, back
@@ -35,8 +35,8 @@ READINGS: dict[str, Callable[[F64], F64]] = {  # to camera to world [N, 4, 4] wi
 
 
 def reading_that_fits(poses: F64, K: F64, look: Callable[[int], Seen]) -> str | None:
-    """Which of `READINGS` of poses [N, 4, 4] (m) explains the frames that `look` gives by their numbers; None
-    where they do not tell, as of a camera that stands still."""
+    """Return which of `READINGS` of poses [N, 4, 4] (m) explains the frames, which `look` gives by number.
+    None if that is not clear, e.g. because the camera stands still."""
     if np.allclose(poses, poses[0], atol=1e-9):
         return None
     first, still, left = look(0), 0.0, dict.fromkeys(READINGS, 0.0)
@@ -55,13 +55,13 @@ def reading_that_fits(poses: F64, K: F64, look: Callable[[int], Seen]) -> str | 
 
 
 def _pixels(shape: tuple[int, ...]) -> F64:
-    """Every `STEP` th pixel of every `STEP` th row [h, w, 2]: x, y."""
+    """The grid [h, w, 2] of every `STEP`-th pixel: x, y."""
     v, u = np.mgrid[: shape[0] : STEP, : shape[1] : STEP]
     return np.stack([u, v], -1).astype(np.float64)
 
 
 def _moved(first: Seen, poses: F64, K: F64) -> F64:
-    """Find where the first frame's `_pixels` lie in the other one; NaN behind it."""
+    """The first frame's `_pixels`, projected into the other frame [h, w, 2]; NaN behind its camera."""
     depth = first.depth[::STEP, ::STEP].astype(np.float64)
     rays = (_pixels(first.depth.shape) - K[:2, 2]) / K[[0, 1], [0, 1]]
     points = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]
@@ -73,8 +73,8 @@ def _moved(first: Seen, poses: F64, K: F64) -> F64:
 
 
 def _difference(first: Seen, other: Seen, way: F64) -> float:
-    """Mean grey levels between a frame and the other one looked up where its pixels went; infinite where too
-    few are seen in both."""
+    """The mean difference (grey levels) of a frame and the other one, sampled at `way`; infinite if too few
+    pixels are in both."""
     gray, there = (
         cv2.GaussianBlur(cv2.cvtColor(each.picture, cv2.COLOR_RGB2GRAY), (0, 0), SOFT).astype(np.float32)
         for each in (first, other)

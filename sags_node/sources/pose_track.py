@@ -1,7 +1,7 @@
-"""Where a robot says that things are, over time: a tree of frames whose transforms are interpolated.
+"""The poses that a robot reports over time: a tree of frames (as tf) whose transforms are interpolated.
 
-A pose is only given where it is known: between two samples that are close together. Nothing is carried on
-beyond the newest one.
+A pose is given only between two samples that are close together in time. Nothing is extrapolated beyond the
+newest one.
 """
 
 import threading
@@ -19,25 +19,25 @@ from sags_node.types import F64, Finding
 
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 POSE_TYPES = (topics.TF, cdr.POSE, TRANSFORM)
-BASE, HAND = "base", "hand"  # the two frames of a topic that holds the pose itself
+BASE, HAND = "base", "hand"  # names of the two frames if a topic holds the pose itself, not a tree
 
-# A scope that a person moves is accelerated by about 1 m/s^2: between two poses so far apart in time a
-# straight line is wrong by less than 2 mm (a t^2 / 8).
+# ns between two samples. A hand accelerates a scope by about 1 m/s^2, so that over this time a straight line
+# is wrong by less than 2 mm (a t^2 / 8).
 LARGEST_GAP_NS = 120_000_000
-IN_VAIN_NS = 4 * LARGEST_GAP_NS  # poses that are so late are not waited for
-FASTEST = 1.0  # m/s: a person pulls a scope out of a trocar with less
+IN_VAIN_NS = 4 * LARGEST_GAP_NS  # ns: if the newest pose is older than this, no newer one is waited for
+FASTEST = 1.0  # m/s: faster is a jump; a person pulls a scope out of a trocar more slowly
 FASTEST_TURN = 2 * np.pi  # rad/s
-SMALLEST_JUMP = 0.002  # m, and 1 degree: below it fast samples only jitter
+SMALLEST_JUMP = 0.002  # m, and 1 degree: smaller steps are jitter, not jumps
 SMALLEST_TURN = np.radians(1)
-LATE_NS = 1_000_000_000  # a stamp that is so much older was not overtaken: the robot was started anew
-JUMP_HELD_NS = 1_000_000_000  # so long a track must be smooth again after a jump
-FARTHEST = 10.0  # m: no robot reaches so far from its base, and in mm every scope seems to
-KEPT = 20_000  # samples of each frame, of a robot that goes on telling
+LATE_NS = 1_000_000_000  # ns: a stamp that goes back by more means a restarted robot; by less, wrong order
+JUMP_HELD_NS = 1_000_000_000  # ns after a jump during which no poses are given
+FARTHEST = 10.0  # m from the base: no robot reaches so far; poses in mm seem to
+KEPT = 20_000  # samples of each frame, for a live robot
 MOST_FRAMES = 1000  # of a tf tree
 
 
 class NoPoseError(SagsError):
-    """There is no pose for that time."""
+    """There is no pose for the requested time."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
@@ -50,7 +50,7 @@ class Sample(NamedTuple):
 
 
 class _Edge:
-    """One frame in its parent, over time."""
+    """The poses of one frame in its parent, over time."""
 
     def __init__(self, parent: str, kept: int) -> None:
         self.parent = parent
@@ -65,8 +65,8 @@ class _Edge:
 
     def add(self, stamp_ns: int, sample: Sample) -> None:
         if self._stamps and stamp_ns < self._stamps[-1] - LATE_NS:
-            self._stamps, self._samples, self._jumps = [], [], []  # the robot was started anew
-        at = bisect_left(self._stamps, stamp_ns)  # not the end: it was overtaken on its way
+            self._stamps, self._samples, self._jumps = [], [], []  # the robot restarted
+        at = bisect_left(self._stamps, stamp_ns)  # not always at the end: samples may come in the wrong order
         if stamp_ns in self._stamps[at : at + 1]:
             return  # sent twice
         self._stamps.insert(at, stamp_ns)
@@ -80,7 +80,7 @@ class _Edge:
             self._jumps = [stamp for stamp in self._jumps if stamp >= self._stamps[0]]
 
     def at(self, t_ns: int) -> F64:
-        """[4, 4] m.
+        """Interpolate the pose [4, 4] m.
 
         Raises:
             NoPoseError: it is not known for this time.
@@ -124,14 +124,14 @@ class _Fixed(NamedTuple):
 
 
 class PoseTrack:
-    """The poses that came so far. Any threads may add and ask.
+    """The poses that came so far. Thread-safe.
 
     Attributes:
-        frame: in which they are, as its sender or `base` says; empty: not known.
+        frame: name of the frame in which poses are, by their sender or `base`; empty: not known.
 
     Args:
-        base, hand: frames between which the pose is asked for; None: of a topic that holds the pose.
-        kept: samples of each frame that are kept.
+        base, hand: the pose of `hand` in `base` is given; None: the topic holds the pose itself.
+        kept: number of samples that are kept for each frame.
     """
 
     def __init__(self, base: str | None = None, hand: str | None = None, kept: int = KEPT) -> None:
@@ -142,10 +142,10 @@ class PoseTrack:
         self._came = threading.Condition()
 
     def add(self, data: bytes | memoryview, kind: str, fixed: bool = False) -> None:
-        """A message of one of `POSE_TYPES`, as CDR; `fixed`: from `tf_static`.
+        """Take in a message of one of `POSE_TYPES`, as CDR; `fixed`: from `tf_static`.
 
         Raises:
-            SagsError: it is damaged, or no pose. What else it holds is taken.
+            SagsError: it is damaged, or holds an invalid pose. Valid poses in it are taken in nevertheless.
         """
         message: Any = cdr.decode(data, kind)
         wrong: SagsError | None = None
@@ -189,8 +189,8 @@ class PoseTrack:
         edge.add(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec, sample)
 
     def at(self, t_ns: int, timeout: float = 0.0) -> F64:
-        """The hand in the base at a time, [4, 4] m. While newer poses come, one that is on its way is waited
-        for, up to `timeout` seconds.
+        """Return the pose of the hand in the base at a time, [4, 4] m. If the newest pose is only a little
+        older, wait for a newer one, up to `timeout` seconds.
 
         Raises:
             NoPoseError: it is not known for this time.
@@ -209,7 +209,7 @@ class PoseTrack:
 
     @property
     def newest_ns(self) -> int:
-        """Stamp of the newest sample; 0 before the first."""
+        """The stamp of the newest sample, ns; 0 before the first."""
         return max((edge.newest for edge in self._edges.values()), default=0)
 
     def _at(self, t_ns: int) -> F64:
@@ -231,7 +231,7 @@ class PoseTrack:
         return T
 
     def _chain(self, frame: str) -> list[str]:
-        """A frame, its parent and so on, up to the root."""
+        """The frame, its parent and so on, up to the root."""
         chain = [frame]
         while chain[-1] in self._edges and len(chain) <= MOST_FRAMES:
             chain.append(self._edges[chain[-1]].parent)
@@ -249,7 +249,7 @@ def to_matrix(sample: Sample) -> F64:
 
 
 def between(one: Sample, other: Sample, share: float) -> F64:
-    """The pose at a share 0..1 of the way: the shortest turn (slerp), a straight line. [4, 4] m."""
+    """Interpolate two poses at `share` 0..1: rotation by slerp, position linearly. [4, 4] m."""
     cosine = float(one.quat @ other.quat)
     end = other.quat if cosine >= 0 else -other.quat
     angle = np.arccos(min(abs(cosine), 1.0))
@@ -269,5 +269,5 @@ def _jumps(one: Sample, other: Sample, ns: int) -> bool:
 
 
 def _plain(name: str) -> str:
-    """ROS 1 wrote frames with a leading slash."""
+    """The name of a frame without the leading slash of ROS 1."""
     return name.strip("/")

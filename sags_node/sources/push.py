@@ -1,4 +1,4 @@
-"""Live stereo that another program hands in over ZeroMQ: a simulator, an engine, a capture program."""
+"""Live stereo that another program pushes over ZeroMQ: a simulator, a game engine, a capture program."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ from sags_node.messaging.wire import Message, WireError
 from sags_node.sources.sent import SentPictures
 from sags_node.types import U8, Finding
 
-NEWEST = 2  # of each eye's waiting pictures: what is older will not be shown
+NEWEST = 2  # pictures of each eye that may wait; older ones will not be shown
 
 
 class PushedPictures(SentPictures):
@@ -34,7 +34,7 @@ class PushedPictures(SentPictures):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Return what is wrong with who sends, and how to fix it. May be read from any thread."""
+        """Return what is wrong with the sender, and how to fix it. Thread-safe."""
         return self._inbox.findings
 
     def close(self) -> None:
@@ -60,16 +60,16 @@ def _eye_and_kind(message: Message) -> tuple[str, str]:
 
 
 def _eyes_of(message: Message) -> list[str]:
-    """Whose pictures it brings."""
+    """The names of the eyes whose pictures a message holds."""
     eye = _eye_and_kind(message)[0]
     return [f"the {one} eye's pictures" for one in ("left", "right") if eye in (one, "stereo")]
 
 
 def _picture(message: Message) -> U8:
-    """RGB [H, W, 3]; over the received memory where that holds RGB.
+    """The picture, RGB [H, W, 3]; a view of the received memory if that holds RGB.
 
     Raises:
-        SagsError: the message is damaged, or no picture that is read.
+        SagsError: the message is damaged, or its encoding is not supported.
     """
     meta, where = message.meta, message.topic
     if meta.type == COMPRESSED:

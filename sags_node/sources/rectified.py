@@ -1,4 +1,4 @@
-"""Whether pictures come rectified: they must not be rectified a second time."""
+"""Finds out whether pictures come rectified: they must not be rectified a second time."""
 
 import re
 from pathlib import Path
@@ -10,13 +10,14 @@ from sags_node.types import StereoRig
 
 RECTIFIED, RAW = {"rect", "rectified"}, {"raw", "unrectified"}
 NOT = {"not", "non", "un", "no"}
-OF_PICTURES = {"image", "images", "img", "frames", "left", "right", "l", "r"}  # beside them rect is no rectum
+# Beside one of these words, rect means rectified, not rectum.
+OF_PICTURES = {"image", "images", "img", "frames", "left", "right", "l", "r"}
 
 
 def as_pictures_come(rig: StereoRig, config: cfg.LaunchConfig) -> StereoRig:
-    """The rig of a session's pictures: of those that come rectified P alone is true.
+    """Return the rig for a session's pictures. If these come rectified, only P of the calibration holds.
 
-    A calibration in files that hardly moves a pixel was made with such pictures: it stays as it is.
+    A calibration from files that hardly moves a pixel was made with rectified pictures: it stays as it is.
     """
     if not come_rectified(config):
         return rig
@@ -24,12 +25,12 @@ def as_pictures_come(rig: StereoRig, config: cfg.LaunchConfig) -> StereoRig:
 
 
 def as_named(rig: StereoRig, *names: Path) -> StereoRig:
-    """The same of pictures in files or folders, by their names."""
+    """Do as `as_pictures_come` for files or folders, by their names alone."""
     return _rectified_with(rig) if named_rectified(*names) and rectifies(rig) else rig
 
 
 def _rectified_with(rig: StereoRig) -> StereoRig:
-    """The rig of pictures that were rectified with it, which is said where its files do not tell how."""
+    """The rig for pictures that were rectified with it; warns if its files do not hold P."""
     if not rig.says_P:
         say(
             f"{rig.path} does not say how pictures were rectified: P of cv2.stereoRectify with alpha=0 is "
@@ -40,8 +41,7 @@ def _rectified_with(rig: StereoRig) -> StereoRig:
 
 
 def come_rectified(config: cfg.LaunchConfig) -> bool:
-    """Tell whether a session's pictures are rectified: as the launch file says, else by the names of its
-    folders, videos or topics."""
+    """Tell whether a session's pictures are rectified: by the launch file, or else by names of the source."""
     source = config.source
     if config.rectified is not None:
         return config.rectified
@@ -56,13 +56,13 @@ def come_rectified(config: cfg.LaunchConfig) -> bool:
 
 
 def named_rectified(*names: Path | str) -> bool:
-    """Tell whether topics, folders or files say that their pictures are rectified."""
+    """Tell whether all these names of topics, folders or files say that pictures are rectified."""
     return bool(names) and all(_says_rectified(name) for name in names)
 
 
 def _says_rectified(name: Path | str) -> bool:
-    """The last part of a name that speaks of it counts: of a topic any; of a path itself, or its folder where
-    that is called after pictures, not after a case."""
+    """Tell by the last part of a name that says raw or rectified. In a topic any part counts. In a path only
+    the last one does, and its folder if that is named after pictures, not after a case."""
     parts = [
         _words(part) for part in (name.absolute().parts[-2:] if isinstance(name, Path) else name.split("/"))
     ]

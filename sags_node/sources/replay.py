@@ -30,13 +30,13 @@ Recording = (
     | cfg.BagSource
     | cfg.DvrkSource
 )
-DEFAULT_RATE = 30.0  # of folders, which do not know theirs
+DEFAULT_RATE = 30.0  # Hz, of recordings that do not tell theirs
 ASSUMED = " (assumed: the files do not say it; set source.rate)"
-# Two eyes that are one: compared in pictures so small that noise and compression are averaged away.
-WIDTH = 80  # px
-SURELY = 0.25  # of what a shift by one of their pixels changes; the eyes of a scope differ by 1 to 5 of it
-LEAST = 1.0  # grey levels, of such a shift: less is a picture of nothing, which tells nothing
-# Colours of a mosaic, shares of the sum of its four pixels.
+# Check for the same picture in both eyes, in pictures so small that noise and compression are averaged away.
+WIDTH = 80  # px of these pictures
+SURELY = 0.25  # times the change by a shift of one pixel; a scope's eyes differ by 1 to 5 times that
+LEAST = 1.0  # grey levels of that change: if it is less, the picture has no texture, and is not judged
+# Largest difference of both greens, smallest of red and blue, as shares of the sum of four pixels.
 GREENS, RED_BLUE = 0.005, 0.03
 MOSAIC = (
     "the pictures are grey, and a Bayer mosaic: each pixel holds one colour; take it apart (OpenCV's "
@@ -47,31 +47,31 @@ MOSAIC = (
 class Replay:
     """A `Source` that plays a recording.
 
-    Every pair of the recording (each stride-th, if a stride is set) has its turn, numbered by `frame_id`: its
-    place in the first pass, counted on when the recording loops. `rate` is that of the turns. In `realtime`
-    pace turn `n` is due `n / rate` seconds after the first, by a clock that nobody sets, and is stamped with
-    the wall clock's time then; a pair that would come more than one period late is left out and counted. In
-    `step` pace the stamp is `frame_id / rate`, whatever the clock says. `epoch` grows with each loop, and
-    where a stamp goes back.
+    Each pair (or each stride-th) has a turn, whose number is `frame_id`: its place in the first pass, counted
+    on when the recording loops. `rate` is the rate of turns. In `realtime` pace turn `n` is due `n / rate`
+    seconds after the first, by a monotonic clock. Its stamp is the wall clock's time then. A pair that would
+    come more than one period late is left out and counted as dropped. In `fast` pace no pair waits, and the
+    stamp is the wall clock's. In `step` pace the stamp is `frame_id / rate`. `epoch` grows with each loop,
+    and when a stamp goes back.
 
-    A recording that keeps a stamp of each picture is played by those, unless `config.rate` is set.
+    A recording that holds a stamp for each picture is played by these, unless `config.rate` is set.
 
     Attributes:
         first: number of the first frame.
-        pairs: what is read.
-        assumed: what is to be said behind the rate, where nobody told it.
+        pairs: the reader of the recording.
+        assumed: text to show behind the rate if it is a guess; else empty.
 
     Args:
         config: which recording, and how to play it.
-        references: read the recording's truth with each frame.
-        clock: monotonic seconds.
-        wall_ns: wall clock, nanoseconds.
+        references: read the recording's ground truth with each frame.
+        clock: monotonic, s.
+        wall_ns: wall clock, ns.
         sleep: waits for seconds; the default is cut short by `stop`.
-        quiet: it is looked at before it is played: then its oddities are said.
+        quiet: do not log warnings about the recording: whoever plays it later does.
 
     Raises:
-        UsageError: files are missing or do not fit each other, pairs are missing before `frames`, or `start`
-            lies behind the end, or a reference is of a frame that is not there.
+        UsageError: files are missing or do not match, pairs are missing before `frames`, `start` lies behind
+            the end, or a reference is of a frame that does not exist.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Replay:
             say(f"{finding.what}; {finding.fix}")
         stamps = None if self.pairs.stamps is None else self.pairs.stamps[:: config.stride]
         self._stamps = stamps if config.rate is None else None  # [turns, 2] ns, of both eyes' pictures
-        # Those of the left pictures, ns: by them poses of the same recording are found.
+        # Stamps of the left pictures, ns: to look up poses in the same bag.
         self._recorded = stamps[:, 0] if stamps is not None and isinstance(self.pairs, BagPairs) else None
         self.dropped = 0
         self._began: float | None = None  # monotonic seconds of the first turn
@@ -124,7 +124,7 @@ class Replay:
                 raise UsageError(f"{self.pairs.cut_off}, or play what is there with source.frames:={there}")
 
     def _compare_poses(self, there: int, lefts: int) -> None:
-        if there == lefts or (self.pairs.cut_off and there > lefts):  # the pictures that it lost have poses
+        if there == lefts or (self.pairs.cut_off and there > lefts):  # the cut-off part has poses, too
             return
         self.pairs.close()
         raise UsageError(
@@ -141,21 +141,21 @@ class Replay:
                 say(misnamed)
 
     def frame_at(self, start: float) -> int:
-        """Number of the frame that this `source.start` begins with."""
+        """Return the number of the frame with which this `source.start` (s) begins."""
         if self._stamps is None:
             return round(start * self.rate)
         return int(np.searchsorted(self._stamps[:, 0], self._stamps[0, 0] + round(start * 1e9)))
 
     def seconds_of(self, frame_id: int) -> float:
-        """The `source.start`, to the nanosecond, that begins with this frame of the first pass; of frames
-        with the same stamp it begins with the first."""
+        """Return the `source.start` (s, to the nanosecond) that begins with this frame of the first pass, or
+        with the first frame that has the same stamp."""
         if self._stamps is None:
             return round(frame_id / self.rate, 9)
         return round(int(self._stamps[frame_id, 0] - self._stamps[0, 0]) * 1e-9, 9)
 
     @property
     def frame_count(self) -> int | None:
-        """How many turns there will be; None for an endless loop."""
+        """The number of turns; None for an endless loop."""
         if self._config.loop:
             return self._config.frames
         there = self._count - self.first
@@ -239,13 +239,13 @@ class Replay:
             frame_id += 1
 
     def _due_in(self, frame_id: int) -> float:
-        """Seconds until the turn of this frame, negative when it is over; the first turn is now."""
+        """The seconds until this frame's turn, negative if it is late. The first call starts the clock."""
         if self._began is None:
             self._began = self._clock()
         return self._began + self._elapsed(frame_id) * 1e-9 - self._clock()
 
     def _elapsed(self, frame_id: int) -> int:
-        """Time from the first turn to this one, as the recording has it, ns."""
+        """The time from the first turn to this one in the recording, ns."""
         turns = frame_id - self.first
         if self._stamps is None:
             return round(turns * 1e9 / self.rate)
@@ -255,7 +255,7 @@ class Replay:
         return passes * one_pass + int(times[turn] - times[0])
 
     def _skew(self, index: int) -> int:
-        """How much later the right picture was taken, ns."""
+        """The delay of the right picture after the left one, ns."""
         if self._stamps is None:
             return round(self.pairs.later * 1e9 / (self.rate * self._config.stride))
         return int(self._stamps[index, 1] - self._stamps[index, 0])
@@ -263,14 +263,14 @@ class Replay:
     def _is_too_late(self, frame_id: int) -> bool:
         """Tell whether to leave this frame out.
 
-        One frame a second comes through even where skipping itself is slower than the recording.
+        One frame per second is let through even if skipping itself is slower than the recording.
         """
         if self._config.pace != "realtime" or self._began is None or self._dropped_in_a_row >= self.rate:
             return False
         return self._due_in(frame_id) < -1.0 / self.rate
 
     def _wait_for_turn(self, frame_id: int) -> int:
-        """Wait as the pace asks; the capture stamp of this frame, ns."""
+        """Wait as the pace demands; return the capture stamp of this frame, ns."""
         if self._config.pace == "step":
             if self._stamps is not None:
                 return int(self._stamps[self.first, 0]) + self._elapsed(frame_id)
@@ -285,7 +285,7 @@ class Replay:
 
 
 def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, one return per kind
-    """The reader that fits the kind of recording; `references`: of the recording's truth, too."""
+    """Open the reader for this kind of recording; `references`: also of ground truth that is part of it."""
     match config:
         case cfg.FoldersSource():
             numbered = config.poses is not None or config.reference != cfg.ReferenceConfig()
@@ -311,8 +311,8 @@ def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, 
 
 
 def is_mosaic(picture: U8) -> bool:
-    """Tell whether a grey picture [H, W, 3] holds a Bayer mosaic of tissue: of four pixels two on one
-    diagonal are alike, since green, and red and blue on the other one are not."""
+    """Tell whether a grey picture [H, W, 3] is a Bayer mosaic of tissue. In each 2x2 block the greens on one
+    diagonal are about equal; red and blue on the other one differ."""
     grey = picture[..., 1]
     if not all(np.array_equal(grey, picture[..., channel]) for channel in (0, 2)):
         return False
@@ -322,13 +322,13 @@ def is_mosaic(picture: U8) -> bool:
 
 
 def refuse_one_eye_twice(left: U8, right: U8 | None) -> None:
-    """Look at the first pair [H, W, 3] of a recording: of one eye twice no depth can come.
+    """Check that the first pair [H, W, 3] of a recording is not one eye twice, which gives no depth.
 
-    Live cameras are not refused: both may send a test picture until the scope is plugged in. There the watch
-    on both eyes warns (`eyes_equal`).
+    Live cameras are not refused: both may send a test picture until the scope is plugged in. They get the
+    warning `eyes_equal` instead.
 
     Raises:
-        UsageError: both pictures are surely of the same eye.
+        UsageError: both pictures are clearly of the same eye.
     """
     if right is None or left.shape != right.shape:
         return

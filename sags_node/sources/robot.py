@@ -1,4 +1,4 @@
-"""Where the robot says that the scope is, for each frame: from ROS 2, from another program, or from a bag."""
+"""Adds to each frame the scope's pose as the robot reports it: by ROS 2, by another program, or in a bag."""
 
 import logging
 import threading
@@ -28,12 +28,12 @@ from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
 
-WAIT_S = 0.1  # for a pose that is on its way: robots tell theirs sooner than cameras their picture
+WAIT_S = 0.1  # s to wait for a pose; robots send theirs sooner than cameras their pictures
 POLL_S = 0.1
 CLOSE_S = 5.0
 STATIC = "/tf_static"
-WHOLE = 10_000_000  # samples of a bag: all
-TOOL_PROBLEMS = {  # why its pose is not known
+WHOLE = 10_000_000  # samples kept of a bag: all
+TOOL_PROBLEMS = {  # why a tool's pose is not known
     "pose_missing": "no pose of the picture's time has come",
     "pose_stopped": "its newest pose is older than the picture",
     "pose_jumped": "its pose jumped within the last second",
@@ -42,17 +42,17 @@ TOOL_PROBLEMS = {  # why its pose is not known
 
 
 class Robot:
-    """Where poses come from, from its making to `close`."""
+    """A source of poses. It receives them from its construction to `close`."""
 
     def __init__(self, config: BagRobot | PushRobot | Ros2Robot, kept: int = KEPT) -> None:
         self.track = PoseTrack(config.base, config.hand, kept)
         self.tools = {absolute(tool.topic): PoseTrack(kept=kept) for tool in config.tools}
 
     def add(self, topic: str, data: bytes | memoryview, kind: str) -> None:
-        """A message of one of `POSE_TYPES`, of the scope or, by its topic, of a tool.
+        """Take in a message of one of `POSE_TYPES`: of a tool if the topic is a tool's, else of the scope.
 
         Raises:
-            SagsError: see `PoseTrack.add`; or a tree of frames where a tool's pose is wanted.
+            SagsError: see `PoseTrack.add`; or a tool's topic holds a tree of frames.
         """
         track = self.tools.get(topic)
         if track is not None and kind == TF:
@@ -60,14 +60,14 @@ class Robot:
         (track or self.track).add(data, kind, fixed=topic == STATIC)
 
     def close(self) -> None:
-        """Receive no more poses."""
+        """Stop receiving poses."""
 
 
 class _BagPoses(Robot):
     """All poses of a bag.
 
     Raises:
-        UsageError: the source is no bag, or the topic is not there or holds no poses.
+        UsageError: the source is no bag, or the topic is missing or holds no poses.
         SagsError: the file is damaged.
     """
 
@@ -77,7 +77,7 @@ class _BagPoses(Robot):
         super().__init__(config, WHOLE)
         wanted = {absolute(config.topic), *self.tools}
         seen: dict[str, str] = {}
-        wrong, first_wrong = 0, ""  # messages that are no pose: at their time there is none, as in tf2
+        wrong, first_wrong = 0, ""  # invalid poses: left out, as in tf2
         for message in read_messages(source.path, wanted=lambda topic, kind: kind in POSE_TYPES):
             topic = absolute(message.topic)
             seen[topic] = message.type
@@ -100,7 +100,7 @@ class _BagPoses(Robot):
 
 
 class _PushedPoses(Robot):
-    """Poses that another program hands in; see `Inbox`."""
+    """Poses that another program pushes; see `Inbox`."""
 
     def __init__(self, config: PushRobot) -> None:
         super().__init__(config)
@@ -127,15 +127,15 @@ class _PushedPoses(Robot):
         self.add(topic, message.cdr(), message.meta.type)
 
     def _topic_of(self, message: Message) -> str:
-        """Whose topic it is: a tool's or the scope's, or as it came without the sender's namespace."""
+        """The known topic (scope, tool, tf_static) that is meant; else the sent one without its namespace."""
         sent, name = absolute(message.topic), absolute(message.topic.partition("/")[2])
         if self._scope is not None and self._scope in {sent, name}:
             return self._scope
-        # A namespace may have parts of its own.
+        # A namespace may itself contain slashes.
         return max((known for known in (STATIC, *self.tools) if sent.endswith(known)), key=len, default=name)
 
     def _pose_of(self, message: Message) -> list[str]:
-        """Transforms of a tree may come from several programs."""
+        """What only one program may send: a pose. Transforms of a tree may come from several."""
         topic = self._topic_of(message)
         whose = f"the pose of {topic}" if topic in self.tools else "the robot's pose"
         return [] if message.meta.type == TF else [whose]
@@ -172,7 +172,7 @@ class _RosPoses(Robot):
                     self._add(topic, reader.kind, data)
 
     def _subscribe(self) -> None:
-        """Subscribe as soon as somebody publishes: only then the type is known."""
+        """Subscribe to topics that have a publisher: only then their type is known."""
         if self._topics <= self._readers.keys():
             return
         there = self._graph.publications()
@@ -196,11 +196,11 @@ class _RosPoses(Robot):
 
 
 def open_robot(config: LaunchConfig) -> Robot:
-    """The poses that a launch file asks for.
+    """Open the source of poses that a launch file names.
 
     Raises:
-        UsageError: it asks for none, or they are not there; a socket that is open to others.
-        SagsError: they cannot be read.
+        UsageError: it names none, there are no poses, or see `Inbox`.
+        SagsError: the poses cannot be read.
     """
     match config.robot:
         case BagRobot():
@@ -213,10 +213,10 @@ def open_robot(config: LaunchConfig) -> Robot:
 
 
 class Posed:
-    """A `Source` whose frames know where the robot says that the left rectified camera is.
+    """A `Source` whose frames hold the pose of the left rectified camera, as the robot reports it.
 
-    Nothing is delivered before the first pose. Later a frame without one keeps the last pose, and says why
-    (`StereoFrame.pose_problem`). Tools are told where their poses are known (`StereoFrame.tools`).
+    No frame is delivered before the first pose. A later frame without a pose gets the last one, and says why
+    (`StereoFrame.pose_problem`). Poses of tools are added where they are known (`StereoFrame.tools`).
 
     Args:
         source: of the pictures.
@@ -253,12 +253,12 @@ class Posed:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Return what is wrong with who sends pictures or poses, and how to fix it."""
+        """Return what is wrong with the senders of pictures or poses, and how to fix it."""
         return findings_of(self._source) + findings_of(self.robot)
 
     @property
     def dropped(self) -> int:
-        """Those of the pictures' source, and frames before the first pose."""
+        """The frames that the pictures' source dropped, and those before the first pose."""
         return self._source.dropped + self._without
 
     def __enter__(self) -> Self:
@@ -293,7 +293,7 @@ class Posed:
             yield replace(frame, T_world_cam=last, pose_problem=problem, tools=tools)
 
     def _told(self, t_ns: int, T_base_hand: F64, deadline: float) -> tuple[ToolPose, ...]:
-        """Where the tools are; poses that are on their way are waited for."""
+        """The tools' poses in the camera; wait for those that are missing until `deadline` (monotonic, s)."""
         T_cam_base, told = invert(T_base_hand @ self._T_hand_cam), []
         for tool in self._tools:
             track = self.robot.tools[absolute(tool.topic)]
@@ -317,15 +317,15 @@ class Posed:
 
 
 def rectified(T_hand_cam: F64, rig: StereoRig) -> F64:
-    """The left rectified camera on the hand [4, 4], of the raw one."""
+    """Convert the raw left camera's pose on the hand [4, 4] to that of the left rectified camera."""
     return T_hand_cam @ rigid(rig.left.R.T, np.zeros(3))
 
 
 def hand_eye_file(config: LaunchConfig) -> Path:
-    """Find where the camera on the robot is said to be.
+    """Return the file of the hand-eye calibration.
 
     Raises:
-        UsageError: nowhere.
+        UsageError: the launch file names none.
     """
     assert config.robot is not None
     if config.robot.hand_eye is not None:

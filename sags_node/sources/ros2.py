@@ -22,23 +22,23 @@ from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.1  # how soon the reading thread notices `stop`, and a topic that is new
-CLOSE_S = 5.0
-QUIET_S = 3.0  # without a picture: it is said what is there instead
-MUCH_LOST = 0.1  # of the pictures; as much as a strict reader of ours allows
-INFO_S = 10.0  # longest wait for the calibration: cameras may just be starting
-ZEROS_S = 2.0  # longest wait where they say that they have none: drivers start before they have read it
+POLL_S = 0.1  # s until the reading thread notices `stop` or a new topic
+CLOSE_S = 5.0  # s to wait for the reading thread
+QUIET_S = 3.0  # s without a picture, after which a warning says which topics there are
+MUCH_LOST = 0.1  # share of lost pictures; a strict `read` of our client allows as much
+INFO_S = 10.0  # s to wait for the calibration: cameras may just be starting
+ZEROS_S = 2.0  # s to wait once an empty one came: drivers may start before they have loaded it
 
 
 class RosCameras(SentPictures):
     """A `Source` of live stereo frames from a ROS 2 graph.
 
-    Pictures come raw or compressed, as their sender publishes them. Its process may end and come again. While
-    the cameras say another calibration than `rig` none is given: its depth would be wrong.
+    Pictures come raw or compressed, as their sender publishes them. The sender may restart. While the cameras
+    publish another calibration than `rig`, no pictures are given: depth would be wrong.
 
     Args:
         size: width and height that pictures must have, px; None: those of the first.
-        rig: what the cameras said at the start, see `read_rig`; None: the calibration is not theirs.
+        rig: the calibration that the cameras published at the start (`read_rig`); None: it is not theirs.
 
     Raises:
         UsageError, SagsError: see `Graph`.
@@ -63,7 +63,7 @@ class RosCameras(SentPictures):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Return what is wrong with the cameras, and how to fix it. May be read from any thread."""
+        """Return what is wrong with the cameras, and how to fix it. Thread-safe."""
         changed = ", ".join(self._changed.copy().values())
         if not changed:
             return ()
@@ -94,8 +94,7 @@ class RosCameras(SentPictures):
                 log.warning("%s", self._silence(eye))
 
     def _subscribe(self) -> None:
-        """Subscribe as soon as somebody publishes: only then it is known whether the pictures are
-        compressed."""
+        """Subscribe to topics that have a publisher: before, it is not known whether they are compressed."""
         if len(self._readers) == len(self._names):
             return
         there = self._graph.publications()
@@ -118,7 +117,7 @@ class RosCameras(SentPictures):
     def _compare(self, eye: Side, said: Calibrated) -> None:
         assert self._infos is not None and self._rig is not None
         taken = self._rig.left if eye == "left" else self._rig.right
-        rectified = already_rectified(StereoRig("ros2", said, said)).left  # which of them was taken is alike
+        rectified = already_rectified(StereoRig("ros2", said, said)).left  # `rig` may be either of them
         if same(taken, said) or same(taken, rectified):
             self._changed.pop(eye, None)
             return
@@ -156,14 +155,14 @@ class RosCameras(SentPictures):
 
 
 def picture_topics(config: Ros2Source) -> dict[Side, str]:
-    """The picture topics of each eye; of the left one only where its pictures show both."""
+    """Return the picture topic of each eye; only that of the left one if its pictures show both."""
     if config.geometry.layout != "separate":
         return {"left": absolute(config.left)}
     return {"left": absolute(config.left), "right": absolute(config.right)}
 
 
 def absolute(name: str) -> str:
-    """A topic as the graph spells it."""
+    """Return a topic with a leading slash, as the graph names it."""
     return "/" + name.lstrip("/")
 
 
@@ -176,11 +175,11 @@ def _explained(name: str, share: float) -> str:
 
 
 def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
-    """The calibration that the cameras publish; None where they publish an empty one.
+    """Read the calibration that the cameras publish; None if it is empty.
 
     Raises:
-        UsageError: no camera_info comes within `seconds`, one eye's is empty, the pictures are turned, or
-            they are implausible.
+        UsageError: no camera_info comes within `seconds`, one eye's is empty, the pictures are flipped, or
+            the calibration is implausible.
         SagsError: a message is damaged.
     """
     graph = Graph(config)
@@ -214,7 +213,7 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
 
 
 class _CameraInfos:
-    """What both eyes' cameras say of their calibration.
+    """Receives the calibrations that both eyes' cameras publish.
 
     Attributes:
         names: the topic of each eye.
@@ -228,7 +227,7 @@ class _CameraInfos:
         self._readers = {eye: graph.reader(name, CAMERA_INFO) for eye, name in self.names.items()}
 
     def take(self) -> Iterator[tuple[Side, Calibrated | None]]:
-        """Return what has come since; None: not calibrated.
+        """Yield the calibrations that have come since, by eye; None: not calibrated.
 
         Raises:
             SagsError: see `read_eye`.

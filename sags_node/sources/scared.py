@@ -1,8 +1,8 @@
-"""Keyframe folders of SCARED (Allan et al., arXiv 2101.01133).
+"""Reads keyframe folders of SCARED (Allan et al., arXiv 2101.01133).
 
-A keyframe is one view of a still organ, measured with structured light, and a video of the scope moving away
-from there: `endoscope_calibration.yaml`, `data/rgb.mp4` (left picture above the right one), `data/frame_data`
-(poses) and `data/scene_points` (the measured surface seen from each frame). The files give millimetres.
+A keyframe is one view of a still organ, measured with structured light, and a video in which the scope moves
+away: `endoscope_calibration.yaml`, `data/rgb.mp4` (left picture above the right one), `data/frame_data`
+(poses) and `data/scene_points` (the measured surface as seen from each frame). Lengths are in mm.
 """
 
 import json
@@ -29,11 +29,11 @@ from sags_node.types import F32, F64, Eye, Reference, StereoRig
 log = logging.getLogger(__name__)
 
 FILE = "endoscope_calibration.yaml"
-METRES = 1e-3  # per unit of the files
+METRES = 1e-3  # m per unit of the files (mm)
 BASELINES = (1e-3, 50e-3)  # m: outside, the file is not in millimetres
 RECTIFIED_FOLDERS = (("left_rectified", "right_rectified"), ("data/left_finalpass", "data/right_finalpass"))
 LARGEST_JSON = 2**20  # bytes
-LARGEST_POINTS = 2**28
+LARGEST_POINTS = 2**28  # bytes
 
 
 class ScaredPairs(Pairs):
@@ -81,7 +81,7 @@ class ScaredPairs(Pairs):
         if data is None:
             return None
         width, height = self._left.width, self._left.height
-        # OpenCV takes the three channels for R, G, B and gives B, G, R.
+        # x, y, z are stored as R, G, B; OpenCV returns B, G, R.
         name = f"data/scene_points of frame {index}"
         points = decode(data, cv2.IMREAD_UNCHANGED, name, "unpack or download scene_points.tar.gz again")
         if points.dtype != np.float32 or points.shape != (2 * height, width, 3):
@@ -92,7 +92,7 @@ class ScaredPairs(Pairs):
         return Reference(self._rectified_depth(points[:height, :, ::-1]), "structured_light")
 
     def _rectified_depth(self, points: F32) -> F32:
-        """Depth [H, W] m in the left rectified picture, of points [H, W, 3] mm at the raw picture's pixels.
+        """Depth [H, W] m in the left rectified picture, from points [H, W, 3] mm at the raw picture's pixels.
         Each rectified pixel takes the point of the nearest raw one: points are never averaged.
         """
         depth = points @ (self._left.R[2] * METRES).astype(np.float32)
@@ -102,8 +102,8 @@ class ScaredPairs(Pairs):
 
 
 def read_rig(folder: Path, judged: bool = True) -> StereoRig:
-    """The keyframe's calibration, for the pictures that are played: raw ones or rectified ones. If it is not
-    `judged`, what is odd about it is not said: pictures may have been resized since.
+    """Read the keyframe's calibration for the pictures that are played, raw or rectified. Unless `judged`,
+    its plausibility is not checked: pictures may have been resized since.
 
     Raises:
         UsageError: pictures or calibration are missing, damaged or implausible.
@@ -117,7 +117,7 @@ def read_rig(folder: Path, judged: bool = True) -> StereoRig:
 
 
 def read_calibration(folder: Path, size: tuple[int, int]) -> StereoRig:
-    """Read `endoscope_calibration.yaml` and rectify as OpenCV does by default, like the public tools for it.
+    """Read `endoscope_calibration.yaml`, and rectify with OpenCV's defaults, as the public SCARED tools do.
 
     Args:
         size: width and height of one eye's picture, px.
@@ -158,7 +158,7 @@ def _matrix(storage: cv2.FileStorage, file: Path, key: str, lengths: tuple[int, 
 
 
 def _open_pictures(folder: Path) -> tuple[OneVideoPairs | FolderPairs, bool]:
-    """The reader of the pictures that are there, and whether they are rectified."""
+    """Open the pictures of the folder; also tells whether they are rectified."""
     if (folder / "data/rgb.mp4").is_file():
         video = Video(folder / "data/rgb.mp4")
         return OneVideoPairs(video, Layout(GeometryConfig(layout="over_under"))), False
@@ -180,10 +180,10 @@ def _open_pictures(folder: Path) -> tuple[OneVideoPairs | FolderPairs, bool]:
 
 
 def _read_poses(folder: Path, count: int, left: Eye) -> F64 | None:
-    """`T_world_cam` [N, 4, 4] m of the left rectified camera; the world is that of frame 0. None without
-    files.
+    """`T_world_cam` [N, 4, 4] m of the left rectified camera; the world is frame 0's camera. None if
+    there are no files.
 
-    `camera-pose` maps points of the keyframe's raw left camera to the frame's.
+    `camera-pose` maps points from the keyframe's raw left camera to the raw left camera of the frame.
     """
     files = open_numbered(folder / "data/frame_data", ".json", LARGEST_JSON)
     if files is None:

@@ -1,4 +1,4 @@
-"""What other programs stamp and send: checked, brought to this machine's clock, paired and counted."""
+"""Checks pictures that other programs send, converts their stamps to this machine's clock, and pairs them."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -13,27 +13,27 @@ from sags_node.sources.pairing import LivePairs, Picture
 from sags_node.sources.pictures import size_text
 from sags_node.types import U8, Side
 
-OLDEST_NS = 1_000_000_000  # what is older is of no use, or of another clock
-AWAY_NS = 1_000_000_000  # without a picture, and
-AWAY_STEPS = 10  # times the usual step: whoever sends was away, and nothing was lost
-ONE_CLOCK_NS = 100_000_000  # the eyes' clocks apart: it is one, and the ways differ
-AHEAD_NS = 100_000_000  # beyond what clocks that are set by each other differ
-LATE_NS = 200_000_000  # on the way: a hand that is shown so late misses
-SMOOTHED = 0.1  # share of the newest picture in what is said of the last ones
-ENOUGH = 0.9  # of the pictures that should come
+OLDEST_NS = 1_000_000_000  # ns: an older picture is of no use, or its clock is another one
+AWAY_NS = 1_000_000_000  # ns: a gap of at least this, and of
+AWAY_STEPS = 10  # usual steps, means that the sender paused: nothing was lost
+ONE_CLOCK_NS = 100_000_000  # ns: if both eyes' clocks differ by less, they are one clock
+AHEAD_NS = 100_000_000  # ns ahead: synchronised clocks do not differ by more
+LATE_NS = 200_000_000  # ns of transit: a hand that is guided by later pictures misses
+SMOOTHED = 0.1  # weight of the newest picture in the mean age
+ENOUGH = 0.9  # share of the nominal rate; if less comes, the sender is told
 OTHER: Mapping[Side, Side] = {"left": "right", "right": "left"}
-WINDOW = 90  # stamps that the loss is counted over: three seconds
+WINDOW = 90  # pictures over which losses are counted: 3 s at 30 Hz
 
 
 class Arrivals:
-    """What came of one eye's pictures, and what was lost on the way, by the gaps between stamps.
+    """Counts one eye's pictures and, by the gaps between stamps, those that were lost in transit.
 
     Attributes:
-        lost: since the start, up to the last full stretch of `WINDOW` pictures.
+        lost: number since the start, up to the last full stretch of `WINDOW` pictures.
     """
 
     def __init__(self) -> None:
-        self._stamps: deque[int] = deque(maxlen=WINDOW + 1)  # with the one before
+        self._stamps: deque[int] = deque(maxlen=WINDOW + 1)  # ns, and the one before
         self._count = 0
         self.lost = 0
 
@@ -48,14 +48,14 @@ class Arrivals:
 
     @property
     def share_lost(self) -> float:
-        """The share lost of the last seconds' pictures; 0 until there are enough to tell."""
+        """The share of pictures lost in the last `WINDOW`; 0 until so many have come."""
         if len(self._stamps) < WINDOW:
             return 0.0
         return self._lost_now() / (self._lost_now() + len(self._stamps))
 
     @property
     def rate(self) -> float:
-        """Hz, by the stamps of the last seconds; infinite until there are enough to tell."""
+        """The rate by the last stamps, Hz; infinite until there are enough."""
         if len(self._stamps) < WINDOW // 3:
             return float("inf")
         return (len(self._stamps) - 1) * 1e9 / (self._stamps[-1] - self._stamps[0])
@@ -66,7 +66,7 @@ class Arrivals:
         return gap_ns > AWAY_STEPS * float(np.median(np.diff(np.array(self._stamps))))
 
     def _lost_now(self) -> float:
-        """In the last stretch: pictures that the usual step between two leaves room for, and did not come."""
+        """The number of pictures missing in the last `WINDOW`, by the median step between stamps."""
         steps = np.diff(np.array(self._stamps))
         return max(0.0, float(steps.sum() / np.median(steps)) - len(steps))
 
@@ -75,7 +75,7 @@ class SentPictures(LivePairs):
     """A `Source` of both eyes' pictures from another program. One receiving thread puts them in.
 
     Attributes:
-        arrivals: of each eye.
+        arrivals: counts of each eye's pictures.
 
     Args:
         size: width and height that pictures must have, px; None: those of the first.
@@ -92,15 +92,15 @@ class SentPictures(LivePairs):
         self._both = Layout(config.geometry.model_copy(update={"layout": both}))
         self._own = config.stamps == "own"
         self._clocks: Mapping[Side, CaptureClock] = {"left": CaptureClock(), "right": CaptureClock()}
-        self._age_ns = 0.0  # of pictures when they come
+        self._age_ns = 0.0  # smoothed age of pictures on arrival
 
     @property
     def dropped(self) -> int:
-        """Pairs that are missing: lost on the way, or without the other eye's picture."""
+        """The number of missing pairs: lost in transit, or without the other eye's picture."""
         return max(super().dropped, *(eye.lost for eye in self.arrivals.values()))
 
     def slowness(self) -> str | None:
-        """Return what is wrong with how pictures come, for who sends them; None: nothing."""
+        """Return a warning for the sender if pictures come too seldom or too late; else None."""
         rate = min(arrivals.rate for arrivals in self.arrivals.values())
         if rate < ENOUGH * self.rate:
             return (
@@ -115,10 +115,10 @@ class SentPictures(LivePairs):
         return None
 
     def put(self, eye: Side, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
-        """Take one eye's picture in.
+        """Put in one eye's picture.
 
         Raises:
-            SagsError: it is refused; why, and how to fix it.
+            SagsError: it is refused; the error says why, and how to fix it.
         """
         t_ns = self._on_wall(eye, stamp_ns, arrival_ns)
         self.arrivals[eye].add(stamp_ns)
@@ -126,7 +126,7 @@ class SentPictures(LivePairs):
         self.add(eye, Picture(t_ns, self._one.eye(picture, eye), stamp_ns, arrival_ns))
 
     def put_both(self, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
-        """Take one picture of both eyes in, side by side unless the geometry says otherwise; see `put`."""
+        """Put in a picture of both eyes: side by side, unless the geometry says otherwise; see `put`."""
         t_ns = self._on_wall("left", stamp_ns, arrival_ns)
         for arrivals in self.arrivals.values():
             arrivals.add(stamp_ns)
@@ -148,14 +148,14 @@ class SentPictures(LivePairs):
         )
 
     def _own_on_wall(self, eye: Side, stamp_ns: int, arrival_ns: int) -> int:
-        """Each eye is followed by itself: their pictures come in any order, and may be of two clocks."""
+        """Convert a stamp by the eye's own clock: pictures come in any order, and there may be two clocks."""
         self._clocks[eye].add(stamp_ns, arrival_ns)
         own, other = self._clocks[eye].to_wall(stamp_ns), self._clocks[OTHER[eye]].to_wall(stamp_ns)
         assert own is not None  # it was just added
         return own if other is None or abs(other - own) > ONE_CLOCK_NS else min(own, other)
 
     def _checked(self, picture: U8, layout: Layout) -> U8:
-        """A picture whose eyes have the right size."""
+        """The picture, if its eyes have the right size."""
         size = layout.size(picture.shape[1], picture.shape[0], "a picture")
         self._size = self._size or size
         if size != self._size:

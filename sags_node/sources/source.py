@@ -1,4 +1,4 @@
-"""What every source of stereo frames offers, and the one function that opens any of them."""
+"""The interface of all sources of stereo frames, and the function that opens any of them."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol, Self
@@ -13,34 +13,34 @@ class Source(Protocol):
 
     @property
     def rate(self) -> float:
-        """Nominal frames per second."""
+        """The nominal rate, Hz."""
 
     @property
     def frame_count(self) -> int | None:
-        """How many frames there will be, None when that is not known or there is no end."""
+        """The number of frames; None if it is not known or there is no end."""
 
     @property
     def dropped(self) -> int:
-        """Frames the source itself left out: late in `realtime` pace, unpaired from cameras."""
+        """The number of frames that the source left out: late ones in `realtime` pace, unpaired live ones."""
 
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *error: Any) -> None: ...
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        """Frames in capture order.
+        """Yield frames in capture order.
 
         Raises:
-            SagsError: a picture cannot be read, or the eyes do not fit each other.
+            SagsError: a picture cannot be read, or the eyes do not match.
         """
 
     def stop(self) -> None:
-        """End the iteration promptly, also while it waits. May be called from any thread."""
+        """End the iteration promptly, also while it waits. Thread-safe."""
 
 
 def findings_of(source: object) -> tuple[Finding, ...]:
-    """Return what a source of frames or poses that knows of more says is wrong, and how to fix it. May be
-    called from any thread."""
+    """Return the findings of a source of frames or poses: what is wrong, and how to fix it. Empty if it has
+    none. Thread-safe."""
     found: tuple[Finding, ...] = getattr(source, "findings", ())
     return found
 
@@ -57,14 +57,14 @@ def open_source(
 
     Args:
         config: the `source` section.
-        references: read the recording's truth with each frame. Only measuring needs it.
+        references: read the recording's ground truth with each frame. Only evaluation needs it.
         progress: called with (done, total) while a phantom session is rendered.
         size: width and height that an eye's live pictures must have, px; None: those of the first.
-        rig: the calibration that live cameras gave, if they did: it must stay the same.
-        quiet: a recording's oddities are said by who plays it.
+        rig: the calibration that live cameras published, if any: it must stay the same.
+        quiet: do not log warnings about a recording: whoever plays it later does.
 
     Raises:
-        UsageError: a file, folder or device is missing or does not fit the rest.
+        UsageError: a file, folder or device is missing or does not match the rest.
         SagsError: a device or file cannot be read.
     """
     if isinstance(config, cfg.V4l2Source):
@@ -92,8 +92,8 @@ def open_source(
 
 
 def recorded_rig(config: cfg.Source, judged: bool = True) -> StereoRig | None:
-    """The calibration that comes with the pictures; None where the launch file must name one. If it is not
-    `judged`, a bag's may be implausible, and SCARED's of another size.
+    """Read the calibration that comes with the pictures; None if the launch file must name one. Unless
+    `judged`, a bag's may be implausible, and SCARED's for another size.
 
     Raises:
         UsageError: it is missing, damaged or implausible.
@@ -120,7 +120,7 @@ def recorded_rig(config: cfg.Source, judged: bool = True) -> StereoRig | None:
 def _phantom_recording(
     config: cfg.PhantomSource, progress: Callable[[int, int], None] | None
 ) -> cfg.FoldersSource:
-    """The rendered session's own pictures, played the way this launch file asks."""
+    """The folders of the rendered session, to be played as this launch file says."""
     from sags_node.phantom import cached_session
 
     recorded = load_launch(cached_session(config, progress)).source

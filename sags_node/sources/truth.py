@@ -1,4 +1,4 @@
-"""What a recording knows of each frame besides the pictures: poses, and the references to measure against."""
+"""Reads what a recording holds besides pictures: poses, and references (ground truth) for evaluation."""
 
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -17,16 +17,16 @@ from sags_node.geometry import is_rotation
 from sags_node.sources.pictures import list_pictures, read_picture, size_text
 from sags_node.types import F32, F64, Bool, Reference
 
-UNKNOWN = 65535  # counts of depth, as many programs write it, beside 0
+UNKNOWN = 65535  # depth count for unknown, beside 0, as many programs write it
 _LARGEST = 2**31  # bytes
-FARTHEST = 1.0  # m that a scope moves: a millimetre that is taken for a metre
+FARTHEST = 1.0  # m: if a scope moves by more, millimetres were taken for metres
 
 
 def read_poses(file: Path) -> F64:
-    """`T_world_cam` [T, 4, 4] m of each frame of a recording.
+    """Read `T_world_cam` [T, 4, 4] m of each frame of a recording.
 
     Raises:
-        UsageError: the file is missing, damaged, or does not hold that.
+        UsageError: the file is missing or damaged, or the poses are missing or implausible.
     """
     poses = load_array(file, "T_world_cam", (None, 4, 4)).astype(np.float64)
     if not np.isfinite(poses).all():
@@ -47,7 +47,7 @@ def read_poses(file: Path) -> F64:
 
 
 class References:
-    """The truth that comes with a recording.
+    """The ground truth that comes with a recording.
 
     Raises:
         UsageError: a file or folder is missing, damaged or not of the stated form.
@@ -56,8 +56,8 @@ class References:
     def __init__(self, config: ReferenceConfig) -> None:
         self._config = config
         self._depth_files = {} if config.depth is None else _by_frame_number(config.depth)
-        self._tracks: dict[int, tuple[F64, Bool]] = {}  # points and which are visible, by frame number
-        self._numbers: Sequence[int] = ()  # of frames, as tracks say them; else each frame has its row
+        self._tracks: dict[int, tuple[F64, Bool]] = {}  # points and their visibility, by frame number
+        self._numbers: Sequence[int] = ()  # frame number of each row of the tracks; empty: row i is frame i
         if config.tracks is not None:
             points = load_array(config.tracks, "points", (None, None, 3)).astype(np.float64)
             visible = load_array(config.tracks, "visible", points.shape[:2]).astype(np.bool_)
@@ -66,8 +66,8 @@ class References:
             self._tracks = dict(zip(self._numbers or range(len(points)), rows, strict=True))
 
     def beyond(self, count: int) -> str:
-        """What is wrong where a number is that of no frame of the recording's `count`, as when they begin
-        at 1; "": nothing."""
+        """Return an error text if a frame number is not below the recording's `count` of frames, e.g. because
+        numbers begin at 1; else ""."""
         config = self._config
         for where, numbers in ((config.depth, self._depth_files), (config.tracks, self._numbers)):
             if (last := max(numbers, default=-1)) >= count:
@@ -78,7 +78,7 @@ class References:
         return ""
 
     def misnamed(self, pictures: Sequence[Path]) -> str:
-        """What is to be said where depth has the name of another picture than its own; "": nothing.
+        """Return a warning if a depth file has the name of another frame's picture; else "".
 
         Args:
             pictures: of all frames, in order.
@@ -93,13 +93,13 @@ class References:
         return ""
 
     def at(self, index: int, size: tuple[int, int]) -> Reference | None:
-        """Return what is known of one frame of the recording, None when that is nothing.
+        """Return the reference of one frame of the recording, None if it has none.
 
         Args:
             size: width and height of its picture, px.
 
         Raises:
-            SagsError: the depth picture is damaged, not 16 bit, or of another shape than the frame's.
+            SagsError: the depth picture is damaged, not 16 bit, or has another aspect ratio than the frame.
         """
         depth_file = self._depth_files.get(index)
         points, visible = self._tracks.get(index, (None, None))
@@ -130,7 +130,7 @@ def _by_frame_number(folder: Path) -> dict[int, Path]:
 
 
 def _frame_numbers(file: Path, count: int) -> Sequence[int]:
-    """Of tracks: as their `frames` [T] says; empty where there is none."""
+    """The frame numbers of tracks, from their array `frames` [T]; empty if there is none."""
     with zipfile.ZipFile(file) as archive:
         if "frames.npy" not in archive.namelist():
             return ()
@@ -146,7 +146,7 @@ def _frame_numbers(file: Path, count: int) -> Sequence[int]:
 def load_array(file: Path, key: str, shape: tuple[int | None, ...]) -> NDArray[np.generic]:
     """Load one numeric array of an npz file; `None` in `shape` stands for any length.
 
-    The header is compared with the bytes that are really there before memory is taken.
+    The header is compared with the size of the file before memory is allocated.
 
     Raises:
         UsageError: the file is missing or damaged, or the array is missing or of another shape or type.
@@ -176,13 +176,13 @@ def _explained(file: Path, kind: str) -> Iterator[None]:
         raise UsageError(f"{file} does not exist; check the path") from None
     except SagsError:
         raise
-    except Exception as error:  # zipfile, zlib and numpy's parser of headers raise what each likes
+    except Exception as error:  # zipfile, zlib and numpy's parser of headers raise many kinds
         said = " ".join(str(error).split())[:200]
         raise UsageError(f"{file} is not a readable {kind} file: {said}") from None
 
 
 def _load(stream: IO[bytes], what: str, shape: tuple[int | None, ...], room: int) -> NDArray[np.generic]:
-    """Load an npy stream whose header fits the wanted shape and `room`, the bytes of the stream."""
+    """Load an npy stream; its header must match the wanted shape and `room`, the bytes of the stream."""
     version = np.lib.format.read_magic(stream)
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,

@@ -19,17 +19,17 @@ from sags_node.types import Samples, Side
 
 log = logging.getLogger(__name__)
 
-FIRST_PICTURE_S = 3  # cameras need this long to start; OpenCV waits for the first picture in one piece
-DEEP = {"Y10 ": 6, "Y12 ": 4, "Y16 ": 0}  # pixel formats of 16 bit words: bits that they leave free
-NEAR_NS = 1_000_000_000  # a stamp so near to its arrival is of the kernel's monotonic clock
-STRANGE = 30  # pictures, none with such a stamp: the driver's clock is another one
+FIRST_PICTURE_S = 3  # s that cameras may need to start: OpenCV blocks until the first picture
+DEEP = {"Y10 ": 6, "Y12 ": 4, "Y16 ": 0}  # pixel formats of 16 bit words, and their unused bits
+NEAR_NS = 1_000_000_000  # ns: a stamp this near to its arrival is of the kernel's monotonic clock
+STRANGE = 30  # pictures: if none of so many has such a stamp, the driver uses another clock
 
 
 class Device:
     """An open camera.
 
-    Most drivers stamp by the kernel's monotonic clock. One that was seen to do so is believed, however old a
-    picture is: the driver's buffers keep those that nobody took for a while.
+    Most drivers stamp by the kernel's monotonic clock. Once a driver was seen to do so, its stamps are
+    believed, however old: its buffers may hold pictures that nobody took for a while.
 
     Args:
         path: device file; a udev link such as /dev/video-left follows its camera from port to port.
@@ -39,8 +39,8 @@ class Device:
         SagsError: the device is missing or cannot be opened, or the driver set another size.
     """
 
-    _is_near = False  # a stamp was near to its arrival
-    _far = 0  # pictures, before there was such a one
+    _is_near = False  # a stamp near to its arrival was seen
+    _far = 0  # pictures up to the first such stamp
 
     def __init__(self, path: str, config: V4l2Source) -> None:
         self._path = path
@@ -63,7 +63,7 @@ class Device:
             raise
 
     def _configure(self, config: V4l2Source) -> float:
-        """Ask for size, rate and format; the rate that the driver set. Drivers may refuse any of them."""
+        """Request size, rate and format; return the rate that the driver set. It may refuse any of them."""
         capture = self._capture
         asked = None if config.fourcc is None else config.fourcc.ljust(4)
         if asked is not None:
@@ -93,7 +93,7 @@ class Device:
         return rate
 
     def read(self, timeout: float) -> Shot | None:
-        """The next picture; None when none comes within `timeout` seconds or its stamp stands still.
+        """Return the next picture; None if none comes within `timeout` seconds, or its stamp is the last one.
 
         Raises:
             SagsError: the device is gone.
@@ -120,10 +120,10 @@ class Device:
         return Shot(arrival_ns - age_ns, image, device_ns=device_ns, arrival_ns=arrival_ns)
 
     def _age(self, driver_ns: int, before_ns: int) -> int:
-        """How long ago a picture was taken, ns, that the driver stamped so long before it arrived; 0 where it
-        gives no stamp (0), or one of another clock.
+        """The age of a picture on arrival, ns, given the driver's stamp and how long before arrival it lies.
+        0 if the driver gives no stamp (0), or one of another clock.
 
-        No picture is taken after it arrived: where a driver stamps ahead (vivid does), arrival counts.
+        No picture is taken after it arrived: if a driver stamps ahead (vivid does), the age is 0.
         """
         if not self._is_near:
             self._is_near = abs(before_ns) <= NEAR_NS
@@ -136,7 +136,7 @@ class Device:
 
 
 def _deep(picture: Samples, shift: int, size: tuple[int, int]) -> Samples:
-    """Gray counts of 10 to 16 bit, as bytes or as OpenCV reads them, as three equal channels of 16 bit."""
+    """Convert grey of 10 to 16 bit, as bytes or as OpenCV reads it, to three equal 16 bit channels."""
     gray = picture.reshape(-1).view(np.uint16).reshape(size[1], size[0])
     rgb: Samples = cv2.merge([cv2.multiply(gray, 1 << shift)] * 3)
     return rgb
@@ -155,12 +155,12 @@ def open_cameras(
     """Open the cameras of a launch file.
 
     Args:
-        config: devices, size, rate, and how far apart the stamps of a pair may be.
+        config: devices, size, rate, and the tolerance of pairs.
         size: width and height that an eye's pictures must have, px.
         open_device: opens one camera.
 
     Raises:
-        UsageError: the devices named cannot make a stereo pair, or not of this size.
+        UsageError: the named devices cannot make a stereo pair, or not of this size.
         SagsError: a device is missing, cannot be opened, or gives another size.
     """
     sides: dict[str, Side | None] = {config.left: None}

@@ -12,25 +12,25 @@ from sags_node.sources.pairing import NEAR, pair
 from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64
 
-PARTNERED = 0.5  # share of the pictures that have a partner, where stamps of two files tell it
+PARTNERED = 0.5  # share of pictures that must find a partner by stamps; else they pair by number
 TORN = (
     "the file says that its pictures are interlaced: what moves is torn, unless both fields are of one moment"
 )
-UNEVEN_RATES = 0.1  # that the usual rates of two files with gaps or jitter may differ
+UNEVEN_RATES = 0.1  # relative difference allowed between the rates of two files with gaps or jitter
 
 
 class VideoPairs(Pairs):
-    """Two videos, or the left one alone, which says how long it is.
+    """Two videos, or the left one alone. The number of pairs follows the left one.
 
-    Pictures of one number are a pair. Where stamps say that some are missing, those nearest in time are.
+    Pictures with the same number are a pair. If stamps show that some are missing, the nearest in time are.
 
     Attributes:
         left, right: the videos; right None: there is one eye.
-        by_number: not by stamps.
-        oddities: see `Video`; also how many pictures have no partner.
+        by_number: pictures are paired by number, not by stamps.
+        oddities: see `Video`; also the number of pictures without a partner.
 
     Args:
-        layout: what is used of each eye's picture.
+        layout: geometry of each eye's picture.
 
     Raises:
         UsageError: a file is missing or not a video, or the two differ in size or rate.
@@ -44,7 +44,7 @@ class VideoPairs(Pairs):
         self._layout = layout
         self.rate = self.left.rate
         self.oddities = [said for video in self._videos for said in _oddities(video, layout)]
-        self._late = 0  # ns, of the right file's stamps
+        self._late = 0  # ns to subtract from the right file's stamps
         try:
             numbers = None if self.right is None else self._joined(self.left, self.right)
             layout.size(*self.left.size, str(left))
@@ -88,7 +88,7 @@ class VideoPairs(Pairs):
         return [self.left] if self.right is None else [self.left, self.right]
 
     def _joined(self, left: Video, right: Video) -> I64 | None:
-        """Numbers of pictures that belong together [N, 2]; None: those of one number do."""
+        """The numbers of the pictures of each pair [N, 2]; None: pictures with the same number are pairs."""
         if left.size != right.size:
             sizes = (
                 f"{left.path} has {size_text(*left.size)} px but {right.path} has {size_text(*right.size)}"
@@ -105,7 +105,7 @@ class VideoPairs(Pairs):
             if apart > (0.01 if is_even else UNEVEN_RATES):
                 said = "they are not one stereo pair: record both at one rate, or bring one to it"
                 way = f"-i {shlex.quote(str(right.path))} -r {left.rate:g}"
-                if left.count == right.count:  # none may be added
+                if left.count == right.count:  # so no picture may be added
                     said = f"both have {left.count} pictures, so one rate is wrong; is it the right one's"
                     way = f"-r {left.rate:g} -i {shlex.quote(str(right.path))}"
                 raise UsageError(
@@ -117,7 +117,7 @@ class VideoPairs(Pairs):
         period = 1e9 / left.rate
         late, ends_late = (int(right.stamps[at] - left.stamps[at]) for at in (0, -1))
         of_one_clock = min(abs(late), abs(ends_late)) <= NEAR * period
-        if not of_one_clock:  # two recorders, each with its own zero
+        if not of_one_clock:  # two recorders, whose stamps begin at different times
             self.oddities.append(
                 f"the stamps of the right video begin {abs(late) * 1e-9:.3f} s "
                 f"{'after' if late > 0 else 'before'} those of the left one; their first pictures are taken "
@@ -142,7 +142,7 @@ class VideoPairs(Pairs):
         return found
 
     def _compare_lengths(self) -> None:
-        """Say what it means that pictures are paired by number, and one eye has more of them."""
+        """Note what it means that pictures are paired by number, and one eye has more of them."""
         left, right = self.left, self.right
         if right is None or not self.by_number or left.count == right.count:
             return
@@ -158,7 +158,7 @@ class VideoPairs(Pairs):
             )
 
     def _drifted(self, left: Video, right: Video, period: float) -> I64 | None:
-        """Do as `_joined`, of two even videos that begin together: rates that differ a little add up."""
+        """Do as `_joined` for two even videos that begin together: small differences of rate add up."""
         assert left.stamps is not None and right.stamps is not None
         last = min(left.count, right.count) - 1
         apart = abs(right.stamps[last] - left.stamps[last])
@@ -186,7 +186,7 @@ class VideoPairs(Pairs):
 
 
 class OneVideoPairs(Pairs):
-    """One video of both eyes: in halves or boxes of a picture, in rows, or one after the other.
+    """One video of both eyes: in halves or boxes of a picture, in alternating rows or pictures.
 
     Attributes:
         size: width and height of an eye's picture, px.
@@ -240,15 +240,15 @@ class OneVideoPairs(Pairs):
 
 
 def _oddities(video: Video, layout: Layout) -> list[str]:
-    """Return what is to be said of a video that is played so."""
+    """Warnings about a video that is played with this layout."""
     if not video.is_interlaced or layout.takes_fields:
         return video.oddities
     return [*video.oddities, f"{video.path}: {TORN}; set source.geometry.deinterlace:=top, or bottom"]
 
 
 def _turns(video: Video) -> I64:
-    """The turn of each picture [N], where the eyes come in turn; even: the first eye's. The time between two
-    pictures says how many were lost, so the eyes are not exchanged by one."""
+    """The turn of each picture [N] if the eyes come in turn; even: the first eye. The time between two
+    pictures tells how many were lost, so that a lost picture does not swap the eyes."""
     turns = np.arange(video.count)
     if video.stamps is not None and video.rate is not None:
         steps = np.maximum(1, np.rint(np.diff(video.stamps) * (video.rate * 1e-9))).astype(np.int64)
