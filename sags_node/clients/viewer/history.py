@@ -10,13 +10,13 @@ from sags_node.clients.viewer.feed import Moment
 from sags_node.types import F64
 
 PERIOD = 1.0  # s between two points
-GAP = 10.0  # s without a point
+GAP = 10.0  # s without a point, after which the older ones are dropped
 LENGTH = 120  # points
 FIGURES = ("rate", "p50", "p99", "rung")
 
 
 class History:
-    """A point per second; nothing is left after a gap, so that no line runs through time that nobody saw."""
+    """One point per second. A gap clears all, so that no line is drawn through time that nobody saw."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
