@@ -87,7 +87,7 @@ class Foxglove(Outlet):
         self._server: WebSocketServer | None = None
         self._shown: dict[str, Received] = {}  # by output
         self._audience = _Audience(self._welcome, self._pin if options.pin else None)
-        self._context = foxglove.Context()  # channels vanish with the last name for it
+        self._context = foxglove.Context()  # channels vanish with the last reference to it
         self._ways = {output.name: _way(output, self._context) for output in offered}
         self._server = _served(options, self._context, self._audience, backlog=len(offered))
 
@@ -133,8 +133,8 @@ class Foxglove(Outlet):
         self._publish(words, is_problem=result is None, about="request")
 
     def _welcome(self) -> None:
-        """Tell everybody what is missing: who comes later has not heard it. All in one status: of as many as
-        there are channels the server lets wait, and with one more it disconnects the client."""
+        """Tell all clients what is missing, as new ones have not heard it. All in one status: the server
+        queues no more messages than there are channels, and disconnects a client that has one more."""
         words = "; ".join(f"{name}: {reason}" for name, reason in self._missing.items())
         if words:
             self._publish(words, is_problem=True, about=PROBLEM)
