@@ -43,7 +43,7 @@ class FoxgloveOptions(ServerOptions):
 
 
 def outputs(options: FoxgloveOptions) -> list[Output]:
-    """One channel for each topic of the node and of an overlay, and one more for each picture as H.264."""
+    """Return a channel for each topic of the node and of an overlay, and another for pictures as H.264."""
     period = 0.0 if options.rate is None else 1 / options.rate
     has_video, channels = importlib.util.find_spec("av") is not None, []
     for ns, offered in ((options.node.ns, topics.TOPICS), (options.overlay.ns, topics.OVERLAY_TOPICS)):
@@ -110,7 +110,7 @@ class Foxglove(Outlet):
         return True
 
     def blank(self, output: Output, reason: str) -> None:
-        """Foxglove goes on showing what came last, so something empty must come."""
+        """Send something empty, as Foxglove goes on showing what came last."""
         self._ways[output.name].blank(self._shown.pop(output.name), reason)
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:

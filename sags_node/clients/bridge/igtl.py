@@ -72,7 +72,7 @@ def surface(places: F64, triangles: NDArray[np.int64]) -> MessageBase:
 
 
 def string(words: str) -> MessageBase:
-    """STRING."""
+    """STRING of these words, in ASCII."""
     return StringMessage(_ascii(words))
 
 

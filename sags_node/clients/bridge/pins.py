@@ -15,7 +15,7 @@ MOST = 64  # points of a list
 
 
 class Pin(NamedTuple):
-    """Pin this point."""
+    """A point that is to be pinned."""
 
     name: str
     place: F64  # [3] mm, as the peer said it

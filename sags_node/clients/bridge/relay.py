@@ -300,7 +300,7 @@ class Feed:
         self._subscriber.ask(names)
 
     def problem(self, name: str) -> str | None:
-        """Why the newest message of a topic must not be shown as new; None when it may be."""
+        """Return why the newest message of a topic must not be shown as new; None when it may be."""
         limit = SILENT_AFTER if name in EVERY_SECOND else self._max_age
         problem, topic = self._subscriber.problem(name, limit), topics.find(name)
         if problem is not None or topic is None or topic.periodic or self.latest("status") is None:

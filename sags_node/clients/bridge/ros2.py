@@ -196,7 +196,7 @@ class Ros2(Outlet):
     # ---- out -----------------------------------------------------------------------------------------------
 
     def wants(self, output: Output) -> bool:
-        """Tell whether it is read, or kept for late readers without a time limit: that must always be new."""
+        """Tell whether it is wanted: somebody reads it, or it is kept for late readers and must be new."""
         offer = self._offers[output.name]
         lasts = offer.delivery.kept and offer.delivery.lifespan is None
         return lasts or output.name in self._read

@@ -127,7 +127,7 @@ class Deformation:
 
 
 def _field(vertices: F64, depth: float, frame: TissueFrame, T: F64) -> _Field:
-    """Find where to pin the followers of an object at T [4, 4], and what they carry."""
+    """Choose where to pin the followers of an object at T [4, 4], and how its vertices follow them."""
     import open3d as o3d
 
     if frame.confidence is None:

@@ -148,7 +148,7 @@ class Proximity:
         return _rows([*(near for near in self._found if near.is_too_near), *self._unknown])
 
     def status(self, now_ns: int) -> dict[str, Any]:
-        """Say which tips are too near to what, and which tips and zones are not known."""
+        """Return which tips are too near to what, and which tips and zones are not known."""
         is_old = self._stamp_ns is None or now_ns - self._stamp_ns > 1e9 * MAX_AGE
         reason = self.reason or ("none came lately" if is_old else None)
         near, unknown = ([], []) if reason else (self._found, self._unknown)

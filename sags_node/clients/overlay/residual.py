@@ -73,8 +73,8 @@ class Residual:
 
 
 def look(placed: Placed, frame: TissueFrame, share: float = 1.0) -> Found | None:
-    """Return the distance (m) below which nine of ten points before or behind an object lie from it, of the
-    share that matched, and the median bound (m) of nine of ten depth errors. None: too few points."""
+    """Return the residual (m) that nine of ten points before or behind an object stay below, of the `share`
+    that matched, and the bound (m) of nine of ten errors of their depths. None: too few points."""
     assert frame.confidence is not None
     every, at = evenly(frame.depth.shape)
     depth, confidence = frame.depth[at], frame.confidence[at]

@@ -20,7 +20,7 @@ class Arrived:
 
     @property
     def size(self) -> int:
-        """Bytes of its parts."""
+        """The bytes of its parts."""
         return sum(memoryview(part).nbytes for part in self.message.parts)
 
 

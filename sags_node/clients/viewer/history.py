@@ -38,7 +38,7 @@ class History:
         return True
 
     def series(self, *figures: str) -> tuple[F64, ...]:
-        """Seconds since now (negative), then each figure; all of the same length."""
+        """Return seconds relative to the newest point (negative), then each figure; all of one length."""
         points = np.array(self._points, np.float64).reshape(-1, 1 + len(FIGURES))
         times = points[:, 0] - (points[-1, 0] if len(points) else 0.0)
         return (times, *(points[:, 1 + FIGURES.index(figure)] for figure in figures))

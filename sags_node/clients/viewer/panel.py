@@ -68,7 +68,7 @@ class Panel:
 
     @property
     def rate(self) -> float:
-        """How often the browser should be brought up to date, Hz."""
+        """The rate at which the browser should be brought up to date, Hz."""
         return float(self._rate.value)
 
     @property
