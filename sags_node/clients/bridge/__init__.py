@@ -1,4 +1,4 @@
-"""`sags bridge`: what a node sends, in the words of other systems (extra `bridges`).
+"""`sags bridge`: what a node sends, by the protocols of other systems (extra `bridges`).
 
 `relay` is the loop that bridges share; `openigtlink`, `foxglove`, `ros2`, `web` and `gst` are what it speaks
 to.

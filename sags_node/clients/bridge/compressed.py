@@ -1,4 +1,4 @@
-"""Pictures as small files: a receiver of ROS 2 as it is installed loses what is larger.
+"""Pictures as small files: a receiver of ROS 2 with default settings loses larger ones.
 
 Colour becomes JPEG; masks, confidence and overlays PNG. Depth becomes a PNG as ROS' `compressedDepth` makes
 it: steps of equal disparity, as stereo measures. All are made coarser until they are small enough.
@@ -20,7 +20,7 @@ from sags_node.messaging.received import Received, ReceivedImage
 from sags_node.types import F32, U8
 
 LARGEST = 160_000  # bytes; stock receivers have 212,992, of which the kernel takes some for each packet
-SMALL = LARGEST // 2  # then the next one may be finer; no step of those below makes a file twice as large
+SMALL = LARGEST // 2  # bytes; below it the next file is finer: no step below makes a file twice as large
 QUALITIES = (90, 80, 65, 50, 35, 20)  # of JPEG
 STEPS = (0.02e-3, 0.04e-3, 0.08e-3, 0.16e-3, 0.32e-3)  # m at `USUAL` that one count of a depth PNG stands for
 USUAL = 0.1  # m, of tissue
@@ -28,12 +28,11 @@ FARTHEST = 10.0  # m; what is farther is unknown
 LEVELS = (256, 64, 16, 8)  # of confidence
 _INVERSE_DEPTH = 0  # the form of a depth PNG, the only one that ROS has
 
-Pack = Callable[[NDArray[Any]], tuple[bytes, str]]  # the file, and what it is in the words of ROS
+Pack = Callable[[NDArray[Any]], tuple[bytes, str]]  # the file, and ROS' name of its format
 
 
 def suffix(topic: topics.Topic) -> str:
-    """Return what ROS' image_transport adds to the name of a picture topic, for the file that is made of
-    it."""
+    """Return the suffix that ROS' image_transport gives to the topic of a picture's file."""
     return "/compressedDepth" if _is_depth(topic.name) else "/compressed"
 
 
@@ -45,7 +44,7 @@ class Compressor:
         self._chosen = 0
 
     def __call__(self, received: Received) -> bytes:
-        """`sensor_msgs/CompressedImage` of a picture; too large only where there is no coarser way."""
+        """Return the `sensor_msgs/CompressedImage` of a picture; too large only where none is coarser."""
         assert isinstance(received, ReceivedImage)
         file, form = self._ways[self._chosen](received.array)
         while len(file) > LARGEST and self._chosen < len(self._ways) - 1:
@@ -89,13 +88,13 @@ def _exact(picture: U8) -> tuple[bytes, str]:
 
 
 def _confidence(sure: F32, levels: int) -> tuple[bytes, str]:
-    """255: 1.0."""
+    """A PNG of confidence in `levels` steps; 255 stands for 1.0."""
     steps = cv2.convertScaleAbs(sure, alpha=levels - 1)  # scales, rounds and saturates in one pass
     return _exact(cv2.convertScaleAbs(steps, alpha=255 / (levels - 1)))
 
 
 def _depth(z: F32, step: float) -> tuple[bytes, str]:
-    """`a / z + b` as 16 bit, 0: unknown, after the numbers `a` and `b`.
+    """A PNG of `a / z + b` as 16 bit (0: unknown), after the numbers `a` and `b`.
 
     Source: ROS' image_transport_plugins, compressed_depth_image_transport/src/codec.cpp.
     """

@@ -43,7 +43,7 @@ class FoxgloveOptions(ServerOptions):
 
 
 def outputs(options: FoxgloveOptions) -> list[Output]:
-    """One channel for each topic of the node and of an overlay, and one more for each picture as H.264."""
+    """Return a channel for each topic of the node and of an overlay, and another for pictures as H.264."""
     period = 0.0 if options.rate is None else 1 / options.rate
     has_video, channels = importlib.util.find_spec("av") is not None, []
     for ns, offered in ((options.node.ns, topics.TOPICS), (options.overlay.ns, topics.OVERLAY_TOPICS)):
@@ -87,7 +87,7 @@ class Foxglove(Outlet):
         self._server: WebSocketServer | None = None
         self._shown: dict[str, Received] = {}  # by output
         self._audience = _Audience(self._welcome, self._pin if options.pin else None)
-        self._context = foxglove.Context()  # channels vanish with the last name for it
+        self._context = foxglove.Context()  # channels vanish with the last reference to it
         self._ways = {output.name: _way(output, self._context) for output in offered}
         self._server = _served(options, self._context, self._audience, backlog=len(offered))
 
@@ -110,7 +110,7 @@ class Foxglove(Outlet):
         return True
 
     def blank(self, output: Output, reason: str) -> None:
-        """Foxglove goes on showing what came last, so something empty must come."""
+        """Send something empty, as Foxglove goes on showing what came last."""
         self._ways[output.name].blank(self._shown.pop(output.name), reason)
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
@@ -133,8 +133,8 @@ class Foxglove(Outlet):
         self._publish(words, is_problem=result is None, about="request")
 
     def _welcome(self) -> None:
-        """Tell everybody what is missing: who comes later has not heard it. All in one status: of as many as
-        there are channels the server lets wait, and with one more it disconnects the client."""
+        """Tell all clients what is missing, as new ones have not heard it. All in one status: the server
+        queues no more messages than there are channels, and disconnects a client that has one more."""
         words = "; ".join(f"{name}: {reason}" for name, reason in self._missing.items())
         if words:
             self._publish(words, is_problem=True, about=PROBLEM)

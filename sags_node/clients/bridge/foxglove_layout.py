@@ -47,7 +47,7 @@ def _picture(topic: str, ns: str) -> fl.ImagePanel:
 
 
 def _scene(ns: str) -> fl.ThreeDeePanel:
-    """The points as coloured, the anchors larger and by how sure they are; from the camera's side."""
+    """The points in their colours, the anchors larger and coloured by confidence; from the camera's side."""
     points = fl.BaseRendererPointCloudTopicSettings(
         visible=True, color_mode="rgb", color_field="rgb", point_size=3
     )

@@ -1,4 +1,4 @@
-"""`sags bridge gst`: the overlay on its key colour into GStreamer pipelines, for displays that blend by one.
+"""`sags bridge gst`: the overlay on its key colour into GStreamer pipelines, for displays with chroma keying.
 
 Each eye is a pipeline in a process of its own, which gets BGRx pictures at the display's rate, new or not. A
 picture is replaced by the key colour alone, which displays show as nothing, as soon as it is too old.
@@ -23,7 +23,7 @@ from sags_node.messaging.received import Frame, ReceivedImage, ReceivedText
 from sags_node.sources.gst_process import GstProcess
 from sags_node.types import U8
 
-PIPE_BYTES = 1 << 20  # the most that Linux gives without rights: less is copied in more turns
+PIPE_BYTES = 1 << 20  # the most that Linux gives without privileges; a smaller pipe takes more writes
 STOPPING = 5.0  # s for a writer to end
 
 
@@ -32,7 +32,7 @@ class GstOptions:
     """How `sags bridge gst` runs; the defaults are those of the command."""
 
     overlay: NodeAddress
-    left: str | None = None  # what comes behind the pictures of that eye, as for gst-launch-1.0
+    left: str | None = None  # the pipeline behind that eye's pictures, as for gst-launch-1.0
     right: str | None = None
     rate: float = 60.0  # Hz of the display
     max_age: float = MAX_AGE
@@ -112,7 +112,7 @@ class Display:
     """One eye's pipeline, and the thread that writes to it.
 
     Args:
-        launch: what comes behind the pictures, as for gst-launch-1.0.
+        launch: the pipeline behind the pictures, as for gst-launch-1.0.
         size: height and width of a picture, px.
         key: RGB, what the display shows as nothing.
         rate: Hz.
@@ -143,7 +143,7 @@ class Display:
         self._thread.start()
 
     def show(self, picture: U8, seconds: float) -> None:
-        """Show a picture [H, W, 3], and for so long only."""
+        """Show a picture [H, W, 3] for at most `seconds`."""
         self._shown = (_bgrx(picture), time.monotonic() + seconds)
 
     def blank(self) -> None:

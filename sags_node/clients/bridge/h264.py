@@ -10,7 +10,7 @@ from av.video.reformatter import Colorspace
 from sags_node.clients.bridge.compressed import over_black
 from sags_node.types import U8
 
-RATE = 30.0  # Hz of the pictures, for what it may send
+RATE = 30.0  # Hz of the pictures, from which the largest bit rate follows
 KEY_EVERY = 30  # pictures: who comes, or has lost one, sees something within a second
 BITS_PER_PIXEL = 0.2  # of a picture: 2 Mbit/s at 640x512 and 30 Hz, with tissue still sharp
 
@@ -26,10 +26,10 @@ class Encoder:
         self._number = 0
 
     def encode(self, picture: U8, key: bool = False) -> bytes:
-        """One picture [H, W, 3], or [H, W, 4] over black: H.264 knows no alpha; cut to even sizes.
+        """Encode a picture [H, W, 3], or [H, W, 4] over black (H.264 has no alpha), cut to even sizes.
 
         Args:
-            key: make it one that stands for itself.
+            key: make it a key picture, which refers to no other.
         """
         height, width = (side - side % 2 for side in picture.shape[:2])
         if self._codec is None or (self._codec.height, self._codec.width) != (height, width):
@@ -47,7 +47,7 @@ class Encoder:
         codec.width, codec.height, codec.pix_fmt = width, height, "yuv420p"
         codec.time_base = Fraction(1, round(RATE))
         codec.thread_count = 1
-        codec.colorspace = Colorspace.ITU601  # said, as decoders take HD that says nothing for BT.709
+        codec.colorspace = Colorspace.ITU601  # stated, as decoders take HD for BT.709 otherwise
         bits = round(BITS_PER_PIXEL * width * height * RATE)
         codec.options = {
             "preset": "ultrafast",

@@ -1,6 +1,6 @@
 """Messages of OpenIGTLink (http://openigtlink.org/protocols/v2), version 1 of the header.
 
-pyigtl packs and reads them. Here is what it has not: STATUS, and a check of what strangers send.
+pyigtl packs and reads them. Here is what it lacks: STATUS, and a check of what strangers send.
 """
 
 import struct
@@ -53,7 +53,7 @@ def transform(T: F64) -> MessageBase:
 
 
 def points(places: F64, names: Sequence[str] = (), colors: Sequence[Sequence[int]] = ()) -> MessageBase:
-    """POINT: named places [N, 3] (mm) with colours RGBA; of none, one that cannot be seen.
+    """POINT: named places [N, 3] (mm) with colours RGBA; for an empty list, one invisible point.
 
     A list without points has no body, and receivers pass over it: what they showed would stand.
     """
@@ -72,12 +72,12 @@ def surface(places: F64, triangles: NDArray[np.int64]) -> MessageBase:
 
 
 def string(words: str) -> MessageBase:
-    """STRING."""
+    """STRING of these words, in ASCII."""
     return StringMessage(_ascii(words))
 
 
 def packed(message: MessageBase, device: str, seconds: float) -> bytes:
-    """A message of this device and time."""
+    """Pack a message with its device and its time (s since the epoch)."""
     message.device_name, message.timestamp = device, seconds
     return bytes(message.pack())
 
@@ -93,8 +93,8 @@ class Said:
 
 
 def header(raw: bytes) -> dict[str, Any] | None:
-    """The fields of the header in 58 bytes from anybody, see `MessageBase.parse_header`, and its `crc`; None
-    when it is none, or announces too much."""
+    """Read a header of 58 bytes from anybody: the fields of `MessageBase.parse_header`, and `crc`. None: it
+    is no header, or announces too long a body."""
     try:
         fields: dict[str, Any] = MessageBase.parse_header(raw)
     except UnicodeDecodeError:
@@ -122,5 +122,5 @@ def said(head: dict[str, Any], body: bytes) -> Said | None:
 
 
 def _ascii(words: str) -> str:
-    """pyigtl cannot pack others, and Slicer shows these."""
+    """The words in ASCII: pyigtl can pack no other characters, and Slicer shows these."""
     return words.encode("ascii", "replace").decode()

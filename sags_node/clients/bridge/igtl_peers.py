@@ -1,4 +1,4 @@
-"""A server for OpenIGTLink peers that keeps the newest of each device for each of them.
+"""A server for OpenIGTLink peers that keeps, for each peer, the newest message of each device.
 
 pyigtl's own holds a hundred messages, serves one peer and takes over the signals of its process.
 """
@@ -17,7 +17,7 @@ from sags_node.messaging.security import RateLimitedLog
 
 MOST_PEERS = 8
 SEND_BUFFER = 1 << 18  # bytes in the kernel: less than a picture, so that nothing old waits there
-STUCK_MS = 15_000  # who takes nothing for so long is cut off: some of them would keep all others out
+STUCK_MS = 15_000  # a peer that takes nothing for so long is cut off, or such peers would keep others out
 LOOK = 0.05  # s between calls of `idle`
 
 log = logging.getLogger(__name__)
@@ -60,14 +60,14 @@ class Peers:
         self._thread.start()
 
     def __len__(self) -> int:
-        """How many are connected."""
+        """The number of peers that are connected."""
         return len(self._peers)
 
     def send(self, device: str, message: bytes, valid: float = float("inf")) -> None:
         """Give the newest message of a device to all peers, in place of one that still waits.
 
         Args:
-            valid: s from now on, after which it is not begun any more.
+            valid: s from now on, after which sending it is not begun any more.
         """
         limit = time.monotonic() + valid
 
@@ -144,7 +144,7 @@ class Peers:
         return True
 
     async def _write(self, peer: _Peer) -> None:
-        """Send the one that waits longest, of those that are still new, one after the other."""
+        """Send one message after another, the one that waits longest first; skip those that are too old."""
         with suppress(OSError):  # it has gone: `_read` sees it, too
             while await peer.owed.wait():
                 if not peer.waiting:

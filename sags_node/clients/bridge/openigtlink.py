@@ -44,7 +44,7 @@ from sags_node.messaging.received import (
 from sags_node.messaging.wire import WireError
 from sags_node.types import F32, F64, U8, Camera
 
-STEEPEST = math.radians(75)  # seen at more than that from the front, an edge joins two surfaces
+STEEPEST = math.radians(75)  # rad from facing the camera; a steeper edge joins two surfaces
 
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)
 RENDER = TopicName("left/render/image", ReceivedImage)
@@ -76,7 +76,7 @@ class IgtlOptions(ServerOptions):
 
 
 def outputs(options: IgtlOptions) -> list[Output]:
-    """Return what peers get, one device each: "Sags" and the name.
+    """Return what peers get, one device each, named "Sags" and the output's name.
 
     Raises:
         UsageError: `send` names something else.
@@ -135,7 +135,7 @@ class OpenIgtLink(Outlet):
 
     def __init__(self, options: IgtlOptions) -> None:
         self._step, self._max_age = options.surface_step, options.max_age
-        # Of pictures that are shown: one without light, and its place.
+        # Of pictures that are shown: a black one of that size, and its pose.
         self._shapes: dict[str, tuple[U8, F64]] = {}
         self._pins = Pins()
         self._answers: deque[Callable[[], list[int]]] = deque()  # for the peers' thread
@@ -153,7 +153,7 @@ class OpenIgtLink(Outlet):
     # ---- out -----------------------------------------------------------------------------------------------
 
     def wants(self, output: Output) -> bool:
-        """OpenIGTLink has no subscriptions: who is connected gets all."""
+        """Tell whether anybody is connected: without subscriptions in OpenIGTLink, all peers get all."""
         return len(self._peers) > 0
 
     def send(self, output: Output, frame: Frame) -> bool:
@@ -243,7 +243,7 @@ class OpenIgtLink(Outlet):
             self._release(self._answers.popleft()())
 
     def _pinned(self, pin: Pin, result: dict[str, Any] | None, words: str) -> None:
-        """On the thread of the requests."""
+        """Take in an answer; runs on the thread of the requests."""
         self._say(f"{pin.name}: {words}")
         if result is not None:
             self._answers.append(partial(self._pins.pinned, pin, int(result["id"])))
@@ -304,8 +304,7 @@ def _ras(places: F64) -> F64:
 
 
 def _before_camera(K: F64) -> F64:
-    """Find where a picture lies: from (column, row, 0, 1) to mm in the camera's axes, at a distance of
-    `PLANE`."""
+    """The pose of a picture [4, 4]: from (column, row, 0, 1) to mm in the camera's RAS axes, at `PLANE`."""
     T = np.eye(4)
     T[0, 0], T[1, 1] = PLANE / K[0, 0], PLANE / K[1, 1]
     T[:3, 3] = [-PLANE * K[0, 2] / K[0, 0], -PLANE * K[1, 2] / K[1, 1], PLANE]
@@ -314,7 +313,7 @@ def _before_camera(K: F64) -> F64:
 
 
 def _written(dark: U8, reason: str) -> U8:
-    """A picture without light that says why."""
+    """A black picture with the reason written on it."""
     scale = max(dark.shape[0] / 1000, 0.4)
     written = dark.copy()
     place, font = (8, dark.shape[0] // 2), cv2.FONT_HERSHEY_SIMPLEX
@@ -325,7 +324,7 @@ def _written(dark: U8, reason: str) -> U8:
 def surface_of(camera: Camera, depth: F32, confidence: F32, step: int) -> tuple[F64, NDArray[np.int64]]:
     """Corners [N, 3] (m, world) and triangles [M, 3] of every `step`-th pixel whose depth is sure to 3 mm.
 
-    A surface says nothing of how far to trust it, so what is less sure is a hole.
+    A POLYDATA surface carries no confidence, so what is less sure is a hole.
     """
     rows = np.arange(step // 2, depth.shape[0], step)
     columns = np.arange(step // 2, depth.shape[1], step)

@@ -15,7 +15,7 @@ MOST = 64  # points of a list
 
 
 class Pin(NamedTuple):
-    """Pin this point."""
+    """A point that is to be pinned."""
 
     name: str
     place: F64  # [3] mm, as the peer said it
@@ -26,7 +26,7 @@ class Pin(NamedTuple):
 class _Point:
     place: F64
     since: float  # monotonic s; when it was put there
-    asked: bool = False  # for an anchor at that place
+    asked: bool = False  # whether an anchor at that place was asked for
     anchor: int | None = None
 
 
@@ -37,7 +37,7 @@ class Pins:
         self._points: dict[tuple[str, int], _Point] = {}  # by name, and number of that name
 
     def hear(self, points: Iterable[tuple[str, F64]], now: float) -> list[int]:
-        """The list as it is now; returns the anchors to give back, since their points have gone or moved."""
+        """Take in the current list; return the anchors to give back, as their points have gone or moved."""
         listed: dict[tuple[str, int], F64] = {}
         named: Counter[str] = Counter()
         for name, place in list(points)[:MOST]:
@@ -55,7 +55,7 @@ class Pins:
         return released
 
     def due(self, now: float) -> list[Pin]:
-        """The points that have come to rest; each is said once."""
+        """Return the points that have come to rest, each of them once."""
         resting = [
             (key, point)
             for key, point in self._points.items()
@@ -66,7 +66,7 @@ class Pins:
         return [Pin(name, point.place, number) for (name, number), point in resting]
 
     def pinned(self, pin: Pin, anchor: int) -> list[int]:
-        """The anchor of a point; it is given back at once if the point has gone or moved meanwhile."""
+        """Note a point's anchor; return it, to be given back, if the point has gone or moved meanwhile."""
         point = self._points.get((pin.name, pin.number))
         if point is None or point.place is not pin.place:
             return [anchor]
@@ -74,7 +74,7 @@ class Pins:
         return []
 
     def forget(self) -> bool:
-        """Let go of all anchors, and give none back: their numbers are another node's by now.
+        """Forget all anchors without giving them back: by now, another node may use their numbers.
 
         Returns:
             whether there were any. Their points are pinned again once they move: the world may be another.

@@ -22,11 +22,11 @@ from sags_node.messaging.wire import Meta
 
 MAX_AGE = 0.4  # s since capture: with `LOOK` and the way to a peer, what stops is gone within 0.5 s
 LOOK = 0.04  # s; how soon it is noticed that something has become too old
-LEAD = 0.2  # s before it is due that a rare output's topics are asked for: a subscription takes up to 0.1 s
+LEAD = 0.2  # s by which a rare output's topics are asked for early: a subscription takes up to 0.1 s
 NO_UNIT = "its lengths have no unit, as nobody has calibrated the eyes; docs/calibration.md"
 GRACE = 0.5  # s for the first message of what was asked for, before it is said that none comes
-LEAST_HZ = 0.5  # a bridge passes on the newest of what comes, so losing some of it is no fault; age is
-AGAIN = 1.0  # s until the same outputs are reported in other words: ages grow all the time
+LEAST_HZ = 0.5  # Hz; a bridge passes on the newest message, so lost ones are no fault; old ones are
+AGAIN = 1.0  # s until a report with other reasons only: the ages in them grow all the time
 EVERY_SECOND = ("status", "diagnostics")
 SILENT_AFTER = 2.5  # s without one of these
 
@@ -81,8 +81,8 @@ class Output:
         period: s between two, at least.
         pulse: for an output with a long period: a small topic of the same sender that comes with every frame.
             Between two of this output only that is asked for, and tells that the sender goes on.
-        optional: it is not missed before it has come once.
-        lengths: it is of lengths, which peers take for metres: nothing is passed on while they have no unit.
+        optional: it is not reported as missing before it has come once.
+        lengths: it holds lengths, which peers take for metres: it is not passed on while they have no unit.
     """
 
     name: str
@@ -94,14 +94,14 @@ class Output:
 
 
 class Outlet(Protocol):
-    """What a bridge speaks to, and what most of them do; all is called from the thread of the loop."""
+    """The side of a bridge that speaks to peers, with defaults; all is called from the loop's thread."""
 
     def wants(self, output: Output) -> bool:
         """Tell whether any peer asks for it."""
         return True
 
     def send(self, output: Output, frame: Frame) -> bool:
-        """Pass a new one on to those who ask for it; False where this frame has nothing for it."""
+        """Pass on a new frame to the peers that ask for the output; False: it holds nothing for them."""
         ...
 
     def blank(self, output: Output, reason: str) -> None:
@@ -109,12 +109,12 @@ class Outlet(Protocol):
         return None
 
     def started_anew(self, ns: str) -> None:
-        """Hear that a sender is another one now: what the last one numbered, as anchors, is gone."""
+        """Take note that a sender was replaced: what the old one numbered, such as anchors, is gone."""
         return None
 
     def report(self, missing: Mapping[str, str], shows: bool) -> None:
-        """Hear what is asked for and does not come, output -> reason, and whether anything does; called when
-        that changes."""
+        """Take note of wanted outputs that do not come (output -> reason), and whether any output does;
+        called when that changes."""
         return None
 
 
@@ -122,11 +122,11 @@ class Outlet(Protocol):
 class _Course:
     """How one output that peers ask for is doing."""
 
-    since: float  # monotonic s; when they began to
+    since: float  # monotonic s; when peers began to ask
     due: float = 0.0  # monotonic s; of the next one
     sent: Meta | None = None  # of the leading message
     shown_ns: int | None = None  # capture time of what is shown; None: nothing is
-    reason: str | None = None  # why nothing is
+    reason: str | None = None  # why nothing is shown
 
 
 class Relay:
@@ -169,7 +169,7 @@ class Relay:
             self.wait()
 
     def wait(self) -> None:
-        """Until something comes, and no longer than `LOOK`."""
+        """Wait until something comes, at most for `LOOK`."""
         self._arrived.wait(LOOK)
         self._arrived.clear()
 
@@ -219,7 +219,7 @@ class Relay:
             course.reason = problem or "no whole frame came"
 
     def _problem(self, output: Output, course: _Course) -> str | None:
-        """Why what is shown, or would be now, must not be."""
+        """Why the output must not be shown now; None: it may be."""
         for source in output.sources if output.pulse is None else (output.pulse,):
             problem = self._feeds[source.ns].problem(source.topic)
             if problem is not None:
@@ -293,14 +293,14 @@ class Feed:
         """Let the sender make and send these topics, and nothing else but `status`.
 
         Raises:
-            UsageError: it has come, and wants keys that are not given, or the other way round.
+            UsageError: the sender has come, and wants keys that are not given, or the other way round.
         """
         if not self._subscriber.endpoint and self._subscriber.refusal is not None:
             raise UsageError(self._subscriber.refusal)
         self._subscriber.ask(names)
 
     def problem(self, name: str) -> str | None:
-        """Why the newest message of a topic must not be shown as new; None when it may be."""
+        """Return why the newest message of a topic must not be shown as new; None when it may be."""
         limit = SILENT_AFTER if name in EVERY_SECOND else self._max_age
         problem, topic = self._subscriber.problem(name, limit), topics.find(name)
         if problem is not None or topic is None or topic.periodic or self.latest("status") is None:
@@ -326,7 +326,7 @@ class Feed:
 
 
 def silent(reason: str) -> str:
-    """Return what a topic of texts says instead of what has been taken back."""
+    """Return the JSON text to send in place of a text that has been taken back."""
     return json.dumps({"state": "silent", "reason": reason})
 
 

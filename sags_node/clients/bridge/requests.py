@@ -12,7 +12,7 @@ from sags_node.messaging.control import ControlClient
 MOST_WAITING = 32
 ANSWER_TIME = 2.0  # s
 
-Answer = Callable[[dict[str, Any] | None, str], None]  # the node's answer, or None; and that in words
+Answer = Callable[[dict[str, Any] | None, str], None]  # the answer (None: refused), and the same in words
 
 
 class Requests:

@@ -1,7 +1,7 @@
 """`sags bridge ros2`: every topic of a node in a ROS 2 graph, as ROS users expect it. No ROS is needed.
 
-The messages are the node's own, byte for byte. Beside them stand small ones, for receivers as ROS 2 installs
-them: pictures as files, and fewer points. What has stopped is not sent again; `/diagnostics` says why.
+The messages are the node's own, byte for byte. Small ones are sent, too, for receivers with ROS 2's default
+settings: compressed pictures, and fewer points. What has stopped is not sent again; `/diagnostics` says why.
 """
 
 import logging
@@ -32,9 +32,9 @@ STATIC = "/tf_static"
 SHARED = (*GLOBAL.values(), STATIC)
 BEAT = 1.0  # s between two messages about the bridge itself
 ATTEND = 0.1  # s between looks at who reads
-STALE = 3  # of a diagnostic status
+STALE = 3  # the level of a diagnostic status
 TWO = "two nodes publish in this graph under one name; stop one of them, or give it another ns"
-PACE = 50e6  # bytes/s: so fast a stock receiver on a loaded machine empties its buffer
+PACE = 50e6  # bytes/s at which a stock receiver on a loaded machine empties its buffer
 ENOUGH = 4 << 20  # bytes of a receive buffer: with that much a raw picture and depth get through
 
 Make = Callable[[Received], bytes]
@@ -56,7 +56,7 @@ class Offer:
     """One topic of the graph.
 
     Attributes:
-        make: its CDR, of a message of the node.
+        make: makes its CDR from a message of the node.
     """
 
     output: Output
@@ -66,10 +66,10 @@ class Offer:
 
 
 def offers(options: Ros2Options) -> list[Offer]:
-    """Every topic of the node, of an overlay and of `options.views` as it is, and the small ones beside.
+    """List all topics of the node, of an overlay and of `options.views`, as they are and in small versions.
 
     Raises:
-        UsageError: a view cannot be named so.
+        UsageError: a view's name is not valid.
     """
     node, overlay = options.node.ns, options.overlay.ns
     found: list[Offer] = []
@@ -112,7 +112,7 @@ def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool
 
 
 def _delivery(topic: topics.Topic, max_age: float) -> Delivery:
-    """As ROS users expect it: pictures and clouds as from a sensor, little things reliably."""
+    """The QoS that ROS users expect: best effort for pictures and clouds, reliable for small messages."""
     if topic.type == topics.TF:
         return Delivery(reliable=True, depth=100, lifespan=max_age)
     if topic.type == topics.DIAGNOSTICS:
@@ -196,7 +196,7 @@ class Ros2(Outlet):
     # ---- out -----------------------------------------------------------------------------------------------
 
     def wants(self, output: Output) -> bool:
-        """Return what is kept for who comes later must always be new, so it is always wanted."""
+        """Tell whether it is wanted: somebody reads it, or it is kept for late readers and must be new."""
         offer = self._offers[output.name]
         lasts = offer.delivery.kept and offer.delivery.lifespan is None
         return lasts or output.name in self._read
@@ -213,7 +213,7 @@ class Ros2(Outlet):
         return True
 
     def blank(self, output: Output, reason: str) -> None:
-        """Return what was sent is not sent again. Only texts are kept by the graph, and must be replaced."""
+        """Replace a text, which the graph keeps for late readers. Anything else is just not sent again."""
         if self._offers[output.name].kind == topics.STRING:
             self._writers[output.name].write(cdr.string(silent(reason)).cdr(), time.time_ns())
 
@@ -234,7 +234,7 @@ class Ros2(Outlet):
                 self._warn_of_refused()
 
     def _beat(self) -> None:
-        """Say how the bridge does, and that the node is silent while it is."""
+        """Publish the state of the bridge and, while the node is silent, that it is."""
         words = "; ".join(dict.fromkeys([*self._missing.values(), *self._namesakes()]))
         statuses = [
             cdr.Status(
@@ -249,7 +249,7 @@ class Ros2(Outlet):
         self._diagnostics.write(_array(statuses, self._ns, now_ns), now_ns)
 
     def _namesakes(self) -> list[str]:
-        """Who else publishes what only this node should: readers would get both, one after the other."""
+        """Warn of others that publish what only this node should: readers would get both in turn."""
         own = [name for name in self.graph.publications() if name in self._writers and name not in SHARED]
         if own and not self._namesake:
             log.warning("%s: %s", ", ".join(own[:3]), TWO)
@@ -274,7 +274,7 @@ class Pace:
         self._free = 0.0  # monotonic s
 
     def wait(self, size: int) -> None:
-        """Until a message of so many bytes may go; larger ones than fit anyway do not wait."""
+        """Wait until a message of `size` bytes may go; one above `LARGEST` does not wait: it cannot fit."""
         if size <= LARGEST:
             time.sleep(max(0.0, self._free - time.monotonic()))
             self._free = time.monotonic() + size / PACE
@@ -293,7 +293,7 @@ def _thinned(received: Received, most: int) -> bytes:
 
 
 def _eyes(received: Received) -> bytes:
-    """Where the right eye is in the left one: all of its pictures are in its own frame."""
+    """The pose of the right eye in the left eye's frame: its pictures are in a frame of their own."""
     assert isinstance(received, ReceivedCameraInfo)
     T = np.eye(4)
     T[0, 3] = -received.P[0, 3] / received.P[0, 0]
@@ -301,7 +301,7 @@ def _eyes(received: Received) -> bytes:
 
 
 def _named(received: Received, ns: str) -> bytes:
-    """The node's diagnostics for a topic that all share."""
+    """The node's diagnostics, named for a topic that all of ROS shares."""
     assert isinstance(received, ReceivedRos)
     statuses = [
         cdr.Status(said.name, said.level, said.message, {each.key: each.value for each in said.values})

@@ -1,6 +1,6 @@
 """What peers in a ROS 2 graph ask of the node: a topic for each operation, and one for all answers.
 
-They are no services: Fast DDS, with which ROS 2 comes, marks the answer to a service in a header that
+They are topics, not services: Fast DDS, ROS 2's default, marks the answer to a service in a header that
 `cyclonedds` cannot write.
 """
 
@@ -42,7 +42,7 @@ class Ask:
 
 
 def asks(views: Collection[str]) -> dict[str, Ask]:
-    """By the last part of the topic's name."""
+    """Return the topics for requests, by the last part of their names."""
     view = partial(_view, views=views)
     return {
         "add_anchor": Ask("add_anchor", POINT, _point),
@@ -83,7 +83,7 @@ class Inbox:
                     self._requests.ask(ask.op, args, partial(self._answer, about), ask.seconds)
 
     def _answer(self, about: Args, result: Args | None, words: str) -> None:
-        """From any thread. All peers hear it: what was asked tells each which answer is its own."""
+        """Send an answer, from any thread. All peers hear it, and find their own by what was asked."""
         said = about | ({"error": words} if result is None else {"result": result})
         self._answers.write(cdr.string(msgspec.json.encode(said).decode()).cdr(), time.time_ns())
 
@@ -111,7 +111,7 @@ def _view(text: Any, views: Collection[str]) -> Args:
 
 
 def _folder(text: Any) -> Args:
-    """Peers may choose a name, and no place."""
+    """The argument of `start_recording`: peers may choose a name, but no path."""
     if re.fullmatch(VIEW_NAME, text.data) is None:
         raise SagsError(f"a recording is named with letters, digits and _, not {text.data!r}")
     return {"path": text.data}

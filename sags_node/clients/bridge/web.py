@@ -30,7 +30,7 @@ from sags_node.messaging.stream import check_topic
 
 MOST_PEERS = 16  # connections; a page takes some for a moment while it is loaded
 MOST_TOPICS = 16  # of one peer
-LONGEST_MESSAGE = 1 << 14  # bytes that a peer may say at once
+LONGEST_MESSAGE = 1 << 14  # bytes of one message of a peer
 SEND_BUFFER = 1 << 18  # bytes in the kernel, so that little waits there that gets old
 STUCK = struct.pack("@ll", 3, 0)  # s and us: who takes nothing for so long is cut off
 HANDSHAKE = 3.0  # s
@@ -99,7 +99,7 @@ def _served(options: WebOptions, requests: Requests, stop: threading.Event) -> t
     server = serve(
         lambda connection: Peer(connection, options, requests).attend(stop),
         sock=listener,
-        origins=[None, *pages],  # None: no browser, which is no page that somebody else wrote
+        origins=[None, *pages],  # None: a client that is no browser, so it runs no page of somebody else
         process_request=_page,
         compression=None,  # pictures do not become smaller by that, and it takes long
         open_timeout=HANDSHAKE,
@@ -114,7 +114,7 @@ def _served(options: WebOptions, requests: Requests, stop: threading.Event) -> t
 
 
 def _bounded(handler: Callable[[socket.socket, Any], None]) -> Callable[[socket.socket, Any], None]:
-    """Only so many connections at once, those included that have not said what they are."""
+    """Limit the number of connections, including those that have not finished their handshake."""
     places = threading.Semaphore(MOST_PEERS)
 
     def handle(accepted: socket.socket, address: Any) -> None:
@@ -190,7 +190,7 @@ class Peer(Outlet):
             self._request(said)
 
     def _subscribe(self, names: list[str]) -> None:
-        """These topics come from now on, and no others."""
+        """Send these topics from now on, and no others."""
         try:
             if len(names) > MOST_TOPICS:
                 raise UsageError(f"{len(names)} topics; at most {MOST_TOPICS} come over one connection")
@@ -238,7 +238,7 @@ class Peer(Outlet):
             "parts": [memoryview(part).nbytes for part in received.parts],
         }
         text = msgspec.json.encode(head)
-        text += b" " * (-len(text) % 4)  # what follows can be looked at as numbers of 4 bytes, where it lies
+        text += b" " * (-len(text) % 4)  # so that what follows is aligned to 4 bytes
         self._connection.send(b"".join((struct.pack("<I", len(text)), text, *received.parts)))
         return True
 

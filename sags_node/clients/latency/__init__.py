@@ -1,8 +1,8 @@
-"""`sags latency`: from a code that is shown to that code in what a display would show.
+"""`sags latency`: the time from showing a code to seeing it in what a display would show.
 
     shown.py    the codes, and what shows them: pictures that are pushed, or a page that a camera films
-    run.py      what a screen shows of the node, and when
-    ledger.py   the figures of both
+    run.py      reads the codes in what a screen would show of the node
+    ledger.py   when codes were shown and seen, and the latencies
 
 Imports messaging and overlay.
 """

@@ -1,6 +1,6 @@
-"""When codes were shown, and when they were seen again, on the monotonic clock.
+"""The times at which codes were shown and seen again, on the monotonic clock.
 
-Stamps of messages are of the wall clock. They are brought to the other by the difference of both.
+Messages are stamped by the wall clock. The difference of the two clocks converts these stamps.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-CLOCK_SET = 2_000_000  # ns by which the difference of both clocks may change while a code is on its way
-MOST_READS = 10  # of both clocks, for one moment
+CLOCK_SET = 2_000_000  # ns; if the clocks' difference changes by more while a code is on its way, one was set
+MOST_READS = 10  # attempts to read both clocks at the same moment
 PERCENTILES = (50, 95, 99, 99.9)
 
 
@@ -28,7 +28,7 @@ class Moment(NamedTuple):
     def now(cls) -> Moment:
         for _ in range(MOST_READS):
             before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-            if after - before < CLOCK_SET // 20:  # else another thread ran between the two
+            if after - before < CLOCK_SET // 20:  # else another thread ran between the readings
                 break
         return cls(after, wall)
 
@@ -49,25 +49,25 @@ class Ledger:
         self._seen: list[tuple[int | None, dict[str, int], Moment]] = []
 
     def shown(self, number: int, at: Moment) -> None:
-        """A code was shown from this moment on, which is later than those before."""
+        """Note that a code is shown from this moment on; moments come in the order of time."""
         self._shown[number].append(at)
 
     def seen(self, number: int | None, stamps: Mapping[str, int], at: Moment) -> None:
-        """A picture was shown.
+        """Note a picture in which a code was looked for.
 
         Args:
-            number: of the code that was read in it; None: none could be.
-            stamps: of its way, wall clock ns by name, in order.
+            number: of the code that was read in it; None: no code could be read.
+            stamps: when it passed each stage, in order: wall clock ns, by the stage's name.
         """
         self._seen.append((number, dict(stamps), at))
 
     def figures(self, since: Moment, until: Moment) -> dict[str, Any]:
-        """The figures of each code that was shown between two moments the first picture that shows it.
+        """Return the latencies of codes shown between two moments, each to the first picture that shows it.
 
         Returns:
-            codes, read, lost (in no picture), unreadable (pictures without a code), unknown (pictures with a
-            code that was not shown before), clock_set (codes that count in the whole alone: the wall clock
-            was set meanwhile), total_ms and parts_ms, by the name of what ends each.
+            codes, read, lost (codes in no picture), unreadable (pictures without a code), unknown (pictures
+            with a code that was not shown before), clock_set (codes that count in total_ms only, as the wall
+            clock was set meanwhile), total_ms, and parts_ms by the name of the stage that ends each part.
         """
         total: dict[Moment, float] = {}
         parts: dict[str, list[float]] = defaultdict(list)

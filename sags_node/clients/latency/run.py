@@ -1,4 +1,4 @@
-"""What a screen shows of a node, and the codes in it."""
+"""Reads the codes in what a screen would show of a node."""
 
 import math
 import threading
@@ -15,11 +15,11 @@ from sags_node.messaging.subscriber import KEPT, Subscriber
 
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)
 OVERLAY = TopicName("left/overlay/image", ReceivedImage)
-SETTLED = 2.0  # s after the first code, from which on codes count: a model has begun by then
-LAST = 1.0  # s that the last code has to be seen
-LOOK = 0.1  # s
-REMIND = 5.0  # s without a code, after which it is said
-WAITING = 64  # pictures that wait for their overlay: for `LAST`, at 60 Hz
+SETTLED = 2.0  # s after the first code; only later codes count, as a model has begun by then
+LAST = 1.0  # s within which the last code must be seen
+LOOK = 0.1  # s, the longest wait for a picture
+REMIND = 5.0  # s without a code until that is said, and said again
+WAITING = 64  # pictures that are kept until their overlay comes: `LAST` at 60 Hz
 
 
 def measure_latency(
@@ -30,19 +30,19 @@ def measure_latency(
     tell: Callable[[str], object],
     stop: threading.Event,
 ) -> dict[str, object]:
-    """See when codes come back in what a screen shows: the node's left picture, and what is drawn over it.
+    """Measure when codes come back in what a screen would show: the node's left picture with its overlay.
 
     Args:
-        overlay: each picture waits for its overlay from there; None: there is none.
-        seconds: how long codes count, from `SETTLED` after the first that is seen.
-        tell: what it waits for.
+        overlay: where overlays come from, for which each picture waits; None: pictures without overlay.
+        seconds: how long codes count, beginning `SETTLED` after the first one that is seen.
+        tell: called with what it waits for.
         stop: ends it early.
 
     Returns:
         As `Ledger.figures`.
 
     Raises:
-        SagsError: no code was seen before it was stopped; node and overlay may be started later.
+        SagsError: no code was seen until it was stopped. That node and overlay start late is no error.
     """
     ledger, reader = codes.ledger, Reader()
     newest: Received | None = None

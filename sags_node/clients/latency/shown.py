@@ -1,4 +1,4 @@
-"""Codes are numbers that cameras can read; they are shown in pictures that are pushed, or on a page."""
+"""ArUco codes that cameras can read, shown in pictures that are pushed to a node, or on a web page."""
 
 import http
 import json
@@ -22,17 +22,17 @@ from sags_node.messaging.sockets import Closes
 from sags_node.types import U8
 
 NUMBERS = 1000  # after the last one the first comes again
-CELLS = 7  # across, the black border included
-EVERY_MS = 100  # a code of the page stands for several exposures: one of them has it alone
-LONGEST = 1024  # bytes that a page may say at once
-SILENT = 2.0  # s, after which a connection is closed
+CELLS = 7  # cells across a code, its black border included
+EVERY_MS = 100  # ms that the page shows a code: several exposures, so that one has this code alone
+LONGEST = 1024  # bytes of one message of a page
+SILENT = 2.0  # s without data, after which a connection is closed
 
 _DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)  # Garrido-Jurado et al., 2014
 Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=1e13)]
 
 
 def cells(number: int) -> U8:
-    """The picture of a number [CELLS, CELLS], 0 or 255."""
+    """The code of a number as a picture [CELLS, CELLS], 0 or 255."""
     return np.asarray(cv2.aruco.generateImageMarker(_DICTIONARY, number % NUMBERS, CELLS), np.uint8)
 
 
@@ -71,12 +71,12 @@ class Codes(Closes):
     problem: str | None = None
 
     def step(self, goes_on: bool) -> float:
-        """Show the next one if it is time, and any is to be shown; returns s until the one after it."""
+        """Show the next code if it is due and `goes_on`; return the seconds until the one after it."""
         return math.inf
 
 
 class Pushed(Codes):
-    """Hands pictures of a session in, both eyes with a code in the upper left corner.
+    """Pushes the pictures of a session to a node, both eyes with a code in the upper left corner.
 
     Args:
         endpoint: of a node with `source.kind: push`.
@@ -114,9 +114,9 @@ class Pushed(Codes):
 
 
 class _Said(msgspec.Struct):
-    page: Milliseconds  # of the epoch, when it was loaded
+    page: Milliseconds  # since the epoch, when it was loaded
     number: Annotated[int, msgspec.Meta(ge=0, lt=NUMBERS)]
-    shown_ms: Milliseconds  # of its own clock, which begins when it is loaded
+    shown_ms: Milliseconds  # by its own clock, which begins when it is loaded
     now_ms: Milliseconds
 
 
@@ -124,7 +124,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = False  # closing waits for what is being answered, at most `SILENT`
 
     def handle_error(self, *whose: Any) -> None:
-        """A browser that has gone is no error."""
+        """Ignore a browser that has gone: that is no error."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(*whose)
 
@@ -132,7 +132,7 @@ class _Server(ThreadingHTTPServer):
 class Page(Codes):
     """Serves a page on this machine, which shows codes and says when.
 
-    The quickest of its messages tells its clock from ours. Both are of this machine.
+    Its message with the least delay gives the offset between its clock and ours, both on this machine.
 
     Args:
         port: 0: any free one.
@@ -145,7 +145,7 @@ class Page(Codes):
 
     def __init__(self, port: int) -> None:
         self.ledger = Ledger("displayed")
-        self._loaded, self._ahead_ms = 0.0, math.inf  # of the page that shows them
+        self._loaded, self._ahead_ms = 0.0, math.inf  # of the page that shows the codes
         self._lock = threading.Lock()
         page = self
 
@@ -177,7 +177,7 @@ class Page(Codes):
         self._thread.start()
 
     def asked(self, host: str | None, path: str) -> tuple[http.HTTPStatus, str]:
-        """The page."""
+        """Return the page, or why there is none for this host or path."""
         if host not in self._hosts or path != "/":
             return http.HTTPStatus.NOT_FOUND, f"there is {self.address} alone"
         bits = [
@@ -188,7 +188,7 @@ class Page(Codes):
         return http.HTTPStatus.OK, text
 
     def told(self, host: str | None, body: bytes, came: Moment) -> tuple[http.HTTPStatus, str]:
-        """Take note of what a page says; one of another host is not ours."""
+        """Note which code a page shows, and since when; a page of another host or an older one is refused."""
         try:
             said = msgspec.json.decode(body, type=_Said)
         except msgspec.MsgspecError:

@@ -1,13 +1,13 @@
 """How an object follows the tissue that bends: its vertices move with anchors on the surface above them.
 
 The object's own anchors hold it rigidly. `FOLLOWERS` more are pinned where the tissue is seen over it. Each
-says how far its tissue has gone from where the rigid motion would have it. Kriging (a Gaussian process whose
-mean is that no tissue is bent; C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine
-Learning", 2006, 2.2) carries that over the surface, by how sure each anchor's depth is. A vertex takes it
-from the surface before it on its ray, fading with the depth below. All that is by the frame of the pinning.
+tells how far its tissue has moved from where the rigid motion would have it. Kriging (a Gaussian process with
+mean zero; C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning", 2006, 2.2)
+interpolates that over the surface, by how sure each anchor's depth is. A vertex moves with the surface in
+front of it on its ray, the less the deeper it lies below. Rays and depths are those of the pinning's frame.
 
-Anchors are the node's points of the tissue: the picture corrects them, they say how sure they are, and come
-back when they were lost. Control nodes and Gaussians do none of that, and are renewed under way.
+Anchors are used, since the picture corrects them, they tell how sure they are, and they come back after they
+were lost. Control nodes and Gaussians do none of that, and are replaced over time.
 """
 
 import math
@@ -29,21 +29,21 @@ from sags_node.types import F32, F64, I64, Bool
 FOLLOWERS = 64  # a quarter of a node's anchors; 32 leave twice the error on the phantom
 LEAST_FOLLOWERS = 3
 RIM = 25  # px, of the picture and of instruments: an anchor needs 12 px of tissue on each side
-STILL = 0.5e-3  # m: so far an anchor wanders on tissue that is still
+STILL = 0.5e-3  # m; an anchor wanders by this much on tissue that is still
 LEAST_ERROR = 0.3e-3  # m, of an anchor's depth
-LEAST_SHARE = 1e-3  # of the confidence above `SURE_OF_ANCHOR`
-BENT = 5e-3  # m: standard deviation of what is expected before anything is seen
-AGAIN = 1.0  # s after a refusal
+LEAST_SHARE = 1e-3  # the least weight of an anchor, by its confidence above `SURE_OF_ANCHOR`
+BENT = 5e-3  # m; prior standard deviation of the bending
+AGAIN = 1.0  # s from a refusal to the next try
 PINNING = "the tissue over it is being pinned"
 UNKNOWN = Anchor(np.full(3, np.nan), 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """What carries the followers' ways to the vertices."""
+    """Carries the followers' displacements to the vertices."""
 
     points: F64  # [k, 3] m, of the object: where the followers were pinned
-    reach: float  # m, of the kernel: the distance between neighbours
+    reach: float  # m, length scale of the kernel: the followers' spacing
     rows: I64  # [n] vertices that are near enough to the surface
     carried: F32  # [n, k] kernel between each vertex' place on the surface and the followers, faded
 
@@ -57,8 +57,8 @@ class Deformation:
 
     Args:
         vertices: [V, 3] m, of the object.
-        depth: m below the surface, from which on the object moves rigidly.
-        asked: of every anchor, see `add_anchor`.
+        depth: m below the surface; what lies deeper moves rigidly.
+        asked: further arguments of `add_anchor` for every anchor.
     """
 
     def __init__(self, vertices: F64, depth: float, pinner: Pinner, worker: Executor, asked: Request) -> None:
@@ -81,11 +81,11 @@ class Deformation:
             self._beginning.add_done_callback(lambda it: it.exception() or give_back(it.result()[1]))
 
     def status(self) -> dict[str, dict[str, int]]:
-        """Say for people and programs: how many followers there are, and how many are sure."""
+        """Return for people and programs how many followers there are, and how many are sure."""
         return {"deform": {"anchors": len(self.ids), "pulling": self._pulling}}
 
     def move(self, frame: TissueFrame, T: F64) -> F64 | None:
-        """The bent vertices [V, 3] (m, of the object) at its rigid pose T [4, 4]; None: it is rigid."""
+        """Return the vertices [V, 3] (m, of the object) as bent, at its rigid pose T [4, 4]; None: rigid."""
         if self._field is None:
             self._begin(frame, T)
             return None
@@ -127,7 +127,7 @@ class Deformation:
 
 
 def _field(vertices: F64, depth: float, frame: TissueFrame, T: F64) -> _Field:
-    """Find where to pin the followers of an object at T [4, 4], and what they carry."""
+    """Choose where to pin the followers of an object at T [4, 4], and how its vertices follow them."""
     import open3d as o3d
 
     if frame.confidence is None:
@@ -169,7 +169,7 @@ def filled(depth: F32, known: Bool) -> F32:
 
 
 def _weights(field: _Field, pulls: I64, ways: F64, states: Sequence[Anchor]) -> F64:
-    """Return what each follower [k] adds to where it carries, by how far each has gone [k, 3] (m)."""
+    """The kriging weights [k, 3] of the followers `pulls` [k], by their displacements [k, 3] (m)."""
     # What is small is noise, what is large counts as it is (the garrote of L. Breiman, Technometrics 1995).
     lengths = np.linalg.norm(ways, axis=1, keepdims=True)
     ways = ways * (1 - (STILL / np.maximum(lengths, STILL)) ** 2)
@@ -182,6 +182,6 @@ def _weights(field: _Field, pulls: I64, ways: F64, states: Sequence[Anchor]) -> 
 
 
 def _kernel(these: Array, others: F64, reach: float) -> F64:
-    """How much places [n, 3] and [k, 3] have in common, 0..1: [n, k]."""
+    """The Gaussian kernel [n, k] between places [n, 3] and [k, 3], 0..1."""
     squares = np.square(these).sum(1)[:, None] + np.square(others).sum(1) - 2 * these @ others.T
     return np.asarray(np.exp(-0.5 * squares / reach**2), np.float64)

@@ -27,22 +27,22 @@ from sags_node.geometry import invert, transform
 from sags_node.kernels.jit import read_only
 from sags_node.types import F32, F64, U8, Camera
 
-UNDER = 0.35
-ON_SURFACE = 0.001  # m; what lies this little under the surface lies on it
+UNDER = 0.35  # share of the opacity that is left under the tissue
+ON_SURFACE = 0.001  # m; what lies less than this under the surface counts as lying on it
 NEAREST = 0.03  # m; no instrument is nearer to the right eye
-DARKEST = 0.45  # of a colour, where the surface is seen edge on
+DARKEST = 0.45  # share of a colour that is left where the surface is seen edge on
 LABEL_ASIDE = 6  # px to the right of the middle
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-NOTHING: Mapping[str, str] = {}  # to warn of
+NOTHING: Mapping[str, str] = {}  # no warnings
 
 
 class Body:
-    """A mesh made ready to be drawn again and again; None: only a label.
+    """A mesh prepared to be drawn again and again; None: only a label.
 
     Attributes:
         vertices: [V, 3] m, in its own coordinates; [0, 3] of a label.
         triangles: [T, 3].
-        corners: [2, 3] m, between which it lies.
+        corners: [2, 3] m, the opposite corners of its bounding box.
     """
 
     def __init__(self, mesh: Mesh | None, opacity: float, label: str | None) -> None:
@@ -61,14 +61,14 @@ class Body:
         self.corners = np.stack([self.vertices.min(0), self.vertices.max(0)])
 
     def painted(self, color: tuple[int, int, int], label: str) -> Body:
-        """It in one colour, opaque."""
+        """Return it in one colour, opaque, with another label."""
         other = copy(self)
         other.label, other._alpha = label, np.uint8(255)
         other._colors = np.broadcast_to(np.array(color, np.float32), self._colors.shape)
         return other
 
     def lit(self, eye: F64) -> U8:
-        """Colours [T, 4] lit from the eye (at [3], m), as an endoscope lights; bent or not."""
+        """Return its colours [T, 4], lit from the eye (at [3], m) as by an endoscope; bending is left out."""
         rays = self._centres - eye
         facing = np.abs(np.einsum("tc,tc->t", self._normals, rays)) / np.linalg.norm(rays, axis=1)
         light = DARKEST + (1 - DARKEST) * facing
@@ -86,12 +86,12 @@ class Placed:
     depth_confidence: float = 1.0  # 0..1, of what holds it
 
     def shape(self, T: F64) -> F64:
-        """Its vertices [V, 3] (m) as T [4, 4] transforms its body's coordinates."""
+        """Return its vertices [V, 3] (m), transformed by T [4, 4] from its body's coordinates."""
         return np.asarray(transform(T, self.body.vertices if self.vertices is None else self.vertices))
 
     def draw(self, camera: Camera, z: F32, rgba: U8, colors: U8 | None = None) -> F64:
-        """Add what one eye sees of it to a picture [H, W, 4] with depths [H, W] (m), in place; its vertices
-        [V, 3] (m) in the camera's coordinates. `colors` are [T, 4]; default: as it is lit."""
+        """Draw what one eye sees of it into a picture [H, W, 4] with depths [H, W] (m), in place. Return its
+        vertices [V, 3] (m, in camera coordinates). `colors` are [T, 4]; default: as it is lit."""
         T_cam_body = invert(camera.T_world_cam) @ self.T_world_body
         local = self.shape(T_cam_body)
         if len(local):
@@ -202,7 +202,7 @@ def _label(rgba: U8, frame: TissueFrame, camera: Camera, placed: Placed, baselin
 def _write(
     rgba: U8, frame: TissueFrame, text: str, at: tuple[int, int], depth: float, baseline: float
 ) -> None:
-    """White on black, in place, as if at a depth (m): before the tissue, but not over instruments."""
+    """Write white on black, in place, as if at a depth (m): over tissue, but not over instruments."""
     height, width = rgba.shape[:2]
     scale = _text_scale(height)
     (_, above), below = cv2.getTextSize(text, FONT, scale, 1)

@@ -1,4 +1,4 @@
-"""The node's messages of one frame, joined to what the overlay needs of it."""
+"""Joins the node's messages of one frame to what the overlay needs of it."""
 
 from dataclasses import dataclass
 
@@ -25,14 +25,14 @@ POSE = TopicName("tf", ReceivedRos)
 ANCHORS = TopicName("anchors", ReceivedCloud)
 RIGHT_INFO = TopicName("right/camera_info", ReceivedCameraInfo)
 NEEDED = (DEPTH, TISSUE, INFO, POSE, ANCHORS)
-CONFIDENCE = TopicName("left/render/depth_confidence", ReceivedImage)  # recordings of before have none
+CONFIDENCE = TopicName("left/render/depth_confidence", ReceivedImage)  # older recordings have none
 
-# Confidence of anchors, by how often those that had it were right: "Is confidence right?" in
-# benchmarks/tracking.md. It is halved in 2 s, so each is a time since the tissue around one was recognised:
-# `SURE_OF_ANCHOR` is 2 s.
-LEAST_IN_SIGHT = 0.02  # 11 s: above it at least two of three are right, below it none to four of five
+# Limits for the confidence of anchors, from how often such anchors were right: "Is confidence right?" in
+# benchmarks/tracking.md. Confidence halves every 2 s, so each limit is a time since the tissue around one was
+# recognised: `SURE_OF_ANCHOR` is 2 s.
+LEAST_IN_SIGHT = 0.02  # 11 s; above it at least 2 of 3 anchors are right, below it 0 to 4 of 5
 LEAST_HIDDEN = 0.1  # 6 s
-TOLD = ("visibility", "confidence", "depth_confidence", "ahead")  # of an `Anchor`, older nodes not all
+TOLD = ("visibility", "confidence", "depth_confidence", "ahead")  # of an `Anchor`; older nodes lack some
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +47,13 @@ class Anchor:
 
     @property
     def is_sure(self) -> bool:
-        """Tell whether it is where it was pinned, as far as anybody knows."""
+        """Tell whether it is most likely on the tissue where it was pinned."""
         return self.confidence >= SURE_OF_ANCHOR
 
     @property
     def holds(self) -> bool:
-        """Tell whether an object may be placed by it, if only faintly. Visible is also one that has slipped
-        to other tissue."""
+        """Tell whether an object may be placed by it, if only drawn faintly. That it is visible is not
+        enough: so is an anchor that has slipped to other tissue."""
         least = LEAST_IN_SIGHT if self.visibility == 1 else LEAST_HIDDEN
         return bool(np.isfinite(self.place).all()) and self.confidence >= least
 
@@ -76,7 +76,7 @@ class TissueFrame:
     metric: bool = True  # False: nobody has calibrated the eyes, so lengths are right up to a factor
 
     def surface(self, where: Bool) -> Surface:
-        """Some points of the surface that is measured where a picture [H, W] is true."""
+        """Take some points of the measured surface, where a mask [H, W] is true."""
         assert self.confidence is not None
         return Surface.of_depth(self.depth, self.confidence, where, self.camera)
 
@@ -85,11 +85,11 @@ def tissue_frame(
     messages: Frame, right: ReceivedCameraInfo | None, confidence: ReceivedImage | None = None,
     ahead: bool = True,
 ) -> TissueFrame | None:  # fmt: skip
-    """The messages `NEEDED` of one frame joined; None when they do not fit together.
+    """Join the messages `NEEDED` of one frame; None: they do not fit together.
 
     Args:
         confidence: of its depth; None: from a node or a recording that does not tell.
-        ahead: anchors are where they are expected, if somebody asked for that; else where they were.
+        ahead: take the predicted place of each anchor that was asked for with one; else where anchors were.
     """
     depth, tissue, info, anchors = messages[DEPTH], messages[TISSUE], messages[INFO], messages[ANCHORS]
     size = (info.height, info.width)

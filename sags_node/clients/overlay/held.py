@@ -24,9 +24,9 @@ from sags_node.geometry import invert, scale_pixels, transform
 from sags_node.types import F64
 
 LEAST_ANCHORS = 3  # for a rigid fit
-FAR = 0.01  # m: so far beyond its own size no object lies from all of its anchors
-MISFIT = 0.003  # m, of an anchor from where its object's shape has it: nine of ten are within half of it
-NORMAL_MEMORY = 0.8  # of the last normal; the depth of one frame is noisy
+FAR = 0.01  # m; an object that is farther than this and its own size from all anchors is misplaced
+MISFIT = 0.003  # m from an anchor to its place on the rigid object; nine of ten are within half of it
+NORMAL_MEMORY = 0.8  # weight of the last normal, as the depth of one frame is noisy
 ELSEWHERE = (
     "it was registered in another session or epoch of the node, whose world may be another: register it again"
 )
@@ -88,14 +88,14 @@ class HeldObject:
         self._follow()
         self._refused: str | None = None  # for good
         self._misread = self._misreadings()
-        self._doubt: str | None = None  # of its `at`, once their unit is known, and of its places
+        self._doubt: str | None = None  # about its `at`, once their unit is known, or about its places
         self._size: tuple[int, int] | None = None  # of the picture that its pixels are meant in: the first
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
 
     def _follow(self) -> None:
-        """Begin to bend and to check it, anew where it was lost."""
+        """Prepare to bend and to check it, again after it was lost."""
         stated = self.spec.registration
         if self.spec.deform:
             depth = 1e-3 * self.spec.deform_depth_mm
@@ -104,7 +104,7 @@ class HeldObject:
             self._residual = Residual(1e-3 * stated.residual_p90_mm, stated.share, self._worker)
 
     def placed(self, frame: TissueFrame) -> Placed | None:
-        """It as it is to be drawn: placed, bent and checked as its scene file says; see `place`."""
+        """Return it as it is to be drawn: placed, bent and checked as its scene file says; see `place`."""
         T = self.place(frame)
         if T is None:
             return None
@@ -132,8 +132,8 @@ class HeldObject:
 
     @property
     def is_sure(self) -> bool:
-        """Tell whether enough of the anchors that place it are, its shape fits them, and nothing speaks
-        against it."""
+        """Tell whether it has a place, enough of its anchors are sure and fit its shape, and nothing else
+        speaks against it."""
         return self.times_pinned > 0 and self.reason is None and self.unsure is None
 
     def _unready(self, frame: TissueFrame) -> str | None:  # noqa: PLR0911, one return per reason
@@ -170,11 +170,11 @@ class HeldObject:
 
     @property
     def ahead_s(self) -> float:
-        """How far ahead of the frame it was placed last."""
+        """The time (s) by which it was placed ahead of its last frame."""
         return max((state.ahead for state in self._states), default=0.0)
 
     def status(self) -> dict[str, Any]:
-        """Say for people and programs: what it is, why it is not drawn, and how its anchors do."""
+        """Return for people and programs what it is, why it is not drawn, and the state of its anchors."""
         return {
             "name": self.spec.name,
             "reason": self.reason,
@@ -207,8 +207,8 @@ class HeldObject:
         return self._lost
 
     def _may_pin_again(self, frame: TissueFrame) -> bool:
-        """Asked for, or the recording loops and has come again to where it was pinned: its pixels then show
-        the same tissue."""
+        """Whether `repin` is set, or a recording loops and is again where the object was pinned: its pixels
+        then show the same tissue."""
         now, held, begun = frame.recorded_s, self._held_s, self._begun_s
         if now is not None and held is not None and now < held:
             self._began_anew = True
@@ -295,7 +295,7 @@ class HeldObject:
         return is_anew or stated.session not in (None, frame.session)
 
     def _misreadings(self) -> dict[float, str | None]:
-        """What is wrong with its `at`, for either unit (m) that they may be in; asked before frames wait."""
+        """What is wrong with its `at`, for either unit (m) they may be in; computed before frames come."""
         said = [anchor.at for anchor in self.spec.anchors if anchor.at is not None]
         if self.spec.file is None or len(said) < LEAST_ANCHORS:
             return {}
@@ -303,7 +303,7 @@ class HeldObject:
         return {unit: misread(shape, unit * at) for unit in {1.0, self.spec.scale}}
 
     def _unit(self, at: F64, places: F64) -> float:
-        """m for one of what every `at` [k, 3] is in, by what lies at the anchors (at [k, 3], m)."""
+        """Metres per unit of every `at` [k, 3]; if not stated, guessed by the anchors' places [k, 3] (m)."""
         scale = 1.0 if self.spec.file is None else self.spec.scale
         if self.spec.at_units is not None or scale == 1:
             return scale if self.spec.at_units != "m" else 1.0
@@ -319,7 +319,7 @@ class HeldObject:
         return 1.0 if in_metres else scale
 
     def _distance(self, points: F64) -> float:
-        """From the object to the nearest of its points [k, 3], m; 0: it is as near as an object may be."""
+        """The distance (m) from the object to the nearest of points [k, 3]; 0: plausibly near."""
         low, high = self._body.corners
         aside = np.maximum(np.maximum(low - points, points - high), 0)
         distance = float(np.linalg.norm(aside, axis=1).min())

@@ -1,6 +1,6 @@
-"""The mark at the rim of an overlay: what the node warns of while it is shown, or why it is blank.
+"""The mark at the rim of an overlay: the node's warnings while it is shown, or why it is blank.
 
-It lies on the lower edge, over whatever is there: a warning must be seen just where nothing else is sure.
+It lies on the lower edge, over whatever is there: a warning must be visible even if nothing else is sure.
 """
 
 import re
@@ -38,7 +38,7 @@ def draw_lines(rgba: U8, lines: Sequence[str], shift: int = 0) -> None:
     """Write some lines on the lower edge, in place.
 
     Args:
-        shift: px to the left, of the right eye: so that it lies at the tissue's depth.
+        shift: px to the left, for the right eye, so that the lines appear at the tissue's depth.
     """
     height, width = rgba.shape[:2]
     scale = max(height / 1000, 0.4)
@@ -58,7 +58,7 @@ def draw_lines(rgba: U8, lines: Sequence[str], shift: int = 0) -> None:
 
 
 def _fitted(text: str, width: int, scale: float, thickness: int) -> str:
-    """Return as much of it as fits into so many px."""
+    """As much of a text as fits into `width` px."""
     shown = text
     while text and cv2.getTextSize(shown, FONT, scale, thickness)[0][0] > width:
         text = text[:-1]

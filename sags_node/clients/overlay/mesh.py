@@ -27,7 +27,7 @@ SMALLEST = 5e-4  # m across: nobody sees what is smaller, and a zone so small wa
 HEADER_BYTES = 1 << 16
 GREEN = (60, 230, 120)  # RGB
 ROD = 0.0003  # m, the radius of a line
-LEAN = np.radians(35)  # of the target's arrow: along the line of sight it would be a dot
+LEAN = np.radians(35)  # rad, tilt of the target's arrow: along the line of sight it would be a dot
 
 _MESHES, _POINTS = (".ply", ".obj", ".stl"), (".ply", ".pcd", ".xyz")
 _KINDS = " ".join(dict.fromkeys(_MESHES + _POINTS))
@@ -52,7 +52,7 @@ def mesh_of(spec: ObjectSpec) -> Mesh | None:
 
 
 def surface_of(file: Path, scale: float) -> Mesh:
-    """The triangles of a file, which no cloud of points has; `scale` is metres per unit of it.
+    """Read the triangles of a file, which must not be a point cloud; `scale`: metres per unit of the file.
 
     Raises:
         UsageError: as `mesh_of`, or it holds points only.
@@ -75,7 +75,7 @@ def _load(spec: ObjectSpec, file: Path, points_too: bool = True) -> Mesh:
     if count > most:
         raise UsageError(f"{file} holds {count} {what}, {most} at most can be drawn; simplify it")
     with np.errstate(over="ignore"):
-        points = (points * spec.scale).astype(np.float32).astype(np.float64)  # as they will be drawn
+        points = (points * spec.scale).astype(np.float32).astype(np.float64)  # rounded as they will be drawn
     _check_vertices(file, points)
     if what == "points":
         points, triangles = _octahedra(points, spec.point_size)
@@ -83,7 +83,7 @@ def _load(spec: ObjectSpec, file: Path, points_too: bool = True) -> Mesh:
 
 
 def _content(file: Path) -> bytes:
-    """The bytes of a file; not of one that is no such file, or would take too much memory."""
+    """The bytes of a file, after a check that it is what its name says and not too large for the memory."""
     kind = file.suffix.lower()
     if f"{kind} " not in f"{_KINDS} ":
         raise UsageError(f"cannot draw {file}: the name must end in one of {_KINDS}")
@@ -162,13 +162,13 @@ def _target(color: tuple[int, int, int]) -> Mesh:
 
 
 def _marker(color: tuple[int, int, int]) -> Mesh:
-    """A ball of 2 mm in the surface."""
+    """A ball of 2 mm radius around the anchor."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 17)
     return _joined([(_turned(0.002 * np.cos(angles), 0.002 * np.sin(angles), 32), color)])
 
 
 def rod(start: F64, end: F64, color: tuple[int, int, int]) -> Mesh:
-    """A thin line between two places [3] (m) that are not the same."""
+    """Return a thin line between two different places [3] (m)."""
     length = float(np.linalg.norm(end - start))
     points, triangles = _turned(np.array([0, ROD, ROD, 0]), np.array([0, 0, length, length]), 8)
     way = (end - start) / length
@@ -177,7 +177,7 @@ def rod(start: F64, end: F64, color: tuple[int, int, int]) -> Mesh:
 
 
 def _turned(radii: F64, heights: F64, segments: int) -> tuple[F64, I32]:
-    """Vertices [V, 3] and outward triangles [T, 3] of a profile (m) that runs upwards, turned about z."""
+    """Vertices [V, 3] and outward triangles [T, 3] of a profile (m, running up) revolved about z."""
     angles = 2 * np.pi * np.arange(segments) / segments
     rings = [radii[:, None] * np.cos(angles), radii[:, None] * np.sin(angles)]
     vertices = np.stack([*rings, np.repeat(heights[:, None], segments, 1)], -1).reshape(-1, 3)

@@ -1,8 +1,8 @@
 """Vertices and triangles of PLY, OBJ and STL files, points of PLY, PCD and XYZ files; nothing else of them.
 
 Such files come from anywhere. Open3D's readers do not look at the length of a line or at the corners of a
-polygon, and end the process where something is wrong. trimesh's draw what came until a file broke off, and a
-vertex 0 of OBJ as the last one. Here Python and numpy read every number, and all must be there.
+polygon, and end the process where something is wrong. trimesh's accept a file that breaks off, and take a
+vertex 0 of OBJ for the last one. Here Python and numpy read every number, and all must be there.
 """
 
 import logging
@@ -34,14 +34,14 @@ log = logging.getLogger(__name__)
 
 
 class _OtherFormError(Exception):
-    """What is sound, but is not read in this form; and what to do."""
+    """A file is sound, but its form is not read; the message says what to do."""
 
 
 def parse_mesh(file: Path, data: bytes) -> Shape:
-    """Points [V, 3] and triangles [T, 3], none of a cloud of points, in the content of a file.
+    """Read points [V, 3] and triangles [T, 3] (none of a point cloud) from the content of a file.
 
     Raises:
-        UsageError: it cannot be followed to its end, or a face names a vertex that is not there.
+        UsageError: it cannot be read to its end, or a face names a vertex that is not there.
     """
     parse = {".ply": _ply, ".obj": _obj, ".stl": _stl, ".pcd": _pcd, ".xyz": _xyz}[file.suffix.lower()]
     try:
@@ -69,8 +69,8 @@ def _warn_of_the_rest(file: Path, points: F64, faces: Sequence[Face]) -> None:
 
 
 def _welded(points: F64, triangles: I32) -> Shape:
-    """With one vertex for each place, as exporters split it at edges of their normals; without triangles that
-    have no area or come twice: what they enclose would be inside of nothing."""
+    """Merge vertices at one place, which exporters split where normals differ. Drop triangles that have no
+    area or come twice: they spoil the count of crossings that tells inside from outside."""
     if not len(triangles):
         return points, triangles
     points, numbers = np.unique(points, axis=0, return_inverse=True)
@@ -104,7 +104,7 @@ class _Numbers:
         self._at = 0
 
     def table(self, kinds: Sequence[str], rows: int) -> F64:
-        """So many rows of numbers of these types, [rows, kinds]."""
+        """The next `rows` rows of numbers of these types, [rows, kinds]."""
         at = self._at
         if not self._order:
             self._at += rows * len(kinds)
@@ -185,14 +185,14 @@ def _obj(data: bytes) -> tuple[F64, list[Face]]:
 
 
 def stl_triangles(start: bytes, size: int) -> int | None:
-    """How many triangles a binary STL file of so many bytes claims; None: it is one of text."""
+    """Return how many triangles a binary STL file of `size` bytes claims; None: it is an ASCII file."""
     claimed = int.from_bytes(start[STL_START - 4 : STL_START], "little")
     is_text = start.lstrip().lower().startswith(b"solid") and size != STL_START + claimed * STL_TRIANGLE
     return None if is_text else claimed
 
 
 def _stl_words(data: bytes) -> list[bytes]:
-    """All words of a text file, in small letters, but for the names of its solids, which may be any."""
+    """All words of an ASCII STL file in lower case, without the names of solids, which may be any words."""
     words: list[bytes] = []
     for line in data.lower().splitlines():
         said = line.split()
@@ -264,7 +264,7 @@ def _xyz(data: bytes) -> tuple[F64, list[Face]]:
 
 
 def triangulate(points: F64, faces: Sequence[Sequence[int]]) -> I32:
-    """Triangles [T, 3] of faces with three corners and more; `points` are [V, 3].
+    """Cut faces with three corners or more into triangles [T, 3]; `points` are [V, 3].
 
     Raises:
         ValueError: a face names a vertex that is not there, or one twice, or has too many or too few corners.
@@ -283,7 +283,7 @@ def triangulate(points: F64, faces: Sequence[Sequence[int]]) -> I32:
 
 
 def _cut(corners: F64) -> list[Sequence[int]]:
-    """Ears of a polygon [N, 3] that need not be convex, one after the other."""
+    """The triangles of a polygon [N, 3], convex or not, by ear clipping."""
     flat = _flattened(corners)
     left = list(range(len(flat)))
     triangles: list[Sequence[int]] = []
@@ -295,7 +295,7 @@ def _cut(corners: F64) -> list[Sequence[int]]:
 
 
 def _flattened(corners: F64) -> list[tuple[float, float]]:
-    """In the two axes in which the polygon is largest, counterclockwise."""
+    """The polygon projected to the two axes in which it is largest, counterclockwise."""
     following = np.roll(corners, -1, axis=0)
     normal = np.cross(corners, following).sum(0)  # twice its area, by Newell
     axis = int(np.abs(normal).argmax())
@@ -306,7 +306,7 @@ def _flattened(corners: F64) -> list[tuple[float, float]]:
 
 
 def _is_ear(flat: list[tuple[float, float]], left: list[int], at: int) -> bool:
-    """A corner that points outwards, with no other one inside."""
+    """Whether a corner is convex, and no other corner lies in the triangle that it cuts off."""
     a, b, c = left[at - 1], left[at], left[(at + 1) % len(left)]
     if _turn(flat[a], flat[b], flat[c]) <= 0:
         return False

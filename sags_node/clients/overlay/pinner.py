@@ -23,10 +23,10 @@ class Pinner:
     def __init__(self, connect: Callable[[], ControlClient]) -> None:
         self._connect = connect
         self._worker = ThreadPoolExecutor(1, "sags-pinner")
-        self._held: dict[int, str | None] = {}  # our anchors, and in which session; the worker's alone
+        self._held: dict[int, str | None] = {}  # our anchors -> session; for the worker's thread only
 
     def pin(self, requests: Sequence[Request]) -> Future[list[int]]:
-        """Ids of new anchors, all or none; or the node's `SagsError`."""
+        """Ask for anchors; the future gives their ids, all or none, or raises the node's `SagsError`."""
         return self._worker.submit(self._pin, requests)
 
     def remove(self, ids: Sequence[int]) -> None:
@@ -34,7 +34,7 @@ class Pinner:
         self._worker.submit(self._remove, list(ids))
 
     def forget(self, ids: Sequence[int]) -> None:
-        """The node that had these anchors is gone; in another one they may be somebody else's."""
+        """Forget anchors of a node that is gone: in another node these ids may be somebody else's."""
         self._worker.submit(self._disown, list(ids))
 
     def close(self) -> None:
@@ -59,7 +59,7 @@ class Pinner:
     def _ask(
         self, op: str, requests: Sequence[Request], timeout: float
     ) -> tuple[dict[int, Any], BaseException | None]:
-        """The answers by number, and what went wrong. Many at once: the node answers between two frames."""
+        """The answers by number, and the first error. Asks many at once: the node answers between frames."""
         answers: dict[int, Any] = {}
 
         def ask(first: int) -> None:

@@ -32,20 +32,20 @@ NEEDED = {
 MOST = 32  # instruments; a node tells of 8
 TISSUE = 0  # in the column zone; others are numbers of objects in the scene file, from 1
 LINE = (255, 255, 255)  # RGB, of a distance that is larger than the margin
-UNKNOWN = -1  # in the column zone: of a tip that is not known
-MAX_AGE = 0.5  # s; what was told before is not said any more
-HELD = 0.2  # s: so long what was told last is drawn, two periods of the node's topic
-RECENT = 0.5  # s, of which the speed is told
-FEWEST = 3  # distances that tell a speed
+UNKNOWN = -1  # in the column zone: the tip's place is not known
+MAX_AGE = 0.5  # s; older results are not told any more
+HELD = 0.2  # s for which the last result is drawn: two periods of the node's topic
+RECENT = 0.5  # s of distances from which the speed is estimated
+FEWEST = 3  # distances that a speed needs
 SLOWEST = 0.002  # m/s: tips are off by 1 mm, so half a second tells no slower approach
 SHORTEST = 1e-4  # m, of a line
 NOWHERE = np.full(3, np.nan)
-UNSURE = 0.98 * SURE  # at most, to a zone whose own place is not sure
+UNSURE = 0.98 * SURE  # the most confidence of a distance to a zone whose own place is not sure
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """A tip and what is nearest to it of a zone, or of the tissue."""
+    """A tip, and the nearest place of a zone or of the tissue."""
 
     instrument: int
     zone: int  # `TISSUE`, or the object's number
@@ -67,7 +67,7 @@ class Near:
         return self.confidence >= SURE
 
     def status(self) -> dict[str, Any]:
-        """Say it for people and programs."""
+        """Return it for people and programs."""
         error = float(error_of(np.array(self.confidence, np.float32)))  # nine of ten are meant to be smaller
         told = {"distance_mm": 1e3 * self.distance, "margin_mm": 1e3 * self.margin}
         told |= {"error_mm": 1e3 * error, "closing_mm_s": 1e3 * self.closing, "contact_s": self.contact}
@@ -87,7 +87,7 @@ class _Zone:
         self._shape.nearest(np.zeros((1, 3)))  # builds its tree now, not while frames wait
 
     def nearest(self, put: Placed, tips: F64) -> F64:
-        """Its nearest places [T, 3] to tips [T, 3] (m, world): a tip inside is one itself."""
+        """Return its nearest places [T, 3] to tips [T, 3] (m, world): for a tip inside, the tip itself."""
         vertices = put.body.vertices if put.vertices is None else put.vertices
         if vertices is not self._vertices:  # it is bent
             self._vertices, self._shape = vertices, Shape(vertices, self._triangles)
@@ -108,16 +108,16 @@ class Proximity:
         ]
         self._source: tuple[str, int] | None = None  # session and epoch of the node
         self._stamp_ns: int | None = None  # of the tips that were looked at last
-        self._past: dict[tuple[int, int], list[tuple[float, float]]] = {}  # s, and m
+        self._past: dict[tuple[int, int], list[tuple[float, float]]] = {}  # times (s) and distances (m)
         self._found: list[Near] = []
         self._unknown: list[Near] = []  # tips, and zones without a place
         self.reason: str | None = "no instruments came yet"  # why nothing is told; None: it is
 
     def look(self, said: ReceivedCloud, frame: TissueFrame, placed: Sequence[Placed | None]) -> F32 | None:
-        """The rows [N, FIELDS] of the topic `proximity`, once for each message of instruments, else None.
+        """Return the rows [N, FIELDS] of the topic `proximity`, once per message of instruments, else None.
 
         Args:
-            placed: every object of the scene, at the time of the frame or some ms beside it.
+            placed: every object of the scene, at the time of the frame or some ms off.
         """
         source = frame.session, frame.epoch
         if source != self._source:
@@ -148,7 +148,7 @@ class Proximity:
         return _rows([*(near for near in self._found if near.is_too_near), *self._unknown])
 
     def status(self, now_ns: int) -> dict[str, Any]:
-        """Say which tips are too near to what, and which tips and zones are not known."""
+        """Return which tips are too near to what, and which tips and zones are not known."""
         is_old = self._stamp_ns is None or now_ns - self._stamp_ns > 1e9 * MAX_AGE
         reason = self.reason or ("none came lately" if is_old else None)
         near, unknown = ([], []) if reason else (self._found, self._unknown)
@@ -160,8 +160,8 @@ class Proximity:
         }
 
     def shown(self, frame: TissueFrame, placed: Sequence[Placed | None]) -> list[Placed]:
-        """What is to be drawn: the objects, zones in `ALARM` where a tip is too near, and distances to the
-        tissue."""
+        """Return what is to be drawn: the objects, zones in `ALARM` where a tip is too near, and distances
+        to the tissue."""
         drawn = dict(enumerate(placed, 1))
         fresh = self._stamp_ns is not None and abs(frame.stamp_ns - self._stamp_ns) <= 1e9 * HELD
         lines: list[Placed] = []
@@ -204,8 +204,8 @@ class Proximity:
         return sorted(found, key=lambda near: -near.distance)  # the nearest tip is the one that is shown
 
     def _approach(self, near: Near, now: float) -> Near:
-        """It with its speed: the median of what any two recent distances tell (Theil and Sen), since a tip
-        may be wrong in one frame."""
+        """The distance with its speed: the median slope between any two recent distances (Theil-Sen), since
+        a tip may be wrong in one frame."""
         past = self._past.setdefault((near.instrument, near.zone), [])
         past.append((now, near.distance))
         if len(past) < FEWEST:
@@ -216,7 +216,7 @@ class Proximity:
 
 
 def _unusable(said: ReceivedCloud) -> str | None:
-    """Why nothing can be told by a message."""
+    """Why a message of instruments cannot be used; None: it can."""
     if not said.metric:
         return "nobody has calibrated the eyes: lengths have no unit"
     if not set(said.points.dtype.names or ()) >= NEEDED:
@@ -240,7 +240,7 @@ def _rows(found: Sequence[Near]) -> F32:
 
 
 def _line(near: Near) -> list[Placed]:
-    """From the tip to the tissue, and how long it is."""
+    """A line from the tip to the tissue, labelled with its length."""
     if not np.isfinite(near.place).all():
         return []
     color = ALARM if near.is_too_near else LINE

@@ -1,7 +1,7 @@
-"""Triangles into a picture with a depth buffer, and what tissue and instruments hide of it.
+"""Draws triangles with a depth buffer, and fades or hides what lies behind tissue and instruments.
 
 Both eyes at 30 Hz are to take half a core in all. One eye's view of a vessel of 20,000 triangles takes 2 ms
-here, lighting included, and 10 ms with Open3D's ray casting, which the tests hold this against.
+here, lighting included, and 10 ms with Open3D's ray casting, with which the tests compare this.
 """
 
 import math
@@ -21,7 +21,7 @@ def fill(pixels: F64, depths: F64, triangles: I32, colors: U8, z: F32, rgba: U8)
     Args:
         pixels: [V, 2] px of the vertices; the centre of the first pixel is (0, 0).
         depths: [V] m, camera z.
-        triangles: [T, 3] vertices, either way round.
+        triangles: [T, 3] vertices, wound either way.
         colors: [T, 4] RGBA.
         z: [H, W] m, infinite where nothing is.
         rgba: [H, W, 4].
@@ -36,7 +36,7 @@ def fill(pixels: F64, depths: F64, triangles: I32, colors: U8, z: F32, rgba: U8)
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0:
             continue
-        # Of barycentric weights over depth: 1 / z is linear in the picture, z is not.
+        # Factors of barycentric weights over depth: 1 / z is linear in the picture, z is not.
         over_a, over_b, over_c = 1 / (area * depths[a]), 1 / (area * depths[b]), 1 / (area * depths[c])
         first_x, last_x = max(0, math.ceil(min(ax, bx, cx))), min(width - 1, math.floor(max(ax, bx, cx)))
         first_y, last_y = max(0, math.ceil(min(ay, by, cy))), min(height - 1, math.floor(max(ay, by, cy)))
@@ -58,7 +58,7 @@ def hide(
     z: F32, rgba: U8, depth: F32, tissue: Bool, sure: Bool, shift: float, nearest: float, slack: float,
     under: float,
 ) -> None:  # fmt: skip
-    """Take from a drawn eye what must not be seen of it, in place.
+    """Make transparent what must not be seen of one eye's drawing, in place.
 
     A point at depth z in column x of this eye is where the left eye sees column x + shift / z. There the
     tissue's depth is looked up, and an instrument can be in front of it anywhere from there to where the left
@@ -69,9 +69,9 @@ def hide(
         rgba: [H, W, 4]; the opacity becomes 0 over instruments and where no depth is known.
         depth: [H, W] m, of the tissue, left eye, NaN unknown.
         tissue: [H, W], left eye, False: instrument.
-        sure: [H, W], left eye; where the depth is not, all is drawn as if under the tissue.
+        sure: [H, W], left eye; False: the depth is not sure, so all is drawn as if under the tissue.
         shift: px m, focal length times the distance of this eye from the left one.
-        nearest: m.
+        nearest: m, from the eye; no instrument is nearer.
         slack: m; what is deeper than this under the tissue keeps `under` of its opacity.
     """
     height, width = z.shape
@@ -92,7 +92,7 @@ def hide(
 
 @kernel
 def key_out(rgba: U8, key: U8, keyed: U8) -> None:
-    """An overlay [H, W, 4] on a key colour [3]; every pixel of `keyed` [H, W, 3] is written."""
+    """Write an overlay [H, W, 4] on a key colour [3] into every pixel of `keyed` [H, W, 3]."""
     height, width, _ = rgba.shape
     for y in range(height):
         for x in range(width):

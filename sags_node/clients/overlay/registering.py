@@ -20,12 +20,12 @@ from sags_node.messaging.address import NodeAddress
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.types import F64
 
-FRAMES = 10  # of the time that is looked at
-PATIENCE = 10.0  # s for the first frame, and beyond that time for the last
+FRAMES = 10  # spread over the time that is looked at
+PATIENCE = 10.0  # s to wait for frames beyond the time that is looked at
 WAIT_FOR_REST = 0.2  # s for what belongs to a frame
 LEAST_SHARE = 0.5  # of the frames, in which a picked point must be known
-HOLDING = 8  # anchors of the scene
-INNER = 0.8  # of the matched points, those nearest to their middle: anchors at a rim are lost first
+HOLDING = 8  # anchors that the scene file gets
+INNER = 0.8  # share of the matched points, nearest to their middle: anchors at a rim are lost first
 
 
 def register_live(
@@ -71,7 +71,7 @@ def register_live(
 
 
 def frames_of(node: NodeAddress, seconds: float) -> list[TissueFrame]:
-    """At most `FRAMES` that are spread over some seconds of one session of a node, without a longer gap.
+    """Return up to `FRAMES` frames, spread over `seconds` of one session and epoch, without a longer gap.
 
     Raises:
         SagsError: no frames, or no calibration.
@@ -102,7 +102,7 @@ def frames_of(node: NodeAddress, seconds: float) -> list[TissueFrame]:
 
 
 def _place(pair: PairSpec, number: int, seen: Sequence[TissueFrame]) -> F64:
-    """Find where the tissue of a pair is: [3] m, world; the middle of what the frames say."""
+    """The place of a pair's tissue, [3] m, world: the median over the frames."""
     found = [place for frame in seen if (place := _place_in(pair, number, frame)) is not None]
     if len(found) < LEAST_SHARE * len(seen):
         what = f"pixel {pair.pixel[0]:g} {pair.pixel[1]:g}" if pair.pixel else f"anchor {pair.anchor}"
@@ -131,7 +131,7 @@ def _place_in(pair: PairSpec, number: int, frame: TissueFrame) -> F64 | None:
 
 
 def holding(points: F64) -> F64:
-    """Some of the matched points [N, 3], far apart from each other: [k, 3]."""
+    """Choose [k, 3] of the matched points [N, 3] that are far apart from each other."""
     import open3d as o3d
 
     away = np.linalg.norm(points - points.mean(0), axis=1)

@@ -4,9 +4,9 @@ What counts as measured is `left/render/depth` on tissue where its confidence is
 registration was stated for, without what is borrowed, old or hidden by an instrument. `left/depth` has no
 confidence, and some frames have none of it.
 
-As when it was registered, what counts is what the eye sees through the object. A point is as far from it as
-from the plane of the triangle that its ray meets: a kernel finds that without the interpreter's lock, which
-Open3D's search for the nearest place holds for a tenth of a second. A slide along the surface is not seen.
+As when it was registered, points that the eye sees before or behind the object count. Their distance is to
+the plane of the triangle that their ray meets: a kernel finds that without the interpreter's lock, which
+Open3D's search for the nearest place holds for a tenth of a second. A slide along the surface is not noticed.
 """
 
 import math
@@ -25,18 +25,18 @@ PERIOD = 1.0  # s
 NINE_OF_TEN = 0.9
 
 
-Found = tuple[float, float]  # see `look`
+Found = tuple[float, float]  # m, the residual and the error of depths: see `look`
 
 
 class Residual:
     """Watches one object that is pinned.
 
-    It is beyond what was stated when it grows by more than the depths that are measured may be wrong by: so
+    It is doubted when its residual exceeds the stated one by more than the error of measured depths: by that
     much it may grow although nothing has moved.
 
     Args:
-        stated: m, nine of ten when it was registered.
-        share: of the surface before it that matched then.
+        stated: m, 90 % quantile of the residual when it was registered.
+        share: of the surface in line with it that matched then.
     """
 
     def __init__(self, stated: float, share: float, worker: Executor) -> None:
@@ -47,16 +47,16 @@ class Residual:
         self._stamp_ns = -math.inf  # of the last frame that was looked at
 
     def status(self) -> dict[str, float | None]:
-        """Say for people and programs; None: nothing was looked at yet, or too little of it is measured
-        now."""
+        """Return the residual and its limit, mm; None: nothing was looked at yet, or too little of it is
+        measured now."""
         told = (None, None) if self._found is None else (self._found[0], self._stated + self._found[1])
         named = zip(("residual_mm", "residual_limit_mm"), told, strict=True)
         return {name: None if each is None else round(1e3 * each, 2) for name, each in named}
 
     def look(self, frame: TissueFrame, placed: Placed, again: bool = True) -> str | None:
-        """Why the object is not sure, by the last look; look `again` in the background, when that is due.
+        """Return why the object is not sure, by the last look; look `again` in the background if it is due.
 
-        What was found last holds while nothing can be measured.
+        The last doubt stays while nothing can be measured.
         """
         if self._looking is not None and self._looking.done():
             self._found, self._looking = self._looking.result(), None
@@ -73,8 +73,8 @@ class Residual:
 
 
 def look(placed: Placed, frame: TissueFrame, share: float = 1.0) -> Found | None:
-    """How far (m) nine of ten measured points before and behind an object are from it, of the share that
-    matched; and what nine of ten errors of their depths stay below. None: there are too few."""
+    """Return the residual (m) that nine of ten points before or behind an object stay below, of the `share`
+    that matched, and the bound (m) of nine of ten errors of their depths. None: too few points."""
     assert frame.confidence is not None
     every, at = evenly(frame.depth.shape)
     depth, confidence = frame.depth[at], frame.confidence[at]

@@ -50,21 +50,21 @@ WAIT_FOR_REST = 0.05  # s for what belongs to the frame
 PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
 UNSEEN = "nothing of it is in sight: beyond the picture, or behind an instrument"
 REMEMBERED = 54_000  # durations: half an hour at 30 Hz
-RECENT = 300  # durations are behind the figures in `status`
+RECENT = 300  # durations that the figures in `status` are of
 
 
 @dataclass(frozen=True, slots=True)
 class OverlayOptions:
     """How `sags overlay` runs; the defaults are those of the command."""
 
-    node: NodeAddress = THE_NODE  # with its endpoint, its control is to be given; `run_dir` is ours, too
+    node: NodeAddress = THE_NODE  # an endpoint needs its `control`, too; `run_dir` is also the overlay's
     own_ns: str = "overlay"
     scene: Path | None = None
     pin: tuple[float, float] | None = None  # u v, of the built-in shape; default: middle of the tissue
     shape: str = "target"
     seconds: float | None = None  # default: until Ctrl-C
     save: Path | None = None  # .mp4 for every picture, .png for the last one with the overlay
-    layers: Path | None = None  # for `Layers`
+    layers: Path | None = None  # the file of `Layers`
     force: bool = False  # it may replace a file
     max_age: float = MAX_AGE
     repin: bool = False
@@ -76,7 +76,7 @@ def run_overlay(options: OverlayOptions, tell: Callable[[str], object] = log.war
     """Publish an overlay of a node until its time is over or Ctrl-C. The node may be started later.
 
     Args:
-        tell: what it waits for.
+        tell: called with what it waits for.
 
     Returns:
         frames, overlay (frames in which something of it was seen), blanked (reason -> frames without),
@@ -185,7 +185,7 @@ class _Overlay:
             raise SagsError(self._node.refusal or self._node.absent or self._silence)
 
     def _say_waiting(self, why: str) -> None:
-        """Once, and again when it is for another reason."""
+        """Tell what it waits for once, and again when the reason changes."""
         if why != self._waiting_because:
             self._waiting_because = why
             self._tell(f"waiting (Ctrl-C ends): {why}")
@@ -220,7 +220,7 @@ class _Overlay:
     # ---- one frame -----------------------------------------------------------------------------------------
 
     def _take(self, leading: Received) -> None:
-        """Show the overlay of one frame, and count why there is none, or nothing of it to be seen."""
+        """Show the overlay of one frame. If there is none, or nothing of it is visible, count why."""
         rgba, reason = self._overlay(leading.stamp_ns)
         self._frames += 1  # once it is known what became of it: Ctrl-C may come in between
         if reason is not None:
@@ -238,7 +238,7 @@ class _Overlay:
             self._output.add(shown, reason is None, leading.stamp_ns)
 
     def _overlay(self, stamp_ns: int) -> tuple[U8 | None, str | None]:
-        """The left eye's overlay, published, where there is one; and why nothing is to be seen of it."""
+        """Publish a frame's overlay; return that of the left eye, and why nothing of it is visible."""
         messages = self._node.aligned(NEEDED, stamp_ns, WAIT_FOR_REST)
         if (stale := self._stale()) is not None:
             self._stream.blank(stale)
@@ -300,7 +300,7 @@ class _Overlay:
     # ---- what is not right ---------------------------------------------------------------------------------
 
     def _stale(self) -> str | None:
-        """Return what may not be shown as new any more, of all that is needed."""
+        """Why what is needed may not be shown as new any more; None: it may."""
         if self._clock is not None and self._clock.problem is not None:
             return "the node's clock is not known"
         for name in NEEDED:
@@ -344,7 +344,7 @@ class _Overlay:
 
     @property
     def _warnings(self) -> dict[str, str]:
-        """Return what the node warned of last."""
+        """The node's latest warnings, by code."""
         status = self._node.latest("status")
         return status.warnings() if isinstance(status, ReceivedText) else {}
 
@@ -360,7 +360,7 @@ class Durations:
     """The newest half hour of one duration, milliseconds, in memory that never grows."""
 
     def __init__(self) -> None:
-        self._ms = np.full(REMEMBERED, np.nan, np.float32)  # written once, so that its pages are there
+        self._ms = np.full(REMEMBERED, np.nan, np.float32)  # written once, so that its memory is allocated
         self._count = 0
 
     def add(self, ms: float) -> None:

@@ -22,8 +22,8 @@ _LAYER = struct.Struct("<5i")  # frame, first row and column, height and width o
 
 
 class Layers:
-    """What was drawn over each frame, and nothing else. A video can be made of it when the node has
-    ended.
+    """Stores what was drawn over each frame, and nothing else. A video can be made of it when the node
+    has ended.
 
     Args:
         force: replace a file that exists.
@@ -41,7 +41,7 @@ class Layers:
             self._file: BinaryIO = file.open("wb")
 
     def add(self, frame_id: int, rgba: U8 | None) -> None:
-        """Add one frame [H, W, 4]; None: it was blank. What cannot be written is said by `close`."""
+        """Add one frame [H, W, 4]; None: it was blank. If it cannot be written, `close` raises that."""
         if self._failed is not None:
             return
         top = left = height = width = 0
@@ -55,9 +55,7 @@ class Layers:
             self._failed = error  # the overlay itself goes on
 
     def close(self) -> None:
-        """Raises:
-        SagsError: not all of it was written.
-        """
+        """Close the file. Raises: SagsError: not all of it was written."""
         with writing(self._path):
             self._file.close()
             if self._failed is not None:
@@ -73,7 +71,7 @@ class Layer(NamedTuple):
 
 
 def read_layers(file: Path) -> dict[int, Layer]:
-    """Read every frame that came, by its number, until where an overlay that was killed had written."""
+    """Read the layers by frame number. If the overlay was killed, those that were written whole before."""
     data, at, found = file.read_bytes(), 0, {}
     while at + _LAYER.size <= len(data):
         frame_id, top, left, height, width = _LAYER.unpack_from(data, at)
@@ -112,7 +110,7 @@ class Output:
         self.saved: str | None = None  # what has been written
 
     def add(self, picture: U8, with_overlay: bool, stamp_ns: int) -> None:
-        """One picture [H, W, 3] RGB, by when it was captured. What a video then lacks is told.
+        """Add a picture [H, W, 3] RGB with its capture time. If a video can get no more, that is logged once.
 
         Raises:
             SagsError: the video cannot be begun.

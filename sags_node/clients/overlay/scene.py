@@ -70,7 +70,7 @@ class AnchorSpec(Section):
 
 
 class Registered(BaseModel):
-    """What the overlay uses of what sags register found; the rest is for people."""
+    """The part of `sags register`'s result that the overlay uses; the rest is for people."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
     residual_p90_mm: float | None = Field(None, ge=0)
@@ -142,7 +142,7 @@ class SceneSpec(Section):
 
     @property
     def asks_for_instruments(self) -> bool:
-        """Tell whether it has margins."""
+        """Tell whether it has margins, for which tips of instruments are needed."""
         return self.tissue_margin is not None or any(thing.margin is not None for thing in self.objects)
 
     @model_validator(mode="after")
@@ -181,7 +181,7 @@ class PairsSpec(Section):
 
 
 def built_in(pixel: tuple[float, float] | None, shape: str) -> SceneSpec:
-    """One shape at a pixel, or in the middle of the tissue.
+    """Return a scene of one shape at a pixel, or in the middle of the tissue.
 
     Raises:
         UsageError: there is no such shape.
@@ -223,7 +223,7 @@ def _read(root: type[S], file: Path, what: str) -> S:
 
 
 def _explain(error: ValidationError, file: Path, root: type[Section]) -> str:
-    """One mistake: where, what, and the nearest known key for an unknown one, which explains most others."""
+    """One mistake: where, what, and the nearest known key. Unknown keys come first, as they cause others."""
     first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
     path = [str(part) for part in first["loc"]]
     where = ".".join(path)

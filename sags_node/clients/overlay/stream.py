@@ -1,7 +1,7 @@
 """What the overlay publishes on its own socket: both eyes' pictures, and what it says of itself.
 
 A picture is never left standing: when nothing fresh can be drawn, an empty one is sent at once and again
-every `BLANK_PERIOD`. Of these, those of the first `SAID` seconds say why on their lower edge.
+every `BLANK_PERIOD`. For the first `SAID` seconds, these pictures say why on their lower edge.
 """
 
 import time
@@ -21,8 +21,8 @@ from sags_node.messaging.sockets import Closes
 from sags_node.messaging.topics import OVERLAY_TOPICS
 from sags_node.types import F32, U8
 
-BLANK_PERIOD = 0.5  # s
-SAID = 5.0  # s
+BLANK_PERIOD = 0.5  # s between two empty pictures
+SAID = 5.0  # s for which empty pictures say why
 STATUS_PERIOD = 1.0  # s
 EYES = {"left": cdr.LEFT_FRAME, "right": cdr.RIGHT_FRAME}
 
@@ -32,7 +32,7 @@ class OverlayStream(Closes):
 
     Args:
         ns: of its topics and its connection file.
-        key: RGB of what shows no overlay in the `color_key` topics.
+        key: RGB of the pixels without overlay in the `color_key` topics.
 
     Raises:
         SagsError: another overlay has this namespace.
@@ -44,7 +44,7 @@ class OverlayStream(Closes):
         self._key = key
         self._size: tuple[int, int] | None = None  # height and width of what was shown last
         self._blank_due = 0.0
-        self._blank_since = 0.0  # for the reason that there is
+        self._blank_since = 0.0  # since when it is blank for the same reason, monotonic s
         self._status_due = 0.0
         self._state: tuple[str, str | None, tuple[str, ...], set[tuple[int, str]]] | None = None
         self._epoch = 0
@@ -52,7 +52,7 @@ class OverlayStream(Closes):
             "waiting for the node"  # why nothing is shown; None: the last picture sent is an overlay
         )
         self.shown_ns: int | None = None  # capture time of the frame shown last, while it is shown
-        self._shown_at = 0.0  # s, by a clock that nobody sets
+        self._shown_at = 0.0  # monotonic s
 
     @property
     def endpoints(self) -> list[str]:
@@ -60,15 +60,15 @@ class OverlayStream(Closes):
 
     @property
     def shown_for(self) -> float:
-        """Seconds since the last frame was shown, whatever became of the wall clock."""
+        """The seconds since the last frame was shown, by the monotonic clock."""
         return time.monotonic() - self._shown_at
 
     def serve(self) -> None:
-        """Take note of who has come and gone."""
+        """Take note of subscribers that have come or gone."""
         self._publisher.poll(0)
 
     def wants(self, eye: str) -> bool:
-        """True while somebody looks at this eye."""
+        """Tell whether somebody looks at this eye."""
         return any(self._publisher.wanted(f"{eye}/overlay/{kind}") for kind in ("image", "color_key"))
 
     def show(
@@ -87,15 +87,15 @@ class OverlayStream(Closes):
                 self._send(eye, pictures.get(eye, self._empty()), frame_id, stamp_ns, ahead_ns)
 
     def tell_proximity(self, rows: F32, frame_id: int, stamp_ns: int, epoch: int) -> None:
-        """Send the rows [N, FIELDS] of the tips that are too near, of the frame captured at `stamp_ns`; none
-        is a message, too."""
+        """Send the rows [N, FIELDS] of tips that are too near or unknown, for the frame captured at
+        `stamp_ns`. A message without rows is sent, too."""
         body = cdr.point_cloud(rows, FIELDS, stamp_ns)
         self._publisher.publish_content("proximity", body, frame_id, stamp_ns, epoch)
 
     def blank(self, reason: str, size: tuple[int, int] | None = None) -> None:
         """Show nothing, because of `reason`; to be called again and again while that is so.
 
-        An empty picture shows no frame: its stamp is the time at which it is true.
+        An empty picture belongs to no frame: its stamp is the time at which it is sent.
 
         Args:
             size: height and width of the node's pictures, where they are known; default: as before.
@@ -112,7 +112,7 @@ class OverlayStream(Closes):
                 self._send(eye, self.notice(), -1, stamp_ns)
 
     def notice(self, size: tuple[int, int] | None = None) -> U8:
-        """Return what stands in the place of an overlay: nothing, or for some seconds why. `size`: see
+        """Return the picture in place of an overlay: empty, or for `SAID` with the reason. `size`: see
         `blank`."""
         rgba, since = self._empty(size), time.monotonic() - self._blank_since
         if self.reason is not None and BLANK_PERIOD <= since < BLANK_PERIOD + SAID:

@@ -20,7 +20,7 @@ class Arrived:
 
     @property
     def size(self) -> int:
-        """Bytes of its parts."""
+        """The bytes of its parts."""
         return sum(memoryview(part).nbytes for part in self.message.parts)
 
 
@@ -28,7 +28,7 @@ class Backlog:
     """A queue between the thread that receives and the one that writes.
 
     Args:
-        most_bytes: a message that would lead beyond is refused.
+        most_bytes: a message that would exceed it is refused.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -65,7 +65,7 @@ class Backlog:
 
     @property
     def finished(self) -> bool:
-        """Closed, and all has been taken."""
+        """Tell whether it is closed and all has been taken."""
         with self._changed:
             return self._closed and not self._waiting
 
@@ -74,19 +74,19 @@ class Ring:
     """Keeps messages of the last `seconds`, and of latched topics the last one however old it is.
 
     Args:
-        clock: s, that nobody sets: with the wall clock all that is kept would get old at once.
+        clock: s, monotonic: when a wall clock is set, all that is kept could get old at once.
     """
 
     def __init__(self, seconds: float, most_bytes: int, clock: Callable[[], float] = time.monotonic) -> None:
         self._span = seconds
         self._most_bytes = most_bytes
         self._clock = clock
-        self._kept: deque[tuple[float, Arrived]] = deque()  # and when it came
+        self._kept: deque[tuple[float, Arrived]] = deque()  # s when it came, and the message
         self._bytes = 0
         self._latched: dict[str, tuple[float, Arrived]] = {}
 
     def add(self, arrived: Arrived, latched: bool) -> list[Arrived]:
-        """Keep a message; returns those that had to go for want of room, although they are young enough."""
+        """Keep a message; return those that were dropped for lack of room although they are young enough."""
         came = self._clock()
         self._kept.append((came, arrived))
         self._bytes += arrived.size
@@ -101,7 +101,7 @@ class Ring:
 
     @property
     def seconds(self) -> float:
-        """From the oldest message that is kept to the newest; latched ones may be older."""
+        """The seconds from the oldest message that is kept to the newest; latched ones may be older."""
         return self._kept[-1][0] - self._kept[0][0] if self._kept else 0.0
 
     def content(self) -> list[Arrived]:

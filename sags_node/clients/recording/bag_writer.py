@@ -21,7 +21,7 @@ from sags_node.files import writing
 
 CHUNK_BYTES = 1 << 20  # what is lost at most when the process is killed between two flushes
 MESSAGE_HEAD_BYTES = 31  # of an MCAP message record
-_NEVER = {"sec": 9223372036, "nsec": 854775807}
+_NEVER = {"sec": 9223372036, "nsec": 854775807}  # an infinite duration of ROS 2
 
 T = TypeVar("T")
 
@@ -78,7 +78,7 @@ class BagWriter:
         self.bytes = 0  # of messages
         self._limits = limits
         self._topics: dict[int, _Topic] = {}  # by channel, the same number in every file
-        self._beginning: list[Callable[[Writer], object]] = []  # what every file has to say first
+        self._beginning: list[Callable[[Writer], object]] = []  # writes what every file begins with
         self._notes: dict[str, dict[str, str]] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._parts: list[_Part] = []
@@ -99,7 +99,7 @@ class BagWriter:
         marks: Mapping[str, str] | None = None,
         encoding: str = "cdr",
     ) -> int:
-        """Announce a topic; its number for `write`.
+        """Announce a topic; return its number for `write`.
 
         Args:
             kind: ROS 2 name of the type.
@@ -185,7 +185,7 @@ class BagWriter:
     # ---- its files -------------------------------------------------------------------------------------
 
     def _say_first(self, say: Callable[[Writer], T]) -> T:
-        """Say it in this file, and at the beginning of those to come."""
+        """Write it into this file, and at the beginning of later ones."""
         if self._limits != NO_LIMITS:
             self._beginning.append(say)
         return say(self._writer)  # numbers are given in order: they are the same in every file

@@ -61,7 +61,7 @@ def _row(name: str, kind: str, topic: _Seen) -> dict[str, Any]:
 
 
 def _lost(sequences: np.ndarray[Any, np.dtype[np.int64]]) -> int | None:
-    """Numbers that are missing; a number that falls is a sender started anew."""
+    """How many numbers are missing; None: there are none. Where they fall, the sender was started anew."""
     if not sequences.any():
         return None
     steps = np.diff(sequences)

@@ -23,7 +23,7 @@ from sags_node.rig import eye_text
 
 Compression = Literal["none", "jpeg", "png"]
 JPEG_QUALITY = 92
-AHEAD_STEP_MS = 10  # how exactly a bag says how far ahead a prediction is: each value is a channel
+AHEAD_STEP_MS = 10  # to which a bag rounds how far ahead a prediction is: each value is a channel
 _COMPRESSIBLE = ("rgb8", "rgba8", "mono8")
 
 
@@ -58,7 +58,7 @@ class MessageWriter:
         """Write one message.
 
         Raises:
-            WireError: its content is not what it says.
+            WireError: its content does not match its header.
         """
         message, meta = arrived.message, arrived.message.meta
         if (meta.session, meta.epoch) != self._source:
@@ -77,7 +77,7 @@ class MessageWriter:
             name, kind, data = f"{name}/compressed", cdr.COMPRESSED, _compressed(message, data, form)
         marks = dict(RELATIVE) if relative else {}  # the node may be another one, calibrated by now
         if meta.ahead_ns:
-            marks[AHEAD] = str(-(-meta.ahead_ns // (AHEAD_STEP_MS * 1_000_000)) * AHEAD_STEP_MS)  # up
+            marks[AHEAD] = str(-(-meta.ahead_ns // (AHEAD_STEP_MS * 1_000_000)) * AHEAD_STEP_MS)  # rounded up
         key = name, kind, *marks.items()
         if key not in self._channels:
             self._channels[key] = self._announce(name, kind, marks)

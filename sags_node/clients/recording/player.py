@@ -30,8 +30,8 @@ log = logging.getLogger(__name__)
 POLL_SECONDS = 0.02  # how soon pause and stop are noticed
 STAMPS_KEPT = 1024
 SAME_CLOCK = round(STALE_AFTER * 1e9)  # ns between stamp and receipt; beyond it another clock stamped
-DAMAGED = 3600 * 1_000_000_000  # ns; beyond it no clock stamped
-STRETCHED = 100_000_000  # ns
+DAMAGED = 3600 * 1_000_000_000  # ns between stamp and receipt; beyond it the stamp is damaged
+STRETCHED = 100_000_000  # ns by which slow playing may change the latency of a message
 CLOCK_TOPIC = topics.PLAYER_TOPICS[0].name
 STAMPED = (topics.IMAGE, cdr.COMPRESSED, topics.POINT_CLOUD, topics.CAMERA_INFO, topics.DIAGNOSTICS)
 COMPRESSED_SUFFIX = "/compressed"
@@ -43,12 +43,12 @@ FRAME_TYPES = (topics.IMAGE, cdr.COMPRESSED, topics.POINT_CLOUD, topics.CAMERA_I
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """The flags of `ros2 bag play`. Seconds are those of the recording, but for `delay`.
+    """The flags of `ros2 bag play`. Seconds are those of the recording, except for `delay`.
 
     Attributes:
         topics, exclude: as the bag has them, or without `/compressed`, leading slash or namespace; no topics:
             all.
-        remap: from old to new name, the same way, new ones without a namespace.
+        remap: from old names, written as for `topics`, to new ones without a namespace.
         clock_hz: how often to publish the recording's time; None: never.
     """
 
@@ -74,15 +74,15 @@ class PlayClock:
         self._started, self._wall = time.monotonic(), WallClock()
 
     def pause(self, seconds: float) -> None:
-        """The last `seconds` did not count."""
+        """Leave the last `seconds` out, in which it was paused."""
         self._started += seconds
 
     def until(self, recorded_ns: int, at: float) -> float:
-        """Seconds from `at` until a moment of the recording is due; negative when it was."""
+        """Return the seconds from `at` until a moment of the recording is due; negative: it was."""
         return self._started + (recorded_ns - self._first_ns) * 1e-9 / self._rate - at
 
     def wall_ns(self, recorded_ns: int) -> int:
-        """When, on the wall clock, a moment of the recording is due."""
+        """Return the wall clock time (ns) at which a moment of the recording is due."""
         began_ns = self._wall.at(self._started, wall_ns=self._wall_ns)
         return began_ns + round((recorded_ns - self._first_ns) / self._rate)
 
@@ -118,12 +118,12 @@ class Player:
         self._epoch = (
             0  # newest one that was published; grows with each pass, and where the wall clock is set back
         )
-        self._frames: OrderedDict[int, tuple[int, int]] = OrderedDict()  # original stamp -> as `_frame_at`
+        self._frames: OrderedDict[int, tuple[int, int]] = OrderedDict()  # original stamp -> see `_frame_at`
         self._frame_count = 0
         self._same_clock: dict[str, bool] = {}  # by topic: the recorder's clock stamped its first message
-        self._session = ""  # recorded one of the last message
-        self._unknown = set[str]()  # topics that were said to be left out
-        self._is_unsorted = False  # the file is not in the order of time, which was said
+        self._session = ""  # the recorded session of the last message
+        self._unknown = set[str]()  # topics that are left out, which was warned of
+        self._is_unsorted = False  # the file is not in the order of time, which was warned of
 
     def stop(self) -> None:
         self._stopping.set()
@@ -279,7 +279,7 @@ class Player:
         return topics.plain_name(self._recorded_ns, name)
 
     def _frame_at(self, message: BagMessage, clock: PlayClock) -> tuple[int, int]:
-        """Number (-1: it shows no frame) and new stamp: the same for all that was stamped alike."""
+        """The frame number (-1: no frame) and the new stamp, equal for messages with equal stamps."""
         log_ns, original_ns = message.log_ns, _original_stamp(message)
         apart = abs(log_ns - original_ns)
         same = self._same_clock.setdefault(message.topic, apart <= SAME_CLOCK) and apart <= DAMAGED
@@ -298,7 +298,7 @@ class Player:
 
 
 def _original_stamp(message: BagMessage) -> int:
-    """Return what the message itself says of its time, ns; when it was published where it says nothing, or 0.
+    """The stamp in the message itself, ns; without one, or if it is 0, the time at which it was published.
 
     Raises:
         SagsError: it is too short.
@@ -308,7 +308,7 @@ def _original_stamp(message: BagMessage) -> int:
 
 
 def outgoing(message: BagMessage, stamp_ns: int) -> tuple[str, Content]:
-    """Topic (without leading slash) and content to send, stamped `stamp_ns`.
+    """Return the topic (without leading slash) and the content to send, stamped `stamp_ns`.
 
     A compressed picture becomes a raw one on the topic it was made of, as consumers of a node know it.
 
@@ -337,7 +337,7 @@ def _restamp(data: bytearray, at: int, stamp_ns: int) -> None:
 
 
 def _parts(message: BagMessage, bulk: int, after: int, stamp_ns: int) -> tuple[Buffer, ...]:
-    """The CDR cut around its bulk data, which stays where it is."""
+    """The CDR, cut around its bulk data, which is not copied."""
     data = memoryview(message.data)
     start = bytearray(data[: len(data) - bulk - after])
     _restamp(start, _HEADER_AT, stamp_ns)
@@ -346,7 +346,7 @@ def _parts(message: BagMessage, bulk: int, after: int, stamp_ns: int) -> tuple[B
 
 
 def _picture(message: BagMessage, stamp_ns: int) -> Content | None:
-    """None: it is valid, but not in the words of this protocol."""
+    """The content of a picture; None: it is valid, but this protocol has no such encoding or layout."""
     ros = cdr.decode(message.data, topics.IMAGE)
     dtype, channels = cdr.IMAGE_ENCODINGS.get(ros.encoding, ("uint8", 0))
     row_bytes = ros.width * channels * np.dtype(dtype).itemsize

@@ -29,9 +29,9 @@ from sags_node.messaging.stream import listen_to
 log = logging.getLogger(__name__)
 
 FLUSH_PERIOD = 0.5  # s; what a killed recorder loses at most, if the disk keeps up
-TAKE_SECONDS = 0.1
-TELL_PERIOD = 1.0  # s
-HIGH_WATER = 10 * len(topics.TOPICS)  # messages: ten whole frames, while the writer holds the interpreter
+TAKE_SECONDS = 0.1  # s that the writing thread waits for a message
+TELL_PERIOD = 1.0  # s between two reports of progress
+HIGH_WATER = 10 * len(topics.TOPICS)  # queued messages: ten whole frames, while the writer holds the GIL
 DEFAULT_CACHE_MB = 256.0
 
 Tell = Callable[[dict[str, Any]], None]
@@ -73,12 +73,12 @@ class Recorder:
         self._snapshot_wanted = threading.Event()
         self._topics: dict[str, _Topic] = {}
         self._rejected = 0
-        self._why_rejected: str | None = None  # the first one
+        self._why_rejected: str | None = None  # the reason of the first one
         self._refused: set[str] = set()  # thin pictures that the node cannot make
-        self._is_mixed = False  # two nodes are recorded, and it was said
+        self._is_mixed = False  # two nodes are recorded, which was warned of
         self._bytes = 0
-        self._free: int | None = None  # bytes of the disk
-        self._kept_s = 0.0  # in the ring
+        self._free: int | None = None  # free bytes of the disk
+        self._kept_s = 0.0  # s from the oldest to the newest message in the ring
         self._began = self._last_came = time.monotonic()
         self._error: SagsError | None = None
         self._progress: Tell = lambda said: None
@@ -101,8 +101,8 @@ class Recorder:
             progress: called with the summary once a second.
 
         Raises:
-            UsageError: something is at the folder already, an unknown topic, or one that says nothing in a
-                bag.
+            UsageError: something is at the folder already, a topic is unknown, or its numbers would have no
+                meaning in a bag.
             SagsError: no node is known, it refuses this client or all that is recorded, the disk is full, or
                 what came was not written for another reason.
         """
@@ -162,7 +162,7 @@ class Recorder:
                     yield None
                     continue
                 message, received_ns = arrived
-                if not options.topics and message.topic.startswith(thin):  # another's, of a whole one
+                if not options.topics and message.topic.startswith(thin):  # another client asked for it
                     continue
                 if not cdr.knows(message.meta.type):
                     self._reject(f"{message.topic}: unknown type {message.meta.type!r}")
@@ -175,7 +175,7 @@ class Recorder:
                     yield Arrived(message, received_ns)
 
     def _refuse(self, topic: str, why: str) -> None:
-        """The node cannot make a thin picture."""
+        """Note that the node cannot make a thin picture."""
         self._refused.add(topic)
         if not self._topics and len(self._refused) == len(set(self._options.topics)):
             raise SagsError(why)  # nothing else is recorded
@@ -268,8 +268,8 @@ class Recorder:
         return self._options.folder / f"snapshot_{number:03d}"
 
     def _save(self, folder: Path, messages: list[Arrived], seconds: float, tell: Tell) -> None:
-        """A thread for each snapshot, so that receiving goes on. One that fails ends nothing: what the ring
-        holds can be saved elsewhere."""
+        """A thread for each snapshot, so that receiving goes on. A failure ends nothing: what the ring holds
+        can be saved elsewhere."""
         try:
             writer = self._writer(folder)
             with writer.bag:
@@ -283,7 +283,7 @@ class Recorder:
 
 
 def _told(folder: Path, error: Exception) -> SagsError:
-    """Return what a failure of a thread that writes is for people."""
+    """The error to raise for a failure of a thread that writes, in words for people."""
     if isinstance(error, SagsError):
         return error
     if isinstance(error, OSError):

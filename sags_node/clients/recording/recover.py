@@ -37,7 +37,7 @@ class Recovery:
     messages: int = 0
     chunks: int = 0  # whole ones
     chunks_damaged: int = 0
-    messages_lost: int = 0  # known by number; a damaged chunk hides how many it held
+    messages_lost: int = 0  # whole, but of an unknown topic; how many a damaged chunk held is not known
     bytes_skipped: int = 0
     unclosed_files: int = 0
     files_missing: int = 0  # by the numbers of those that are there
@@ -101,7 +101,7 @@ def _files(path: Path) -> list[Path]:
 
 
 class _Writer:
-    """Messages of the old file into the new one."""
+    """Copies messages of the old files into the new bag."""
 
     def __init__(self, bag: BagWriter, done: Recovery) -> None:
         self._bag = bag

@@ -1,4 +1,4 @@
-"""Where a model lies on measured tissue, by pairs of points and by its surface, and how sure that is.
+"""Registration of a model to measured tissue, by pairs of points and by its surface, and its expected error.
 
 Imports no other folder.
 """

@@ -13,11 +13,11 @@ from sags_node.geometry import Array, invert, transform
 from sags_node.types import F64, Bool
 
 LEAST_PAIRS, MOST_PAIRS = 3, 20
-OTHER_UNIT = 1.3  # times too large or too small: no picking is so wrong
-MATCHED = 0.003  # m: nearer to the model the surface is the model's
-NEAR = 0.010  # m: farther from it the surface is something else
+OTHER_UNIT = 1.3  # times too large or too small: beyond it the unit is wrong, as no picking is so inexact
+MATCHED = 0.003  # m; the measured surface that is nearer to the model belongs to it
+NEAR = 0.010  # m; what is farther from the model is something else
 
-# Beyond the first a registration is doubtful, beyond the second it is refused, and why; mm, or a share in %.
+# The limit (mm, or %) beyond which a registration is doubtful, the one beyond which it is refused, and why.
 LIMITS = (
     (4.0, 10.0, "the pairs fit each other to {:.1f} mm only: pick the worst of them again"),
     # Five picked pairs hold it better than a surface on which it slides that far.
@@ -26,16 +26,16 @@ LIMITS = (
     (1.5, 4.0, "the surface is {:.1f} mm off: is the organ deformed, or another one?"),
     (5.0, 15.0, "errors up to {:.1f} mm are expected: add pairs, farther apart"),
 )
-FREELY = 0.1  # m: no organ slides farther
+FREELY = 0.1  # m; a longer slide is given as this one: no organ slides farther
 MIRRORED = (
     "it fits as its mirror image only, so the file has the other handedness: turn one of its axes round"
 )
 ASIDE = "a point `at` lies {:.3g} mm from the model: are these points of this file, in its unit and its axes?"
 UNSEEN = "no surface was measured where the pairs put the model: check them, and that it is in sight"
 UNITS = {1000: "mm for m", 100: "cm for m", 10: "mm for cm", 25.4: "mm for inch"}
-ON = 0.003  # m: so near to a surface a point is picked on it
-# Times nearer than they were, and than they lie apart: neither chance nor a scale that draws all of them
-# together brings them there.
+ON = 0.003  # m; a point that is so near to a surface was picked on it
+# In another reading, points must come so many times nearer to the surface than they were, and must be so many
+# times nearer than they lie apart: neither chance nor a scale that shrinks them together does that.
 CLEARLY, APART = 3.0, 10.0
 LPS = "-x, -y, z"
 
@@ -51,22 +51,21 @@ Verdict = Literal["good", "doubtful", "refused"]
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where the model lies. Lengths in m; None: it was not come to."""
+    """Where the model lies. Lengths in m; None: not known, as the registration was refused before."""
 
     verdict: Verdict
-    reason: str = ""  # and its remedy; empty: it is good
+    reason: str = ""  # why it is not good, and the remedy; empty: it is good
     T_world_model: F64 | None = None  # [4, 4]
-    fiducials: F64 | None = None  # [k] how far each pair is off by the pairs alone
-    expected_by_pairs: F64 | None = None  # [t] at each target, nine of ten, by the pairs alone
+    fiducials: F64 | None = None  # [k] error of each pair after the fit to the pairs alone
+    expected_by_pairs: F64 | None = None  # [t] bound of nine of ten errors at each target, by the pairs alone
     expected: F64 | None = None  # [t] the same after the surface fit
     moved: F64 | None = None  # [t] how far the surface fit moved each target
-    residual: tuple[float, float] | None = None  # of the surface to the model: median, nine of ten
-    share: float = 0.0  # of the surface in line with the model that lies within `MATCHED` of it
+    residual: tuple[float, float] | None = None  # distance of surface and model: median, 90 % quantile
+    share: float = 0.0  # part of the surface in line with the model that lies within `MATCHED` of it
     matched: Bool | None = None  # [N] which points of the surface these are
 
     def figures(self, targets: F64) -> dict[str, Any]:
-        """Say for people and programs, in mm; without what was not come to. `targets` [t, 3] are told as they
-        are."""
+        """Return it in mm for people and programs, without what is not known. `targets` [t, 3] are copied."""
         said: dict[str, Any] = {"verdict": self.verdict, "reason": self.reason or None}
         if self.fiducials is not None:
             said["fiducial_mm"] = _in_mm(_rms(self.fiducials))
@@ -111,7 +110,7 @@ def register(  # noqa: PLR0911, one return per reason
 
 
 def _wrong_unit(factor: float) -> str:
-    """Return what is wrong with a model that is `factor` times as large as where its points were picked."""
+    """The reason to refuse a model that is `factor` times as large as the tissue where it was picked."""
     times, verb = (factor, "divide") if factor > 1 else (1 / factor, "multiply")
     said = f"the model is {times:.3g} times too {'large' if factor > 1 else 'small'} for where its points lie"
     unit = min(UNITS, key=lambda each: abs(np.log(times / each)))
@@ -154,13 +153,13 @@ def _placed(model: Shape, at: F64, places: F64, surface: Surface, targets: F64) 
 
 
 def _expected(information: F64, arms: Array, bias: F64) -> F64:
-    """Nine of ten errors at targets [t, 3]; `bias` [3] is what all depths may be wrong by at once."""
+    """The bounds (m) of nine of ten errors at targets [t, 3]; `bias` [3] (m) is common to all depths."""
     covariance = np.asarray(np.linalg.inv(information), np.float64)
     return np.array([nine_of_ten(covariance, arm, bias) for arm in arms])
 
 
 def _judged(found: Registration, slide: float) -> Registration:
-    """With the worst of what speaks against it; of equals, the first."""
+    """The registration with the worst verdict that a limit gives; of equal ones, the first."""
     assert found.fiducials is not None and found.expected is not None and found.residual is not None
     slide = min(slide, FREELY)
     lengths = _rms(found.fiducials), slide, 0.1 * (1 - found.share), found.residual[0], found.expected.max()
@@ -184,13 +183,13 @@ def _in_mm(metres: float) -> float:
 
 
 def farthest(model: Shape, at: F64) -> float:
-    """How far the farthest of points [k, 3] (m) lies from a model's surface, m."""
+    """Return how far the farthest of points [k, 3] (m) lies from a model's surface, m."""
     return float(np.linalg.norm(model.nearest(at)[0] - at, axis=1).max())
 
 
 def misread(model: Shape, at: F64) -> str | None:
-    """Say how points [k, 3] (m) that lie aside of a model's surface would all lie on it; None: they do lie on
-    it, or they may be meant so, as those inside of a model or on an organ around it."""
+    """Return the axes or unit in which points [k, 3] (m) off a model's surface would all lie on it. None:
+    they lie on it, or no axes or unit bring them there: they may be meant to lie inside or around it."""
     off = farthest(model, at)
     if off <= ON:
         return None

@@ -1,11 +1,11 @@
 """The rigid transform that best moves some points to others, and how sure it is: the information (inverse
 covariance) that measurements give of its six freedoms.
 
-A small motion is a rotation vector (rad) about a centre, and a translation (m). Of points with one error in
-all directions this is the target registration error of J. M. Fitzpatrick, J. B. West and C. R. Maurer
-("Predicting error in rigid-body point-based registration", IEEE TMI 17(5), 1998). Its spread about a target
-is Gaussian, so nine of ten follow as in Fitzpatrick and West ("The distribution of target registration
-error in rigid-body point-based registration", IEEE TMI 20(9), 2001).
+A small motion is a rotation vector (rad) about a centre, and a translation (m). For points whose error is
+equal in all directions, this is the target registration error of J. M. Fitzpatrick, J. B. West and C. R.
+Maurer ("Predicting error in rigid-body point-based registration", IEEE TMI 17(5), 1998). The error at a
+target is Gaussian, so the bound of nine of ten errors follows as in Fitzpatrick and West ("The distribution
+of target registration error in rigid-body point-based registration", IEEE TMI 20(9), 2001).
 """
 
 import numpy as np
@@ -14,10 +14,10 @@ from sags_node.geometry import Array, rigid, transform
 from sags_node.types import F64
 
 ROUNDS = 8  # of reweighting
-LEAST_ERROR = 1e-3  # m; anchors off by less than this keep their weight
+LEAST_ERROR = 1e-3  # m; the least scale of the weights: anchors that are off by much less keep theirs
 LEAST_SPREAD = 0.05  # second over first singular value: below it points lie on a line
-PICKED = 1e-3  # m along each axis: what people pick landmarks to, before the pairs say more
-PICKED_COUNTS = 6  # residuals that this guess is worth
+PICKED = 1e-3  # m along each axis: prior for the error with which people pick landmarks
+PICKED_COUNTS = 6  # residuals that this prior is worth
 NINE_OF_TEN = 1.2816  # standard deviations, below which nine of ten of a normal distribution lie
 
 
@@ -51,27 +51,27 @@ def rigid_fit(model: F64, places: F64, weights: F64) -> tuple[F64, float]:
 
 
 def on_a_line(points: F64) -> bool:
-    """True when points [k, 3] lie so nearly on a line that no rotation follows from them."""
+    """Tell whether points [k, 3] lie so nearly on a line that no rotation follows from them."""
     spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(spread[1] < LEAST_SPREAD * spread[0] or spread[0] == 0)
 
 
 def motion_rows(arms: Array, directions: F64) -> F64:
-    """How far points [N, 3] (m, from the centre) go along directions [N, 3] in a small motion: [N, 6]."""
+    """The Jacobian [N, 6] of points [N, 3] (m, from the centre) along directions [N, 3] for small motions."""
     return np.hstack([np.cross(arms, directions), directions])
 
 
 def picking_error(residuals: Array) -> float:
-    """Standard deviation (m) along each axis of picked points, by what their rigid fit left [k, 3].
+    """The standard deviation (m) of picked points along each axis, by the residuals [k, 3] of a rigid fit.
 
-    The fit takes six freedoms of them away. Three or four pairs tell little, so `PICKED` counts as well.
+    The fit uses up six degrees of freedom. Three or four pairs tell little, so the prior `PICKED` counts.
     """
     squares = np.square(residuals).sum() + PICKED_COUNTS * PICKED**2
     return float(np.sqrt(squares / (residuals.size - 6 + PICKED_COUNTS)))
 
 
 def of_pairs(arms: Array, error: float) -> F64:
-    """The information [6, 6] of points [k, 3] (m, from the centre) known to `error` (m) along each axis."""
+    """The information [6, 6] from points [k, 3] (m, from the centre) known to `error` (m) along each axis."""
     rows = motion_rows(np.repeat(arms, 3, axis=0), np.tile(np.eye(3), (len(arms), 1)))
     return rows.T @ rows / error**2
 
@@ -84,7 +84,7 @@ def nine_of_ten(covariance: F64, arm: Array, bias: F64) -> float:
     Args:
         covariance: [6, 6] of the motion.
         arm: [3] m, the target from the centre.
-        bias: [3] m, one standard deviation of what shifts everything along one direction.
+        bias: [3] m, one standard deviation of an error that shifts everything along one direction.
     """
     rows = motion_rows(np.tile(arm, (3, 1)), np.eye(3))
     spread = rows @ covariance @ rows.T + np.outer(bias, bias)

@@ -2,11 +2,11 @@
 
 Iterated closest points to planes (Y. Chen and G. Medioni, "Object modelling by registration of multiple range
 images", IVC 1992), trimmed (D. Chetverikov et al., "The trimmed iterative closest point algorithm", ICPR
-2002), with the weights of Geman and McClure. The pairs stay in the sum as far as they are exact: where the
-surface could slide, they hold it. Open3D's own ICP knows neither weights of points nor pairs; its search for
-the nearest place on a mesh is used (`Shape`).
+2002), with the weights of Geman and McClure. The pairs stay in the least squares, weighted by their accuracy:
+where the model could slide on the surface, they hold it. Open3D's own ICP has neither weights of points nor
+pairs; its search for the nearest place on a mesh is used (`Shape`).
 
-Errors of a depth are much the same all over a patch of `PATCH`, so a patch counts as one measurement.
+Depth errors are almost the same all over a patch of `PATCH`, so a patch counts as one measurement.
 """
 
 from dataclasses import dataclass
@@ -19,35 +19,35 @@ from sags_node.clients.registration.surfaces import Shape, Surface
 from sags_node.geometry import invert, rigid, transform
 from sags_node.types import F64, I64
 
-GATES = (0.010, 0.005, 0.003)  # m, one after the other: what lies farther from the model is no part of it
-STEPS = 20  # at most, for each
-KEPT = 0.9  # of what is within the gate: the nearest
-ASIDE = 0.5e-3  # m and, of the distance, the half: what lies farther aside is beyond the model's rim
-PATCH = 0.005  # m
-STILL = 1e-6  # m and rad
+GATES = (0.010, 0.005, 0.003)  # m, one after the other: points farther from the model do not count
+STEPS = 20  # iterations for each gate, at most
+KEPT = 0.9  # share of the points within the gate that counts: the nearest
+ASIDE = 0.5e-3  # m, plus half of the distance: points farther beside the normal are beyond the rim
+PATCH = 0.005  # m, the side of a patch
+STILL = 1e-6  # m and rad; a smaller step ends the iteration
 LEAST_POINTS = 50
 
 
 @dataclass(frozen=True, slots=True)
 class Counted:
-    """The measured points that count: how a motion moves the model under them, and how far it is off."""
+    """The measured points that count: how a motion moves the model at them, and how far it is off there."""
 
     rows: F64  # [N, 6], see `motion_rows`; about the middle of the pairs
     off: F64  # [N] m
-    errors: F64  # [N] m, one standard deviation, no better than the points fit
+    errors: F64  # [N] m, one standard deviation, enlarged where the points fit worse
     weights: F64  # [N] m^-2
     patches: I64  # [N]
 
     def information(self) -> F64:
-        """[6, 6] of the mean row of each patch: facets and noise of a model's normals are no information, so
-        a plane made of small triangles still slides."""
+        """Return the information [6, 6] from the mean row of each patch: it averages out facets and noise of
+        the model's normals, so that a plane made of small triangles still slides."""
         weights = np.bincount(self.patches, self.weights)
         sums = np.stack([np.bincount(self.patches, self.weights * column) for column in self.rows.T], 1)
         means = sums / np.where(weights > 0, weights, 1)[:, None]
         return means.T @ (weights[:, None] * means)
 
     def slide(self) -> float:
-        """How far (m) the model could slide on the surface, one standard deviation; inf: freely."""
+        """Return how far (m) the model could slide on the surface, one standard deviation; inf: freely."""
         arms = np.linalg.norm(self.rows[:, :3], axis=1)
         per_metre = np.array([1 / np.sqrt(np.mean(arms**2))] * 3 + [1.0] * 3)
         least = np.linalg.eigvalsh(self.information() * np.outer(per_metre, per_metre))[0]
@@ -57,10 +57,10 @@ class Counted:
 def fit_surface(
     model: Shape, surface: Surface, at: F64, places: F64, picked: float, T: F64
 ) -> tuple[F64, Counted] | None:
-    """The pose [4, 4] of a model, and what says so; None where too little of the surface is near it.
+    """Return the pose [4, 4] of a model and the points that give it; None: too little surface is near it.
 
     Args:
-        at: [k, 3] m, of the model, that lie at `places` [k, 3] (m, world) but for `picked` (m, each axis).
+        at: [k, 3] m, of the model, picked at `places` [k, 3] (m, world) with error `picked` (m, each axis).
         T: [4, 4] to start from, within some millimetres.
     """
     centre = places.mean(0)
@@ -98,6 +98,6 @@ def _counted(side: Shape, surface: Surface, patches: I64, centre: F64, T: F64, g
     off, patches, errors = off[kept], patches[kept], surface.errors[kept]
     errors = errors * max(1.0, 1.4826 * float(np.median(np.abs(off) / errors)))
     counts = np.bincount(patches)
-    counts = np.maximum(counts, np.median(counts[counts > 0]))  # of a patch's corner does not count as much
+    counts = np.maximum(counts, np.median(counts[counts > 0]))  # a mere corner of a patch counts less
     weights = 1 / (1 + np.square(off / (2 * errors))) ** 2 / (np.square(errors) * counts[patches])
     return Counted(motion_rows(near[kept] - centre, normals[kept]), off, errors, weights, patches)

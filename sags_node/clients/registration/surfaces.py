@@ -13,14 +13,14 @@ from sags_node.geometry import Array, unproject
 from sags_node.types import F32, F64, I32, Bool, Camera
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
-POINTS = 1500  # of one frame, about
+POINTS = 1500  # points that are taken of one frame, about
 NINE_OF_TEN = 1.645  # standard deviations, within which nine of ten errors of a depth lie
 DIRECTIONS = 99  # of rays that tell inside from outside; odd, so that there is a majority
-BEHIND = 1.01  # of the way to a triangle's middle: what is hit there first is the triangle itself
+BEHIND = 1.01  # a ray that meets nothing before 1 / `BEHIND` of the way to a triangle reaches it
 
 
 class Shape:
-    """A model: triangles [T, 3] between vertices [V, 3] (m, in its own coordinates). Open3D searches it."""
+    """A model: triangles [T, 3] between vertices [V, 3] (m, in its own coordinates), searched by Open3D."""
 
     def __init__(self, vertices: F64, triangles: I32) -> None:
         import open3d.core as o3c
@@ -33,8 +33,8 @@ class Shape:
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(corners))
 
     def facing(self, eye: Array) -> Shape:
-        """Return what of it an eye at [3] sees: triangles whose middles nothing hides. Files wind their
-        triangles either way, so that does not count."""
+        """Return the part that an eye at [3] sees: the triangles whose middles nothing hides. Their winding
+        does not count, as files have it either way."""
         middles = self.vertices[self.triangles].mean(1)
         seen = self._meets(eye, middles) > 1 / BEHIND
         return Shape(self.vertices, self.triangles[seen])
@@ -47,31 +47,30 @@ class Shape:
         )
 
     def contains(self, points: Array) -> Bool:
-        """Which points [N, 3] lie inside of it: most rays from there cross it an odd number of times
-        (Nooruddin and Turk 2003), so that it may have holes."""
+        """Tell which points [N, 3] lie inside: most rays from there cross it an odd number of times
+        (Nooruddin and Turk 2003). As most are enough, it may have holes."""
         rays = np.empty((len(points), DIRECTIONS, 6), np.float32)
         rays[..., :3], rays[..., 3:] = points[:, None], _all_round(DIRECTIONS)
         crossed = self._scene.count_intersections(self._tensor(rays)).numpy()
         return np.asarray((crossed % 2).mean(1) > 0.5)
 
     def hides(self, eye: Array, points: Array) -> Bool:
-        """Which rays from an eye at [3] through points [N, 3] meet it, before or behind the point."""
+        """Tell which rays from an eye at [3] through points [N, 3] meet it, before or behind the point."""
         return np.isfinite(self._meets(eye, points))
 
     def mirrored(self) -> Shape:
-        """It with x turned round, as a file of the other handedness would have it."""
+        """Return it mirrored in x, as a file of the other handedness would have it."""
         return Shape(self.vertices * MIRROR, self.triangles[:, ::-1])
 
     def _meets(self, eye: Array, points: Array) -> F32:
-        """Find where rays from an eye through points [N, 3] meet it first, in lengths of the way; inf:
-        nowhere."""
+        """Where rays from an eye through points [N, 3] meet it first; 1: at the point, inf: nowhere."""
         rays = np.hstack([np.broadcast_to(eye, points.shape), points - eye]).astype(np.float32)
         found: F32 = self._scene.cast_rays(self._tensor(np.ascontiguousarray(rays)))["t_hit"].numpy()
         return found
 
 
 def _all_round(count: int) -> F64:
-    """So many directions [count, 3], evenly spread: a spiral by the golden angle."""
+    """Directions [count, 3] that are evenly spread: a spiral by the golden angle."""
     turns = np.arange(count) * np.pi * (3 - 5**0.5)
     z = 1 - (2 * np.arange(count) + 1) / count
     flat = np.sqrt(1 - z**2)
@@ -79,14 +78,14 @@ def _all_round(count: int) -> F64:
 
 
 def evenly(shape: tuple[int, ...]) -> tuple[int, tuple[slice, slice]]:
-    """How many pixels apart about `POINTS` of a picture [H, W] lie, and which these are."""
+    """Return a spacing in px that leaves about `POINTS` pixels of a picture [H, W], and their slices."""
     every = max(1, int(np.sqrt(shape[0] * shape[1] / POINTS)))
     return every, np.s_[every // 2 :: every, every // 2 :: every]
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Measured points that say how exact they are."""
+    """Measured points with their errors."""
 
     points: F64  # [N, 3] m, world
     errors: F64  # [N] m, one standard deviation
@@ -94,7 +93,7 @@ class Surface:
 
     @classmethod
     def of_depth(cls, depth: F32, confidence: F32, tissue: Bool, camera: Camera) -> Surface:
-        """About `POINTS` of a depth picture [H, W] (m; 0 or NaN: unknown), evenly, where there is tissue."""
+        """Take about `POINTS`, evenly, from the tissue in a depth picture [H, W] (m; 0 or NaN: unknown)."""
         every, at = evenly(depth.shape)
         rows, columns = np.nonzero((depth[at] > 0) & tissue[at] & (confidence[at] >= LEAST))
         pixels = np.stack([columns, rows], -1) * every + every // 2
@@ -105,7 +104,7 @@ class Surface:
 
     @classmethod
     def joined(cls, parts: Sequence[Surface]) -> Surface:
-        """All that several frames saw, from where the last of them stood."""
+        """Join what several frames saw; the eye is that of the last one."""
         points, errors = (
             np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "errors")
         )

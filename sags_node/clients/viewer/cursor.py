@@ -1,4 +1,4 @@
-"""The depth under the cursor, looked up by the page itself: what a browser points at does not come here."""
+"""The depth under the cursor, looked up by the page itself: a browser does not send the cursor's place."""
 
 import base64
 
@@ -8,8 +8,8 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, Moment
 from sags_node.clients.viewer.pictures import BAR, COLUMNS, VIEWS
 from sags_node.confidence import SURE
 
-STEP = 1e-4  # m
-GUESS = 1 << 15  # the bit of a depth that is none to trust; 0: none is known
+STEP = 1e-4  # m per count of a depth in the page
+GUESS = 1 << 15  # the bit that marks a depth as not sure; a depth of 0: unknown
 # Runs in the page. A picture's depth lies behind it as base64 of little-endian uint16.
 SCRIPT = """<script>
 (() => {
@@ -38,7 +38,7 @@ SCRIPT = """<script>
 
 
 def depth_line(moment: Moment, view: str, height: int, unit: str) -> str:
-    """The line below a sheet of that height (px) that tells the depth; empty where none is shown."""
+    """The HTML line that tells the depth below a sheet of that height (px); empty where no depth is shown."""
     names = VIEWS[view]
     depth, confidence = moment.pictures.get(DEPTH), moment.pictures.get(CONFIDENCE)
     if depth is None or confidence is None or depth.shape != confidence.shape:

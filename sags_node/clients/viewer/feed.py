@@ -1,7 +1,7 @@
 """What a running node shows at this moment, and why nothing is shown when there is nothing.
 
-The node may come, go and come back: the feed connects by itself and lets go of what is old. Pictures come
-thin, as small JPEG and PNG files, and those alone that somebody looks at.
+The node may come, go and come back: the feed connects by itself and drops what is old. Pictures come thin, as
+small JPEG and PNG files, and only those that somebody looks at.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,7 +27,7 @@ from sags_node.messaging.subscriber import Subscriber
 from sags_node.messaging.wire import WireError
 from sags_node.types import U8, Camera
 
-# Numbers are picked, not averaged: of every fourth pixel they cost a fifth of what those of every second do.
+# Numbers are subsampled, not averaged: taking every fourth pixel costs a fifth of every second one.
 LEFT = "thin/half/left/image_rect_color/jpeg"
 MODEL = "thin/half/left/render/image/jpeg"
 RIGHT = "thin/half/right/image_rect_color/jpeg"
@@ -42,7 +42,7 @@ SPLAT_FIELDS = {"scale_0", "rot_w", "f_dc_0", "opacity", "id"}
 ANCHOR_FIELDS = {"id", "visibility", "confidence", "depth_confidence", "age"}
 
 MAX_AGE = 1.0  # s; older content is not shown
-WAIT_FOR_PICTURE = MAX_AGE  # s: later none is new
+WAIT_FOR_PICTURE = MAX_AGE  # s; a picture that comes later is old
 WAIT_FOR_REST = 0.3  # s for what belongs to a picture
 
 _STATES = {
@@ -78,7 +78,7 @@ SILENT = Status()
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """All that may be shown as new; what may not is missing. All but the status is of one frame."""
+    """All that is new enough to be shown; the rest is missing. All but the status is of one frame."""
 
     problem: str | None = None  # why nothing is shown; None while all is well
     status: Status = SILENT
@@ -111,14 +111,13 @@ class Feed:
         self._overlay = OverlayFeed(node.run_dir)
 
     def now(self, pictures: Iterable[str], overlaid: Iterable[str] = (), steady: bool = False) -> Moment:
-        """Return what may be shown now, newer than what was shown before; `WAIT_FOR_PICTURE` is waited for
-        it.
+        """Return what may be shown now. Wait up to `WAIT_FOR_PICTURE` for a picture newer than the last one.
 
         Args:
             pictures: those of `PICTURES` that are looked at. The node makes no others.
             overlaid: eyes whose overlay is looked at.
-            steady: let more come until the next call, for updates that follow at once; else the node sends
-                one frame for each call, and nothing between.
+            steady: let the node go on sending until the next call, which follows at once; else it sends one
+                frame for each call, and nothing in between.
         """
         subscriber, overlaid = self._subscriber, tuple(overlaid)
         names = (*WHOLE, *dict.fromkeys((*pictures, LEFT)))
@@ -133,7 +132,7 @@ class Feed:
                 self._frame = whole or self._frame
             return self._seen(subscriber, set(names), overlaid)
         finally:
-            if not steady:  # the overlay goes on: one that begins to draw has nothing of this frame
+            if not steady:  # not the overlay: one that only begins to draw would miss this frame
                 subscriber.pause()
 
     def pause(self) -> None:
@@ -171,14 +170,14 @@ class Feed:
         )
 
     def close(self) -> None:
-        """Follow no node any more."""
+        """Stop following the node."""
         self._subscriber.close()
         self._overlay.close()
         if self._clock is not None:
             self._clock.close()
 
     def _problem(self, subscriber: Subscriber, status: Status) -> str | None:
-        """Why nothing may be shown: what the node is, and else what its pictures are."""
+        """Why nothing may be shown: first by the node's state, then by the age of its pictures."""
         why = subscriber.refusal or subscriber.absent
         if not status.state:
             return why or f"waiting for a node at {subscriber.endpoint}"
@@ -194,7 +193,7 @@ class Feed:
         return subscriber.problem(LEFT, MAX_AGE)
 
     def _is_fresh(self, shown: Received, newest: Received) -> bool:
-        """Tell whether a frame may stand for the newest picture, of which not everything came."""
+        """Tell whether an older whole frame may be shown, as not all of the newest one has come."""
         same = (shown.meta.session, shown.meta.epoch) == (newest.meta.session, newest.meta.epoch)
         return same and shown.age(self._subscriber.now_ns()) <= MAX_AGE
 

@@ -10,13 +10,13 @@ from sags_node.clients.viewer.feed import Moment
 from sags_node.types import F64
 
 PERIOD = 1.0  # s between two points
-GAP = 10.0  # s without a point
+GAP = 10.0  # s without a point, after which the older ones are dropped
 LENGTH = 120  # points
 FIGURES = ("rate", "p50", "p99", "rung")
 
 
 class History:
-    """A point per second; nothing is left after a gap, so that no line runs through time that nobody saw."""
+    """One point per second. A gap clears all, so that no line is drawn through time that nobody saw."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -38,7 +38,7 @@ class History:
         return True
 
     def series(self, *figures: str) -> tuple[F64, ...]:
-        """Seconds since now (negative), then each figure; all of the same length."""
+        """Return seconds relative to the newest point (negative), then each figure; all of one length."""
         points = np.array(self._points, np.float64).reshape(-1, 1 + len(FIGURES))
         times = points[:, 0] - (points[-1, 0] if len(points) else 0.0)
         return (times, *(points[:, 1 + FIGURES.index(figure)] for figure in figures))

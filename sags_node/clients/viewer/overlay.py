@@ -1,4 +1,4 @@
-"""What `sags overlay` shows on this machine: its pictures, and how its objects do."""
+"""What `sags overlay` on this machine publishes: its pictures, and the state of its objects."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,9 +9,9 @@ from sags_node.messaging.received import ReceivedImage, ReceivedText, TopicName
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.types import U8
 
-NS = "overlay"  # of its topics and its connection file, unless it is told another
+NS = "overlay"  # default namespace of its topics and its connection file
 EYES = {eye: TopicName(f"{eye}/overlay/image", ReceivedImage) for eye in ("left", "right")}
-LEAST_HZ = 1e-3  # it is looked at now and then: losing pictures is no fault
+LEAST_HZ = 1e-3  # Hz; it is looked at now and then, so lost pictures are no fault
 WAIT = 0.1  # s for the overlay of a frame: it takes some ms to draw
 SILENT_AFTER = 2.5  # s without a `status`, which comes every second
 
@@ -49,7 +49,7 @@ class OverlayFeed:
         self._subscriber.ask(EYES[eye] for eye in eyes)
 
     def says(self) -> Overlay | None:
-        """None while none runs, or says nothing."""
+        """Return what the overlay says of itself; None: none runs, or it says nothing."""
         status = self._subscriber.latest("status")
         if not isinstance(status, ReceivedText) or status.age() > SILENT_AFTER:
             return None
@@ -59,7 +59,7 @@ class OverlayFeed:
             return None
 
     def pictures(self, eyes: Iterable[str], stamp_ns: int) -> dict[str, U8]:
-        """[H, W, 4] of each eye, of exactly the frame captured at `stamp_ns`; empty where there is none."""
+        """Return the overlay [H, W, 4] of each eye for the frame captured at `stamp_ns`; empty: none came."""
         names, said = {eye: EYES[eye] for eye in eyes}, self.says()
         if not names or said is None or said.state != "running":
             return {}

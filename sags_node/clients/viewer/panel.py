@@ -34,7 +34,7 @@ BRIGHT, BLUE, ORANGE = "#c9d1d9", "#4dabf7", "#ffa94d"
 
 
 def tell(client: viser.ClientHandle | None, title: str, text: str, color: Any) -> None:
-    """A notice in the browser that asked."""
+    """Show a notice in the browser that asked."""
     if client is not None:
         client.add_notification(title, text, color=color, auto_close_seconds=NOTICE_TIME)
 
@@ -68,22 +68,22 @@ class Panel:
 
     @property
     def rate(self) -> float:
-        """How often the browser should be brought up to date, Hz."""
+        """The rate at which the browser should be brought up to date, Hz."""
         return float(self._rate.value)
 
     @property
     def view(self) -> str:
-        """Which of the `VIEWS` is looked at."""
+        """The one of the `VIEWS` that is looked at."""
         return str(self._view.value)
 
     @property
     def frozen(self) -> bool:
-        """Tell whether somebody wants to look at one moment."""
+        """Tell whether the page is frozen at one moment."""
         return self._frozen_since is not None
 
     @property
     def chosen(self) -> int | None:
-        """The anchor that Remove takes."""
+        """The anchor that the button Remove removes; None: none is chosen."""
         return None if self._chosen.value == NONE else int(self._chosen.value)
 
     def fit(self, client: viser.ClientHandle) -> None:
@@ -106,7 +106,7 @@ class Panel:
         self._list_anchors(moment.anchors)
 
     def stay(self) -> None:
-        """Say how old the frozen moment is by now; what is looked at of it may change."""
+        """Show how old the frozen moment is by now. The view of it may still be changed."""
         assert self._frozen_since is not None
         age = time.monotonic() - self._frozen_since
         self._say(Moment(f"FROZEN {age:.0f} s ago: what you see is old; Go on shows the node again"))
@@ -207,7 +207,7 @@ class Panel:
 
         @self._auto.on_update
         def _(event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
-            """Fixed colours begin as they are."""
+            """Begin the fixed range of colours with the one that is shown."""
             if not event.target.value:
                 near, far = self._sheet.shown
                 self._near.value = round(near / UNIT)  # type: ignore[misc]  # viser's setter, which mypy misses
@@ -235,7 +235,7 @@ class Panel:
     # ---- what is asked for ---------------------------------------------------------------------------
 
     def _ask(self, client: viser.ClientHandle | None, title: str, op: str, args: Mapping[str, Any]) -> Any:
-        """One request of its own: callbacks come from several threads. None: it was refused."""
+        """Ask by a connection of its own, as callbacks run on several threads. None: it was refused."""
         try:
             with ControlClient.at(self._node) as control:
                 answer = control.request(op, args, ANSWER_TIME)
@@ -259,7 +259,7 @@ class Panel:
         self._send(client, f"Export {kind}", f"_{kind}.ply", lambda: exported(moment, kind, self._exporter))
 
     def _send(self, client: viser.ClientHandle, title: str, ending: str, make: Callable[[], bytes]) -> None:
-        """A file of this moment, named by its time; where nothing is shown, by now."""
+        """Send a file of this moment, named by its time; by the time now where nothing is shown."""
         stamp = 1e-9 * self._moment.t_capture_ns or time.time()
         name = time.strftime("sags_%Y%m%d_%H%M%S", time.localtime(stamp)) + ending
         try:
@@ -302,7 +302,7 @@ class Panel:
             self.choose(int(answer["id"]))
 
     def choose(self, anchor: int) -> None:
-        """Choose it for Remove. The one chosen before is what the distance is measured to."""
+        """Choose an anchor for Remove. The distance is measured to the one that was chosen before."""
         before = self._chosen.value
         for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
             if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
@@ -326,7 +326,7 @@ class Panel:
 
 
 def distance(first: Any, second: Any, unit: str) -> str:
-    """How far two anchors, rows of `anchors`, are apart in a straight line; a guess is said to be one."""
+    """Return the straight distance of two anchors, rows of `anchors`, in words; a guess is called one."""
     apart = float(np.linalg.norm([first[axis] - second[axis] for axis in "xyz"])) / UNIT
     if not np.isfinite(apart):
         return "Distance: one of them is lost"
@@ -335,7 +335,7 @@ def distance(first: Any, second: Any, unit: str) -> str:
 
 
 def _recording(folder: viser.GuiTextHandle, keep: viser.GuiNumberHandle[float]) -> dict[str, Any]:
-    """A new folder each time, on the node's machine."""
+    """Arguments of `start_recording`: a new folder each time, on the node's machine."""
     args: dict[str, Any] = {"path": f"{folder.value}_{time.strftime('%Y%m%d_%H%M%S')}"}
     return args | ({"snapshot_seconds": float(keep.value)} if keep.value else {})
 
@@ -350,7 +350,7 @@ def status_line(moment: Moment, second: int = 0) -> str:
     """One line: why nothing is shown, or how the node does; below it what it warns of.
 
     Args:
-        second: of any clock, so that a line comes every second, see `still`.
+        second: of any clock. With it the line changes every second, which `still` listens for.
     """
     status = moment.status
     if moment.problem is not None:
@@ -369,7 +369,7 @@ def status_line(moment: Moment, second: int = 0) -> str:
 
 
 def _warnings(status: Status) -> str:
-    """One line for each."""
+    """One line for each warning."""
     style = f"margin:0.2em 1em;padding-left:0.5em;font-size:0.9em;border-left:3px solid;color:{ORANGE}"
     return "".join(
         f'<div class="sags-warning" style="{style}">{html.escape(said)} '
@@ -395,7 +395,7 @@ def _overlay_table(overlay: Overlay | None) -> str:
 
 
 def anchor_table(rows: list[Any], unit: str) -> str:
-    """Say where each anchor is, how sure it is to be on its tissue, and which depth is a guess."""
+    """Return a table of where each anchor is, how sure it is on its tissue, and which depth is a guess."""
     if not rows:
         return _line("none yet")
     cells = []

@@ -11,7 +11,7 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT,
 from sags_node.quality.gallery import TILE_WIDTH, Picture, depth_range, depth_tile, error_tile, shrunk
 from sags_node.types import U8
 
-# What each picture is made of.
+# The topics that each picture is made of.
 NEEDS = {
     "Left input": (LEFT,),
     "Model": (MODEL,),
@@ -37,18 +37,18 @@ VIEWS = {
 }
 COLUMNS = 2
 BAR = 24  # px above each picture
-RANGE_MEMORY = 0.9  # of the last depth range: the colours must not flicker
+RANGE_MEMORY = 0.9  # weight of the last depth range, so that the colours do not flicker
 _GROUND, _MARKED = 36, (255, 169, 77)
 _NOTHING = np.zeros((0, 0), np.uint8)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 class Sheet:
-    """Draws the sheet, one after another with steady depth colours.
+    """Draws one sheet after another, with steady depth colours.
 
     Attributes:
         shown: the range of the depth colours, m.
-        fixed: that they are to have; None: they follow the tissue.
+        fixed: the range that they are to have, m; None: they follow the tissue.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Sheet:
         self._height = round(TILE_WIDTH * 0.8)  # of a tile; that of the last picture
 
     def draw(self, moment: Moment, view: str, remark: str = "") -> U8:
-        """The pictures of a view [h, w, 3], RGB; empty where there is nothing new to show."""
+        """Draw the pictures of a view [h, w, 3], RGB; a place is left empty where nothing is new."""
         model = _model(moment.pictures)
         if DEPTH in moment.pictures and TISSUE in moment.pictures:
             self._follow(model)
@@ -109,18 +109,18 @@ class Sheet:
 
 
 def needs_of(view: str) -> list[str]:
-    """The topics of its pictures. The confidence of a depth costs the node too much where nobody reads it."""
+    """The topics that a view needs. Depth confidence costs the node much, so only one view asks for it."""
     sure = [CONFIDENCE] if view == "Depth under the cursor" else []
     return sure + [topic for name in VIEWS[view] for topic in NEEDS[name]]
 
 
 def overlaid_in(view: str) -> list[str]:
-    """The eyes whose overlay it shows."""
+    """The eyes whose overlay a view shows."""
     return [OVERLAID[name] for name in VIEWS[view] if name in OVERLAID]
 
 
 def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
-    """Return what came of a frame, as small as its numbers are: all that follows costs by the pixel."""
+    """The pictures of a frame, resized to its mask and depth: all that follows costs time per pixel."""
     tissue = pictures.get(TISSUE, _NOTHING)
     size = tissue.shape[::-1]
     truth, render = (

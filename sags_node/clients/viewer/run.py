@@ -18,7 +18,7 @@ from sags_node.messaging.address import THE_NODE, NodeAddress
 from sags_node.messaging.node_clock import NodeClock
 
 RATE = 20.0  # Hz, at first
-PULLED = 5.0  # Hz; for fewer updates each frame is asked for, for more the node sends all
+PULLED = 5.0  # Hz of updates; below it each frame is asked for, above it the node sends all
 IDLE_WAIT = 0.25  # s between looks for a browser, and for whether a frozen page goes on
 BROWSER_TIME = 2.0  # s that a browser may take to show an update
 
@@ -60,7 +60,7 @@ def run_viewer(
 
 
 def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, stop: threading.Event) -> None:
-    """Nothing but `status` comes from the node while no browser looks; none gets ahead of what it shows."""
+    """Update the browsers until `stop`, as fast as they can show it; without any, only `status` comes."""
     period = 0.0
     while not stop.is_set():
         if not server.get_clients():
@@ -92,9 +92,9 @@ def _follow(server: viser.ViserServer, feed: Feed, scene: Scene, panel: Panel, s
 
 
 def _await(client: viser.ClientHandle) -> None:
-    """Wait until a browser has shown all that was sent: it answers what is asked behind it.
+    """Wait until a browser has shown all that was sent: only then does it answer this request.
 
-    Without this a slow browser piles up updates: viser has no other sign of life.
+    Without this a slow browser piles up updates: viser has no other sign of what it has shown.
     """
     with suppress(TimeoutError, RuntimeError):  # too slow, gone, or without storage: it has had its time
         client.local_storage.get_item("sags-view", timeout=BROWSER_TIME)

@@ -13,7 +13,7 @@ from sags_node.types import U8, Camera, Gaussians
 
 RENDER_TIME = 20.0  # s that a browser may take to draw its scene once more
 KINDS = ("mesh", "points", "splats")
-Exporter = Callable[[Gaussians, Camera, int, str], bytes]  # a model, a camera, its time, one of KINDS
+Exporter = Callable[[Gaussians, Camera, int, str], bytes]  # a model, a camera, its time (ns), one of KINDS
 
 
 def screenshot(client: viser.ClientHandle, sheet: U8) -> bytes:

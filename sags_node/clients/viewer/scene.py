@@ -24,7 +24,7 @@ UNIT = 1e-3  # m
 FRUSTUM = 12.0  # mm deep
 PICTURE_WIDTH = 240  # px, of the picture in the frustum
 JPEG_QUALITY = 80
-STEP = 4096  # splats
+STEP = 4096  # their number is filled up to a multiple of this
 NEAR = 1.0  # mm; nothing closer is drawn
 ANCHOR_SIZE = 1.5  # mm
 SEEN, UNSURE, HIDDEN = (255, 220, 0), (255, 90, 0), (150, 150, 150)  # colours of an anchor
@@ -77,12 +77,12 @@ class Scene:
             client.camera.position = transform(pose, eye * UNIT) / UNIT
             client.camera.look_at = transform(pose, np.array([0.0, 0.0, self._depth]) * UNIT) / UNIT
             client.camera.up_direction = -pose[:3, 1]
-            client.camera.near = 1.1 * FRUSTUM if through else NEAR  # not at the picture in the frustum
+            client.camera.near = 1.1 * FRUSTUM if through else NEAR  # beyond the picture in the frustum
             if through and self.camera is not None:
                 client.camera.fov = _fov(self.camera)
 
     def _show_splats(self, splats: Splats | None) -> None:
-        """A browser builds its buffers anew when the number changes, so it is filled up to a round one."""
+        """Show splats, padded to a round number, as browsers rebuild their buffers when it changes."""
         self.splats = splats
         if splats is None or len(splats.means) == 0:
             if self._drawn_splats is not None:
@@ -130,7 +130,7 @@ class Scene:
         self._frustum.position = camera.T_world_cam[:3, 3] / UNIT
 
     def _show_anchors(self, anchors: NDArray[Any] | None, names: Mapping[int, str]) -> None:
-        """Anchors that have a place, as numbered points; `names` are of what the overlay holds by them."""
+        """Show anchors that have a place, as numbered points; `names`: of overlay objects that they hold."""
         rows = () if anchors is None else anchors[np.isfinite(anchors["x"])]
         self.places = {int(row["id"]): np.array([row[axis] for axis in "xyz"]) / UNIT for row in rows}
         for gone in self._labels.keys() - self.places.keys():
@@ -155,8 +155,7 @@ class Scene:
 
 
 def names_of(overlay: Overlay) -> dict[int, str]:
-    """The names of each anchor that holds an object of the overlay: what that is, with a `?` where it is not
-    sure."""
+    """The name of the overlay's object that each anchor holds, with a `?` where its place is not sure."""
     return {
         int(anchor["id"] or 0): thing.name + ("" if thing.unsure is None else " ?")
         for thing in overlay.objects
@@ -165,7 +164,7 @@ def names_of(overlay: Overlay) -> dict[int, str]:
 
 
 def anchor_color(row: Any) -> tuple[int, int, int]:
-    """Grey while the left eye does not see it; orange where it is seen, and its place in space not sure."""
+    """The colour of an anchor: grey if the left eye does not see it, orange if its place is not sure."""
     if row["visibility"] == 0:
         return HIDDEN
     return SEEN if is_sure_in_space(row) else UNSURE

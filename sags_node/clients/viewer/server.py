@@ -16,8 +16,8 @@ from sags_node.clients.viewer import cursor, still
 from sags_node.errors import SagsError, UsageError
 from sags_node.messaging.security import is_loopback
 
-# The quad of a splat has two numbers a corner in viser 1.1.1, of which three.js reads three: it reports a
-# sphere of radius NaN around it, and culls nothing. The third is not drawn; large, it culls nothing.
+# viser 1.1.1 gives two numbers for each corner of a splat's quad, and three.js reads three: it reports a
+# bounding sphere of radius NaN, and culls nothing. A large third number is not drawn, and culls nothing, too.
 MEND = """<script>
 (() => {
   const { head } = document, append = head.appendChild;
@@ -32,7 +32,7 @@ MEND = """<script>
 
 class _LocalServer(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> None:
-        """viser would tunnel the page through a server on the internet; any browser may ask for that."""
+        """Do nothing: viser would tunnel the page through a server on the internet if any browser asks."""
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def serving(host: str, port: int, insecure: bool) -> Iterator[tuple[viser.ViserS
     """The server and its address, until the end of the block.
 
     On loopback, only pages of this server may open its websocket: else any page that the user has open could
-    read the pictures and press the buttons. With `insecure` the page may have any name, as this machine may.
+    read the pictures and press the buttons. With `insecure`, pages of any host name may open it, on its port.
 
     Args:
         port: 0 for any free one.
@@ -101,7 +101,7 @@ def _answer(
 
 @contextmanager
 def _only_from(origin: re.Pattern[str]) -> Iterator[None]:
-    """viser has no setting for the origins it accepts, nor for its page; websockets has."""
+    """Patch websockets' `serve`: viser has no setting for the origins that it accepts, nor for its page."""
     serve = websockets.asyncio.server.serve
 
     def served(*args: Any, process_request: Any, **options: Any) -> Any:

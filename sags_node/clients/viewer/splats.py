@@ -13,7 +13,7 @@ from sags_node.types import F32, F64
 
 MAX_SPLATS = 60_000  # that a browser draws smoothly; of more, those that cover most
 REACH = 3.0  # standard deviations within which a Gaussian is met
-SURFACE = 0.5  # of the light has been taken: where the renderer puts the depth, too
+SURFACE = 0.5  # share of the light that is absorbed at the surface, also where the renderer puts the depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,13 +27,12 @@ class Splats:
     opacities: F32  # [N]
 
     def covariances(self, unit: float) -> F32:
-        """[N, 3, 3] in squares of a unit of so many metres."""
+        """Return the covariances [N, 3, 3], in squares of a unit of `unit` metres."""
         sides = self.rotations * (self.scales / unit)[:, None, :]
         return np.asarray(np.einsum("nik,njk->nij", sides, sides))
 
     def hit(self, origin: F64, direction: F64) -> F64 | None:
-        """Find where a ray from `origin` (m) along `direction` meets the tissue: half of its light is taken
-        there.
+        """Find where a ray from `origin` (m) along `direction` meets the tissue: half of its light is left.
 
         Each Gaussian counts where it is densest along the ray, front to back. None when the ray meets nothing
         that is more opaque than clear.
