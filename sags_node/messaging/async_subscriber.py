@@ -19,8 +19,8 @@ T = TypeVar("T")
 
 
 class AsyncSubscriber(Receiver):
-    """Receives topics in the background; `latest` and `read` give what has come, `wait`, `aligned` and
-    `messages` what is still to come.
+    """Receives topics in the background; `latest` and `read` return what has come; `wait`, `aligned`
+    and `messages` also wait for what is still to come.
 
     Arguments and errors: see `Receiver`. Any number of tasks may wait, in any number of event loops.
     """

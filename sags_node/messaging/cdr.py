@@ -60,7 +60,7 @@ class Content:
     window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture per px of its own
     relative: bool = False  # its lengths have no unit
     detail_age_ns: int | None = (
-        None  # of the oldest picture in a view, before its frame; None: the model alone
+        None  # ns from the oldest picture in a view to its frame; None: the model alone
     )
 
     def cdr(self) -> bytes:

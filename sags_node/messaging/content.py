@@ -65,7 +65,7 @@ def splats(result: FrameResult) -> Content:
     rows[:, 15] = _confidence(gaussians)
     rows[:, 17:20] = 0 if gaussians.slopes is None else gaussians.slopes
     bits = rows.view(np.uint32)
-    bits[:, 14], bits[:, 16] = gaussians.ids & 0xFFFFFFFF, gaussians.ids >> 32  # high: 0 for a day or more
+    bits[:, 14], bits[:, 16] = gaussians.ids & 0xFFFFFFFF, gaussians.ids >> 32  # low and high 32 bits
     return cdr.point_cloud(rows, SPLAT_FIELDS, result.pair.t_capture_ns)
 
 

@@ -38,7 +38,7 @@ SEND_HIGH_WATER = 2 * MAX_REQUESTS_AT_ONCE  # answers, before a peer that does n
 HERE = ("ipc:", "tcp://127.", "tcp://localhost", "tcp://[::1]")  # endpoints of this machine
 LOOK_MS = 100  # after which a client notices that its node was restarted
 TOO_LATE = "it was not begun in the time that its sender waits, and is not done"
-ANONYMOUS = "anonymous"  # how ZeroMQ's authenticator calls a peer without a key
+ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls a peer without a key
 PLAIN = Client("a client without a key")  # it was let in without one, so it may do everything
 
 Handler = Callable[[dict[str, Any]], Any]
@@ -225,7 +225,7 @@ class ControlServer:
         body = msgspec.msgpack.encode(reply)
         try:
             self._socket.send_multipart([*sender.envelope, body], zmq.NOBLOCK)
-        except zmq.ZMQError as error:  # the peer is gone or does not read: its loss
+        except zmq.ZMQError as error:  # the peer is gone or does not read: its own loss
             log.debug("a reply was not sent: %s", error)
 
 

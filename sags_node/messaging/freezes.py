@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 WINDOW = 30  # intervals in the mean
 LONGER = 3.0  # times the mean
-MORE = 0.15  # s
+MORE = 0.15  # s more than the mean
 
 
 class Freezes:

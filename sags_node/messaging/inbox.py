@@ -38,7 +38,7 @@ MAX_UNTAKEN_BYTES = 4 * MAX_PART_BYTES  # of a peer that may wait unread
 RECEIVE_HIGH_WATER = 8  # messages of a sender that wait in the socket
 SEND_HIGH_WATER = 4
 MOST_AT_ONCE = 64  # messages read in one go
-POLL_MS = 100  # how soon the thread notices that it should end
+POLL_MS = 100  # after which the thread notices that it should end
 RECEIPT_S = 1.0
 FORGOTTEN_S = 10.0  # of silence, after which a sender is forgotten
 ALONE_S = 1.0  # after a program's last message, until another one may send the same
@@ -219,5 +219,5 @@ class Inbox:
                 )
                 try:
                     self._socket.send_multipart([identity, msgspec.msgpack.encode(receipt)], zmq.NOBLOCK)
-                except zmq.ZMQError as error:  # it is gone or does not read: its loss
+                except zmq.ZMQError as error:  # the sender is gone or does not read: its own loss
                     log.debug("a receipt was not sent: %s", error)

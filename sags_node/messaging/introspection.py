@@ -252,7 +252,7 @@ def _content(received: Received) -> Any:
 
 
 def _fields(pairs: list[tuple[str, Any]]) -> Record:
-    """Without a message's type and constants: the fields of ROS messages are in lower case."""
+    """The fields of a ROS message, which are in lower case, without its type and constants."""
     return {key: value for key, value in pairs if key[0].islower()}
 
 

@@ -255,7 +255,7 @@ class Publisher(Closes):
         return noted or (self._any_view and name.startswith("view/"))
 
     def looked_at(self, picture: str) -> bool:
-        """True while somebody subscribes to that topic, or to a thin form of it."""
+        """Tell whether somebody subscribes to the topic `picture`, or to a thin form of it."""
         return self.wanted(picture) or any(thin.topic == picture for thin in self.thin.values())
 
     def _publish_text(self, name: str, text: Content, stamp_ns: int) -> None:

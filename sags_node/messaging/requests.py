@@ -48,7 +48,7 @@ class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AnchorName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`remove_anchor`."""
+    """`remove_anchor`: an anchor by its id."""
 
     id: int
     session: str | None = None  # that pinned it; in another session the id is another anchor's
@@ -121,7 +121,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ViewName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`close_view`."""
+    """`close_view`: a view by its name."""
 
     name: Name
 

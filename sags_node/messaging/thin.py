@@ -121,7 +121,7 @@ def _numbers(
 
 
 def _averaged(picture: U8, every: int) -> U8:
-    """Each pixel the mean of `every` x `every`."""
+    """The picture with each pixel the mean of `every` x `every` pixels."""
     height, width = picture.shape[:2]
     if every == 1:
         return picture
