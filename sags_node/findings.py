@@ -78,10 +78,10 @@ def by_stage(findings: Iterable[Finding]) -> Findings:
 
 
 def by_code(findings: Findings) -> dict[str, str]:
-    """Code -> what is wrong and how to fix it."""
+    """The findings by code: what is wrong and how to fix it."""
     return {finding.code: finding.text for found in findings.values() for finding in found}
 
 
 def in_words(findings: Findings) -> dict[str, str]:
-    """Stage -> what is wrong with it and how to fix it."""
+    """The findings by stage: what is wrong with it and how to fix it."""
     return {stage: "; ".join(finding.text for finding in found) for stage, found in findings.items()}

@@ -382,7 +382,7 @@ class AnchorsAhead:
 class AnchorStates:
     """The points that users pinned to the tissue, at one time."""
 
-    ids: I64  # [A] never used again
+    ids: I64  # [A] an id is never used again
     points: F32  # [A, 3] m, world; NaN: lost
     pixels: F32  # [A, 2] in the left picture, also beyond its edges; NaN: behind the camera or lost
     visibility: F32  # [A] 0..1, seen by the left eye: neither behind an instrument nor behind other tissue
@@ -406,7 +406,7 @@ class AnchorStates:
 class InstrumentStates:
     """The instruments in one frame. What is not known is NaN, and its confidence 0."""
 
-    ids: I64  # [I] never used again
+    ids: I64  # [I] an id is never used again
     tips: F32  # [I, 3] m, world
     axes: F32  # [I, 3] unit, world, from the shaft to the tip
     pixels: F32  # [I, 2] of the tip in the left picture
