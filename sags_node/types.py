@@ -134,7 +134,7 @@ class ToolPose:
     """Where a robot says that the tip of one of its tools is."""
 
     name: str  # its topic
-    error: float  # m, predicted: nine of ten real ones are smaller
+    error: float  # m; nine of ten real errors are smaller
     T_cam_tool: F64 | None  # [4, 4] in the left rectified camera, z out of its tip; None: not known now
     problem: str = ""  # why it is not known
 

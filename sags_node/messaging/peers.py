@@ -63,7 +63,7 @@ class Peers:
         name: of the socket, for the log.
         max_untaken: bytes a tcp peer may have sent beyond what `waiting` has read. This bounds what ZeroMQ
             itself does not: the number of parts of a message, and of subscriptions.
-        revocations: how many keys were revoked. When it grows, all tcp peers must connect anew.
+        revocations: how often keys were revoked. When it grows, all tcp peers must connect anew.
     """
 
     def __init__(
