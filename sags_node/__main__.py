@@ -1,4 +1,4 @@
-"""The `sags` command, also as `python -m sags_node`, from its first moment on: loading it takes a while."""
+"""The entry point of `sags` and `python -m sags_node`: sets up stderr and Ctrl-C before the slow imports."""
 
 import atexit
 import errno
@@ -11,7 +11,7 @@ from typing import Any
 
 
 class _Messages(io.FileIO):
-    """What stderr leads to. A full disk or a terminal that is gone swallows messages, and ends no work."""
+    """The file behind stderr. On a full disk or a closed terminal messages are lost, and the work goes on."""
 
     def write(self, said: Any) -> int:
         try:
@@ -28,11 +28,11 @@ def main() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:  # closed: else the next file that is opened gets what libraries print
             setattr(sys, name, open(os.open(os.devnull, os.O_RDWR), mode, closefd=False))
-    messages: Any = _Messages(2, "w", closefd=False)  # which has what TextIOWrapper needs
+    messages: Any = _Messages(2, "w", closefd=False)  # it has all that TextIOWrapper needs
     sys.stderr = io.TextIOWrapper(messages, sys.stderr.encoding, "backslashreplace", write_through=True)
 
     def end() -> None:
-        """Python itself would break a daemon thread off inside OpenCV, whose code answers with SIGABRT."""
+        """Exit at once: Python would stop a daemon thread inside OpenCV, which ends in SIGABRT."""
         if any(thread.daemon for thread in threading.enumerate()):
             print(end="", flush=True)
             print(end="", flush=True, file=sys.stderr)

@@ -1,6 +1,6 @@
-"""What was looked at before anything plays: fine, odd or wrong, each with its fix.
+"""The results of the checks made before anything plays: ok, warning or error, each with its fix.
 
-A running node's warnings are another thing: `findings`.
+The warnings of a running node are in `findings`.
 """
 
 import os
@@ -17,7 +17,7 @@ _BEFORE_NAME, _BEHIND_NAME = re.compile(r"""[\s"'(=:]"""), re.compile(r"""[\s"')
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     level: Level
     what: str
@@ -27,20 +27,20 @@ class Finding:
 
 
 def is_wrong(found: Iterable[Finding]) -> bool:
-    """True where one of them is an error."""
+    """Tell whether one of the findings is an error."""
     return any(each.level == "error" for each in found)
 
 
 def as_warnings(found: Iterable[Finding]) -> list[Finding]:
-    """The same, of something that is wrong, and yet is played."""
+    """Return the findings with errors lowered to warnings, for something that is played all the same."""
     return [replace(each, level="warning") if each.level == "error" else each for each in found]
 
 
 def refuse_errors(found: Iterable[Finding], where: object) -> None:
-    """Refuse what has errors; `where` names it.
+    """Raise one error that lists all findings of level error; `where` names what was checked.
 
     Raises:
-        UsageError: there are some.
+        UsageError: there is such a finding.
     """
     errors = [f"{where}: {each.what}; {each.fix}" for each in found if each.level == "error"]
     if errors:
@@ -48,8 +48,8 @@ def refuse_errors(found: Iterable[Finding], where: object) -> None:
 
 
 def parted(level: Level, message: str, otherwise: str = "") -> Finding:
-    """The finding of a message, which says what is wrong, and after a semicolon how to fix it: the first one
-    that is in no name of a file."""
+    """Split a message "what is wrong; how to fix it" into a finding, at the first semicolon that is not part
+    of an existing file's name. `otherwise` is the fix where the message has none."""
     for found in re.finditer("; ", message):
         if not _is_in_a_name(message, *found.span()):
             return Finding(level, message[: found.start()], message[found.end() :] or otherwise)
@@ -64,6 +64,6 @@ def _is_in_a_name(message: str, start: int, end: int) -> bool:
 
 
 def refused(what: str, error: SagsError) -> Finding:
-    """The finding of an error that was raised while looking at a file."""
+    """The finding for an error that was raised while a file was checked."""
     found = parted("error", str(error), "fix or remove that file")
     return replace(found, what=f"{what}: {found.what}")

@@ -1,7 +1,7 @@
-"""The front door for programs that use a node: a subscriber, what it receives, requests, and what hands
-pictures in.
+"""The API for programs that use a node: subscribers, received messages, control requests, and senders of
+pictures and poses.
 
-Importing this loads numpy, ZeroMQ and the message formats, and none of what maps: no Numba, torch, OpenCV
+Importing it loads NumPy, ZeroMQ and the message formats, but nothing of the mapper: no Numba, torch, OpenCV
 or Open3D.
 """
 

@@ -2,8 +2,8 @@
 
     confidence = 2 ** (-error / 3 mm)        error = 3 mm * log2(1 / confidence)
 
-`error` is the predicted one: nine of ten real ones are smaller. So 0.5 says within 3 mm, 0.8 within 1 mm,
-0.25 within 6 mm; below 1/64, 18 mm, no depth is stated.
+`error` is predicted: nine of ten real errors are smaller. So 0.5 says within 3 mm, 0.8 within 1 mm, 0.25
+within 6 mm. Below 1/64 (18 mm) no depth is stated.
 """
 
 from typing import Any
@@ -12,17 +12,17 @@ import numpy as np
 
 from sags_node.types import F32, F64
 
-HALVING = 3e-3  # m of error
-LEAST = 1 / 64  # of confidence, with which a depth is still stated
-SURE = 0.5  # of confidence, with which a depth may decide something
+HALVING = 3e-3  # m of error by which the confidence halves
+LEAST = 1 / 64  # lowest confidence with which a depth is stated
+SURE = 0.5  # lowest confidence with which a depth may decide something
 SURE_OF_ANCHOR = (
-    0.5  # of an anchor's confidence, with which it is taken to be on its tissue, see `overlay.frame`
+    0.5  # lowest confidence with which an anchor is taken to be on its tissue, see `overlay.frame`
 )
-FAINTEST = 1e-30  # of confidence: 0.3 m
+FAINTEST = 1e-30  # lowest confidence that `error_of` tells apart: 0.3 m
 
 
 def is_sure_in_space(anchor: Any) -> bool:
-    """Tell whether the place of an anchor, a row of `anchors`, is measured: on its tissue, its depth sure."""
+    """Tell whether an anchor (a row of `anchors`) is surely on its tissue, and its depth is sure."""
     return bool(anchor["confidence"] >= SURE_OF_ANCHOR and anchor["depth_confidence"] >= SURE)
 
 

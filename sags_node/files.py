@@ -1,6 +1,6 @@
 """Files that others made: only plain ones are opened. A pipe or a device would make the reader wait.
 
-Files that we make: each appears when all of it is there, and takes the place of nothing but our own results.
+Files that we make: each appears only when it is complete, and replaces nothing but our own results.
 """
 
 import difflib
@@ -22,7 +22,7 @@ SHOWN = "[!.]*"  # no hidden files: macOS puts `._NAME` beside each on foreign d
 NO_TEXT = "holds bytes that are no UTF-8 text, so no other program can be told of it: rename it"
 LARGEST_RESULT = 64 << 20  # bytes of figures as JSON
 log = logging.getLogger(__name__)
-_checked: set[Path] = set()  # asked for without --force: what comes there before `whole` has ended stays
+_checked: set[Path] = set()  # checked without --force: `whole` keeps a file that appears there later
 _KINDS = (
     (stat.S_ISDIR, "it is a folder"),
     (stat.S_ISFIFO, "it is a pipe, no file"),
@@ -56,7 +56,7 @@ def open_file(path: Path) -> BinaryIO:
     _refuse_others(path, path.stat().st_mode)  # before it is opened: that alone wakes some devices
     opened = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _refuse_others(path, os.fstat(opened).st_mode)  # it may have been another one before
+        _refuse_others(path, os.fstat(opened).st_mode)  # another file may have taken its name since
     except OSError:
         os.close(opened)
         raise
@@ -77,7 +77,7 @@ def read_file(path: Path, largest: int) -> bytes:
 
 
 def near(path: Path) -> str:
-    """The remedy for a path that cannot be read: if nothing is there, what beside it is named alike."""
+    """The remedy for a path that cannot be read: where nothing is there, the most similar name beside it."""
     try:
         beside = [] if path.exists() else [each.name for each in path.absolute().parent.iterdir()]
     except OSError:
@@ -97,7 +97,7 @@ def _refuse_others(path: Path, mode: int) -> None:
 
 @contextmanager
 def writing(target: Path) -> Iterator[None]:
-    """A full disk or missing rights become one message.
+    """Turn an error of writing (full disk, missing rights) into one message.
 
     Raises:
         SagsError: the block raised an `OSError`.
@@ -110,12 +110,12 @@ def writing(target: Path) -> Iterator[None]:
 
 @contextmanager
 def whole(path: Path, new: bool = False) -> Iterator[Path]:
-    """A place on the same disk to write a file or folder to. When nothing went wrong it becomes `path`; else
-    nothing of it is left, and what stood at `path` stays.
+    """Give a temporary path on the same disk to write a file or folder to. When the block succeeds, it is
+    moved to `path`. Otherwise it is deleted, and what stood at `path` stays.
 
     Args:
-        new: it takes the place of no other file. After `check_file` or `check_results` it takes none's but
-            of what they allow. Both hold for a file that comes while it is written, too.
+        new: no file is replaced. After `check_file` or `check_results`, only what they allow is replaced.
+            Both hold also for a file that appears at `path` meanwhile.
 
     Raises:
         SagsError: it cannot be written, or another file is there.
@@ -126,9 +126,9 @@ def whole(path: Path, new: bool = False) -> Iterator[Path]:
     with writing(path), tempfile.TemporaryDirectory(prefix=".sags-", dir=target.parent) as passing:
         partial = Path(passing) / path.name
         yield partial
-        if (new or target in _checked) and not partial.is_dir():  # which replaces nothing but an empty folder
+        if (new or target in _checked) and not partial.is_dir():  # a folder can only replace an empty folder
             try:
-                target.open("xb").close()  # only one can make it
+                target.open("xb").close()  # only one program can create it
             except FileExistsError:
                 if new or not is_result(target):
                     said = "exists now: another program wrote it meanwhile, and it was left as it is"
@@ -138,7 +138,7 @@ def whole(path: Path, new: bool = False) -> Iterator[Path]:
 
 
 def check_folder(folder: Path) -> None:
-    """Make the folder, and be sure that a file can be made in it.
+    """Make the folder, and check that a file can be created in it.
 
     Raises:
         SagsError: it cannot.
@@ -150,7 +150,7 @@ def check_folder(folder: Path) -> None:
 
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
-    """No second program that asks this writes into the folder meanwhile, as far as its disk has locks.
+    """Lock the folder against other programs that lock it, during the block, where its disk has locks.
 
     Raises:
         UsageError: another one does.
@@ -162,7 +162,7 @@ def alone(folder: Path) -> Iterator[None]:
         except BlockingIOError:
             said = f"another program writes into {folder}; wait for its end, or name another folder"
             raise UsageError(said) from None
-        except OSError as error:  # disks of a network need not lock folders
+        except OSError as error:  # network disks may be unable to lock folders
             log.debug("%s is not locked: %s", folder, error)
         yield
     finally:
@@ -170,11 +170,11 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 def check_file(file: Path, force: bool | None = None) -> None:
-    """Be sure that this file can be written, without touching it.
+    """Check that this file can be written, without changing it.
 
     Args:
-        force: it may take the place of any file. Else only of an empty one, and of earlier figures: JSON that
-            says under `provenance` where it comes from. None: the command has no option --force.
+        force: any file may be replaced. Otherwise only an empty one, or earlier figures: JSON that has the
+            key `provenance`. None: as False, for a command without an option --force.
 
     Raises:
         UsageError: another file is there.
@@ -196,10 +196,10 @@ def check_file(file: Path, force: bool | None = None) -> None:
 
 
 def check_results(folder: Path, names: Sequence[str], ours: bool) -> None:
-    """`check_folder`, for results that have fixed names.
+    """Check the folder as `check_folder` does, and that results of these names may be written in it.
 
     Args:
-        ours: what is there under these names is known to be of an earlier run, and may be replaced.
+        ours: files of these names are known to come from an earlier run, and may be replaced.
 
     Raises:
         UsageError: something else is there.
@@ -215,7 +215,7 @@ def check_results(folder: Path, names: Sequence[str], ours: bool) -> None:
 
 
 def is_result(file: Path) -> bool:
-    """Tell whether this is an empty file, or figures that say where they come from."""
+    """Tell whether this is an empty file, or figures as JSON with the key `provenance`."""
     size = file.stat().st_size
     try:
         return size == 0 or (size <= LARGEST_RESULT and "provenance" in json.loads(file.read_bytes()))

@@ -1,4 +1,4 @@
-"""Every warning that there is. docs/warnings.md says of each what causes it and how to fix it."""
+"""Every warning that there is. docs/warnings.md gives the cause and the fix of each."""
 
 from collections.abc import Iterable, Mapping
 
@@ -60,16 +60,16 @@ STAGES: Mapping[str, str] = {  # code -> which stage of the work it is about
     "recording_disk_low": "recording",
 }
 
-# Stages whose warnings make nothing that is shown less sure.
+# Stages whose warnings do not make what is shown less certain.
 OF_THE_FLOW = frozenset({"source", "capture", "recording"})
-UNHEALTHY = frozenset({"recording_ended", "no_model"})  # whatever the state
+UNHEALTHY = frozenset({"recording_ended", "no_model"})  # codes that make the node unhealthy in any state
 
 Findings = Mapping[str, tuple[Finding, ...]]  # by stage; a stage without any is left out
 NOTHING: Findings = {}
 
 
 def by_stage(findings: Iterable[Finding]) -> Findings:
-    """Raises KeyError for a code that is not in `STAGES`: nobody could look it up."""
+    """Group findings by stage. A code that is not in `STAGES` raises KeyError: nobody could look it up."""
     sorted_out: dict[str, tuple[Finding, ...]] = {}
     for finding in findings:
         stage = STAGES[finding.code]
@@ -78,10 +78,10 @@ def by_stage(findings: Iterable[Finding]) -> Findings:
 
 
 def by_code(findings: Findings) -> dict[str, str]:
-    """Code -> what is wrong and how to fix it."""
+    """The findings by code: what is wrong and how to fix it."""
     return {finding.code: finding.text for found in findings.values() for finding in found}
 
 
 def in_words(findings: Findings) -> dict[str, str]:
-    """Stage -> what is wrong with it and how to fix it."""
+    """The findings by stage: what is wrong with it and how to fix it."""
     return {stage: "; ".join(finding.text for finding in found) for stage, found in findings.items()}

@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from sags_node.types import F32, F64, Camera
 
 Array = NDArray[np.floating]
-ROTATION_TOLERANCE = 1e-3  # of the elements of R R^T
+ROTATION_TOLERANCE = 1e-3  # largest error of an element of R R^T
 
 
 def rigid(R: Array, t: ArrayLike) -> F64:
@@ -28,17 +28,17 @@ def transform(T: F64, points: Array) -> Array:
 
 
 def is_rotation(matrices: F64) -> NDArray[np.bool_]:
-    """Which of the matrices [..., 3, 3] are rotations, as exactly as files written by people give them."""
+    """Tell which matrices [..., 3, 3] are rotations, to the precision of files written by people."""
     products = matrices @ np.swapaxes(matrices, -1, -2)
     orthogonal = np.abs(products - np.eye(3)).max((-1, -2)) < ROTATION_TOLERANCE
     return np.asarray(orthogonal & (np.linalg.det(matrices) > 0))
 
 
 def is_rigid(T: F64) -> bool:
-    """True of a rotation and a translation above a last row 0 0 0 1: [4, 4] and finite."""
+    """Tell whether `T` is finite, [4, 4], and a rotation and a translation above a last row 0 0 0 1."""
     if T.shape != (4, 4) or not np.isfinite(T).all() or not is_rotation(T[:3, :3]):
         return False
-    return bool(np.abs(T[3] - (0, 0, 0, 1)).max() < 1e-6)  # as exactly as float32 computes it
+    return bool(np.abs(T[3] - (0, 0, 0, 1)).max() < 1e-6)  # to the precision of float32
 
 
 def quat_to_matrix(quats: Array) -> Array:
@@ -94,8 +94,8 @@ def unproject(camera: Camera, pixels: Array, depths: Array) -> Array:
 
 
 def scale_intrinsics(K: F64, size: tuple[int, int], new_size: tuple[int, int]) -> F64:
-    """`K` [3, 3] for a picture resized from `size` to `new_size` (width, height): pixel centres are integers,
-    so a corner, not a centre, stays in place."""
+    """`K` [3, 3] for a picture resized from `size` to `new_size` (width, height). Pixel centres are integers,
+    so the point that stays in place is the corner (-0.5, -0.5), not (0, 0)."""
     sx, sy = new_size[0] / size[0], new_size[1] / size[1]
     scaled = K.copy()
     scaled[0] *= sx
@@ -112,7 +112,7 @@ def resized_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def scale_pixels(pixels: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
-    """Pixels [..., 2] of a picture resized from `size` to `new_size` (width, height), in the resized one."""
+    """Convert pixels [..., 2] of a picture of `size` (width, height) to that resized to `new_size`."""
     factors = np.array(new_size, np.float64) / size
     return (pixels + 0.5) * factors - 0.5
 

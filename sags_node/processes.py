@@ -1,4 +1,4 @@
-"""Processes: how others end, with a limit on every wait, and the memory of one."""
+"""End other processes, with a limit on every wait, and read the memory of a process."""
 
 import os
 import subprocess
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 PAGE = os.sysconf("SC_PAGE_SIZE")
-KILL_SECONDS = 5.0  # a killed process that waits for a disk ends when the disk answers
+KILL_SECONDS = 5.0  # longest wait after a kill: a process that waits for a disk ends only when that answers
 
 
 def end(process: subprocess.Popen[Any], grace: float) -> bool:
@@ -28,7 +28,7 @@ def _ends(process: subprocess.Popen[Any], seconds: float) -> bool:
 
 
 def resident_mb(process: int | str = "self") -> float:
-    """Resident memory, MB.
+    """The resident memory of a process, MB.
 
     Raises:
         OSError: it has ended.

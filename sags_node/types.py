@@ -39,10 +39,10 @@ Bool = NDArray[np.bool_]
 Samples = NDArray[np.uint8] | NDArray[np.uint16]  # of a picture as a camera gives it
 Side = Literal["left", "right"]
 
-# What is drawn small is learnt from means over small pixels. A mean differs from what is in the middle by
-# 1/24 of the second difference along each axis (Taylor). Measured: 0.15 to 0.3 dB for taking it out.
+# A view drawn at a small size holds the mean colour of each pixel. It differs from the colour at the centre
+# by 1/24 of the second difference along each axis (Taylor). Correcting it gains 0.15 to 0.3 dB (measured).
 MIDDLES = np.array([-1 / 24, 26 / 24, -1 / 24], np.float32)
-_ENLARGING = threading.Lock()  # one for all: it is held for a millisecond or two, and pictures stay copyable
+_ENLARGING = threading.Lock()  # one for all objects, so that they can be copied; it is held for 1 to 2 ms
 SH_DEGREE_0 = 0.5 / math.sqrt(math.pi)  # Y_00, the constant spherical harmonic: rgb = 0.5 + Y_00 f_dc
 
 
@@ -95,13 +95,13 @@ class StereoRig:
     name: str
     left: Eye
     right: Eye
-    # Where it was read, for what people are told to do with it.
+    # Where it was read from, for messages that say how to fix it.
     path: Path | str = field(default="PATH", kw_only=True)
-    # False: guessed, so that lengths are right up to a factor that nobody knows.
+    # False: the calibration is guessed, so lengths are right only up to an unknown factor.
     metric: bool = field(default=True, kw_only=True)
-    # Its files do not say the unit of lengths; this one is usual of their form, and was taken.
+    # The unit of lengths: the usual one of its files' format, which does not state it.
     unit: str = field(default="m", kw_only=True)
-    # False: R and P stand in none of its files: `cv2.stereoRectify` made them.
+    # False: its files have no R and P; `cv2.stereoRectify` made them.
     says_P: bool = field(default=True, kw_only=True)
 
     @property
@@ -120,7 +120,7 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """What a recording knows to be true of one frame. Only for measuring: the frame path never reads
+    """The ground truth that a recording has for one frame. Only for evaluation: the frame path never reads
     it."""
 
     depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified picture at calibration size
@@ -134,9 +134,9 @@ class ToolPose:
     """Where a robot says that the tip of one of its tools is."""
 
     name: str  # its topic
-    error: float  # m, nine of ten are smaller
+    error: float  # m; nine of ten real errors are smaller
     T_cam_tool: F64 | None  # [4, 4] in the left rectified camera, z out of its tip; None: not known now
-    problem: str = ""  # why not
+    problem: str = ""  # why it is not known
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,13 +158,13 @@ class StereoFrame:
     pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
     tools: tuple[ToolPose, ...] = ()  # where a robot says that its tools are
     warm_up: bool = False  # the model learns from it, and nothing of it is shown or counted
-    recorded_s: float | None = None  # its place in the recording, from 0 again when that loops; None: live
-    recorded_number: int = -1  # of its left picture among all of the recording, from 0; -1: live
+    recorded_s: float | None = None  # s, its time in the recording, from 0 in each loop; None: live
+    recorded_number: int = -1  # index of its left picture in the recording, from 0; -1: live
 
 
 @dataclass(frozen=True, slots=True)
 class GrayPyramid:
-    """A gray picture, and smaller ones of it; see `vision.pyramid`."""
+    """A gray picture and its smaller copies; see `vision.pyramid`."""
 
     full: U8  # [H, W]
     halves: tuple[F32, ...]  # grey levels 0..255; [k] has (H >> k + 1) x (W >> k + 1) px and a border around
@@ -172,20 +172,20 @@ class GrayPyramid:
 
 @dataclass(frozen=True, slots=True)
 class RectifiedPictures:
-    """What a frame's pair is made of before anybody knows where its camera is: all that takes time."""
+    """The rectified pictures of a frame, before its camera's pose is known: the part that takes time."""
 
     left: U8  # [H, W, 3] RGB
     right: U8 | None  # [H, W, 3] RGB
     gray: tuple[GrayPyramid, GrayPyramid | None]
-    ms: float  # that it took
+    ms: float  # that making them took
 
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """How a frame is seen from outside: in a size that no machine's speed changes (`messaging.published`)."""
+    """A frame as it is published: its size does not depend on the machine's speed (`messaging.published`)."""
 
     camera: Camera  # left eye, at the world's origin
-    picture: Callable[[Side], U8]  # [H, W, 3] RGB, rectified; made when it is asked for, once
+    picture: Callable[[Side], U8]  # [H, W, 3] RGB, rectified; made once, when first asked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,18 +199,18 @@ class RectifiedPair:
     left: U8  # [H, W, 3] RGB
     right: U8 | None  # [H, W, 3] RGB; None where the session has no right eye
     gray: tuple[GrayPyramid, GrayPyramid | None] | None = None  # of both, where they are made already
-    published: Published | None = None  # None: in the size in which it is worked
+    published: Published | None = None  # None: it is published at the working size
 
 
 @dataclass(frozen=True, slots=True)
 class DepthGrid:
-    """The depth that a frame tells of, coarse and everywhere; see `vision.depth_grid`.
+    """The depth of a frame on a coarse grid, also where it was not measured; see `vision.depth_grid`.
 
     Errors are predicted: nine of ten real ones are smaller. A depth z has the error `error * z * z`.
     """
 
     side: float  # px of a cell
-    inverse: F32  # [h, w] 1/m, of the inverse depth: measured, else borrowed from around; 0: unknown
+    inverse: F32  # [h, w] 1/m, inverse depth: measured, else that of the surroundings; 0: unknown
     error: F32  # [h, w] 1/m, of the inverse depth; it grows with the distance to what was measured
 
 
@@ -256,11 +256,11 @@ class Gaussians:
 
 @dataclass(frozen=True, slots=True)
 class MotionState:
-    """How well motion is predicted lately (`mapping.motion_field`)."""
+    """How well motion was predicted over the last frames (`mapping.motion_field`)."""
 
-    period: float | None  # s after which the tissue moves as before; None: it does not
-    skill: float  # share of the motion's energy that was said right one frame ahead: 1 all, 0 none
-    reach: float  # s: so far ahead of a frame motion is predicted; 0: not at all
+    period: float | None  # s, after which the tissue's motion repeats; None: it does not repeat
+    skill: float  # share of the motion's energy predicted right one frame ahead: 1 all, 0 none
+    reach: float  # s, how far ahead of a frame motion is predicted; 0: not at all
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,12 +288,12 @@ class Snapshot:
     loss: float  # mean absolute colour residual over tissue, last step
     counts: Mapping[str, int] = field(default_factory=dict)  # inserted, removed, iterations, ...
     forecast: Forecast | None = None  # None: nobody asks for it, or too little is known yet
-    right_colors: F32 | None = None  # [N, 3] what the right eye sees more; None: nobody looks there
+    right_colors: F32 | None = None  # [N, 3] added to `colors` for the right eye; None: nobody looks there
 
 
 class Colours:
-    """The colours of a drawn picture, normalised by coverage, in the size in which they were drawn. Most of
-    what is drawn is looked at in a few pixels only: it is enlarged when somebody asks, on that thread, once.
+    """The colours of a drawn view, normalised by coverage, at the size in which they were drawn. They are
+    enlarged once, when first asked for, on the asking thread: of most views only a few pixels are read.
 
     Attributes:
         small: [h, w, 3] RGB.
@@ -302,19 +302,19 @@ class Colours:
     __slots__ = ("_made", "_size", "small")
 
     def __init__(self, small: U8, width: int | None = None, height: int | None = None) -> None:
-        """`width`, `height`: of the view that they are of, px; None: as they are."""
+        """`width`, `height`: of the view, px; None: those of `small`."""
         self.small = small
         self._size = width or small.shape[1], height or small.shape[0]
         self._made: dict[tuple[int, int], U8] = {(small.shape[1], small.shape[0]): small}
 
     @property
     def whole(self) -> U8:
-        """[H, W, 3] in the size of the view, as `at`."""
+        """The colours [H, W, 3] at the size of the view, as by `at`."""
         return self.at(*self._size)
 
     def at(self, width: int, height: int) -> U8:
-        """[height, width, 3] by cubic polynomials, which keep twice the sharpness of straight lines. Any
-        thread may ask."""
+        """The colours [height, width, 3], by bicubic interpolation, which keeps twice the sharpness of
+        bilinear. Any thread may ask."""
         import cv2  # a client that only reads these types need not load it
 
         size = width, height
@@ -325,8 +325,8 @@ class Colours:
             return self._made[size]
 
     def every(self, step: int) -> U8:
-        """Every `step` th pixel of every `step` th row of the whole, less sharp where it was drawn small. It
-        is the same whether somebody asked for the whole or not."""
+        """Every `step`-th pixel of every `step`-th row of `whole`, but less sharp where the view was drawn
+        small. The result does not depend on whether `whole` was made before."""
         if self._size == self.small.shape[1::-1]:
             return self.small[::step, ::step]
         import cv2
@@ -346,7 +346,7 @@ class Shown:
     `sags_node.detail`."""
 
     rgb: U8  # [H, W, 3]
-    taken: U8  # [H, W] 0..255 of it is a picture's
+    taken: U8  # [H, W] 0..255, the share that comes from a picture
     oldest_ns: int  # when the oldest of these pictures was captured
 
 
@@ -365,7 +365,7 @@ class RenderedView:
 
     @property
     def rgb(self) -> U8:
-        """[H, W, 3] RGB, normalised by coverage. The first who asks makes it (`Colours`)."""
+        """[H, W, 3] RGB, normalised by coverage. Made at the first call (`Colours`)."""
         return self.colours.whole
 
 
@@ -382,7 +382,7 @@ class AnchorsAhead:
 class AnchorStates:
     """The points that users pinned to the tissue, at one time."""
 
-    ids: I64  # [A] never used again
+    ids: I64  # [A] an id is never used again
     points: F32  # [A, 3] m, world; NaN: lost
     pixels: F32  # [A, 2] in the left picture, also beyond its edges; NaN: behind the camera or lost
     visibility: F32  # [A] 0..1, seen by the left eye: neither behind an instrument nor behind other tissue
@@ -406,7 +406,7 @@ class AnchorStates:
 class InstrumentStates:
     """The instruments in one frame. What is not known is NaN, and its confidence 0."""
 
-    ids: I64  # [I] never used again
+    ids: I64  # [I] an id is never used again
     tips: F32  # [I, 3] m, world
     axes: F32  # [I, 3] unit, world, from the shaft to the tip
     pixels: F32  # [I, 2] of the tip in the left picture
@@ -431,20 +431,20 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RungState:
-    """On which rung of the ladder of quality the frames are worked (`mapping.ladder`)."""
+    """The rung of the quality ladder on which frames are processed (`mapping.ladder`)."""
 
     number: int  # 0: the cheapest
     of: int  # how many there are
     reason: str  # why it is that one
     gaussians: int  # at most
-    scale: float  # of the working size, at which the model is drawn and refined
+    scale: float  # share of the working size at which the model is drawn and refined
     depth_every: int  # frames: how often depth is matched
 
 
 class Strained(Protocol):
-    """How tissue is stretched since a moment; see `sags_node.model.strain`."""
+    """The strain of the tissue since a moment; see `sags_node.model.strain`."""
 
-    since_ns: int  # by the clock as it is now
+    since_ns: int  # that moment, by the present clock of the frames
 
     def at(self, gaussians: Gaussians) -> F32:
         """The largest and the smallest principal strain [N, 2] where each Gaussian is; NaN: not known."""
@@ -452,7 +452,7 @@ class Strained(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """One frame's whole story."""
+    """All results of one frame."""
 
     pair: RectifiedPair
     observation: Observation
@@ -463,7 +463,7 @@ class FrameResult:
     skipped: Mapping[str, str] = field(default_factory=dict)  # what was left out, and why
     anchors: AnchorStates = field(default_factory=AnchorStates.none)
     rung: RungState | None = None  # None: fixed steps, no ladder
-    held: str = ""  # why the frame was not taken in, so that the model is that of an older one; empty: it was
+    held: str = ""  # why the frame was not taken in, so the model is of an older one; empty: it was taken in
     hurried: bool = False  # there was no time to measure its depth
     recorded_s: float | None = None  # as `StereoFrame.recorded_s`
     instruments: InstrumentStates | None = None  # None: nobody asked
@@ -477,9 +477,9 @@ class DrawnView:
     eyes: Mapping[str, RenderedView]  # "left" and "right" of a stereo pair, "" of a single view
     baseline: float  # m, of the pair
     depth: bool  # also publish the depth
-    still: bool  # drawn once: sent again to who subscribes later
+    still: bool  # drawn once, and sent again to those who subscribe later
     epoch: int
-    ahead_s: float = 0.0  # it shows where the tissue is expected so long after its frame; 0: where it was
+    ahead_s: float = 0.0  # s; shows where the tissue is expected so long after its frame; 0: where it was
 
 
 @dataclass(frozen=True, slots=True)
@@ -488,7 +488,7 @@ class ViewStatus:
 
     asked_hz: float  # 0: drawn once
     granted_hz: float  # what its share of the machine allows
-    held_hz: float  # drawn over the last seconds
+    held_hz: float  # rate at which it was drawn over the last seconds
     draw_ms: float  # of one drawing; 0 before the first
     limited_by: str  # what keeps it below the rate asked for; empty: nothing
 
@@ -497,9 +497,9 @@ class ViewStatus:
 class ClockStatus:
     """The clock that stamps live pictures, against this machine's wall clock."""
 
-    offset_ms: float  # wall clock - that clock, and the shortest way that pictures take
+    offset_ms: float  # wall clock - that clock, plus the shortest delay of a picture
     drift_ppm: float | None  # how fast the offset grows, us/s; None: it is not known yet
-    seconds: float  # that it was watched
+    seconds: float  # for which it was watched
 
 
 @dataclass(frozen=True, slots=True)
@@ -522,4 +522,4 @@ class NodeHealth:
     rung: RungState | None = None  # None: fixed steps, or no frame yet
     motion: MotionState | None = None  # None: nobody asks for it, or too little is known yet
     clock: ClockStatus | None = None  # None: a recording, or pictures without stamps
-    recording: Mapping[str, object] | None = None  # how the one that was asked for goes; None: none was
+    recording: Mapping[str, object] | None = None  # state of the recording asked for; None: none was

@@ -1,4 +1,4 @@
-"""Threads that read for as long as a program runs: what nobody foresaw ends none of them."""
+"""Threads that read for as long as a program runs: an unforeseen error does not end them."""
 
 import logging
 import threading
@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 log = logging.getLogger(__name__)
 
-PAUSE_S = 1.0  # after an error that nobody foresaw
+PAUSE_S = 1.0  # s, after an unforeseen error
 
 
 def go_on(turn: Callable[[], object], stopping: threading.Event, who: str) -> None:
     """Call `turn` again and again until `stopping` is set, or until it returns False.
 
-    What it raises is logged, at first with where it comes from, and `turn` is called again after a pause: a
-    thread that ended would leave a silence that nothing explains.
+    What it raises is logged, a new error with its traceback, and `turn` is called again after a pause: a
+    thread that ended would leave a silence without an explanation.
     """
     said = ""
     while not stopping.is_set():

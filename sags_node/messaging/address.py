@@ -18,8 +18,8 @@ from sags_node.messaging.security import KeyPair, public_key, read_key_pair
 from sags_node.messaging.sockets import HANDSHAKES, HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS
 
 HANDSHAKE_MS = 5000
-LOOK_S = 0.1  # between looks for a node that is not there
-RETRIES = 3  # failed handshakes in a row, where one alone may be a node that is just starting anew
+LOOK_S = 0.1  # s between looks for a node that is not there
+RETRIES = 3  # failed handshakes in a row that count as a refusal; one alone may be a node that restarts
 
 _HOW = "make a key pair with sags keygen, have its .pub put into publish.allow, give --key (client_keys)"
 
@@ -33,7 +33,7 @@ class ClientKeys:
 
 
 def client_keys(key: Path | str | None, node_key: str | None) -> ClientKeys | None:
-    """The keys that are named: an own `.key` file, and the node's public key or `.pub` file.
+    """Read the client's own `.key` file, and the node's public key (40 characters or a `.pub` file).
 
     Raises:
         UsageError: a file is not what it should be, or the node's key is given without an own one.
@@ -63,15 +63,15 @@ class Clock(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NodeAddress:
-    """Where a sender is: a node, an overlay, a player. A socket that is not given is in the connection
-    file.
+    """Where a sender is: a node, an overlay or a player. A socket that is not given is read from the
+    connection file.
 
     Attributes:
         ns: namespace of its topics, and name of its connection file.
         endpoint: its data socket.
         control: its control socket.
         run_dir: of its connection file; default: the user's own.
-        clock: that stamps what it sends, where that is another machine's.
+        clock: of the sender's machine, which stamps what it sends; None: this machine's clock.
     """
 
     ns: str = "sags"
@@ -85,7 +85,7 @@ class NodeAddress:
         object.__setattr__(self, "ns", self.ns.strip("/"))  # as ROS writes it: /sags
 
     def now_ns(self) -> int:
-        """Return what the clock that stamps what it sends shows now, at the latest."""
+        """Return the latest time (ns) that the sender's clock may show now."""
         return time.time_ns() if self.clock is None else self.clock.latest_ns()
 
     def data(self) -> Address:
@@ -121,7 +121,7 @@ class NodeAddress:
 
 
 def found(find: Callable[[], Address], deadline: float) -> Address:
-    """Wait for a node until `deadline` (monotonic s), while there is none.
+    """Return the address of a node; while there is none, wait for it until `deadline` (s, monotonic).
 
     Raises:
         UsageError: there is one, and it wants other keys.
@@ -138,7 +138,7 @@ def found(find: Callable[[], Address], deadline: float) -> Address:
         time.sleep(LOOK_S)
 
 
-THE_NODE = NodeAddress()  # of this machine, where nothing else is said
+THE_NODE = NodeAddress()  # the default: the node of this machine
 
 
 def _given(endpoint: str, keys: ClientKeys | None) -> Address:
@@ -190,7 +190,7 @@ def connect(socket: zmq.Socket[bytes], address: Address, max_message_bytes: int)
 
 
 class HandshakeWatch:
-    """Why a consumer gets nothing: without it a refused socket is merely silent."""
+    """Watches the handshakes of a consumer's socket: by itself a refused socket is merely silent."""
 
     def __init__(self, socket: zmq.Socket[bytes], address: Address) -> None:
         self._monitor = socket.get_monitor_socket(HANDSHAKES)
@@ -199,8 +199,7 @@ class HandshakeWatch:
         self._last = (0, 0)  # event and value of the last one
 
     def refusal(self) -> str | None:
-        """Return what the node has against this client, and how to fix it; None while nothing speaks against
-        it."""
+        """Return why the node refuses this client, and how to fix it; None: it does not."""
         while self._monitor.poll(0):
             said = recv_monitor_message(self._monitor)
             if said["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED:

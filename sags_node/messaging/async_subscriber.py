@@ -19,8 +19,8 @@ T = TypeVar("T")
 
 
 class AsyncSubscriber(Receiver):
-    """Receives topics in the background; `latest` and `read` give what has come, `wait`, `aligned` and
-    `messages` what is still to come.
+    """Receives topics in the background; `latest` and `read` return what has come; `wait`, `aligned`
+    and `messages` also wait for what is still to come.
 
     Arguments and errors: see `Receiver`. Any number of tasks may wait, in any number of event loops.
     """
@@ -30,7 +30,7 @@ class AsyncSubscriber(Receiver):
     @overload
     async def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None: ...
     async def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None:
-        """The newest message of a topic once there is one newer than `after`; None after `timeout` s."""
+        """Wait for a message newer than `after`, and return the newest one; None after `timeout` s."""
         return await self._until(lambda: self._newer(name, after), timeout)
 
     async def aligned(self, names: Iterable[str], stamp_ns: int, timeout: float = 0.0) -> Frame | None:
@@ -46,7 +46,7 @@ class AsyncSubscriber(Receiver):
     @overload
     def messages(self, name: str, timeout: float = 1.0) -> AsyncIterator[Received]: ...
     async def messages(self, name: str, timeout: float = 1.0) -> AsyncIterator[Received]:
-        """The newest message of a topic, again and again; who is slow misses some and never lags.
+        """Yield the newest message of a topic, again and again. A slow consumer misses some, but never lags.
 
         Raises:
             StaleError: nothing new came for `timeout` seconds, or what came must not be shown as new. The
@@ -59,11 +59,11 @@ class AsyncSubscriber(Receiver):
         raise StaleError(f"{topics.full_name(self._ns, name)} is stale: nothing new for {timeout:g} s")
 
     async def _until(self, find: Callable[[], T | None], timeout: float) -> T | None:
-        """Return what `find` gives, asked anew whenever a message has come."""
+        """Return the first result of `find`, called after each message; None after `timeout` s."""
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
-            with suppress(RuntimeError):  # the loop was closed over a task that still waited
+            with suppress(RuntimeError):  # the loop was closed while a task still waited
                 loop.call_soon_threadsafe(arrived.set)
 
         with self.notified(wake), suppress(TimeoutError):

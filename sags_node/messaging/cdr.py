@@ -35,8 +35,8 @@ COMPRESSED = topics.COMPRESSED_IMAGE
 POSE = "geometry_msgs/msg/PoseStamped"
 NODES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 UINT32_FIELDS = ("id", "id_high")
-PACKED_FIELDS = (*UINT32_FIELDS, "rgb")  # 32-bit words that are no numbers on a scale
-OTHER_IN_ROS1 = {  # types of that name have other fields there
+PACKED_FIELDS = (*UINT32_FIELDS, "rgb")  # 32-bit words that are not numbers on a scale
+OTHER_IN_ROS1 = {  # types whose ROS 1 version has other fields
     "sensor_msgs/msg/Range", "shape_msgs/msg/SolidPrimitive", "visualization_msgs/msg/Marker",
     "visualization_msgs/msg/MarkerArray",
     *(f"visualization_msgs/msg/InteractiveMarker{part}" for part in ("", "Control", "Init", "Update")),
@@ -56,11 +56,11 @@ class Content:
     encoding: str = ""
     shape: tuple[int, ...] = ()
     dtype: DType = ""
-    scale: float = 0.0  # of a thin picture whose numbers are whole; 0: none
-    window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture for one of its own
+    scale: float = 0.0  # size of one step of a thin picture of integers; 0: none
+    window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture per px of its own
     relative: bool = False  # its lengths have no unit
     detail_age_ns: int | None = (
-        None  # of the oldest picture in a view, before its frame; None: the model alone
+        None  # ns from the oldest picture in a view to its frame; None: the model alone
     )
 
     def cdr(self) -> bytes:
@@ -115,7 +115,7 @@ def decode(data: Buffer, type_name: str) -> Any:
 
 
 def from_ros1(raw: bytes, type_name: str) -> bytes:
-    """The CDR of a ROS 1 message; one of a type that is not stock, or another one there, stays as it is.
+    """Convert a ROS 1 message to CDR. A type that is not stock, or differs in ROS 1, stays as it is.
 
     Raises:
         WireError: it is damaged.
@@ -134,7 +134,7 @@ def compressed_image(file: bytes, form: str, header: Any) -> bytes:
 
 
 def file_form(encoding: str, kind: str) -> str:
-    """Return what a JPEG or PNG file (`kind`) is made of, in the words of ROS's compressed_image_transport.
+    """Return the `format` of a JPEG or PNG file (`kind`), as ROS's compressed_image_transport writes it.
 
     `encoding` is that of the picture.
     """
@@ -151,8 +151,8 @@ def thin_picture(
     scale: float,
     window: tuple[int, int, int],
 ) -> Content:
-    """`sensor_msgs/CompressedImage` whose file is a part of its own; `scale` 0: the numbers are meant as they
-    are."""
+    """`sensor_msgs/CompressedImage` whose file is a separate part; `scale` 0: the pixels are not steps of
+    a depth or confidence."""
     form = file_form(encoding, kind)
     message = _ros[COMPRESSED](_header(stamp_ns, frame), form, np.empty(0, np.uint8))
     start = _serialize(message)[:-4]  # without the length of the empty data
@@ -189,7 +189,7 @@ def camera_info(camera: Camera, stamp_ns: int, frame: str = LEFT_FRAME, baseline
 
 
 def uncalibrated(camera_info: bytes) -> bytes:
-    """A `CameraInfo` whose matrices are zero: so ROS says that nobody has calibrated the camera."""
+    """The `CameraInfo` with zero matrices, which is how ROS says that a camera is not calibrated."""
     message = decode(camera_info, topics.CAMERA_INFO)
     zeros = {name: np.zeros_like(getattr(message, name)) for name in "krp"}
     return _serialize(replace(message, **zeros))

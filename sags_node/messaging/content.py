@@ -1,4 +1,4 @@
-"""What each topic says of one frame (`FrameResult`) or of the node (`NodeHealth`)."""
+"""The content of each topic, made from one frame (`FrameResult`) or the node's health (`NodeHealth`)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -65,12 +65,12 @@ def splats(result: FrameResult) -> Content:
     rows[:, 15] = _confidence(gaussians)
     rows[:, 17:20] = 0 if gaussians.slopes is None else gaussians.slopes
     bits = rows.view(np.uint32)
-    bits[:, 14], bits[:, 16] = gaussians.ids & 0xFFFFFFFF, gaussians.ids >> 32  # not 0 after a day or more
+    bits[:, 14], bits[:, 16] = gaussians.ids & 0xFFFFFFFF, gaussians.ids >> 32  # low and high 32 bits
     return cdr.point_cloud(rows, SPLAT_FIELDS, result.pair.t_capture_ns)
 
 
 def gaussians_of(points: NDArray[Any]) -> Gaussians:
-    """Rows [N] of the topic `splats`, by their names. Older nodes send neither confidence nor slopes."""
+    """Convert rows [N] of the topic `splats` to Gaussians. Older nodes send no confidence and no slopes."""
     names = points.dtype.names or ()
 
     def columns(*wanted: str) -> F32:
@@ -145,7 +145,7 @@ def view_topics(name: str, stereo: bool, depth: bool) -> list[str]:
 
 
 def view(name: str, drawn: DrawnView) -> dict[str, Content]:
-    """Return what the topics of a view that a consumer asked for say, by name without the namespace."""
+    """Return the content of a consumer's view, by topic name without the namespace."""
     said = {}
     for eye, shown in drawn.eyes.items():
         topic = f"view/{name}/{eye}/" if eye else f"view/{name}/"
@@ -191,7 +191,7 @@ def _eye(result: FrameResult, side: Side) -> Content:
 
 
 def _confidence(gaussians: Gaussians) -> F32:
-    """[N] 0..1 of the depth of each; NaN: unknown."""
+    """The confidence [N] 0..1 of each Gaussian's depth; NaN: unknown."""
     if gaussians.depth_errors is None:
         return np.full(len(gaussians), np.float32(np.nan))
     return confidence_of(gaussians.depth_errors)
@@ -253,9 +253,9 @@ OF_THE_MODEL = (
 
 
 def tells_of(result: FrameResult, topic: str) -> bool:
-    """Tell whether a frame has something for a topic: there may have been no time to measure its depth,
-    nobody may have looked at its right eye, and nothing of the model belongs to a frame that was not taken
-    in."""
+    """Tell whether a frame has content for a topic. A held frame has none of the model. The depth may not
+    have been measured for lack of time, and the right eye is drawn only while somebody looks at it.
+    """
     if result.held and topic in OF_THE_MODEL:
         return False
     if topic == "right/render/image" and "right" not in result.views:
@@ -276,7 +276,7 @@ def health_fields(health: NodeHealth) -> dict[str, Any]:
 
 
 def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
-    """Do as `health_fields`, and under `last_frame` its loss, counts and what was skipped."""
+    """Return `health_fields`, and under `last_frame` its loss, counts and what was skipped."""
     fields = health_fields(health)
     fields["last_frame"] = (
         {}
@@ -292,8 +292,8 @@ def status(health: NodeHealth, last: FrameResult | None) -> dict[str, Any]:
 
 
 def health_answer(health: NodeHealth) -> dict[str, Any]:
-    """Tell whether the node does its work: frames come and are shown, or it was paused; and what it was asked
-    to record is recorded."""
+    """Return the node's state, its warnings, and whether it is healthy: running or paused, and without a
+    warning of `UNHEALTHY`."""
     codes = list(by_code(health.warnings))
     healthy = health.state in HEALTHY and UNHEALTHY.isdisjoint(codes)
     return {"healthy": healthy, "state": health.state, "warnings": codes}

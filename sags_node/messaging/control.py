@@ -21,25 +21,25 @@ from sags_node.messaging.security import Gate, RateLimitedLog
 from sags_node.messaging.sockets import Closes, waiting
 from sags_node.messaging.wire import PROTOCOL
 
-# As many views as there may be, each moved as often as it is drawn, are 480 a second.
+# The most views there may be, each moved as often as it is drawn, make 480 requests a second.
 RATE = 500.0  # requests/s
 BURST = 300  # at once: all anchors and views there may be, and some more
 FORGET_ABOVE = 1000  # clients remembered, before those with a full bucket are forgotten
 
 MAX_REQUEST_BYTES = 65536  # per part
-MAX_UNANSWERED_BYTES = 4 << 20  # one peer may have sent; more than its high-water mark can hold
+MAX_UNANSWERED_BYTES = 4 << 20  # of one peer that may wait; more than its high-water mark can hold
 MAX_REPLY_BYTES = 1 << 20
 MAX_REQUEST_PARTS = 4  # identity, the empty delimiter of REQ, the request
 MAX_REQUESTS_AT_ONCE = 32  # so that a flood cannot keep the publishing thread from its frames
 MAX_PENDING = 64
-MAX_PENDING_OF_ONE = MAX_PENDING // 2  # client, so that the others are still answered
+MAX_PENDING_OF_ONE = MAX_PENDING // 2  # of one client, so that the others are still answered
 RECEIVE_HIGH_WATER = 8  # requests one peer may have waiting
 SEND_HIGH_WATER = 2 * MAX_REQUESTS_AT_ONCE  # answers, before a peer that does not read loses some
 HERE = ("ipc:", "tcp://127.", "tcp://localhost", "tcp://[::1]")  # endpoints of this machine
-LOOK_MS = 100  # how soon a client notices that its node is another one
+LOOK_MS = 100  # after which a client notices that its node was restarted
 TOO_LATE = "it was not begun in the time that its sender waits, and is not done"
-ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls who has no key
-PLAIN = Client("a client without a key")  # it came in all the same, so it may do everything
+ANONYMOUS = "anonymous"  # what ZeroMQ's authenticator calls a peer without a key
+PLAIN = Client("a client without a key")  # it was let in without one, so it may do everything
 
 Handler = Callable[[dict[str, Any]], Any]
 Identifier = int | Annotated[str, msgspec.Meta(max_length=128)] | None
@@ -52,14 +52,14 @@ class Request(msgspec.Struct, frozen=True):
     id: Identifier
     op: Annotated[str, msgspec.Meta(max_length=64)]
     args: dict[str, Any] = msgspec.field(default_factory=dict)
-    # For how long it is waited for: what has not begun by then is not done any more. By the wall clock, too,
-    # where that is the same one: a node that was stopped for a while does not know how long.
+    # How long its sender waits. A request that has not begun by then is not carried out. On the same machine
+    # also by the wall clock: a node whose process was stopped does not know for how long.
     within_s: float | None = None
     until_ns: int | None = None
 
     @property
     def left(self) -> float:
-        """s that are left for it now."""
+        """The time in which it must begin, s from now."""
         left = inf if self.until_ns is None else (self.until_ns - time.time_ns()) * 1e-9
         return left if self.within_s is None else min(left, self.within_s)
 
@@ -77,7 +77,7 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
 def refused(
     identifier: Identifier, error: str, code: str | None = None, retry_after_s: float | None = None
 ) -> Reply:
-    """Say why a request is not carried out."""
+    """Make the reply that says why a request is not carried out."""
     return Reply(PROTOCOL, identifier, False, None, error, code, retry_after_s)
 
 
@@ -87,11 +87,11 @@ _BAD_BYTES = (msgspec.MsgspecError, UnicodeError, RecursionError, TypeError, Val
 
 @dataclass(frozen=True, slots=True)
 class _Sender:
-    """Who asks.
+    """The sender of a request.
 
     Attributes:
-        envelope: what leads back to it.
-        id: its key, or where it has none its connection.
+        envelope: the frames that route an answer back to it.
+        id: its key, or its connection if it has no key.
         client: None: its key was taken off the list a moment ago.
     """
 
@@ -107,11 +107,11 @@ class ControlServer:
     A `SagsError` it raises is the answer; anything else is answered as an internal error and logged.
 
     Args:
-        read: what has arrived, so many messages and parts of each at most; default: `sockets.waiting`.
-        gate: who came through it with which key.
+        read: returns what has arrived, given the most messages and parts of each; default: `sockets.waiting`.
+        gate: tells which client has a key.
 
     Attributes:
-        refused: requests that were not looked at further, by why.
+        refused: number of refused requests, by reason.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class ControlServer:
 
     @property
     def pending(self) -> bool:
-        """True while a future's answer is owed."""
+        """Tell whether the answer of a future is still to be sent."""
         return bool(self._pending)
 
     def serve(self) -> None:
@@ -174,7 +174,7 @@ class ControlServer:
         self._answer(sender, request.id, lambda: handler(request.args), time.monotonic() + request.left)
 
     def _refusal(self, sender: _Sender, request: Request) -> Reply | None:
-        """Return what speaks against a request, before it is looked at further."""
+        """Return the reply to a request that must not be carried out; None: it may be."""
         wait = self._rate.wait(sender.id)
         if wait:
             self._count("requests_too_often", sender, request.op)
@@ -225,14 +225,14 @@ class ControlServer:
         body = msgspec.msgpack.encode(reply)
         try:
             self._socket.send_multipart([*sender.envelope, body], zmq.NOBLOCK)
-        except zmq.ZMQError as error:  # the peer is gone or does not read: its loss
+        except zmq.ZMQError as error:  # the peer is gone or does not read: its own loss
             log.debug("a reply was not sent: %s", error)
 
 
 class ControlClient(Closes):
     """Asks the node; one request at a time, from one thread.
 
-    A node that is restarted is followed, to another port, too, when it was found by its connection file.
+    It follows a node that is restarted, also to another port if it was found by its connection file.
 
     Args:
         endpoint: of the ROUTER socket; default: from the connection file of `ns`.
@@ -256,27 +256,27 @@ class ControlClient(Closes):
 
     @classmethod
     def at(cls, node: NodeAddress) -> Self:
-        """Asks this node; see the class."""
+        """Make a client of this node; see the class."""
         return cls(node.control, node.ns, node.run_dir, node.keys)
 
     @property
     def endpoint(self) -> str:
-        """Find where the node is, or was when it was last asked."""
+        """The endpoint of the node, as of the last request."""
         return self._address.endpoint
 
     def request(self, op: str, args: Mapping[str, Any] | None = None, timeout: float = 2.0) -> Any:
-        """The result of an operation. It is asked for once: what may have been done is not repeated. What the
-        node has not begun within `timeout` it does not do any more.
+        """Request an operation and return its result. A request that may have been carried out is not
+        repeated. The node does not begin it after `timeout` s.
 
         Raises:
-            SagsError: the node refused (its own words), refuses this client altogether, is another one before
-                it answered, or did not answer within `timeout` seconds.
+            SagsError: the node refused the request (in its words) or this client, was restarted before it
+                answered, or did not answer within `timeout` seconds.
             UsageError: it cannot be sent, or the node wants keys that are not given, or the other way round.
         """
         deadline, until_ns = time.monotonic() + timeout, time.time_ns() + round(timeout * 1e9)
         silence = f"no answer from {self.endpoint} in {timeout:g} s; is the node running?"
         self._follow(deadline)
-        while not self._socket.poll(LOOK_MS, zmq.POLLOUT):  # nothing is left waiting for a node to come
+        while not self._socket.poll(LOOK_MS, zmq.POLLOUT):  # queue none for an absent node
             if (refusal := self._watch.refusal()) is not None or time.monotonic() > deadline:
                 raise SagsError(refusal or silence)
             self._follow(deadline)
@@ -285,7 +285,7 @@ class ControlClient(Closes):
         asked = Request(PROTOCOL, self._last_id, op, dict(args or {}), timeout, until_ns if is_here else None)
         try:
             request = msgspec.msgpack.encode(asked)
-        except (OverflowError, TypeError, UnicodeError) as error:  # more than 64 bits, half a letter
+        except (OverflowError, TypeError, UnicodeError) as error:  # more than 64 bits, a lone surrogate
             raise UsageError(f"{op}: what is asked cannot be sent: {error}") from None
         self._socket.send(request, zmq.NOBLOCK)
         while (left := deadline - time.monotonic()) > 0:
@@ -297,9 +297,9 @@ class ControlClient(Closes):
                 reply = msgspec.msgpack.decode(self._socket.recv(), type=Reply)
             except _BAD_BYTES:
                 continue
-            if reply.id == self._last_id:  # an earlier one came too late for its own request
+            if reply.id == self._last_id:  # else: of an earlier one
                 wait = reply.retry_after_s
-                if wait is not None and time.monotonic() + wait < deadline:  # it was not even looked at
+                if wait is not None and time.monotonic() + wait < deadline:  # it was not carried out
                     time.sleep(max(0.0, wait))
                     self._socket.send(request, zmq.NOBLOCK)
                     continue
@@ -341,9 +341,9 @@ class ControlClient(Closes):
 
 
 class RequestRate:
-    """The requests that each client may send: a bucket of tokens that fills again at a steady rate.
+    """Limits the requests of each client by a token bucket that fills again at a steady rate.
 
-    Each is full at first. Of each one number is kept: when it will be full again (GCRA, ITU-T I.371).
+    Each bucket is full at first. Only the time when it will be full again is kept (GCRA, ITU-T I.371).
 
     Args:
         clock: s.
@@ -356,7 +356,7 @@ class RequestRate:
         self._full: dict[bytes, float] = {}  # by client: when its bucket is full again
 
     def wait(self, client: bytes) -> float:
-        """Take a token; 0. Where there is none: s until there is one."""
+        """Take a token and return 0. If there is none, return the time until there is one, s."""
         now = self._clock()
         full = max(now, self._full.get(client, now)) + 1 / self._rate
         wait = full - now - self._burst / self._rate

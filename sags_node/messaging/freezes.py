@@ -1,13 +1,13 @@
-"""Moments at which a picture stood still at whoever shows it, as WebRTC counts them: an interval of at least
-three times the mean of those before, and 150 ms more than it (W3C, "Identifiers for WebRTC's Statistics API",
+"""Freezes of a picture that is being shown, as WebRTC counts them: an interval of at least three times the
+mean of those before, and at least 150 ms more than it (W3C, "Identifiers for WebRTC's Statistics API",
 `freezeCount`)."""
 
 from collections import deque
 from collections.abc import Iterable
 
-WINDOW = 30  # intervals behind the mean
+WINDOW = 30  # intervals in the mean
 LONGER = 3.0  # times the mean
-MORE = 0.15  # s
+MORE = 0.15  # s more than the mean
 
 
 class Freezes:
@@ -25,7 +25,7 @@ class Freezes:
         self._intervals: deque[float] = deque(maxlen=WINDOW)
 
     def add(self, now: float) -> None:
-        """A picture was shown, s of any clock that only goes forward."""
+        """Note that a picture was shown at `now`, s of any monotonic clock."""
         before, self._last = self._last, now
         if before is None:
             return
@@ -38,7 +38,7 @@ class Freezes:
         self._intervals.append(interval)
 
     def status(self) -> dict[str, float]:
-        """As it stands in figures."""
+        """The figures for a status message."""
         return {"count": self.count, "seconds": round(self.seconds, 3)}
 
 

@@ -1,4 +1,4 @@
-"""Is what one topic shows new enough to be believed? Pure bookkeeping of stamps and sequence numbers."""
+"""Tell whether a topic's content is new enough to be shown, from stamps and sequence numbers alone."""
 
 import time
 from collections import deque
@@ -9,15 +9,15 @@ from statistics import median
 from sags_node.errors import SagsError
 from sags_node.messaging.wire import Meta
 
-WINDOW = 20  # messages behind the period and the rate
-STALE_PERIODS = 10
+WINDOW = 20  # messages from which the period and the rate are computed
+STALE_PERIODS = 10  # an age of more periods is too old
 STALE_AFTER = 0.5  # s, at most, for content that shows a frame; a grasper pulls tissue 10 mm meanwhile
 MIN_RATE = 0.9  # of what the sender sends, or of the declared rate
-ENOUGH = 6  # messages that tell the period
-UNKNOWN_PERIOD = 0.1  # s, at most, until so many have come: who begins slowly must not be believed for long
-SESSIONS = 8  # of nodes that another one followed; each start of a node has a new one
+ENOUGH = 6  # messages from which the period is known
+UNKNOWN_PERIOD = 0.1  # s, the longest period assumed until then: a slow start must not allow old content
+SESSIONS = 8  # remembered, of earlier nodes; each start of a node has a new one
 TWO_NODES = "two nodes send under this name; stop one of them, or give it another ns"
-MAX_CLOCK_AHEAD = 1.0  # s; beyond it an age says nothing
+MAX_CLOCK_AHEAD = 1.0  # s; of a stamp that is further ahead, the age says nothing
 
 
 class StaleError(SagsError):
@@ -29,8 +29,8 @@ class Freshness:
 
     Args:
         rate_hz: what the topic must keep; default: every message that its sender sends.
-        periodic: False for a topic that speaks only when something changes: it cannot be too old.
-        clock: s, that nobody sets. Stamps tell nothing of a silence where they are ahead.
+        periodic: False for a topic that sends only when something changes: it cannot be too old.
+        clock: monotonic, s. It measures silence, which stamps that are ahead would hide.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Freshness:
         self._came = 0.0  # when the last message did
         self._window: deque[Meta] = deque(maxlen=WINDOW)
         self._followed: deque[str] = deque(maxlen=SESSIONS)
-        self._mixed = 0  # messages of one node that are due until it is believed to be the only one
+        self._mixed = 0  # messages of one node still needed until it counts as the only one
 
     def accept(self, meta: Meta) -> bool:
         """Note a message; False when it is not newer than the last one (a last value sent again)."""
@@ -54,7 +54,7 @@ class Freshness:
                 return False
             self.lost += meta.seq - last.seq - 1
         if last is not None and meta.session != last.session:
-            if meta.session in self._followed:  # a node that was started anew never comes back
+            if meta.session in self._followed:  # a restarted node has a new session: the old one still sends
                 self._mixed = WINDOW
             self._followed.append(last.session)
         elif self._mixed:
@@ -67,7 +67,7 @@ class Freshness:
 
     @property
     def is_mixed(self) -> bool:
-        """A node that another one had followed came back."""
+        """Tell whether two nodes send: one came back after another had followed it."""
         return self._mixed > 0
 
     @property
@@ -83,7 +83,7 @@ class Freshness:
 
     @property
     def rate(self) -> float:
-        """Messages that came over messages due, in the window."""
+        """The share of the messages due that came, in the window."""
         if len(self._window) < 2:
             return 1.0
         first, last = self._window[0], self._window[-1]

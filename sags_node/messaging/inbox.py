@@ -1,7 +1,7 @@
-"""A socket that takes in what other programs hand over, in the form of `wire`, and tells them what is wrong.
+"""A socket that receives messages of other programs in the format of `wire`, and tells them what is wrong.
 
 A sender connects with DEALER, and sends messages as the node itself publishes them. Once a second it gets a
-`wire.Receipt`. Nobody is waited for: of what came too fast the newest is taken.
+`wire.Receipt`. The socket waits for nobody: of messages that come too fast the newest are taken.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_PART_BYTES = 64 << 20  # a picture of 4096 x 4096 px, 4 bytes each
-MAX_UNTAKEN_BYTES = 4 * MAX_PART_BYTES  # that a peer may have sent and we not read
+MAX_UNTAKEN_BYTES = 4 * MAX_PART_BYTES  # of a peer that may wait unread
 RECEIVE_HIGH_WATER = 8  # messages of a sender that wait in the socket
 SEND_HIGH_WATER = 4
 MOST_AT_ONCE = 64  # messages read in one go
-POLL_MS = 100  # how soon the thread notices that it should end
+POLL_MS = 100  # after which the thread notices that it should end
 RECEIPT_S = 1.0
-FORGOTTEN_S = 10.0  # a sender that is silent for so long
-ALONE_S = 1.0  # after one's last message another may send the same
+FORGOTTEN_S = 10.0  # of silence, after which a sender is forgotten
+ALONE_S = 1.0  # after a program's last message, until another one may send the same
 
 Take = Callable[[Message, int], None]
 
@@ -60,7 +60,7 @@ class _Sender:
     refused: int = 0
     overtaken: int = 0
     problem: str | None = None
-    second: float = -inf  # when it last sent what another one does, too
+    second: float = -inf  # when it last sent what another program sends, too
 
 
 class Inbox:
@@ -69,12 +69,12 @@ class Inbox:
     Args:
         endpoint: to bind.
         config: who may send.
-        section: of the launch file that both stand in.
-        take: called with each message and its arrival (wall clock, ns); what it refuses it raises as
-            `SagsError`, which the sender gets.
-        advice: what else its sender gets; None: nothing.
-        newest: of each topic so many messages are taken from what waits; 0: all.
-        about: what a message is about that only one program may send at a time. The second one is refused,
+        section: of the launch file that holds both.
+        take: called with each message and its arrival (wall clock, ns). It raises `SagsError` for what it
+            refuses; the sender gets the text.
+        advice: returns what a sender is told if nothing was refused; None: nothing.
+        newest: how many waiting messages of each topic are taken, the newest ones; 0: all.
+        about: returns what in a message only one program may send at a time. A second program is refused,
             and both are told.
 
     Raises:
@@ -98,8 +98,8 @@ class Inbox:
         self._about = about
         self._senders: dict[bytes, _Sender] = {}
         self._holders: dict[str, _Holder] = {}
-        self._two = "", -ALONE_S  # what two programs sent, and when the second one last did
-        self._refused = "", -ALONE_S  # why something was, and when
+        self._two = "", -ALONE_S  # what is said of two equal senders, and when the second last sent
+        self._refused = "", -ALONE_S  # why a message was refused, and when
         self._seldom = RateLimitedLog()
         self._stopping = threading.Event()
         self._resources = ExitStack()
@@ -123,7 +123,7 @@ class Inbox:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Return what is wrong with who sends, and how to fix it. May be read from any thread."""
+        """What is wrong with the senders, and how to fix it. May be read from any thread."""
         for code, (said, when) in (("two_senders", self._two), ("sent_refused", self._refused)):
             if time.monotonic() - when < 2 * ALONE_S:
                 return (Finding(code, said),)
@@ -152,11 +152,11 @@ class Inbox:
         self._tell()
 
     def _refuse_second(self, sender: _Sender, session: str, things: tuple[str, ...]) -> None:
-        """Of two programs that send the same the second one is refused in all: the eyes of both must not
-        become a pair.
+        """Refuse all messages of the second of two programs that send the same: pictures of both must not
+        become a stereo pair.
 
         Raises:
-            SagsError: it is one.
+            SagsError: this is the second program.
         """
         now = time.monotonic()
         for thing in things:
@@ -170,7 +170,7 @@ class Inbox:
             raise SagsError(f"{self._two[0]}; the other's is taken")
 
     def _waiting(self) -> list[tuple[_Sender, Message, int]]:
-        """Return what has come, in its order; of each sender's topics the newest."""
+        """Return the messages that have come, in order; only the newest of each sender and topic."""
         came: list[tuple[_Sender, Message, int]] = []
         for identity, *frames in self._peers.waiting(MOST_AT_ONCE, wire.MAX_PARTS + 1):
             arrival_ns = time.time_ns()
@@ -219,5 +219,5 @@ class Inbox:
                 )
                 try:
                     self._socket.send_multipart([identity, msgspec.msgpack.encode(receipt)], zmq.NOBLOCK)
-                except zmq.ZMQError as error:  # it is gone or does not read: its loss
+                except zmq.ZMQError as error:  # the sender is gone or does not read: its own loss
                     log.debug("a receipt was not sent: %s", error)

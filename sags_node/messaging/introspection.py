@@ -1,4 +1,4 @@
-"""What `sags topic` finds: what a node publishes, in the words of `ros2 topic`.
+"""What a node publishes, for `sags topic`, in the terms of `ros2 topic`.
 
 Each function gives plain dictionaries that JSON can hold.
 """
@@ -43,7 +43,7 @@ class _Sample:
 
 
 def topic_list(node: NodeAddress = THE_NODE, seconds: float = 3.0) -> list[Record]:
-    """Every topic of the contract, a node's or an overlay's, and others that were heard in `seconds`.
+    """List all topics that a node (or an overlay) may publish, and others heard within `seconds`.
 
     `messages` and `mean_bytes` are 0 where nothing came; `rate_hz` is None where too little came to tell.
 
@@ -66,11 +66,11 @@ def topic_list(node: NodeAddress = THE_NODE, seconds: float = 3.0) -> list[Recor
 
 
 def _listed(heard: set[str]) -> list[topics.Topic]:
-    """Return what the sender of these topics may send: only an overlay has nothing but an overlay's
-    topics."""
+    """Return the topics that the sender of `heard` may send. It is an overlay if all of them are an
+    overlay's."""
     of_overlay = heard <= {topic.name for topic in topics.OVERLAY_TOPICS}
     listed = {topic.name: topic for topic in (topics.OVERLAY_TOPICS if of_overlay else topics.TOPICS)}
-    for name in sorted(heard - set(listed)):  # views, a clock; not what no contract knows
+    for name in sorted(heard - set(listed)):  # views and a clock; unknown topics are left out
         if (topic := topics.find(name)) is not None:
             listed[name] = topic
     return list(listed.values())
@@ -83,10 +83,10 @@ def topic_echo(
     count: int | None = None,
     warned: Callable[[Mapping[str, str]], object] = lambda warnings: None,
 ) -> Iterator[Record]:
-    """Each message of one or some topics: who, when, and its content (arrays as their range).
+    """Yield each message of one or more topics: its stamps, and its content (arrays as their range).
 
     Args:
-        warned: called with all that the sender's `status` warns of, code -> text, whenever one comes.
+        warned: called with the warnings (code -> text) of each `status` of the sender.
 
     Raises:
         UsageError: there is no such topic.
@@ -99,7 +99,7 @@ def topic_echo(
     for arrived in listen_to(node, [*asked, "status"], seconds):
         received = None if arrived is None else interpret(*arrived)
         if received is not None and received.topic == status:
-            assert isinstance(received, ReceivedText)  # so says its topic
+            assert isinstance(received, ReceivedText)
             warned(received.warnings())
             if "status" not in (topics.plain_name(node.ns, name) for name in asked):
                 received = None
@@ -116,7 +116,7 @@ def topic_echo(
 
 
 def topic_info(name: str, node: NodeAddress = THE_NODE, seconds: float = 1.0) -> Record:
-    """Return what a topic is by the contract, and what was heard of it in `seconds`.
+    """Return the definition of a topic, and what was heard of it within `seconds`.
 
     Raises:
         UsageError: there is no such topic.
@@ -206,7 +206,7 @@ def _heard(names: Sequence[str], node: NodeAddress, seconds: float) -> dict[str,
 
 
 def _without_resent(name: str, samples: list[_Sample]) -> list[_Sample]:
-    """The last value that a cached topic sends again to a new subscriber says nothing of its rate."""
+    """Leave out the value that a cached topic sends to each new subscriber: it says nothing of the rate."""
     topic = topics.find(name)
     return samples[1:] if topic is not None and topic.cached else samples
 
@@ -223,7 +223,7 @@ def _silence(topic: str, node: NodeAddress, seconds: float) -> SagsError:
 def _echo(received: Received) -> Record:
     meta: Record = msgspec.to_builtins(received.meta)
     kept = ("type", "seq", "frame_id", "stamp_ns", "epoch", "step", "dropped")
-    where_present = ("ahead_ns", "detail_age_ns", "recorded_s", "units")  # else it is what a camera saw, in m
+    where_present = ("ahead_ns", "detail_age_ns", "recorded_s", "units")  # else: seen by a camera, in m
     return {
         "topic": received.topic,
         **{key: meta[key] for key in (*kept, *where_present) if key in meta},
@@ -252,7 +252,7 @@ def _content(received: Received) -> Any:
 
 
 def _fields(pairs: list[tuple[str, Any]]) -> Record:
-    """Without a message's type and constants: the fields of ROS messages are in lower case."""
+    """The fields of a ROS message, which are in lower case, without its type and constants."""
     return {key: value for key, value in pairs if key[0].islower()}
 
 

@@ -1,4 +1,4 @@
-"""What anchors measure on tissue: a distance, a path, an area, with the error that follows from the anchors'.
+"""Measure a distance, a path or an area on tissue by anchors, with the error that follows from theirs.
 
 with Subscriber(MEASURING) as subscriber:
     newest = subscriber.wait(ANCHORS, timeout=3.0)
@@ -29,8 +29,8 @@ POSE = TopicName("tf", ReceivedRos)
 INFO = TopicName("left/camera_info", ReceivedCameraInfo)
 MEASURING = (ANCHORS, POSE, INFO)
 
-# Of the picture's width. Nine of ten anchors that are seen lie nearer to their point in the picture: 0.7 to
-# 1.4 px of 640 (`off_by_px` in benchmarks/results/tracking_*.json).
+# Share of the picture's width. Nine of ten visible anchors are nearer than this to their point in the
+# picture: 0.7 to 1.4 px of 640 (`off_by_px` in benchmarks/results/tracking_*.json).
 SIDEWAYS = 1.5 / 640
 NORMAL = 1.645  # standard deviations of a normal distribution, within which nine of ten lie
 
@@ -41,7 +41,7 @@ class Measured:
 
     Attributes:
         value: m, or m2 of an area; None: an anchor is lost, or there is none of that number.
-        error: nine of ten are smaller, as of a depth's confidence; a standard deviation is `error / NORMAL`.
+        error: nine of ten real ones are smaller, as for a depth; the standard deviation is `error / NORMAL`.
             None: not known.
         unsure: why it must not be shown as sure; None: nothing speaks against it.
         metric: False: the node has no calibration, and the value no unit.
@@ -53,9 +53,9 @@ class Measured:
     metric: bool = True
 
     def stretch(self, reference: Measured) -> tuple[float, float] | None:
-        """The ratio to an earlier value, and its error; None where one of both has none.
+        """The ratio to an earlier value, and its error; None where either lacks a value or an error.
 
-        The errors of both are taken to be independent. What is wrong in both in the same way makes it better.
+        Both errors are assumed independent. An error that is the same in both makes the real one smaller.
         """
         if not self.value or not reference.value or self.error is None or reference.error is None:
             return None
@@ -64,7 +64,7 @@ class Measured:
 
 
 def check_numbers(numbers: Sequence[int], area: bool) -> None:
-    """Tell whether something can be measured between anchors of these numbers.
+    """Check that something can be measured between anchors of these numbers.
 
     Raises:
         UsageError: too few, or the same one where it makes no sense.
@@ -80,16 +80,16 @@ def check_numbers(numbers: Sequence[int], area: bool) -> None:
 
 
 def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measured:
-    """The length of the way along anchors, of two their distance; or the area of the polygon of anchors.
+    """Measure the length of the path along anchors (of two: their distance), or the area of their polygon.
 
-    Each anchor is moved by its errors, in depth along its ray and sideways, and what that changes is added
-    in squares. Errors in depth are alike where the calibration is wrong, and independent where matches are:
-    the larger of both sums counts.
+    Each anchor is moved by its error in depth along its ray, and sideways. The changes of the value are added
+    in quadrature. Depth errors are common to all anchors where the calibration is wrong, and independent
+    where matches are wrong: the larger of both sums counts.
 
     Args:
         frame: the messages `MEASURING` of one frame.
         numbers: of the anchors, in order.
-        area: of a polygon that is not flat, that of its shadow on its mean plane (Newell's).
+        area: measure the area; of a polygon that is not flat, of its projection on its mean plane (Newell).
 
     Raises:
         UsageError: see `check_numbers`.
@@ -116,13 +116,13 @@ def measure(frame: Frame, numbers: Sequence[int], area: bool = False) -> Measure
 def measured(
     states: AnchorStates, camera: Camera, numbers: Sequence[int], area: bool = False, metric: bool = True
 ) -> Measured:
-    """Do as `measure`, of the anchors of a frame and the left camera that sees them."""
+    """Measure as `measure` does, from the anchors of a frame and its left camera."""
     check_numbers(numbers, area)
     rows = {int(number): row for row, number in enumerate(states.ids)}
     if missing := [number for number in numbers if number not in rows]:
         listed = ", ".join(map(str, missing))
         return Measured(None, None, f"there is no anchor {listed}", metric)
-    distinct = list(dict.fromkeys(numbers))  # a way may come back to an anchor, which errs once
+    distinct = list(dict.fromkeys(numbers))  # a path may return to an anchor, whose error counts once
     order = [distinct.index(number) for number in numbers]
     chosen = [rows[number] for number in distinct]
     points = states.points[chosen].astype(np.float64)
@@ -156,7 +156,7 @@ def measured(
 
 
 def length_of(points: F64) -> float:
-    """The length of the way along points [N, 3]."""
+    """The length of the path along points [N, 3]."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
@@ -167,7 +167,7 @@ def area_of(points: F64) -> float:
 
 
 def _error(of: Callable[[F64], float], points: F64, depth_errors: F64, camera: Camera) -> float:
-    """The error of what `of` says of the points [N, 3], whose depths have these errors [N] (m)."""
+    """The error of the value `of(points)`, for points [N, 3] whose depths have these errors [N] (m)."""
     T_world_cam = camera.T_world_cam
     depths = transform(invert(T_world_cam), points)[:, 2]
     along = (points - T_world_cam[:3, 3]) * (depth_errors / depths)[:, None]
@@ -178,7 +178,7 @@ def _error(of: Callable[[F64], float], points: F64, depth_errors: F64, camera: C
         return max(abs(of(points + moves) - value), abs(of(points - moves) - value))
 
     def each(moves: F64) -> float:
-        """One anchor at a time, added in squares."""
+        """The changes by moving one anchor at a time, added in quadrature."""
         return math.hypot(*(change(one) for one in np.eye(len(points))[:, :, None] * moves))
 
     sideways = math.hypot(*(each(beside[:, None] * T_world_cam[:3, axis]) for axis in (0, 1)))

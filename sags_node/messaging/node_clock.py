@@ -19,10 +19,10 @@ from sags_node.messaging.sockets import Closes
 from sags_node.workers import go_on
 
 DRIFT = 500e-6  # s/s between two clocks, at most: NTP slews by no more (RFC 5905), quartz drifts by a tenth
-PERIOD = 1.0  # s between two looks
-EXCHANGES = 8  # of a look: where delays vary some are short, and only short ones tell much
+PERIOD = 1.0  # s between two rounds of exchanges
+EXCHANGES = 8  # in a round: where delays vary, some are short, and only those give tight bounds
 PATIENCE = 1.0  # s for an answer
-KNOWN_FOR = 5.0  # s since the last answer: a clock that was set since would not be noticed
+KNOWN_FOR = 5.0  # s after the last answer; later, a clock may have been set unnoticed
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +45,10 @@ class Exchange(NamedTuple):
 class OffsetEstimate:
     """The offset that agrees with every exchange.
 
-    A message takes time, so an exchange says: the offset is at least `answered - came` and at most
-    `received - asked`. Nothing is assumed of how the way there and the way back share the delay. What was
-    found gets less sure with time, by `DRIFT`; what each exchange leaves of it is kept. Where nothing is
-    left, one of the clocks was set: the newest exchange alone counts then.
+    A message takes time, so each exchange bounds the offset: it is at least `answered - came` and at most
+    `received - asked`. Nothing is assumed about how the delay divides between both ways. The interval is
+    widened with time, by `DRIFT`, and intersected with that of each new exchange. If the intersection is
+    empty, one of the clocks was set, and only the newest exchange counts.
 
     Attributes:
         jumps: how often a clock was set.
@@ -57,10 +57,10 @@ class OffsetEstimate:
     def __init__(self) -> None:
         self.jumps = 0
         self._between: tuple[float, float] | None = None  # s
-        self._at = 0.0  # s, when that was true
+        self._at = 0.0  # s, when `_between` held
 
     def add(self, exchange: Exchange, now: float) -> None:
-        """Take one in that was made `now`, s of a clock that is never set."""
+        """Add an exchange that was made at `now`, s of a monotonic clock."""
         asked, received, answered, came = exchange
         low, high = 1e-9 * (answered - came), 1e-9 * (received - asked)
         if low > high:  # a clock was set meanwhile
@@ -117,7 +117,7 @@ class NodeClock(Closes):
 
     @classmethod
     def at(cls, node: NodeAddress) -> Self:
-        """Follows the clock of this node; see the class."""
+        """Follow the clock of this node; see the class."""
         return cls(node.control, node.ns, node.run_dir, node.keys)
 
     @property
@@ -141,13 +141,13 @@ class NodeClock(Closes):
             return self._estimate.jumps
 
     def latest_ns(self) -> int:
-        """Return what the node's clock shows now at the latest, so that no age is given too young. Where the
-        offset is not known, what the clock here shows."""
+        """Return the latest time (ns) that the node's clock may show now, so that no age is underestimated.
+        If the offset is not known, return the time here."""
         offset = self.offset
         return time.time_ns() + (0 if offset is None else round(1e9 * (offset.seconds + offset.bound)))
 
     def status(self) -> dict[str, Any]:
-        """Give for a status message: `offset_ms`, `bound_ms`, `jumps`, `problem`."""
+        """Return for a status message: `offset_ms`, `bound_ms`, `jumps`, `problem`."""
         offset = self.offset
         return {
             "offset_ms": None if offset is None else round(1e3 * offset.seconds, 3),
@@ -186,14 +186,14 @@ def stamps() -> dict[str, int]:
 
 
 def exchange(ask: Callable[[], Any]) -> Exchange:
-    """One question and its answer.
+    """Ask once, and return the four stamps.
 
     Raises:
         SagsError: no answer came, or it holds no stamps.
     """
     asked, began = time.time_ns(), time.monotonic_ns()
     answer = ask()
-    came = asked + time.monotonic_ns() - began  # also where the clock here is set meanwhile
+    came = asked + time.monotonic_ns() - began  # right even if the clock here is set meanwhile
     try:
         received, answered = int(answer["received_ns"]), int(answer["answered_ns"])
     except (KeyError, TypeError, ValueError, OverflowError):

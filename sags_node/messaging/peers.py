@@ -1,4 +1,4 @@
-"""Who is connected to a bound socket, from ZeroMQ's socket monitor: counted, capped, and expelled."""
+"""The peers of a bound socket, from ZeroMQ's socket monitor: counted, limited in number, and expelled."""
 
 import ctypes
 import logging
@@ -21,7 +21,7 @@ from sags_node.workers import go_on
 MAX_PEERS = 64  # of one socket; ZeroMQ has no such limit of its own
 SMALL_TALK = 1024  # bytes per second that a peer may send besides its messages: heartbeats
 QUARANTINE = 2.0  # s without new tcp peers after a flood; its sender would be back at once
-CHECK_MS = 20  # how soon a flood is seen
+CHECK_MS = 20  # between checks for a flood
 MAX_EVENTS_AT_ONCE = 1000
 
 _ADDRESS_BYTES = 16  # of sockaddr_in
@@ -33,14 +33,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class _Peer:
-    connection: sockets.socket  # a duplicate, so that its descriptor cannot pass on to another peer
+    connection: sockets.socket  # a duplicate, so that its descriptor is not reused for another peer
     since: float
     taken: int = 0  # bytes of its messages that the node has read
     expelled: bool = False
 
     @property
     def is_local(self) -> bool:
-        """Tell whether it came by ipc, so that it is a process of the same user."""
+        """Tell whether it is connected by ipc, and so is a process of the same user."""
         return self.connection.family == sockets.AF_UNIX
 
     @property
@@ -55,15 +55,15 @@ class _Peer:
 class Peers:
     """Follows the connections of one bound socket, from a thread of its own.
 
-    libzmq takes in subscriptions on the thread that uses the socket and does not come back while they keep
-    coming, so that thread could not stop a flood.
+    libzmq reads subscriptions on the thread that uses the socket, and does not return while they keep coming.
+    So that thread could not stop a flood.
 
     Args:
         socket: not yet bound.
         name: of the socket, for the log.
         max_untaken: bytes a tcp peer may have sent beyond what `waiting` has read. This bounds what ZeroMQ
             itself does not: the number of parts of a message, and of subscriptions.
-        revocations: when it grows all tcp peers are cut off. Those who may come in are back at once.
+        revocations: how often keys were revoked. When it grows, all tcp peers must connect anew.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Peers:
         self._thread.start()
 
     def counts(self) -> dict[str, int]:
-        """Connections that are open, and that were refused since the start, some of those by reason.
+        """The numbers of open connections, and of those refused since the start, some by reason.
 
         `refused` also holds a connection that is in the middle of its handshake; `flooding` counts peers that
         were expelled for sending too much, `too_many` those expelled for want of room or just after a flood.
@@ -103,14 +103,14 @@ class Peers:
         }
 
     def waiting(self, most: int, most_parts: int) -> Iterator[list[zmq.Frame]]:
-        """Read the messages that have arrived, as `sockets.waiting`, and note of whom."""
+        """Read the messages that have arrived, as `sockets.waiting`, and count the bytes of each peer."""
         for frames in waiting(self._socket, most, most_parts):
             if (peer := self._open.get(int(frames[-1].get(zmq.SRCFD)))) is not None:
                 peer.taken += sum(len(frame) for frame in frames)
             yield frames
 
     def close(self) -> None:
-        """End the thread; before the socket is closed, on its thread."""
+        """End the thread. To be called before the socket is closed, on the socket's thread."""
         self._socket.disable_monitor()  # first: libzmq waits for a reader when many events have gathered
         self._stopping.set()
         self._thread.join()
@@ -139,7 +139,7 @@ class Peers:
                 self._closed_until = now + QUARANTINE
 
     def _expel_all(self) -> None:
-        """Nothing tells which key a connection came with: each has to show it anew."""
+        """Cut off all tcp peers. Nothing tells which key each one used, so all must authenticate again."""
         for peer in self._open.values():
             if not peer.expelled and not peer.is_local:
                 self._expel(peer, "renewed")

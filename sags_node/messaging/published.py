@@ -1,7 +1,7 @@
-"""What is seen of a frame from outside has one size on every machine, whatever size it is worked at.
+"""What is published of a frame has the same size on every machine, whatever the working size.
 
-Here, and nowhere else, what was worked out becomes what is published. Depths, confidences and masks are those
-of the nearest working pixel: a mean across an edge is a surface that does not exist.
+Only this module converts from the working to the published size. Depths, confidences and masks are those of
+the nearest working pixel: a mean across an edge would be a surface that does not exist.
 """
 
 from dataclasses import replace
@@ -23,14 +23,14 @@ def size_of(pair: RectifiedPair) -> tuple[int, int]:
 
 
 def camera_of(pair: RectifiedPair) -> Camera:
-    """The left eye, as it is published."""
+    """The left camera at the published size."""
     if pair.published is None:
         return pair.camera
     return replace(pair.published.camera, T_world_cam=pair.camera.T_world_cam)
 
 
 def picture(pair: RectifiedPair, side: Side) -> U8:
-    """The rectified picture [H, W, 3] of an eye that is there: from the camera's own, so none is enlarged."""
+    """The rectified picture [H, W, 3] of an eye that exists, made from the raw one instead of enlarged."""
     if pair.published is not None:
         return pair.published.picture(side)
     shown = pair.left if side == "left" else pair.right
@@ -39,7 +39,7 @@ def picture(pair: RectifiedPair, side: Side) -> U8:
 
 
 def nearest(pair: RectifiedPair, plane: Plane) -> Plane:
-    """Depth, confidence or mask [h, w] of the working size, as [H, W]."""
+    """Resize a depth, confidence or mask [h, w] of the working size to the published one [H, W]."""
     if pair.published is None:
         return plane
     values = plane.view(np.uint8) if plane.dtype == np.bool_ else plane
@@ -48,15 +48,15 @@ def nearest(pair: RectifiedPair, plane: Plane) -> Plane:
 
 
 def colours(view: RenderedView, size: tuple[int, int]) -> U8:
-    """Return what a view shows in a size of width and height, px, [H, W, 3] RGB: with the detail of pictures,
-    where it has it."""
+    """Return the colours [H, W, 3] RGB of a view at `size` (width, height; px), with the detail of pictures
+    if it was made at that size."""
     if view.shown is not None and view.shown.rgb.shape[1::-1] == size:
         return view.shown.rgb
     return view.colours.at(*size)
 
 
 def alpha(view: RenderedView, size: tuple[int, int]) -> F32:
-    """Its coverage in that size, by the model or a picture, [H, W] 0..1."""
+    """The coverage [H, W] 0..1 of a view at `size` (width, height; px), by the model or a picture."""
     drawn = view.alpha
     if drawn.shape[::-1] != size:
         drawn = np.asarray(cv2.resize(drawn, size, interpolation=cv2.INTER_LINEAR))
@@ -71,7 +71,7 @@ def detail_age_ns(view: RenderedView) -> int | None:
 
 
 def view(pair: RectifiedPair, drawn: RenderedView) -> RenderedView:
-    """All of a view of the frame, in arrays of its own."""
+    """The view of a frame at the published size. Its depth is a copy, which may be written."""
     size, sure, camera = size_of(pair), drawn.confidence, camera_of(pair)
     return replace(
         drawn,
@@ -84,7 +84,7 @@ def view(pair: RectifiedPair, drawn: RenderedView) -> RenderedView:
 
 
 def anchors(pair: RectifiedPair, states: AnchorStates) -> AnchorStates:
-    """Anchors with the pixels in which they are published."""
+    """The anchors with their pixels at the published size."""
     if pair.published is None:
         return states
     ahead = states.ahead
@@ -94,7 +94,7 @@ def anchors(pair: RectifiedPair, states: AnchorStates) -> AnchorStates:
 
 
 def pixels(pair: RectifiedPair, places: F32) -> F32:
-    """Places [N, 2] of the working size, in the published one."""
+    """Convert pixels [N, 2] of the working size to the published one."""
     if pair.published is None:
         return places
     return scale_pixels(places, (pair.camera.width, pair.camera.height), size_of(pair)).astype(np.float32)

@@ -32,20 +32,20 @@ SEND_HIGH_WATER = 2 * len(topics.TOPICS)
 MAX_SUBSCRIPTIONS_AT_ONCE = 200
 MAX_SUBSCRIPTION_BYTES = 512  # also the longest step of a CURVE handshake
 MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers them until the peer goes
-MAX_PREFIXES = 1024  # noted: a view may be subscribed to before it is opened, so any name may come
-SUBSCRIPTIONS_HIGH_WATER = 64  # that one peer may have waiting
+MAX_PREFIXES = 1024  # at most noted: a view may be subscribed to before it is opened, so any name may come
+SUBSCRIPTIONS_HIGH_WATER = 64  # messages of one peer that may wait
 MAX_THIN = 8  # thin pictures made at once, as many as views
-MAX_THIN_NAME = 120  # bytes; a longer one is none, and is not answered
-PENDING_POLL_MS = 10  # how soon the result of a handler's future is looked for
+MAX_THIN_NAME = 120  # characters; a longer name gets no answer
+PENDING_POLL_MS = 10  # between looks for the result of a handler's future
 EARLY_PICTURE = "left/image_rect_color"
-LOOK_SECONDS = 1.0  # between looks whether a client can still find this node
-ENOUGH_FILES = 512  # open at once: 64 peers of two sockets take 256
+LOOK_SECONDS = 1.0  # between checks that clients can still find this node
+ENOUGH_FILES = 512  # files open at once: 64 peers of two sockets take 256
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """What is sent of a topic, once or again for those who subscribe later."""
+    """The value of a topic: sent once, and if it is kept, again to those who subscribe later."""
 
     body: Content
     stamp_ns: int
@@ -64,7 +64,7 @@ class Publisher(Closes):
         handlers: control op -> function of its args, see `control.ControlServer`; `ping` is always there.
         offered: what may be subscribed to, beside views.
         thins: whether somebody makes the thin pictures of `thin`.
-        recording: what is played here by `sags bag play`; None: this is a node.
+        recording: what `sags bag play` plays here; None: this is a node.
         metric: False: lengths have no unit, as nobody has calibrated the eyes; every message says so.
 
     Attributes:
@@ -96,12 +96,12 @@ class Publisher(Closes):
         }
         self._seq = dict.fromkeys((t.name for t in self._names.values()), 0)
         self._subscribed: set[str] = set()  # prefixes, only those of our topics and of views
-        self._any_view = False  # more views were subscribed to than are noted: each one may be meant
+        self._any_view = False  # more view topics were subscribed to than are noted: any view may be wanted
         self.thin: Mapping[str, topics.ThinPicture] = {}
         self._thins = thins
         self._recording = recording
         self._metric = metric
-        self._thin_seq = self._view_seq = 0  # where the numbers of the next one begin
+        self._thin_seq = self._view_seq = 0  # where the `seq` of the next one begins
         self._last: FrameResult | None = None
         self._dropped = 0
         self._pictured = -1  # the newest frame whose picture went before its result
@@ -131,7 +131,7 @@ class Publisher(Closes):
         self._watch("data", self._data, MAX_SUBSCRIPTIONS_BYTES, gate)
         self._data.setsockopt(
             zmq.XPUB_VERBOSE, 1
-        )  # each new peer's subscription is seen: the last values are due
+        )  # reports the subscription of every new peer, which then gets the last values
         endpoints = [bind(self._data, self._run.ipc_endpoint, "publish.ipc", keys)] if config.ipc else []
         option = "publish.data" if self._recording is None else "--endpoint"
         endpoints += [bind(self._data, endpoint, option, keys) for endpoint in config.data]
@@ -161,15 +161,15 @@ class Publisher(Closes):
 
     @property
     def connections(self) -> dict[str, dict[str, int]]:
-        """The connections of each socket: connections open and refused, see `Peers.counts`; of the control
-        socket also requests that were refused."""
+        """The numbers of connections of each socket, open and refused (`Peers.counts`); of the control socket
+        also of refused requests."""
         counts = {name: peers.counts() for name, peers in self._peers.items()}
         if self._control is not None:
             counts["control"] |= self._control.refused
         return counts
 
     def start_anew(self, session: str) -> None:
-        """Go on as a node that was started anew: nobody gets again what the one before said."""
+        """Go on as a newly started node: last values of the session before are not sent again."""
         self.session = session
         self._kept.clear()
 
@@ -207,7 +207,7 @@ class Publisher(Closes):
     def publish_content(
         self, name: str, body: Content, frame_id: int, stamp_ns: int, epoch: int, ahead_ns: int = 0
     ) -> None:
-        """Send what was made elsewhere, e.g. recorded; the topic `name` (without namespace) may be any."""
+        """Send content made elsewhere, e.g. recorded, on any topic `name` (without namespace)."""
         self._seq[name] = self._seq.get(name, 0) + 1
         topic, value = topics.find(name), _Value(body, stamp_ns, frame_id, epoch, ahead_ns)
         if topic is not None and topic.cached:
@@ -219,14 +219,14 @@ class Publisher(Closes):
         shown, ahead_ns = next(iter(drawn.eyes.values())), round(drawn.ahead_s * 1e9)
         said = content.view(name, drawn)
         for topic in [kept for kept in self._kept if kept.startswith(f"view/{name}/") and kept not in said]:
-            del self._kept[topic]  # of when it was opened with another eye, or with depth
+            del self._kept[topic]  # from before the view was opened anew with other eyes or without depth
         for topic, body in said.items():
             self._seq[topic] = self._seq.get(topic, self._view_seq) + 1
             value = _Value(body, shown.t_capture_ns, shown.frame_id, drawn.epoch, ahead_ns)
             if drawn.still or body.type == topics.CAMERA_INFO:
                 self._kept[topic] = value
             else:
-                self._kept.pop(topic, None)  # of when it was drawn once
+                self._kept.pop(topic, None)  # from when it was drawn only once
             if self.wanted(topic):
                 self._send(topic, value)
 
@@ -237,7 +237,7 @@ class Publisher(Closes):
             self.publish_content(name, pictures[name], pair.frame_id, pair.t_capture_ns, result.epoch)
 
     def forget_view(self, name: str) -> None:
-        """Nothing is sent again of a view that was closed, and its numbers do not come again."""
+        """Forget the last values of a closed view. No `seq` of it is used again."""
         for topic in [topic for topic in self._seq if topic.startswith(f"view/{name}/")]:
             self._view_seq = max(self._view_seq, self._seq.pop(topic))
             self._kept.pop(topic, None)
@@ -255,7 +255,7 @@ class Publisher(Closes):
         return noted or (self._any_view and name.startswith("view/"))
 
     def looked_at(self, picture: str) -> bool:
-        """True while somebody subscribes to that topic, or to a thin form of it."""
+        """Tell whether somebody subscribes to the topic `picture`, or to a thin form of it."""
         return self.wanted(picture) or any(thin.topic == picture for thin in self.thin.values())
 
     def _publish_text(self, name: str, text: Content, stamp_ns: int) -> None:
@@ -340,7 +340,7 @@ class Publisher(Closes):
                     self._send_frame_topic(name)
 
     def _subscription(self, message: bytes, resend: set[str]) -> None:
-        """`\\x01prefix` subscribes and `\\x00prefix` ends it; anything else is a stranger's noise."""
+        """`\\x01prefix` subscribes and `\\x00prefix` ends it; anything else is ignored."""
         try:
             prefix = message[1:].decode()
         except UnicodeError:
@@ -364,9 +364,9 @@ class Publisher(Closes):
             self._subscribed.discard(prefix)
 
     def _thin_subscription(self, name: str, begins: bool) -> None:
-        """Who asks for what cannot be made gets the reason on that very topic."""
+        """Begin or end a thin picture. If it cannot be made, the reason is sent on its topic."""
         if not begins:
-            if name in self.thin:  # any number of names may come and go, and a number must not come again
+            if name in self.thin:  # names come and go without limit, and no `seq` may be used again
                 self.thin = {asked: thin for asked, thin in self.thin.items() if asked != name}
                 self._thin_seq = max(self._thin_seq, self._seq.pop(name))
             return
@@ -386,7 +386,7 @@ class Publisher(Closes):
             self._seq.setdefault(name, self._thin_seq)
 
     def _stay_findable(self) -> None:
-        """Put back what somebody has removed from the run directory; who is connected stays so."""
+        """Put back what somebody has removed from the run directory. Connected peers stay connected."""
         if time.monotonic() < self._next_look:
             return
         self._next_look = time.monotonic() + LOOK_SECONDS

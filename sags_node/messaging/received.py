@@ -1,4 +1,4 @@
-"""What a subscriber gets: each message as a typed value over the received memory."""
+"""Received messages as typed values, which are views of the received memory."""
 
 import time
 from dataclasses import dataclass, field
@@ -45,7 +45,7 @@ class Received:
         return b"".join(self.parts)
 
     def ros(self) -> bytes:
-        """The message for readers that are told no `units`: a camera that nobody has calibrated says so."""
+        """The message for readers without `meta`: the CameraInfo of an uncalibrated camera says so itself."""
         return told_in_ros(self.meta, self.cdr())
 
 
@@ -71,7 +71,7 @@ class ReceivedCompressed(Received):
 
     @property
     def window(self) -> tuple[int, int, int]:
-        """x and y of its first pixel in the whole picture, and how many px of that are one of this."""
+        """The x and y of its first pixel in the whole picture, and px of that per px of this one."""
         x, y, every = self.meta.window or (0, 0, 1)
         return x, y, every
 
@@ -138,7 +138,7 @@ _KINDS: dict[str, type[Received]] = {
 
 
 def told_in_ros(meta: Meta, data: bytes) -> bytes:
-    """The CDR of a message for readers that get nothing of `meta`, see `Received.ros`."""
+    """The CDR of a message for readers that do not get `meta`, see `Received.ros`."""
     guessed = meta.type == topics.CAMERA_INFO and meta.units is not msgspec.UNSET
     return cdr.uncalibrated(data) if guessed else data
 
@@ -173,7 +173,7 @@ class Frame(dict[str, Received]):
 
 
 def interpret(message: Message, received_ns: int) -> Received:
-    """The typed value of a message from anybody.
+    """Convert a message from any sender to its typed value.
 
     Raises:
         WireError: content and description do not fit, or the type is not one of this protocol.
@@ -183,7 +183,7 @@ def interpret(message: Message, received_ns: int) -> Received:
     if kind == topics.IMAGE:
         return ReceivedImage(*head, array=_image(message))
     if kind == topics.COMPRESSED_IMAGE:
-        message.array()  # is there, and as long as it is said to be
+        message.array()  # raises unless it is there, and as long as `meta` claims
         return ReceivedCompressed(*head)
     if kind == topics.POINT_CLOUD:
         return ReceivedCloud(*head, points=_records(message))

@@ -1,4 +1,4 @@
-"""What the control operations of consumers take as `args`, checked."""
+"""The `args` of the control operations that consumers ask for, and their checks."""
 
 import math
 from collections.abc import Mapping
@@ -16,8 +16,8 @@ MAX_VIEW_SIDE = 1920  # px
 MAX_VIEW_PIXELS = 1920 * 1200  # of each eye
 MAX_VIEW_HZ = 60.0
 MAX_AHEAD_MS = 1000.0
-MAX_MEASURED = 256  # anchors: the mapping thread does it
-LARGEST = 1e6  # px or m: float32 and its squares bear it
+MAX_MEASURED = 256  # anchors at once: the mapping thread measures them
+LARGEST = 1e6  # px or m: float32 can hold it and its square
 MAX_DISTANCE = 10.0  # m from the world's origin or the left camera
 
 Row = tuple[float, ...]
@@ -37,25 +37,25 @@ class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     x: float | None = None  # m
     y: float | None = None
     z: float | None = None
-    ahead_ms: AheadMs = 0.0  # say also where it is expected so much later; auto: when it is published
+    ahead_ms: AheadMs = 0.0  # also publish where it is expected so much later; auto: at publication
 
     def __post_init__(self) -> None:
         given = {name for name in "uvxyz" if getattr(self, name) is not None}
         if given not in ({"u", "v"}, {"x", "y", "z"}):
             raise ValueError("give either a pixel {u, v} of the left picture or a point {x, y, z} in metres")
-        if not all(abs(getattr(self, name)) <= LARGEST for name in given):  # nor is NaN
+        if not all(abs(getattr(self, name)) <= LARGEST for name in given):  # refuses NaN, too
             raise ValueError(f"{', '.join(sorted(given))} must be finite, and no more than {LARGEST:g}")
 
 
 class AnchorName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`remove_anchor`."""
+    """`remove_anchor`: an anchor by its id."""
 
     id: int
-    session: str | None = None  # that pinned it; in another one the number is somebody else's
+    session: str | None = None  # that pinned it; in another session the id is another anchor's
 
 
 class MeasureRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`measure`: the anchors along a way, or around an area."""
+    """`measure`: the anchors along a path, or around an area."""
 
     anchors: Annotated[tuple[int, ...], msgspec.Meta(max_length=MAX_MEASURED)]
     area: bool = False
@@ -74,7 +74,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Annotated[float, msgspec.Meta(gt=0, le=MAX_VIEW_HZ)] = 10.0
     depth: bool = False
     static: bool = False  # draw once
-    stereo: bool = False  # and the right eye, at the rig's baseline
+    stereo: bool = False  # also draw the right eye, at the rig's baseline
     ahead_ms: AheadMs = 0.0  # draw the tissue where it is expected so much later; auto: when it is drawn
     show: Literal["tissue", "strain"] = "tissue"  # in its own colours, or in those of its strain
 
@@ -91,7 +91,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         self.intrinsics()
 
     def pose(self) -> F64:
-        """[4, 4] m: `T_world_cam`, or else `T_left_cam`."""
+        """The pose [4, 4] (m): `T_world_cam`, or else `T_left_cam`."""
         rows = self.T_world_cam if self.T_world_cam is not None else self.T_left_cam
         if rows is None:
             return np.eye(4)
@@ -104,7 +104,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return T
 
     def intrinsics(self) -> F64 | None:
-        """[3, 3] px; None: those of the left camera."""
+        """The intrinsics [3, 3] (px); None: those of the left camera."""
         if self.fov is not None:
             focal = 0.5 * self.width / math.tan(math.radians(0.5 * self.fov))
             centre = 0.5 * (self.width - 1), 0.5 * (self.height - 1)
@@ -121,7 +121,7 @@ class ViewRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ViewName(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`close_view`."""
+    """`close_view`: a view by its name."""
 
     name: Name
 
@@ -142,6 +142,6 @@ def _matrix(rows: tuple[Row, ...], size: int, name: str) -> F64:
     if len(rows) != size or any(len(row) != size for row in rows):
         raise ValueError(f"{name} must be {size} rows of {size} numbers")
     matrix = np.array(rows, np.float64)
-    if not (np.abs(matrix) <= LARGEST).all():  # nor is NaN
+    if not (np.abs(matrix) <= LARGEST).all():  # refuses NaN, too
         raise ValueError(f"{name} must be finite, and no more than {LARGEST:g}")
     return matrix

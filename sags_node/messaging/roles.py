@@ -1,6 +1,6 @@
-"""What a client may ask of the node, by the role of its key: the name of the folder of its `.pub` file.
+"""What a client may ask of the node, by the role of its key: the name of its `.pub` file's folder.
 
-Data may be had in every role. Each role may also do what those before it may.
+Every role may receive data. Each role may also do what those before it may.
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ _OPERATIONS: dict[Role, frozenset[str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """Who has a key.
+    """A client that has a key.
 
     Attributes:
-        name: of its file.
+        name: of the key's file.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Client:
 
     @property
     def rank(self) -> int:
-        """The place of its role: 0 may do the least."""
+        """The index of its role in `ROLES`: 0 may do the least."""
         return ROLES.index(self.role)
 
     def may(self, op: str) -> bool:
@@ -50,6 +50,6 @@ def needed(op: str) -> Role:
 
 
 def client_of(file: Path) -> Client:
-    """Whose key a `.pub` file holds, by its place."""
+    """The client whose key is in a `.pub` file, with the role by the file's folder."""
     folder = file.absolute().parent.name.lower()
     return Client(file.stem, next((role for role in ROLES if role == folder), ALL))

@@ -36,7 +36,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     data: list[str]  # XPUB endpoints, the quickest first
     control: str | None
     public_key: str | None = None  # Z85; set when the tcp endpoints speak CURVE
-    recording: str | None = None  # what `sags bag play` plays there; no node
+    recording: str | None = None  # what `sags bag play` plays there, instead of a node
 
 
 def default_run_dir() -> Path:
@@ -105,7 +105,7 @@ class RunDirectory:
             return False
 
     def take_again(self) -> None:
-        """Make the directory anew and lock the place in it, where they have gone.
+        """Make the directory and the locked file again, if they were removed.
 
         Raises:
             SagsError: another node has taken the place meanwhile.
@@ -118,7 +118,7 @@ class RunDirectory:
 
     @property
     def ipc_endpoint(self) -> str:
-        """Find where to bind the ipc socket.
+        """The endpoint to bind the ipc socket to.
 
         Raises:
             UsageError: the path is too long for a Unix socket.
@@ -149,7 +149,7 @@ def connection_path(folder: Path, ns: str) -> Path:
 
 
 def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
-    """Find where the node named `ns` on this machine is.
+    """Return how to reach the node named `ns` on this machine.
 
     Raises:
         UsageError: others may have written the file.
@@ -172,8 +172,8 @@ def read_connection(ns: str, run_dir: Path | None = None) -> Connection:
 
 
 def _check_ours(path: Path, info: os.stat_result, linked_by: int) -> None:
-    """Raises UsageError for what somebody else, but for root, may have written: anybody can make a folder in
-    /tmp, or a link, and say there that a node of his own is the one that is looked for."""
+    """Raise UsageError for what anybody but this user or root may have written. Anybody can make a folder or
+    a link in /tmp, and name his own node there."""
     if not {info.st_uid, linked_by} <= {os.getuid(), 0} or info.st_mode & 0o022:
         raise UsageError(
             f"{path} is not yours alone, so it is not believed where the node is; say it (--endpoint and "

@@ -35,7 +35,7 @@ KEY_CHARACTERS = 40  # a CURVE key in Z85
 MAX_KEY_FILE_BYTES = 4096
 MAX_ALLOWED = 1000
 ZAP_DOMAIN = b"sags"  # set on plain sockets too: libzmq then refuses peers of the old protocols 1 and 2
-LOOK_AGAIN = 1.0  # s, for keys that were added or removed
+LOOK_AGAIN = 1.0  # s between checks for keys that were added or removed
 LOG_PERIOD = 10.0  # s between two lines about refused connections
 
 log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ def write_key_pair(folder: Path, name: str) -> tuple[Path, Path]:
     with writing(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     with whole(secret_file, new=True) as secret_part, whole(public_file, new=True) as public_part:
-        secret_part.touch(0o600)  # never with a moment in which others can read it
+        secret_part.touch(0o600)  # from the start, so that others can never read it
         secret_part.write_text(private, encoding="ascii")
         public_part.write_text(shared, encoding="ascii")
     return secret_file, public_file
@@ -180,10 +180,10 @@ _OPEN = {
 
 
 def check_endpoint(endpoint: str, config: Guarded, section: str = "publish") -> None:
-    """Refuse to listen where other machines can reach, unless only listed keys get in.
+    """Refuse an endpoint that other machines can reach, unless it needs listed keys or is `insecure`.
 
     Args:
-        section: of the launch file that `config` is, for the message.
+        section: of the launch file, from which `config` is; for the message.
 
     Raises:
         UsageError: not tcp or ipc, or not loopback while neither keys are set nor `insecure`.
@@ -218,13 +218,13 @@ def is_loopback(host: str) -> bool:
 
 
 class RateLimitedLog:
-    """Logs at most once in `LOG_PERIOD`, so that no stranger fills the log."""
+    """Limits log lines to one per `LOG_PERIOD`, so that no stranger can fill the log."""
 
     def __init__(self) -> None:
         self._next = 0.0
 
     def due(self) -> bool:
-        """True at most once in that time."""
+        """Tell whether a line may be logged now: at most once per `LOG_PERIOD`."""
         now = time.monotonic()
         if now < self._next:
             return False
@@ -233,10 +233,10 @@ class RateLimitedLog:
 
 
 class AllowList:
-    """The keys that may come in, as their files are now; used from several threads.
+    """The keys that may connect, by their files as they are now; used from several threads.
 
-    A file that is added or removed counts within `LOOK_AGAIN` s. While it is read anew a file that cannot be
-    used lets nobody in, and keeps nobody else out.
+    A file that is added or removed takes effect within `LOOK_AGAIN` s. A file that cannot be used then lets
+    nobody in, and does not affect the other files.
 
     Raises:
         UsageError: at the start, as `read_allow_list`.
@@ -252,7 +252,7 @@ class AllowList:
         self._seldom = RateLimitedLog()
 
     def callback(self, domain: str, key: bytes) -> bool:
-        """Answers the authenticator whether a key may come in."""
+        """Tell the authenticator whether a key may connect."""
         self._look()
         if key not in self._allowed and self._seldom.due():
             log.warning(
@@ -261,7 +261,7 @@ class AllowList:
         return key in self._allowed
 
     def client(self, key: bytes) -> Client | None:
-        """Whose key it is, as it was at the last look."""
+        """The client that has this key, as of the last look at the files; None: it is not on the list."""
         return self._allowed.get(key)
 
     def revocations(self) -> int:
@@ -289,7 +289,7 @@ class AllowList:
 
 
 def _versions(places: Sequence[Path], section: str) -> dict[Path, tuple[int, int]]:
-    """The files of an allow list, and what changes when one is written."""
+    """The files of an allow list, with what changes when one is written: mtime (ns) and inode."""
     found = {}
     for file in _files(places, section):
         with suppress(OSError):  # it has just gone
@@ -306,7 +306,7 @@ def _usable(files: Iterable[Path]) -> Iterator[tuple[bytes, Client]]:
 
 
 def _files(places: Sequence[Path], section: str) -> list[Path]:
-    """Those of `publish` also in the folders of roles; who hands pictures or poses in has none."""
+    """The key files. Only `publish` has folders of roles; senders of pictures or poses have no role."""
     within = ("", *ROLES) if section == "publish" else ("",)
     files: list[Path] = []
     for place in places:
@@ -319,12 +319,12 @@ def _files(places: Sequence[Path], section: str) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Who gets through to bound sockets.
+    """Who may connect to bound sockets.
 
     Attributes:
-        keys: the node's; None: everybody who reaches them does.
-        revocations: how often keys were taken off the list. Who is in must show a key anew then.
-        client: whose public key that is; None: it is not on the list.
+        keys: the node's; None: everybody who reaches the sockets may connect.
+        revocations: how often keys were taken off the list. Connected peers must then authenticate again.
+        client: returns whose public key that is; None: it is not on the list.
     """
 
     keys: KeyPair | None = None
@@ -336,10 +336,10 @@ class Gate:
 def authenticated(
     context: zmq.Context[zmq.Socket[bytes]], config: Guarded, section: str = "publish"
 ) -> Iterator[Gate]:
-    """With `key` only the keys of `allow` are let in.
+    """Authenticate peers during the block: where `key` is set, only the keys of `allow` are let in.
 
     Args:
-        section: of the launch file that `config` is, for messages.
+        section: of the launch file, from which `config` is; for messages.
 
     Raises:
         UsageError: a key file is missing, damaged or open to others, or nobody is allowed.

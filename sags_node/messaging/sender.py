@@ -1,4 +1,4 @@
-"""Handing pictures and poses to a node, from a simulator or any program that holds them.
+"""Send pictures and poses to a node, from a simulator or any program that has them.
 
 with FrameSender() as sender:
     sender.send(left, right)  # [H, W, 3] uint8 RGB
@@ -30,18 +30,18 @@ log = logging.getLogger(__name__)
 
 Picture = NDArray[Any] | bytes  # [H, W] or [H, W, C] uint8; or the bytes of a JPEG or PNG file
 MAX_RECEIPT_BYTES = 1 << 16
-CONNECT_MS = 500  # longest wait for a node, when a sender is made: its first picture is not left out then
-SILENT = 3.0  # s without a receipt, of which one comes each second
+CONNECT_MS = 500  # longest wait for the node when a sender is made, so that the first picture is not left out
+SILENT = 3.0  # s without a receipt, after which no node is there; one comes each second
 
 
 class Sender(Closes):
     """Sends to a node without ever waiting: what does not fit into the queue is left out and counted.
 
-    Used from one thread. A node that is away or restarted gets what is sent from then on. Only the making of
-    a sender waits for it, up to `CONNECT_MS`.
+    Used from one thread. A node that was away or restarted gets what is sent after it is back. Only the
+    constructor waits for it, up to `CONNECT_MS`.
 
     Attributes:
-        receipt: the node's last words; None before the first, which comes after a second.
+        receipt: the last one of the node; None before the first, which comes after a second.
         left_out: messages that did not fit.
 
     Args:
@@ -54,7 +54,7 @@ class Sender(Closes):
     """
 
     _queued: int  # messages that may wait for the network
-    _key: str  # of the launch file: with `push` the node takes what is sent
+    _key: str  # of the launch file, which must be `push` for the node to take what is sent
 
     def __init__(self, endpoint: str, ns: str, keys: ClientKeys | None) -> None:
         self.receipt: Receipt | None = None
@@ -64,11 +64,11 @@ class Sender(Closes):
         self._session = uuid.uuid4().hex
         self._seq: Counter[str] = Counter()
         self._said: str | None = None
-        self._unanswered: float | None = None  # since when (monotonic) it was sent without a receipt
+        self._unanswered: float | None = None  # s, monotonic: since when no receipt has come
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.SNDHWM, self._queued)
-        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # nothing waits for a node that is away: it would come late
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # queue nothing for an absent node: it would be late
         try:
             self._watch = connect(self._socket, Address(endpoint, keys), MAX_RECEIPT_BYTES)
         except SagsError:
@@ -78,7 +78,7 @@ class Sender(Closes):
 
     @property
     def problem(self) -> str | None:
-        """Return what the node has against what is sent, or that it is not there; None: all is well."""
+        """The node's objection to what is sent, or that no node is there; None: all is well."""
         self._listen()
         if (refusal := self._watch.refusal()) is not None:
             return refusal
@@ -113,7 +113,7 @@ class Sender(Closes):
             self._unanswered = None
 
     def _complain(self) -> None:
-        """Each problem once in the log, when it begins."""
+        """Log each problem once, when it begins."""
         problem = self.problem
         if problem is not None and problem != self._said:
             log.warning("%s: %s", self._endpoint, problem)
@@ -137,7 +137,7 @@ class FrameSender(Sender):
     def send(
         self, left: Picture, right: Picture, stamp_ns: int | None = None, encoding: str | None = None
     ) -> bool:
-        """Both eyes' pictures of one moment; False when one of them was left out.
+        """Send both eyes' pictures of one moment; return False when one of them was left out.
 
         Args:
             stamp_ns: when they were taken, wall clock (`time.time_ns`); default: now.
@@ -154,13 +154,13 @@ class FrameSender(Sender):
     def send_eye(
         self, eye: Literal["left", "right"], picture: Picture, stamp_ns: int, encoding: str | None = None
     ) -> bool:
-        """One eye's picture: for eyes that two programs hold. Stamps say which belong together."""
+        """Send one eye's picture, where each eye has its own program. Their stamps say which form a pair."""
         return self._send_picture(eye, picture, stamp_ns, encoding)
 
     def send_side_by_side(
         self, picture: Picture, stamp_ns: int | None = None, encoding: str | None = None
     ) -> bool:
-        """One picture of both eyes, the left one in its left half; see `send`."""
+        """Send one picture of both eyes, the left one in its left half; see `send`."""
         return self._send_picture("stereo", picture, stamp_ns, encoding)
 
     def _send_picture(self, whose: str, picture: Picture, stamp_ns: int | None, encoding: str | None) -> bool:
@@ -190,11 +190,11 @@ class PoseSender(Sender):
         super().__init__(endpoint, ns, keys)
 
     def send(self, T_base_hand: F64, stamp_ns: int | None = None, topic: str = "pose") -> bool:
-        """Tell where what carries the camera was at a moment, [4, 4], m.
+        """Send the pose [4, 4] (m), at one moment, of the robot's part that carries the camera.
 
         Args:
             stamp_ns: wall clock (`time.time_ns`); default: now.
-            topic: of one of the node's `robot.tools`, whose tip was there.
+            topic: default: the camera's; that of one of the node's `robot.tools` sends the pose of its tip.
 
         Raises:
             ValueError: it is no rotation and translation; the quaternion on the wire would hide that.

@@ -10,16 +10,16 @@ import zmq
 from sags_node.errors import SagsError
 from sags_node.messaging.security import ZAP_DOMAIN, KeyPair
 
-OWN_SOCKETS = "'publish.data:=[tcp://127.0.0.1:*]' 'publish.control:=tcp://127.0.0.1:*'"  # of one more node
+OWN_SOCKETS = "'publish.data:=[tcp://127.0.0.1:*]' 'publish.control:=tcp://127.0.0.1:*'"  # of a second node
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 2000, 6000
-RECEIVE_BUFFER = 16384  # bytes in the kernel, which an expelled peer still gets read
+RECEIVE_BUFFER = 16384  # bytes in the kernel; those of an expelled peer are still read
 HANDSHAKES = (  # events of a socket's monitor
     zmq.EVENT_HANDSHAKE_SUCCEEDED
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
-HANDSHAKE_MS = 3000  # a peer that has not made itself known by then is cut off
+HANDSHAKE_MS = 3000  # a peer that has not finished its handshake by then is cut off
 
 
 class Closes:
@@ -82,8 +82,8 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, option: str, keys: KeyPair | 
 
 
 def waiting(socket: zmq.Socket[bytes], most: int, most_parts: int) -> Iterator[list[zmq.Frame]]:
-    """Read the messages that have arrived, at most `most` of them, so that no peer keeps the reader; their
-    parts as in `receive_frames`."""
+    """Read the messages that have arrived, at most `most` of them, so that no peer occupies the reader.
+    `most_parts` is the limit of `receive_frames`."""
     for _ in range(most):
         try:
             yield receive_frames(socket, most_parts)
@@ -92,7 +92,7 @@ def waiting(socket: zmq.Socket[bytes], most: int, most_parts: int) -> Iterator[l
 
 
 def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:
-    """The next message, without waiting; of more than `most` parts one is kept and the rest thrown away.
+    """The next message, without waiting. Of the parts beyond `most` only the last one is kept.
 
     Raises:
         zmq.Again: nothing has arrived.

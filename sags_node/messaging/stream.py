@@ -14,7 +14,7 @@ from sags_node.messaging.sockets import receive_frames
 
 MAX_MESSAGE_BYTES = 128 << 20  # of one part: a 4096 x 4096 picture of 8 bytes a pixel
 RECEIVE_HIGH_WATER = 32
-POLL_MS = 100  # how soon a reader notices that it should end
+POLL_MS = 100  # after which a reader notices that it should end
 
 
 def check_topic(name: str) -> topics.Topic:
@@ -37,7 +37,7 @@ def check_topic(name: str) -> topics.Topic:
 def data_socket(
     address: Address, prefixes: Sequence[str], high_water: int = RECEIVE_HIGH_WATER
 ) -> Iterator[tuple[zmq.Socket[bytes], HandshakeWatch]]:
-    """A SUB socket for every topic that begins with one of `prefixes`, and what a node has against it.
+    """Open a SUB socket for every topic that begins with one of `prefixes`, with its handshake watch.
 
     Raises:
         SagsError: the endpoint is malformed.
@@ -54,10 +54,10 @@ def data_socket(
 
 
 def receive(socket: zmq.Socket[bytes]) -> wire.Message:
-    """The next message, over the memory it was received into.
+    """The next message; its parts are views of the memory it was received into.
 
     Raises:
-        WireError: it is none.
+        WireError: it is malformed.
         zmq.Again: nothing has arrived.
     """
     return wire.decode([frame.buffer for frame in receive_frames(socket, wire.MAX_PARTS)])
@@ -74,14 +74,14 @@ def listen_to(
     high_water: int = RECEIVE_HIGH_WATER,
     refused: Callable[[str, str], None] = _refuse,
 ) -> Generator[tuple[wire.Message, int] | None, None, None]:
-    """Give every message of some topics and its time of arrival, for up to `seconds`.
+    """Yield every message of some topics and its time of arrival (ns), for up to `seconds`.
 
     Topics may be named with or without the namespace; naming none means all. Up to `high_water` messages wait
     when the caller is slow.
 
-    Yields None at least every `POLL_MS` while none of them arrives, so that a caller can keep time. What
-    is no message is left out. So is why a thin picture cannot be made, which its topic says: `refused`
-    gets both.
+    Yields None at least every `POLL_MS` while none of them arrives, so that a caller can keep time.
+    Malformed messages are left out. If a thin picture cannot be made, its topic brings the reason: `refused`
+    gets the topic and the reason instead.
 
     Raises:
         UsageError: an unknown topic.
@@ -108,5 +108,5 @@ def listen_to(
                     continue
             except wire.WireError:
                 continue
-            # A subscription is a prefix: that to a depth brings its confidence too.
+            # A subscription is a prefix: that to `depth` also brings `depth_confidence`.
             yield None if wanted and message.topic not in wanted else (message, time.time_ns())

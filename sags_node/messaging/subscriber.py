@@ -30,7 +30,7 @@ from sags_node.messaging.wire import WireError
 from sags_node.workers import go_on
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
-# Of the node, in `status`. While frames are held their pictures are true, and nothing of the model is sent.
+# States of the node with valid content. While it is held, pictures are valid, and no model is sent.
 VALID_STATES = ("running", "held", "degraded")
 _ALWAYS = frozenset({"status"})
 
@@ -43,7 +43,7 @@ class Receiver:
     """What `Subscriber` and `AsyncSubscriber` have in common: everything but the waiting.
 
     `status` is always received too: a sender that says it is not running makes every topic stale. A node
-    that is restarted is followed, to another port, too, when it was found by its connection file.
+    that is restarted is followed, also to another port if it was found by its connection file.
 
     Args:
         names: topics without the namespace.
@@ -51,17 +51,17 @@ class Receiver:
         rates: Hz a topic must keep; default: every message that its sender sends.
         clock_ns: the wall clock that capture stamps are compared with.
         keys: for a node that wants them.
-        clock: of the node's machine, where that is another one; in place of `clock_ns`. While it is not known
-            every topic is stale.
+        clock: of the node's machine if it is another one, instead of `clock_ns`. While its offset is not
+            known, every topic is stale.
         paused: begin as after `pause`.
         patience: s to wait for a node that does not run yet; default: 10, and 0 for asyncio, whose loop must
             not be blocked. With an `endpoint` none need run.
-        may_be_absent: wait for none, and follow the node as soon as there is one.
-        kept: newest messages of a topic that `aligned` and `nearest` find.
+        may_be_absent: do not wait for a node; connect as soon as there is one.
+        kept: number of newest messages of each topic, in which `aligned` and `nearest` search.
 
     Attributes:
         refusal: why the node does not let this client in.
-        absent: that no node runs, as far as that is known.
+        absent: why no node can be found; None: one was found.
         rejected: malformed messages.
 
     Raises:
@@ -122,13 +122,13 @@ class Receiver:
 
     @classmethod
     def at(cls, node: NodeAddress, names: Iterable[str], **options: Any) -> Self:
-        """Subscribes to this node, which runs; see the class."""
+        """Subscribe to this node, which must be running; see the class."""
         usual = {"keys": node.keys, "clock": node.clock, "patience": 0.0}
         return cls(names, node.endpoint, node.ns, node.run_dir, **usual | options)
 
     @property
     def endpoint(self) -> str:
-        """Find where the node is, or was when it was last heard of; empty before that."""
+        """The endpoint of the node, as last known; empty before it was found."""
         return "" if self._address is None else self._address.endpoint
 
     # ---- what has come ---------------------------------------------------------------------------------
@@ -147,7 +147,7 @@ class Receiver:
     @overload
     def nearest(self, name: str, stamp_ns: int) -> Received | None: ...
     def nearest(self, name: str, stamp_ns: int) -> Received | None:
-        """Of the newest messages of a topic the one whose stamp is nearest; None before the first."""
+        """The one of the newest messages of a topic whose stamp is nearest; None before the first."""
         with self._arrived:
             return min(self._kept[name], key=lambda kept: abs(kept.stamp_ns - stamp_ns), default=None)
 
@@ -170,7 +170,7 @@ class Receiver:
         return newest
 
     def problem(self, name: str, max_age: float | None = None) -> str | None:
-        """Why a strict `read` of this topic would raise; None when it would not."""
+        """Why `read` of this topic would raise; None when it would not."""
         with self._arrived:
             return self._problem(name, max_age)
 
@@ -189,12 +189,12 @@ class Receiver:
             return self._fresh[name].period
 
     def now_ns(self) -> int:
-        """Return what the clock that stamped the messages shows now, at the latest: for `Received.age`."""
+        """Return the latest time (ns) that the node's clock may show now, for `Received.age`."""
         return self._clock_ns()
 
     @contextmanager
     def notified(self, wake: Callable[[], None]) -> Iterator[None]:
-        """Within, the receiver thread calls `wake` for every message that comes; it must be quick."""
+        """Let the receiver thread call `wake` for every message during the block; it must return quickly."""
         with self._arrived:
             self._wakes.append(wake)
         try:
@@ -204,16 +204,16 @@ class Receiver:
                 self._wakes.remove(wake)
 
     def ask(self, names: Iterable[str]) -> None:
-        """Let only these of the topics come, and `status`: the node makes and sends nothing else for this
-        client then. Takes effect within `POLL_MS`. Topics with `rates` count nothing as lost."""
+        """Receive only these of the topics, and `status`; the node then makes and sends nothing else for this
+        client. Takes effect within `POLL_MS`. What is not received meanwhile counts as `lost`."""
         self._asked = _ALWAYS | frozenset(names)
 
     def pause(self) -> None:
-        """Let nothing but `status` come, until `resume` or `ask`."""
+        """Receive nothing but `status`, until `resume` or `ask`."""
         self.ask(())
 
     def resume(self) -> None:
-        """Let everything come again, in the order of the names that were given."""
+        """Receive all topics again, subscribed in the order in which they were given."""
         self.ask(self._kept)
 
     def _newest(self, name: str) -> Received | None:
@@ -261,7 +261,7 @@ class Receiver:
         self._socket, self._watch = resources.enter_context(data_socket(address, prefixes))
         self._resources.close()
         self._resources, self._address, self._subscribed = resources, address, asked
-        self.refusal = None  # what the one before had against this client
+        self.refusal = None  # it was of the node before
 
     def _receive_next(self) -> None:
         if self._socket is None:
@@ -276,7 +276,7 @@ class Receiver:
             self._look_for_node()
 
     def _subscribe(self, socket: zmq.Socket[bytes]) -> None:
-        """Subscribe as it is asked for now; a socket is used by one thread alone."""
+        """Apply the last `ask` to the socket, on the receiver thread: only that one may use it."""
         asked = self._asked
         if asked == self._subscribed:
             return
@@ -287,7 +287,7 @@ class Receiver:
         self._subscribed = asked
 
     def _look_for_node(self) -> None:
-        """Nothing comes: the node may have come, or been restarted elsewhere."""
+        """Look for a node that has started, or was restarted elsewhere; called while nothing comes."""
         try:
             address = self._find()
             self.absent = None
@@ -303,7 +303,7 @@ class Receiver:
         try:
             message = receive(socket)
             name = self._names.get(message.topic)
-            if name is None:  # a subscription is a prefix: that to a depth brings its confidence too
+            if name is None:  # a subscription is a prefix: that to `depth` also brings `depth_confidence`
                 return
             received = interpret(message, self._clock_ns())
             if self._types[name] == topics.COMPRESSED_IMAGE and isinstance(received, ReceivedText):
@@ -344,7 +344,7 @@ class Subscriber(Receiver, Closes):
     @overload
     def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None: ...
     def wait(self, name: str, timeout: float, after: Received | None = None) -> Received | None:
-        """The newest message of a topic once there is one newer than `after`; None after `timeout` s."""
+        """Wait for a message newer than `after`, and return the newest one; None after `timeout` s."""
         with self._arrived:
             return self._arrived.wait_for(lambda: self._newer(name, after), timeout)
 

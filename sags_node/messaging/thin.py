@@ -1,7 +1,7 @@
-"""Thin pictures: smaller forms of what a node draws and measures, for links that do not carry the whole.
+"""Thin pictures: smaller forms of what a node draws and measures, for links that are too slow for the whole.
 
-Colour becomes JPEG, over black where it has an alpha; that comes beside it. Depth becomes PNG of 16 bit. A
-depth is never averaged with its neighbour: at half size every second one comes, as it is.
+Colour becomes JPEG, blended over black where it has an alpha, which has a topic of its own. Depth becomes
+16-bit PNG. Depths are never averaged: at half size every second one is sent unchanged.
 """
 
 import logging
@@ -23,7 +23,7 @@ from sags_node.messaging.topics import ThinPicture
 from sags_node.messaging.wire import Buffer, WireError
 from sags_node.types import U8, FrameResult, Side
 
-DEPTH_STEP = 5e-5  # m: 25 um at most beside the depth, far below what any depth here is sure to; up to 3.2 m
+DEPTH_STEP = 5e-5  # m; errs by 25 um at most, far below the error of any depth here; reaches 3.2 m
 CONFIDENCE_STEP = 1 / 255
 QUALITY = 80  # of JPEG; the default of ROS's image transport
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, QUALITY)
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 def thin_pictures(
     result: FrameResult, asked: Mapping[str, ThinPicture], logged: set[str] | None = None
 ) -> dict[str, Content]:
-    """Return what a frame has for thin topics, by topic; a text where it cannot be made.
+    """Return the thin pictures of a frame, by topic; a text instead of one that cannot be made.
 
     Args:
         logged: topics whose failure was logged; those that fail now are added.
@@ -50,7 +50,7 @@ def thin_pictures(
             part = np.s_[y : y + high - high % thin.every, x : x + wide - wide % thin.every]
             try:
                 made[name] = _thin(result, thin, part, (x, y, thin.every))
-            except Exception as error:  # it costs this topic alone
+            except Exception as error:  # only this topic fails
                 if name not in logged:
                     logged.add(name)
                     log.exception("'%s' cannot be made", name)
@@ -81,7 +81,7 @@ def _thin(
 
 
 def _colour(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
-    """[H, W, 3]; what was drawn lies over black."""
+    """The colours [H, W, 3]; drawn views are blended over black."""
     side, pair = _side(topic), result.pair
     if topic.endswith("image_rect_color"):
         return published.picture(pair, side)[part]
@@ -104,7 +104,7 @@ def _alpha(result: FrameResult, topic: str, part: tuple[slice, slice]) -> U8:
 def _numbers(
     result: FrameResult, topic: str, part: tuple[slice, slice], few: tuple[slice, slice]
 ) -> tuple[float, str, NDArray[Any]]:
-    """Return what must not be averaged: its scale (0: none), its encoding, and itself."""
+    """Return the scale (0: none), encoding and pixels of what must not be averaged."""
     if topic == "left/tissue_mask":
         tissue = published.nearest(result.pair, result.observation.tissue)
         return 0.0, "mono8", tissue[part][few].view(np.uint8) * np.uint8(255)
@@ -116,12 +116,12 @@ def _numbers(
         return CONFIDENCE_STEP, "mono8", steps
     depth = view.depth if topic == "left/render/depth" else result.observation.depth
     steps = published.nearest(result.pair, depth)[part][few] * np.float32(1 / DEPTH_STEP) + np.float32(0.5)
-    told = np.where(steps < 65536, steps, 0)  # 0: unknown, or further than can be said
+    told = np.where(steps < 65536, steps, 0)  # 0: unknown, or too far for 16 bits
     return DEPTH_STEP, "16UC1", told.astype(np.uint16)
 
 
 def _averaged(picture: U8, every: int) -> U8:
-    """Each pixel the mean of `every` x `every`."""
+    """The picture with each pixel the mean of `every` x `every` pixels."""
     height, width = picture.shape[:2]
     if every == 1:
         return picture

@@ -1,4 +1,4 @@
-"""The contents page of the wire: every topic this node publishes, under its namespace.
+"""The topics of the protocol: every topic that a node publishes, under its namespace.
 
 Coordinates: images and depth belong to the left or right optical frame, `points`, `splats`, `anchors` and
 `instruments` to `world`.
@@ -32,8 +32,8 @@ class Topic:
 
     @property
     def in_metres(self) -> bool:
-        """Tell whether it is of lengths. So is a camera_info, but that can say that nobody has calibrated
-        it."""
+        """Tell whether it holds lengths. A camera_info does, too, but can say by itself that it is not
+        calibrated."""
         return self.type in (POINT_CLOUD, TF) or self.name.endswith("/depth")
 
 
@@ -88,7 +88,7 @@ _VIEW_KINDS = {
 
 THIN = "thin/"  # how the names of thin pictures begin
 _EVERY = {"full": 1, "half": 2, "quarter": 4}
-THIN_FORMS = {  # of each picture, what may come in its place
+THIN_FORMS = {  # for each picture, the forms that may be sent instead
     "left/image_rect_color": ("jpeg",),
     "right/image_rect_color": ("jpeg",),
     "left/render/image": ("jpeg", "alpha"),
@@ -107,14 +107,14 @@ class ThinPicture:
 
     topic: str  # of the whole picture
     form: str  # jpeg, png or alpha
-    every: int  # px of the whole picture for one of this
+    every: int  # px of the whole picture per px of this one
     region: tuple[int, int, int, int] | None  # x, y, width, height in the whole picture; None: all of it
 
 
 def thin_picture(name: str) -> ThinPicture:
-    """Return what a name asks for: `thin/SIZE/[X,Y,WIDTH,HEIGHT/]TOPIC/FORM`, without the namespace.
+    """Parse the name of a thin picture: `thin/SIZE/[X,Y,WIDTH,HEIGHT/]TOPIC/FORM`, without the namespace.
 
-    No such name is the beginning of another, so a subscription to one brings no other.
+    No such name is a prefix of another, so a subscription to one brings no other.
 
     Raises:
         UsageError: there is nothing of that name.
@@ -142,13 +142,13 @@ def thin_picture(name: str) -> ThinPicture:
 
 
 def is_scaled(thin: ThinPicture) -> bool:
-    """Tell whether its numbers are steps of a depth or a confidence, which `scale` in `meta` says."""
+    """Tell whether its pixels are steps of a depth or confidence; `scale` in `meta` is the size of a step."""
     return thin.form == "png" and thin.topic.endswith(("/depth", "/depth_confidence"))
 
 
 def find(name: str) -> Topic | None:
-    """The entry of a topic named without the namespace, also of a player or an overlay, of a view that a
-    consumer may have opened, or of a thin picture."""
+    """The entry of a topic named without the namespace; None: there is no such topic. Knows also those of
+    players, overlays, thin pictures, and views that a consumer may have opened."""
     known = BY_NAME.get(name) or _OF_OTHERS.get(name)
     if known is not None:
         return known

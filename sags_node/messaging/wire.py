@@ -1,4 +1,4 @@
-"""One message on the wire: `[topic, meta, part0, part1, ...]`, and the check of what strangers send.
+"""One message on the wire: `[topic, meta, part0, part1, ...]`, and the check of what arrives.
 
 `meta` is a msgpack map that says what the parts are; the parts joined are one ROS 2 CDR message.
 Decoding looks only at bytes that have arrived: a claimed size is compared with them, never allocated.
@@ -53,23 +53,23 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     shape: Annotated[list[Annotated[int, msgspec.Meta(ge=0, lt=2**31)]], msgspec.Meta(max_length=4)]
     dtype: DType  # of part 1, little-endian; empty: no bulk part
     dropped: Count  # frames the node dropped so far
-    ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # shown is what is expected so long after `stamp_ns`
+    ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # what is shown is expected so long after `stamp_ns`
     detail_age_ns: Count | msgspec.UnsetType = (
         msgspec.UNSET
-    )  # the oldest picture in a view came so long before
-    scale: Scale | msgspec.UnsetType = msgspec.UNSET  # of a thin picture whose numbers are whole
-    window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin picture: x, y, and px for one of its own
-    recorded_s: Seconds | msgspec.UnsetType = msgspec.UNSET  # place of the frame in the recording played
+    )  # how long before `stamp_ns` the oldest picture in a view was captured
+    scale: Scale | msgspec.UnsetType = msgspec.UNSET  # size of one step of a thin picture of integers
+    window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin picture: x, y, px of the whole per px
+    recorded_s: Seconds | msgspec.UnsetType = msgspec.UNSET  # time of the frame in the recording played
     units: Text | msgspec.UnsetType = msgspec.UNSET  # of lengths: "relative", of a guessed rig; unset: metres
 
 
 class Receipt(msgspec.Struct, frozen=True, kw_only=True):
-    """What a program that hands pictures or poses in gets back, once a second."""
+    """The node's answer, once a second, to a program that sends it pictures or poses."""
 
     v: str = PROTOCOL
     taken: int  # messages since it connected
     refused: int
-    overtaken: int  # that newer ones came before they were looked at
+    overtaken: int  # messages left out because newer ones came before they were read
     problem: str | None = None  # what is wrong and how to fix it
 
 
@@ -114,7 +114,7 @@ def encode(message: Message) -> list[Buffer]:
 
 
 def decode(frames: Sequence[Buffer]) -> Message:
-    """The message in ZeroMQ parts from anybody.
+    """Decode the ZeroMQ parts that any sender sent into a message.
 
     Raises:
         WireError: too few, too many or too large parts, or a `meta` that does not follow the protocol.
@@ -129,6 +129,6 @@ def decode(frames: Sequence[Buffer]) -> Message:
         decoded = _decoder.decode(bytes(meta))
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise WireError(f"not a message of protocol {PROTOCOL}: {error}") from None
-    if not name.isprintable():  # it is named in messages and in the log
+    if not name.isprintable():  # the name appears in error messages and in the log
         raise WireError(f"no topic has the name {name!r}")
     return Message(name, decoded, tuple(parts))

@@ -1,25 +1,25 @@
-"""What drawing for consumers may take of a core, so that the mapping goes first.
+"""The share of a core that drawing for consumers may use, so that the mapping goes first.
 
-It is not a low priority: threads of one process share the interpreter, and one that is kept from the
-processor while it holds that keeps all others waiting.
+A low thread priority would not do: threads share the interpreter lock, and one that is kept from the
+processor while it holds the lock keeps all others waiting.
 """
 
 SHARE = 0.25  # of one core
-LEAST_SHARE = 0.05  # while the mapping is behind: less than its own rate varies by
-BEHIND = 0.05  # share of late frames from which on it is
-LATE = 0.005  # s that a frame waited for the mapping
+LEAST_SHARE = 0.05  # of one core, while the mapping is behind: less than its rate varies anyway
+BEHIND = 0.05  # share of late frames above which the mapping is behind
+LATE = 0.005  # s that a frame waits for the mapping, above which it is late
 FORGETTING = 0.03  # share of a new frame in the running mean of late ones: about a second
-SAVED_UP = 0.1  # s: what was not used for longer is lost
+SAVED_UP = 0.1  # s: time left unused for longer than this is lost
 
 
 class Allowance:
-    """The mapping thread says how late frames are; others ask what they may take."""
+    """The mapping thread reports how late frames are; other threads read their share."""
 
     def __init__(self) -> None:
         self._late = 0.0  # running share of the frames
 
     def frame(self, waited: float, missed: bool) -> None:
-        """A frame was taken, `waited` s after it came; `missed`: others were left out before it."""
+        """Note a frame that was taken `waited` s after it came; `missed`: others were left out before it."""
         self._late += FORGETTING * ((missed or waited > LATE) - self._late)
 
     @property
@@ -28,7 +28,7 @@ class Allowance:
 
     @property
     def share(self) -> float:
-        """The share of one core."""
+        """The share of one core that drawing may use."""
         return LEAST_SHARE if self.is_behind else SHARE
 
 
@@ -43,5 +43,5 @@ class Pace:
         return now >= self._due
 
     def worked(self, now: float, seconds: float) -> None:
-        """It has, for so much processor time."""
+        """Note that it worked until `now` for `seconds` of processor time."""
         self._due = max(self._due, now - SAVED_UP) + seconds / self._allowance.share

@@ -1,4 +1,4 @@
-"""What the node says of itself: rates, latencies and costs of its last frames."""
+"""The health of the node: rates, latencies and costs of its last frames, and warnings from them."""
 
 import threading
 import time
@@ -15,14 +15,14 @@ from sags_node.findings import Findings, by_code, by_stage
 from sags_node.processes import resident_mb
 from sags_node.types import ClockStatus, Finding, FrameResult, MotionState, NodeHealth, RungState, ViewStatus
 
-WAITING_AFTER = 1.0  # s without a frame, or without one that was taken in
-WINDOW = 150  # frames behind the published rates and latencies
-MOST_LEFT_OUT = 0.1  # of the frames; a strict reader refuses what comes less often (`messaging.freshness`)
-BACK_AT = 0.8  # of that: a warning ends
-DRAWN = 0.05  # of the tissue, at least: with less nothing is shown
-EVERY = 8  # px: what is drawn is looked at
-WHY_NONE = {"calibration_changed", "sent_refused"}  # these say why no frame comes
-LONGER = 1.05  # times the time from frame to frame: a budget that is rounded is none that is too long
+WAITING_AFTER = 1.0  # s without a frame until the state is `waiting`, without one taken in until it is `held`
+WINDOW = 150  # frames from which the published rates and latencies are computed
+MOST_LEFT_OUT = 0.1  # share of frames; with more left out, readers refuse the rest (`messaging.freshness`)
+BACK_AT = 0.8  # share of `MOST_LEFT_OUT` at which a warning ends
+DRAWN = 0.05  # share of the tissue; with less drawn, nothing is shown
+EVERY = 8  # px between the pixels that `_lacks` looks at
+WHY_NONE = {"calibration_changed", "sent_refused"}  # warnings that say themselves why no frame comes
+LONGER = 1.05  # times the period of frames: a budget that was only rounded up is not too long
 
 
 LOWER = ", or lower mapping.max_gaussians or vision.scale"  # on the lowest rung nothing is left to lower
@@ -33,7 +33,7 @@ def why_missed(mapping: MappingConfig, rate: float | None) -> str:
     """Why frames are left out, if they are, and the remedy.
 
     Args:
-        rate: frames that come a second; None: they come when they are taken.
+        rate: frames that come per second; None: they come when they are taken.
     """
     if mapping.iterations is not None:
         return "mapping.iterations fixes the work on each: lower it, or leave it out"
@@ -46,7 +46,7 @@ def why_missed(mapping: MappingConfig, rate: float | None) -> str:
 
 
 class Statistics:
-    """What the last frames tell of rate, latency and cost.
+    """Rate, latency and cost of the last frames.
 
     Args:
         source: where they come from.
@@ -56,10 +56,10 @@ class Statistics:
         self._nothing_comes, self._too_few_come = _remedies(source)
         self._lock = threading.Lock()
         self._published: deque[float] = deque(maxlen=WINDOW)
-        self._taken_in = -inf  # when a frame was published that was
+        self._taken_in = -inf  # when a frame that was taken in was last published
         self._resumed = -inf
-        self._drawn = inf  # when one was that shows the model; inf: none is expected yet
-        self._lacks = ""  # why the last one that was taken in does not
+        self._drawn = inf  # when one that shows the model was; inf: none is expected yet
+        self._lacks = ""  # why the last frame that was taken in does not show the model
         self._latency: deque[float] = deque(maxlen=WINDOW)
         self._stamped_now = not (isinstance(source, RecordedSource) and source.pace == "step")
         self._worked: deque[float] = deque(maxlen=WINDOW)  # ms on each
@@ -70,16 +70,16 @@ class Statistics:
         self._motion: MotionState | None = None
         self._started = False
         self._left_out: deque[Mapping[str, int]] = deque(maxlen=WINDOW)  # slot -> frames, since the start
-        self._too_many: set[str] = set()  # slots that leave out too much
+        self._too_many: set[str] = set()  # slots that leave out too many frames
         # Median time from capture to published; 0 before the first frame. Read without the lock, which others
         # may hold for long.
         self.latency_s = 0.0
 
     def add(self, result: FrameResult, latency_ms: float, dropped: Mapping[str, int]) -> bool:
-        """Take a published frame; `dropped`: how many each slot has left out until now.
+        """Add a published frame; `dropped`: how many frames each slot has left out until now.
 
         Returns:
-            Whether none was expected any more, or none had come yet.
+            Whether it is the first after a time without frames: the node was waiting or starting.
         """
         with self._lock:
             waited = self._is_waiting(time.monotonic())
@@ -91,7 +91,7 @@ class Statistics:
                 self._lacks = _lacks(result)
             if result.held or not self._lacks or waited:
                 self._drawn = self._published[-1]
-            if self._stamped_now:  # else stamps are no times of day
+            if self._stamped_now:  # else stamps are not wall-clock times of now
                 self._latency.append(latency_ms)
                 self.latency_s = 1e-3 * median(self._latency)
             self._worked.append(sum(result.timings_ms.values()))
@@ -111,12 +111,12 @@ class Statistics:
 
     @property
     def flowing(self) -> bool:
-        """Tell whether frames come, since the last pause."""
+        """Tell whether frames come; those before the last pause do not count."""
         with self._lock:
             return bool(self._published) and not self._is_waiting(time.monotonic())
 
     def resume(self) -> None:
-        """After a pause the time without frames says nothing."""
+        """Start anew after a pause: the time without frames during it does not count."""
         with self._lock:
             self._published.clear()
             self._resumed = self._taken_in = time.monotonic()
@@ -136,7 +136,7 @@ class Statistics:
         working: float = 0.0,
         recording: Mapping[str, object] | None = None,
     ) -> NodeHealth:
-        """Return what is true now.
+        """Return the health of the node now.
 
         Args:
             missed: why frames are left out, if they are, and the remedy.
@@ -187,7 +187,7 @@ class Statistics:
     def _findings(
         self, state: str, now: float, missed: str, working: float, consumers: int, known: Findings
     ) -> list[Finding]:
-        """Return what the flow of frames says; asked with the lock held."""
+        """Return the warnings about the flow of frames; to be called with the lock held."""
         found = []
         if state == "waiting" and working > WAITING_AFTER:
             said = f"one frame has been worked on for {working:.0f} s, as {missed}"
@@ -217,7 +217,7 @@ class Statistics:
 
 
 def _relief(consumers: int) -> str:
-    """Return what leaves a node more of its machine."""
+    """Return advice that leaves the node more of its machine's time."""
     if consumers == 0:
         return "end other programs"
     what = "1 consumer takes" if consumers == 1 else f"{consumers} consumers take"
@@ -225,7 +225,7 @@ def _relief(consumers: int) -> str:
 
 
 def _lacks(result: FrameResult) -> str:
-    """Why hardly anything of the model is drawn in a frame; empty: it is."""
+    """Why hardly anything of the model is drawn in a frame; empty: enough is."""
     tissue = result.observation.tissue[::EVERY, ::EVERY]
     if not tissue.any():
         return "no tissue is seen; is the scope where it should be, and does the mask fit (vision.tissue)?"
@@ -236,13 +236,13 @@ def _lacks(result: FrameResult) -> str:
 
 
 def _percentiles(values: Sequence[float]) -> dict[str, float]:
-    """0 of nothing."""
+    """The percentiles and the maximum; 0 if there are no values."""
     p50, p90, p99, most = np.percentile(values or [0.0], [50, 90, 99, 100]).tolist()
     return {"p50": p50, "p90": p90, "p99": p99, "max": most}
 
 
 def _remedies(source: Source | None) -> tuple[str, str]:
-    """Return what helps where no frame comes, and where over a tenth is left out."""
+    """Return the remedies for when no frame comes, and for when over a tenth is left out."""
     match source:
         case PushSource():
             what = f"start the sender at {source.endpoint}"

@@ -58,6 +58,6 @@ class Latest(Generic[T]):
 
     @property
     def closed(self) -> bool:
-        """True once closed and emptied: nothing will come any more."""
+        """Tell whether it is closed and empty: nothing will come any more."""
         with self._condition:
             return self._closed and self._value is None

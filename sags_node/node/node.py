@@ -4,7 +4,7 @@ r"""The running node: five threads and the slots between them.
                            \--scenes--> drawing --views--/ \--------thin----/
 
 Slots hold the newest value only (live), or hand every value over (recordings not played in real time).
-The sockets live on the publishing thread; what a client asks of the model runs on the mapping thread,
+The sockets live on the publishing thread; clients' requests about the model run on the mapping thread,
 between two frames. Consumers' own views are drawn, and thin pictures made, on threads of their own, which
 take no more of a core than `allowance` says.
 """
@@ -53,10 +53,10 @@ from sags_node.types import (
 
 log = logging.getLogger(__name__)
 
-HEALTH_PERIOD = 1.0  # s
+HEALTH_PERIOD = 1.0  # s between two health messages
 STOP_SECONDS = 10.0  # longest wait for all threads to end
-LAST_WORDS = 1.0  # s for the last health message, where another thread hangs
-REQUEST_WAIT = 0.05  # s: how soon a request is served while no frames come
+LAST_WORDS = 1.0  # s to wait for the last health message, where another thread hangs
+REQUEST_WAIT = 0.05  # s between looks for requests while no frames come
 
 OnResult = Callable[[FrameResult, float], None]  # a published result and its latency, ms
 
@@ -76,7 +76,7 @@ class Node:
 
         Args:
             on_result: called on the publishing thread after each result has been sent.
-            manager: notified of the state of the node.
+            manager: is notified of the state of the node.
 
         Raises:
             SagsError: an endpoint cannot be bound, or the configuration does not fit the rig.
@@ -125,7 +125,7 @@ class Node:
         self._stopping = threading.Event()
         self._last_sent: FrameResult | None = None
         self._sent = 0
-        self._working_since: float | None = None  # when the frame came that is worked on
+        self._working_since: float | None = None  # since when (s, monotonic) the newest frame is worked on
         self._publisher = Publisher(
             config.publish, config.ns, session, self._handlers(), thins=True, metric=rig.metric
         )
@@ -187,16 +187,16 @@ class Node:
 
     @property
     def config(self) -> LaunchConfig:
-        """As it is now: some parameters change while the node runs."""
+        """The configuration now: some parameters change while the node runs."""
         return self._state.config
 
     @property
     def endpoints(self) -> list[str]:
-        """Find where the data socket is bound."""
+        """The endpoints to which the data socket is bound."""
         return self._publisher.connection.data
 
     def health(self) -> NodeHealth:
-        """Return what is true now; may be called from any thread."""
+        """Return the health of the node now; may be called from any thread."""
         return self._state.statistics.health(
             dropped=self.dropped,
             stopping=self._stopping.is_set(),
@@ -216,7 +216,7 @@ class Node:
 
     @property
     def failed(self) -> bool:
-        """Tell whether an error ends it: `wait` raises it."""
+        """Tell whether an error has ended the node; `wait` raises that error."""
         return self._error is not None
 
     @property
@@ -234,10 +234,10 @@ class Node:
         }
 
     def _guard(self, name: str, work: Callable[[], None], after: Callable[[], None]) -> None:
-        """Run one thread's work; its failure ends the node in order, and is raised by `wait`."""
+        """Run one thread's work. If it fails, the node ends in order, and `wait` raises the error."""
         try:
             work()
-        except BaseException as error:  # everything ends the node, nothing is lost silently
+        except BaseException as error:  # any error ends the node
             if self._error is None:
                 self._error = error
             if not isinstance(error, SagsError):
@@ -263,7 +263,7 @@ class Node:
                 if frame.t_device_ns and frame.t_arrival_ns:
                     self._clock.add(frame.t_device_ns, frame.t_arrival_ns)
                 at = time.monotonic()
-                give((frame, at, rectifier.pictures(frame)))  # here: mapping has more to do than this thread
+                give((frame, at, rectifier.pictures(frame)))  # here: mapping has more to do
 
     def _map(self) -> None:
         leave_a_core(self._state.config.engine.threads)
@@ -328,7 +328,7 @@ class Node:
         self._wake_publishing()
 
     def _offer_picture(self, pair: RectifiedPair, epoch: int) -> None:
-        """Out with it now: a mask made of it is in time for the next frame then."""
+        """Publish the picture at once, so that a mask made of it is in time for the next frame."""
         self._pictures.put((pair, epoch))
 
     def _wake_publishing(self) -> None:
@@ -383,7 +383,7 @@ class Node:
         if self._publisher.thin:
             self._whole.put((result, self._publisher.thin))
         if self._state.statistics.add(result, latency_ms, self.dropped):
-            self._state.status_due.set()  # until it is told, consumers refuse what comes
+            self._state.status_due.set()  # until they get the new state, consumers refuse the content
         self._last_sent, self._sent = result, self._sent + 1
         if self._on_result is not None:
             self._on_result(result, latency_ms)

@@ -1,4 +1,4 @@
-"""What clients may ask of a running node: by which name, and on which of its threads it is done."""
+"""The operations that clients may ask of a running node, by name, and the threads that carry them out."""
 
 import threading
 from collections.abc import Callable
@@ -41,11 +41,11 @@ class NodeState:
     pipeline: Pipeline  # of the mapping thread
     budget: Budget  # of the mapping thread
     views: Views  # of the drawing thread
-    session: str  # of this start
+    session: str  # id of this start of the node
     statistics: Statistics = field(default_factory=Statistics)
     paused: threading.Event = field(default_factory=threading.Event)
     parameters_changed: threading.Event = field(default_factory=threading.Event)
-    status_due: threading.Event = field(default_factory=threading.Event)  # at once
+    status_due: threading.Event = field(default_factory=threading.Event)  # publish the status at once
 
 
 class Operations:
@@ -53,7 +53,7 @@ class Operations:
     views for the drawing thread. A disk may hang: each file is written by a thread of its own.
 
     Args:
-        show_view: called with a view's name and what is to be published of it; None: it is closed.
+        show_view: called with a view's name and its drawing to publish; None: the view was closed.
     """
 
     def __init__(self, state: NodeState, show_view: Callable[[str, DrawnView | None], None]) -> None:
@@ -64,7 +64,7 @@ class Operations:
         self._saving: list[Future[Any]] = []  # models that are being written
 
     def handlers(self) -> dict[str, Callable[[dict[str, Any]], Any]]:
-        """By the operation's name; a `Future` where another thread does the work."""
+        """The handlers by operation name; one returns a `Future` where another thread does the work."""
         return {
             "get_parameters": lambda args: self._state.config.model_dump(mode="json"),
             "set_parameters": lambda args: self.for_mapping.post(lambda: self._set_parameters(args)),
@@ -94,7 +94,7 @@ class Operations:
         return self._state.config.model_dump(mode="json")
 
     def reconfigure(self) -> None:
-        """Let frames get what the configuration, or the rate of frames, says now; on the mapping thread."""
+        """Apply the present configuration and rate to the next frames; to be called on the mapping thread."""
         self._state.pipeline.reconfigure(self._state.config)
         self._state.budget = self._state.pipeline.make_budget(self._state.budget.speed)
 
@@ -121,7 +121,7 @@ class Operations:
             raise SagsError("there is no model yet; wait for the first frame")
         frame = newest.observation, newest.snapshot, newest.views["left"]
         if request.u is not None and request.v is not None:
-            if held := self._state.pipeline.held:  # the picture that was clicked on is another one
+            if held := self._state.pipeline.held:  # the consumer clicked on a newer picture
                 raise SagsError(f"frames are held: {held}; pin when they are taken in again")
             size = published.size_of(newest.pair)
             anchor = self._state.pipeline.anchors.add_pixel(request.u, request.v, *frame, size)
@@ -165,12 +165,12 @@ class Operations:
             self._state.pipeline.predict_motion()
         drawn = self._state.views.open(request, self._scene(), self._state.pipeline.seen)
         status = self._state.views.status[request.name]
-        if drawn is not None or status.draw_ms == 0:  # None: what was kept of it shows another viewpoint
+        if drawn is not None or status.draw_ms == 0:  # None: forget kept pictures of the old viewpoint
             self._show_view(request.name, drawn)
         return {"topics": content.view_topics(request.name, request.stereo, request.depth), **asdict(status)}
 
     def _scene(self) -> FrameResult | None:
-        """Return what shows the tissue as it is now; None: the next frame that is taken in will."""
+        """Return the result that shows the tissue now; None: the next frame that is taken in will."""
         state, newest = self._state, self._state.pipeline.newest
         if newest is None or state.pipeline.held or state.paused.is_set() or not state.statistics.flowing:
             return None
@@ -206,7 +206,7 @@ class Operations:
         return saved
 
     def finish(self, seconds: float) -> None:
-        """Wait so long at most for models that are being written."""
+        """Wait at most `seconds` for models that are being written."""
         wait(self._saving, seconds)
 
 
@@ -222,7 +222,7 @@ class Requests:
         return future
 
     def serve(self) -> None:
-        """Do all that waits."""
+        """Do all the work that waits."""
         while True:
             try:
                 work, future = self._waiting.get_nowait()
@@ -232,7 +232,7 @@ class Requests:
 
 
 def _answer(future: Future[Any], work: Callable[[], Any]) -> None:
-    """Do it, unless nobody waits for it any more; its failure is the answer, and does not end the thread."""
+    """Do the work unless it was cancelled. A failure becomes the answer, and does not end the thread."""
     if not future.set_running_or_notify_cancel():
         return
     try:

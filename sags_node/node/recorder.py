@@ -1,4 +1,4 @@
-"""A recorder in a process of its own, started by the node: whatever the disk does, the node does not feel it.
+"""A recorder in a process of its own, started by the node, so that a slow disk does not slow the node.
 
 The child is `sags bag record --stdin`: it ends when its standard input does, so also when the node is killed.
 A disk may hang, so nothing here waits for the child without a limit.
@@ -26,13 +26,13 @@ from sags_node.files import check_name
 from sags_node.processes import KILL_SECONDS, end
 from sags_node.types import Finding
 
-START_SECONDS = 60.0  # for the child to load and to open its file
-SNAPSHOT_SECONDS = 60.0  # to write what the ring holds
-FINISH_SECONDS = 60.0  # to write what waits and the index
-PATIENCE = 1.0  # s until a node that ends says what it waits for
-SILENT_SECONDS = 3.0  # without a message; a node says its status once a second
-LOW_SECONDS = 300.0  # that the disk has room for
-WHOLE = 0.9  # of the seconds asked for a snapshot: the oldest message came after their beginning
+START_SECONDS = 60.0  # longest wait for the child to load and to open its file
+SNAPSHOT_SECONDS = 60.0  # longest wait for it to write what the ring buffer holds
+FINISH_SECONDS = 60.0  # longest wait for it to write what is queued, and the index
+PATIENCE = 1.0  # s after which a node that ends says what it waits for
+SILENT_SECONDS = 3.0  # without a message, after which it warns; a node sends `status` each second
+LOW_SECONDS = 300.0  # of recording; with less room on the disk, it warns
+WHOLE = 0.9  # share of the snapshot seconds asked for; fewer kept are warned of
 
 log = logging.getLogger(__name__)
 
@@ -54,14 +54,14 @@ class RecorderProcess:
 
     Args:
         ns: of the node.
-        endpoint: where the child subscribes; ipc, so that it needs no keys. None: recording is refused.
+        endpoint: to which the child subscribes; ipc, so that it needs no keys. None: recording is refused.
     """
 
     def __init__(self, ns: str, endpoint: str | None) -> None:
         self._ns = ns
         self._endpoint = endpoint
         self._child: _Child | None = None
-        self._begun: _Child | None = None  # whose recording is told of
+        self._begun: _Child | None = None  # the one whose recording `status` describes
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
 
     def start(self, args: Mapping[str, Any]) -> Future[Any]:
@@ -77,15 +77,15 @@ class RecorderProcess:
         return self._worker.submit(self._stop)
 
     def status(self) -> dict[str, Any] | None:
-        """How the recording goes, as the recorder said it last, and under `ended` why it has ended by itself.
-        None: nothing is being recorded. Any thread may call this."""
+        """The last state that the recorder reported, and under `ended` why it ended by itself. None: nothing
+        is being recorded. Any thread may call this."""
         child = self._begun
         if child is None:
             return None
         return {"folder": str(child.folder), **child.progress, "ended": child.ended}
 
     def findings(self) -> Iterator[Finding]:
-        """Return what a person should know of the recording. Any thread may call this."""
+        """Yield the warnings about the recording. Any thread may call this."""
         said = self.status()
         if said is not None and said["ended"] is not None:
             text = f"the recording to {said['folder']} has ended: {said['ended']}; begin another one"
@@ -94,7 +94,7 @@ class RecorderProcess:
             yield from findings(said)
 
     def close(self) -> None:
-        """Finish a recording that is still running. A Ctrl-C meanwhile ends it at once."""
+        """Finish a recording that is still running. A Ctrl-C meanwhile kills the recorder at once."""
         child = self._child
         try:
             if child is not None:
@@ -104,7 +104,7 @@ class RecorderProcess:
                 child.kill()
             raise
         finally:
-            self._worker.shutdown(wait=False)  # each of its requests has its time limit
+            self._worker.shutdown(wait=False)  # each of its requests has a time limit
 
     def _wait_for(self, stopped: Future[Any], child: _Child) -> None:
         try:
@@ -112,7 +112,7 @@ class RecorderProcess:
                 stopped.result(PATIENCE)
             except TimeoutError:
                 log.warning("waiting for the recorder of %s; Ctrl-C breaks off", child.folder)
-                stopped.result(SNAPSHOT_SECONDS + FINISH_SECONDS + KILL_SECONDS)  # what waits before it, too
+                stopped.result(SNAPSHOT_SECONDS + FINISH_SECONDS + KILL_SECONDS)  # with earlier requests
         except (SagsError, TimeoutError) as error:
             log.warning("%s", error)
 
@@ -144,9 +144,9 @@ class RecorderProcess:
             answer = self._child.answer(START_SECONDS)
             self._begun = self._child
             return answer
-        except SagsError:  # it has said why, and ends
+        except SagsError:  # the child has said why, and ends
             self._child.kill()
-            self._child = self._begun  # one that has ended is told of until another begins
+            self._child = self._begun  # `status` describes the last one until another begins
             raise
         except TimeoutError:
             self._child.kill()
@@ -193,7 +193,7 @@ class RecorderProcess:
 
 
 class _Child:
-    """The command and what it answers, line by line.
+    """The recorder's process, and what it answers, line by line.
 
     Args:
         folder: of the recording.
@@ -208,12 +208,10 @@ class _Child:
             raise SagsError("path and topics cannot hold a zero character")
         self.folder = folder
         self.has_ring = has_ring
-        self.progress: dict[str, Any] = {}  # once a second
-        self.ended: str | None = None  # why, where nobody has asked for it
-        self._owes = False  # an answer
-        self._errors = tempfile.TemporaryFile(
-            "w+", errors="replace"
-        )  # a pipe that is full would stop the child
+        self.progress: dict[str, Any] = {}  # updated once a second
+        self.ended: str | None = None  # why it ended unasked; None: it runs
+        self._owes = False  # whether it still owes an answer
+        self._errors = tempfile.TemporaryFile("w+", errors="replace")  # a full pipe would stop the child
         self._lines: SimpleQueue[dict[str, Any] | None] = SimpleQueue()  # None: there will be no more
         pipe = subprocess.PIPE
         try:
@@ -227,10 +225,10 @@ class _Child:
         return self._process.poll() is None
 
     def ask(self, line: str) -> None:
-        """Send a line; an answer to the one before that came too late is forgotten.
+        """Send a line. A late answer to the line before is discarded.
 
         Raises:
-            SagsError: that one has not come yet; it would be taken for the answer to this line.
+            SagsError: that answer has not come yet; it would be taken for the answer to this line.
         """
         while not self._lines.empty() and self._next_line(0.0) is not None:
             self._owes = False
@@ -247,18 +245,18 @@ class _Child:
             pass  # it has ended; `answer` says why
 
     def answer(self, seconds: float) -> Any:
-        """The next line it says.
+        """Return the next line of its output.
 
         Raises:
             SagsError: it has ended instead.
-            TimeoutError: it says nothing.
+            TimeoutError: no line came.
         """
         line = self._next_line(seconds)
         self._owes = False
         return self._said(line)
 
     def finish(self, seconds: float) -> Any:
-        """Let it end; the last line it says.
+        """Let it end, and return its last line.
 
         Raises:
             SagsError: it has failed.
@@ -304,7 +302,7 @@ class _Child:
             self._lines.put(None)
 
     def _next_line(self, seconds: float) -> dict[str, Any] | None:
-        """None when there will be no more, however often it is asked."""
+        """The next line; None, at every call, when there will be no more."""
         try:
             line = self._lines.get(timeout=seconds)
         except Empty:
@@ -314,7 +312,7 @@ class _Child:
         return line
 
     def _said(self, said: dict[str, Any] | None) -> Any:
-        """Return what it says; a failure where it says `error`, or nothing more."""
+        """Return the line; raise `SagsError` if it holds an error, or if there is none."""
         if said is None:
             raise SagsError(self.ended)
         if "error" in said:
@@ -322,7 +320,7 @@ class _Child:
         return said
 
     def _last_words(self) -> str:
-        """The last words of a recorder that ended without a line on stdout."""
+        """Why the recorder ended without an `error` line on stdout, from its stderr."""
         try:
             self._process.wait(KILL_SECONDS)
         except subprocess.TimeoutExpired:
@@ -336,7 +334,7 @@ class _Child:
 
 
 def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """The findings of what `Recorder.summary` says."""
+    """Yield the warnings that follow from a `Recorder.summary`."""
     folder, silent, free = summary["folder"], summary["silent_s"], summary["free_bytes"]
     if silent > SILENT_SECONDS:
         yield Finding(

@@ -1,4 +1,4 @@
-"""What a service manager is notified of: systemd's protocol (sd_notify(3)), datagrams to `$NOTIFY_SOCKET`."""
+"""Notify a service manager by systemd's protocol (sd_notify(3)): datagrams to `$NOTIFY_SOCKET`."""
 
 import os
 import socket
@@ -6,17 +6,17 @@ import threading
 import time
 from collections.abc import Mapping, MutableMapping
 
-LOOPS = frozenset({"mapping", "publishing"})  # that must turn
-PINGS = 3  # in the time after which the manager restarts the process
+LOOPS = frozenset({"mapping", "publishing"})  # loops that must turn for a watchdog ping
+PINGS = 3  # in the period of silence after which the manager restarts the process
 LONGEST_STATUS = 400  # characters
 
 
 class ServiceManager:
-    """Whoever started the process and asked for notifications; where nobody did, nothing is sent.
+    """The service manager that started the process. If none asked for notifications, none are sent.
 
     Args:
-        environment: `NOTIFY_SOCKET` says where, `WATCHDOG_USEC` how long silence may last, and `WATCHDOG_PID`
-            whose. They are meant for this process, not for its children, and are taken out.
+        environment: `NOTIFY_SOCKET` is the address, `WATCHDOG_USEC` the longest silence, and `WATCHDOG_PID`
+            the process watched. They are removed, as they are not meant for child processes.
     """
 
     def __init__(self, environment: MutableMapping[str, str]) -> None:
@@ -24,23 +24,23 @@ class ServiceManager:
         for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"):
             environment.pop(name, None)
         self._lock = threading.Lock()
-        self._turned: set[str] = set()  # since the next ping is due
+        self._turned: set[str] = set()  # loops that have turned since the next ping is due
         self._next_ping = 0.0
 
     def ready(self) -> None:
-        """The sockets are bound, and all loops run."""
+        """Say that the sockets are bound, and all loops run."""
         self._send("READY=1")
 
     def stopping(self) -> None:
         self._send("STOPPING=1")
 
     def status(self, words: str) -> None:
-        """One line for `systemctl status`."""
+        """Send one line for `systemctl status`."""
         self._send("STATUS=" + " ".join(words.split())[:LONGEST_STATUS])
 
     def turned(self, loop: str) -> None:
-        """One of `LOOPS` has come round. A ping goes out when all have since the last one: with a loop
-        that hangs there are no more, and the manager starts the process anew."""
+        """Note that one of `LOOPS` has turned. A ping is sent when all have since the last one. When a loop
+        hangs, no more are sent, and the manager restarts the process."""
         if self._period is None:
             return
         with self._lock:
@@ -65,7 +65,7 @@ class ServiceManager:
 
 
 def _asked(environment: Mapping[str, str]) -> tuple[str | None, float | None]:
-    """Find where to send, and after how many seconds of silence the process is given up."""
+    """Return the address, and the seconds of silence after which the process is restarted; None: none."""
     address = environment.get("NOTIFY_SOCKET") or None
     if address is not None and address.startswith("@"):
         address = "\0" + address[1:]

@@ -1,4 +1,4 @@
-"""The detail of consumers' views, and what it takes to know how far to trust it."""
+"""The detail of consumers' views, and lessons on how far to trust it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,22 +11,22 @@ from sags_node.messaging import published
 from sags_node.model.forecast import gaussians_ahead, reached
 from sags_node.types import FrameResult, Gaussians, RenderedView, Shown, Snapshot
 
-ROUNDING = 1e-3  # s, of stamps
+ROUNDING = 1e-3  # s, tolerance for rounded stamps
 
 
 class Teacher:
-    """Adds detail to views from anywhere; learns from frame to frame, and from the right eye."""
+    """Adds detail to views from any viewpoint; learns from frame to frame, and from the right eye."""
 
     def __init__(self) -> None:
         self._detail = Detail(Lessons())
         self._before: tuple[Snapshot, SeenFrame] | None = None
         self._now: tuple[Snapshot, SeenFrame] | None = None
-        self._whole: SeenFrame | None = None  # with its left view, where nobody else looks at that
+        self._whole: SeenFrame | None = None  # with its left view, if nobody else looks at it
         self._step = 0.0  # s between the last two scenes
         self._ahead = self._aside = 0  # views of either kind that were drawn
 
     def take(self, scene: FrameResult, now: SeenFrame) -> None:
-        """Remember a scene: the next one tells what views of it, ahead of it, were worth."""
+        """Remember a scene: the next one shows how good views ahead of it were."""
         self._before, self._now = self._now, (scene.snapshot, now)
         if self._before is not None:
             seconds = (now.t_capture_ns - self._before[1].t_capture_ns) * 1e-9
@@ -51,12 +51,12 @@ class Teacher:
         self, scene: FrameResult, seen: Sequence[SeenFrame], gaussians: Gaussians, view: RenderedView,
         ahead: float, right: bool,
     ) -> Shown:  # fmt: skip
-        """Return what is shown of a view. Every few of its kind, learn first how far to trust it.
+        """Return a view with detail. Every few views of a kind, first learn how far to trust the detail.
 
         Args:
             seen: the scene's frame, and older ones.
-            gaussians: of the scene, there or moved by `ahead` seconds.
-            right: it has the colours that the right eye sees.
+            gaussians: of the scene, moved to `ahead` seconds after it.
+            right: the view has the colours that the right eye sees.
         """
         now, *older = seen
         if ahead > 0:

@@ -1,7 +1,7 @@
 """Viewpoints that consumers asked for, drawn from the newest snapshot beside the mapping.
 
 Mapping goes first. All views together get a share of one core, see `allowance`; it is split so that each
-keeps the same part of the rate it asked for. A view that nobody subscribes to is not drawn. Used from one
+gets the same fraction of the rate it asked for. A view that nobody subscribes to is not drawn. Used from one
 thread; only `status` and `pairs` may be read by others.
 """
 
@@ -29,8 +29,8 @@ from sags_node.node.teacher import Teacher, is_of
 from sags_node.types import F32, Camera, DrawnView, FrameResult, Gaussians, RenderedView, ViewStatus
 
 MAX_VIEWS = 8
-HELD_OVER = 5.0  # s over which the held rate is counted
-EARLY = 0.25  # of a period: a view that is nearly due is drawn rather than left to the next frame
+HELD_OVER = 5.0  # s over which the rate kept is counted
+EARLY = 0.25  # share of a period by which a view may be drawn early, rather than at the next frame
 LEARNING = 0.2  # share of a new measurement in a running mean of costs
 
 log = logging.getLogger(__name__)
@@ -44,8 +44,8 @@ class _View:
     due: float  # when it is to be drawn next
     cost: float = 0.0  # s of processor time for one drawing; 0: never drawn
     drawn_at: deque[float] = field(default_factory=deque)
-    failure: str = ""  # of the last drawing
-    logged: str = ""  # the last failure that was
+    failure: str = ""  # of the last drawing; empty: none
+    logged: str = ""  # the last failure that was logged
 
     @property
     def finished(self) -> bool:
@@ -56,8 +56,8 @@ class Views:
     """The open views.
 
     Attributes:
-        status: how each is served; replaced as a whole whenever it changes.
-        pairs: those of both eyes that are drawn again and again; replaced as `status` is.
+        status: how each view is served; replaced as a whole whenever it changes.
+        pairs: names of the stereo views that are drawn repeatedly; replaced as `status` is.
     """
 
     def __init__(
@@ -72,9 +72,9 @@ class Views:
         """
         Args:
             allowance: what drawing may take of one core.
-            latency: s from capture to published, as it was lately.
-            backend: as `make_rasterizer` has it.
-            detail: views have that of pictures.
+            latency: returns the recent time from capture to publication, s.
+            backend: as for `make_rasterizer`.
+            detail: whether views get the detail of pictures.
         """
         self.status: Mapping[str, ViewStatus] = {}
         self.pairs: Collection[str] = ()
@@ -91,8 +91,8 @@ class Views:
     def open(
         self, request: ViewRequest, scene: FrameResult | None, seen: Sequence[SeenFrame] = ()
     ) -> DrawnView | None:
-        """Open a view, or change one of that name; returns its first picture where there is a scene. Else
-        it is drawn with the next one.
+        """Open a view, or change the one of that name. Returns its first picture if there is a scene;
+        otherwise it is drawn with the next scene.
 
         Raises:
             SagsError: there are too many views.
@@ -104,11 +104,11 @@ class Views:
             raise SagsError(f"{MAX_VIEWS} views are open, the most there can be ({names}); close one first")
         view = _View(request, self._clock()) if known is None else known
         if request.static or view.request.static:
-            view.cost = 0.0  # it was not drawn as it is asked for now
+            view.cost = 0.0  # not yet drawn as it is requested now
         view.request = request
         self._views[request.name] = view
         self._forget_sizes()
-        self._watched = {*self._watched, request.name}  # until it is known better
+        self._watched = {*self._watched, request.name}  # assumed until `draw_due` says who subscribes
         drawn = None
         if scene is not None and view.cost == 0:
             try:
@@ -120,23 +120,21 @@ class Views:
         return drawn
 
     def close(self, name: str) -> None:
-        """Raises:
-        SagsError: no view of that name is open.
-        """
+        """Close a view; raises `SagsError` where none of that name is open."""
         if self._views.pop(name, None) is None:
             raise SagsError(f"no view '{name}' is open; open are: {', '.join(sorted(self._views)) or 'none'}")
         self._forget_sizes()
         self._note()
 
     def _forget_sizes(self) -> None:
-        """Let go of what draws a size that no view has any more: tens of MB each."""
+        """Free the rasterizers of sizes that no view has any more: tens of MB each."""
         sizes = {(view.request.width, view.request.height) for view in self._views.values()}
         self._rasterizers = {size: kept for size, kept in self._rasterizers.items() if size in sizes}
 
     def draw_due(
         self, scene: FrameResult, watched: Collection[str], seen: Sequence[SeenFrame] = ()
     ) -> Iterator[tuple[str, DrawnView]]:
-        """Draw what is due of a new scene, longest overdue first. A drawing that fails costs its view alone.
+        """Draw the views due of a new scene, longest overdue first. A failure affects only its own view.
 
         Args:
             watched: views that somebody subscribes to.
@@ -200,7 +198,7 @@ class Views:
         return DrawnView(pictures, scene.pair.baseline, request.depth, request.static, scene.epoch, ahead)
 
     def _planes(self, gaussians: Gaussians, camera: Camera) -> F32:
-        """Do as `Rasterizer.forward`. Where a GPU fails the CPU draws, and ever after."""
+        """Draw as `Rasterizer.forward` does. After a failure of the GPU, always the CPU draws."""
         size = camera.width, camera.height
         try:
             if size not in self._rasterizers:
@@ -216,7 +214,7 @@ class Views:
     # ---- rates -----------------------------------------------------------------------------------------
 
     def _granted(self, view: _View) -> float:
-        """Hz: the part of the rate asked for that all views can keep."""
+        """The granted rate, Hz: the fraction of the rate asked for that all views can keep."""
         served = {id(view): view, **{id(v): v for n, v in self._views.items() if n in self._watched}}
         demand = sum(one.cost * one.request.rate_hz for one in served.values() if not one.request.static)
         return view.request.rate_hz * min(1.0, self._allowance.share / max(demand, 1e-9))
@@ -249,7 +247,7 @@ class Views:
 
 
 def _published(scene: FrameResult, camera: Camera) -> RenderedView | None:
-    """The right eye as the node shows it, where that is this camera's; its depth may be written."""
+    """The node's own view of the right eye, if `camera` is that eye; its depth may be written."""
     shown = scene.views.get("right")
     if shown is None or published.size_of(scene.pair) != (camera.width, camera.height):
         return None

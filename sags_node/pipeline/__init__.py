@@ -1,4 +1,4 @@
-"""One frame from the camera to the model, what a launch opens for it, and compiling ahead.
+"""The way of a frame from the camera to the model, the session that a launch opens, and the warm-up.
 
 Imports config, detail, engine, instruments, kernels, mapping, messaging, model, phantom, rig, sources and
 vision.

@@ -1,4 +1,4 @@
-"""One stereo frame in, one result out: the straight line. No threads, sockets or clock decisions here."""
+"""The frame path: one stereo frame in, one result out. No threads, sockets or clock decisions here."""
 
 from __future__ import annotations
 
@@ -69,20 +69,20 @@ from sags_node.vision.watch.scene_watch import SceneWatch, enlarged, exposed
 if TYPE_CHECKING:
     from sags_node.mapping.sags_mapper import SagsMapper
 
-UNHURRIED_MS = 60.0  # a budget that has room for several steps and a finer flow
-GAP = 3.0  # usual steps between two frames: beyond, frames have failed to come
-NOTICED_LATE = HALVING  # m, error assumed of depth from before wrong matches were found
+UNHURRIED_MS = 60.0  # a budget with room for several optimiser steps and finer optical flow
+GAP = 3.0  # times the usual period: after a longer one, frames have failed to come
+NOTICED_LATE = HALVING  # m, error assumed of depth from before wrong matches were noticed
 
 
 @dataclass(frozen=True, slots=True)
 class FrameRequest:
     """What consumers want of one frame."""
 
-    waited: float = 0.0  # s since it came
+    waited: float = 0.0  # s since the frame came
     left: bool = False  # somebody looks at the left view: it gets the picture's detail
     right: bool = False  # somebody looks at the right eye: it is drawn, where there is one
-    latency: float = 0.0  # s from capture to what shows it, as it was lately
-    instruments: bool = False  # somebody wants to know where they are
+    latency: float = 0.0  # s, recent time from capture to publication
+    instruments: bool = False  # somebody wants to know where the instruments are
 
 
 NOTHING_ASKED = FrameRequest()
@@ -94,14 +94,14 @@ class Pipeline:
     Args:
         masks: of another process, for `vision.tissue.method` topic.
         on_rectified: called with each pair and its epoch, before anything else is done with it.
-        rate: see below.
+        rate: the attribute's first value.
 
     Attributes:
-        rate: frames that come a second; None: they come when they are taken. `reconfigure` after a change.
+        rate: frames that come per second; None: they come when taken. Call `reconfigure` after a change.
         newest: the frame mapped last; None before the first, and after a reset.
         held: why the last frame was not taken in; empty: it was.
         seen: the frames that lend views their pictures, the newest first: the one mapped last and older ones.
-        metric: lengths are metres: the calibration is no guess.
+        metric: whether lengths are metres: the calibration is no guess.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Pipeline:
         self.map = TissueMap(affordable(config, width, height), field=config.mapping.field is True)
         self.mapper: Mapper | SagsMapper
         if config.mapping.method == "sags":
-            from sags_node.mapping.sags_mapper import SagsMapper  # and torch, which takes a second
+            from sags_node.mapping.sags_mapper import SagsMapper  # it loads torch, which takes a second
 
             self.mapper = SagsMapper(self.map)
         else:
@@ -145,7 +145,7 @@ class Pipeline:
         self.anchors = Anchors(self.tissue.usable)
         self._instruments = Instruments(self.tissue.usable)
         self._instruments_asked = False  # for the last frame that was mapped
-        self._tools: tuple[ToolPose, ...] = ()  # of the newest frame, as a robot tells them
+        self._tools: tuple[ToolPose, ...] = ()  # of the newest frame, as a robot reports them
         self._pose = PoseWatch(needed=vision.pose in ("session", "refine"))
         self._scene = SceneWatch(moving=vision.pose == "estimate")
         self._freeze = FreezeWatch(vision.tissue.exclude)
@@ -157,17 +157,17 @@ class Pipeline:
         self.newest: FrameResult | None = None
         self.held = ""
         self.seen: tuple[SeenFrame, ...] = ()
-        self._strain: Strain | None = None  # since somebody asked for it
-        self._last: Drawn | None = None  # what motion starts from: the last frame in which something moved
+        self._strain: Strain | None = None  # None: nobody asked for it
+        self._last: Drawn | None = None  # where motion starts: the last frame in which something moved
         self._unwatched = 0.0  # m: how far tissue may have moved while no frame was taken in
         self._came_ns: int | None = None  # when the last frame was captured
-        self._mapped_ns = 0  # when the last one that was mapped was, by the clock as it was set since
-        self._steps: deque[float] = deque(maxlen=15)  # s between the last ones
+        self._mapped_ns = 0  # when the last mapped frame was captured, corrected where the clock was set back
+        self._steps: deque[float] = deque(maxlen=15)  # s between the last frames
 
     def reset(self) -> None:
         """Forget the model; the next frame makes a new one, in a new epoch.
 
-        While the scope's pose is not known no frame can: it is forgotten when one comes whose pose is.
+        While the scope's pose is unknown, the model stays until a frame with a known pose comes.
         """
         self._reset_due = True
         if not self._pose.findings:
@@ -184,16 +184,16 @@ class Pipeline:
 
     @property
     def may_be_sure(self) -> bool:
-        """Neither the calibration nor the scale is a guess. May be read from any thread."""
+        """Tell whether neither calibration nor scale is a guess. May be read from any thread."""
         return self.metric and not self.depth.scale_is_declared
 
     def anchor_confidence(self, anchor_id: int) -> float:
-        """How far to trust the depth of an anchor that is there, 0..1, now."""
+        """Return how far to trust the depth of an existing anchor now, 0..1."""
         sure = self.anchors.depth_confidence(anchor_id) * float(confidence_of(np.float32(self._unwatched)))
         return sure if self.may_be_sure else min(sure, MOST)
 
     def start_strain(self) -> int:
-        """From now on frames say how tissue is stretched since the newest one; returns its stamp.
+        """Report from now on the strain of tissue since the newest frame; returns that frame's stamp (ns).
 
         Raises:
             SagsError: no depth is sure enough to tell strain from noise.
@@ -209,12 +209,12 @@ class Pipeline:
         return strain.since_ns
 
     def stop_strain(self) -> dict[str, Any]:
-        """Frames say no more of it."""
+        """Report strain no more."""
         self._strain = None
         return {}
 
     def predict_motion(self) -> None:
-        """Somebody wants motion predicted. Any thread may call this."""
+        """Begin to predict motion. Any thread may call this."""
         if self._config.mapping.field is not False and self._config.mapping.method == "nodes":
             self.map.remember_motion()
 
@@ -239,15 +239,15 @@ class Pipeline:
         return by_stage(found)
 
     def reconfigure(self, config: LaunchConfig) -> None:
-        """Take changed parameters over; the model stays."""
+        """Apply changed parameters; the model stays."""
         self._config = config
         unhurried = config.mapping.frame_ms(self.rate) >= UNHURRIED_MS
         self.mapper.pace(unhurried)
         self._surface.pace(unhurried)
 
     def make_budget(self, speed: float | None = None) -> Budget:
-        """Return what frames get, by the configuration and how long this machine takes (`Ladder.speed`);
-        None: it is measured now, which takes less than a tenth of a second."""
+        """Return the budget of frames, by the configuration and this machine's speed (`Ladder.speed`). None:
+        the speed is measured now, which takes less than a tenth of a second."""
         camera = self.rectifier.camera
         return make_budget(self._config, camera.width, camera.height, speed, self.rate, self._skips)
 
@@ -255,8 +255,8 @@ class Pipeline:
         self, frame: StereoFrame, budget: Budget, request: FrameRequest = NOTHING_ASKED,
         pictures: RectifiedPictures | None = None,
     ) -> FrameResult:  # fmt: skip
-        """Everything that happens to one frame; `pictures`: of `rectifier.pictures`, where another thread
-        made them ahead."""
+        """Do all the work on one frame. `pictures`: the result of `rectifier.pictures`, if another thread has
+        made it already."""
         result = replace(self._processed(frame, budget, request, pictures), recorded_s=frame.recorded_s)
         self.held = result.held
         return result if self.may_be_sure else unsure(result)
@@ -271,7 +271,7 @@ class Pipeline:
             pair = self._rectified(frame, pictures)
         clock.timings_ms["rectify"] += 0.0 if pictures is None else pictures.ms
         self._on_rectified(pair, self._epoch(frame))
-        # 1. Watch: may this frame be trusted? One that may not is held, an equal one is the last again.
+        # 1. Watch: may this frame be trusted? If not, it is held. An equal one repeats the last result.
         right = pair.right is not None and (request.right or self._config.publish.right is True)
         with clock("watch"):
             judged = self._watch(frame, pair, right, request.instruments)
@@ -279,8 +279,8 @@ class Pipeline:
             return self._carried_on(frame, pair, judged, unseen(pair), clock)
         if judged.is_new_scene:
             self._forget()
-        # 2. Segment: where is tissue? Cover, and drops on the lens, are none.
-        seen = pair if judged.gain is None else exposed(pair, judged.gain)  # as the model was exposed
+        # 2. Segment: where is tissue? What covers it, and drops on the lens, are not tissue.
+        seen = pair if judged.gain is None else exposed(pair, judged.gain)  # in the exposure of the model
         still = self._still_frames(pair)
         with clock("mask"):
             tissue = self._segmented(frame, seen, judged)
@@ -307,7 +307,7 @@ class Pipeline:
             views = {"left": self._left_eye(mapped.view, pair, request.left or right)}
             if right:
                 views["right"] = self._right_eye(mapped, observation, pair, seen, judged, by_both)
-        if not still:  # still frames are cheap: they would bias the cost
+        if not still:  # still frames cost less: they would bias the estimate
             budget.finish(self.map.model.count, matched=plan.depth and measured.is_new)
         with clock("anchors"):
             self.anchors.update(observation, mapped.snapshot, mapped.view, judged.learn)
@@ -327,15 +327,15 @@ class Pipeline:
         return replace(self.newest, held=judged.hold) if judged.hold else self.newest
 
     def _rectified(self, frame: StereoFrame, pictures: RectifiedPictures | None) -> RectifiedPair:
-        """Until its pose is found, its camera is where it was last, or as it is given."""
+        """Rectify a frame. Until its pose is found, it has the last camera pose, or the given one."""
         return self.rectifier(replace(frame, T_world_cam=self._camera.guess(frame.T_world_cam)), pictures)
 
     def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool, instruments: bool) -> Judgement:
-        """Return what all watchers together say of a frame."""
+        """Return the judgement of all watchers on a frame."""
         if self._reset_due and frame.pose_problem is None:
             self._forget()
         last = self.newest
-        lacks = last is not None and (  # somebody has just come
+        lacks = last is not None and (  # somebody has just asked for it
             (right and "right" not in last.views) or (instruments and not self._instruments_asked)
         )
         equal = last is not None and self._skips.duplicates and not lacks and is_repeat(pair, last.pair)
@@ -349,8 +349,8 @@ class Pipeline:
         self, frame: StereoFrame, pair: RectifiedPair, judged: Judgement, observation: Observation,
         clock: Stopwatch,
     ) -> FrameResult:  # fmt: skip
-        """The last result, for a frame that is not mapped: it equals the last one, or it is held. Then its
-        picture teaches nothing; the tissue moves meanwhile, and the depth is less and less sure."""
+        """The last result, for a frame that is not mapped: it equals the last one, or it is held. While
+        frames are held the tissue moves unseen, so the depth gets less and less sure."""
         assert self.newest is not None
         if not judged.hold:
             self.anchors.age(pair.t_capture_ns, equal=not self._freeze.findings)
@@ -364,8 +364,8 @@ class Pipeline:
         return replace(held, observation=observation, skipped=skipped, held=judged.hold, hurried=False)
 
     def _note_gap(self, t_capture_ns: int) -> None:
-        """Find where no frame has come for longer than is usual, nobody watched the tissue. Where the clock
-        was set back, what is counted by it goes on."""
+        """Note how long no frame came: after an unusual gap the tissue may have moved unseen. If the clock
+        was set back, correct the stamps that are kept."""
         before, self._came_ns = self._came_ns, t_capture_ns
         seconds = 1e-9 * (t_capture_ns - before) if before is not None else 0.0
         if before is not None and t_capture_ns < before:
@@ -375,11 +375,11 @@ class Pipeline:
                 self.newest = replace(self.newest, strain=self._strain)
         if self._steps and seconds > GAP * median(self._steps):
             self._unwatched = max(self._unwatched, UNWATCHED * seconds)
-        if seconds > 0:  # long ones, too: they are usual where the camera's rate has fallen
+        if seconds > 0:  # long ones, too: after a fall of the camera's rate they are usual
             self._steps.append(seconds)
 
     def _still_frames(self, pair: RectifiedPair) -> int:
-        """Count for how many frames nothing has moved."""
+        """Return for how many frames nothing has moved."""
         if not self._skips.still:
             return 0
         if self._camera.by_picture:
@@ -428,14 +428,14 @@ class Pipeline:
             self._right.miss()
         begins = self.map.deformation is None
         mapped = self.mapper.update(observation, tracks, budget, still, learn, right)
-        if not still or begins:  # a still frame is passed over: slow motion adds up until seen
+        if not still or begins:  # skips still frames, so that slow motion adds up until seen
             self._last = Drawn(observation, mapped.view)
         self._camera.learn(observation, mapped.view)
         return mapped
 
     def _lend(self, mapped: Mapped, pair: RectifiedPair, observation: Observation, judged: Judgement) -> None:
-        """Note which pictures views may have their detail from. One in another light lends none, nor one in
-        which the model knows nothing."""
+        """Note the pictures from which views may take detail. None is taken from one in another light, or if
+        the model is empty."""
         self.seen = ()
         known = len(mapped.snapshot.gaussians) > 0
         if self._detail is None or not known or not judged.learn or judged.gain is not None:
@@ -463,7 +463,7 @@ class Pipeline:
         self, mapped: Mapped, observation: Observation, pair: RectifiedPair, seen: RectifiedPair,
         judged: Judgement, by_both: Bool,
     ) -> RenderedView:  # fmt: skip
-        """The model drawn for the right eye, which is learnt from where both see tissue."""
+        """The model drawn for the right eye, whose colours are learnt where both eyes see tissue."""
         last, stamp = self.newest, mapped.view.t_capture_ns
         if last is not None and "right" in last.views and last.views["left"].colours is mapped.view.colours:
             return replace(last.views["right"], frame_id=mapped.view.frame_id, t_capture_ns=stamp)
@@ -513,21 +513,21 @@ class Pipeline:
         return {**skipped, **measured.skipped}
 
     def _draw_model(self, camera: Camera) -> RenderedView:
-        """The model as it is now, in the light of a scope that is there."""
+        """The model drawn as it is now, lit by a scope that is at `camera`."""
         return to_view(self._refiner.show(self.map.relight(camera), camera), camera, 0, 0)
 
     def _epoch(self, frame: StereoFrame) -> int:
-        """Grows with the source's epochs and with every new model: ids then mean other Gaussians."""
+        """The epoch: it grows with the source's and with every new model, whose ids mean other Gaussians."""
         return frame.epoch + self.map.restarts
 
 
 def _without(tissue: Bool, cover: Bool | None) -> Bool:
-    """The mask less what a small mask says is covered."""
+    """The tissue mask without what a smaller mask says is covered."""
     return tissue if cover is None else tissue & ~enlarged(cover, tissue.shape)
 
 
 class Stopwatch:
-    """Wall time of named stages, ms; of one that comes twice the sum."""
+    """Measures the wall time of named stages, ms; the times of a repeated stage are added."""
 
     def __init__(self) -> None:
         self.timings_ms: dict[str, float] = {}

@@ -1,9 +1,9 @@
 """Changes to the result of a mapped frame: it is repeated for a frame that is not mapped, doubted while
 frames are held, or unsure where the calibration is a guess.
 
-Lengths of a guessed calibration, or of a declared scale, are right up to a factor that nobody knows. The
-confidence of a depth states an error in mm, and there is none to state. So no confidence reaches `SURE`:
-programs that decide something by a depth, or show it as sure, take none of these.
+Lengths of a guessed calibration, or of a declared scale, are right only up to an unknown factor. A depth's
+confidence states an error in mm, which is not known then. So no confidence reaches `SURE`, and programs
+that decide something by a depth, or show it as sure, use none of these.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,8 @@ from sags_node.types import F32, AnchorStates, Finding, FrameResult, Observation
 from sags_node.vision.depth import Measured
 from sags_node.vision.observe import observe
 
-MOST = 0.98 * SURE
-LEAST_ERROR = error_of(np.array(MOST, np.float32))  # m
+MOST = 0.98 * SURE  # highest confidence where the scale is a guess
+LEAST_ERROR = error_of(np.array(MOST, np.float32))  # m, predicted error at `MOST`
 FINDING = Finding(
     "uncalibrated",
     f"no calibration: a field of view of {GUESSED_FOV:g} degrees is guessed, and depth has no unit; "
@@ -30,7 +30,7 @@ FINDING = Finding(
 def repeated(
     mapped: FrameResult, pair: RectifiedPair, epoch: int, timings: Mapping[str, float], anchors: AnchorStates
 ) -> FrameResult:
-    """The last mapped result under the ids of a frame that equals it."""
+    """The last mapped result, with the id and stamp of a frame that is not mapped."""
     frame_id, stamp = pair.frame_id, pair.t_capture_ns
     still = np.zeros_like(mapped.snapshot.velocities)
     views = {eye: replace(view, frame_id=frame_id, t_capture_ns=stamp) for eye, view in mapped.views.items()}
@@ -46,12 +46,12 @@ def repeated(
         timings_ms=timings,
         skipped={**mapped.skipped, "frame": "equals its predecessor"},
         anchors=anchors,
-        instruments=None,  # they are told of the frame in which they were found
+        instruments=None,  # they are published only with the frame in which they were found
     )
 
 
 def doubted(held: FrameResult, error: float) -> FrameResult:
-    """A result whose depth may be wrong by so much more, m."""
+    """The result with `error` (m) added to the predicted errors of its depths."""
     gaussians, anchors = held.snapshot.gaussians, held.anchors
     if gaussians.depth_errors is not None:
         gaussians = replace(gaussians, depth_errors=gaussians.depth_errors + np.float32(error))
@@ -71,7 +71,7 @@ def unseen(pair: RectifiedPair) -> Observation:
 
 
 def unsure(result: FrameResult) -> FrameResult:
-    """A frame whose depths are nowhere sure; what they look like is as it was."""
+    """The result with no confidence above `MOST`; all else is unchanged."""
     views = {
         eye: view if view.confidence is None else replace(view, confidence=_at_most(view.confidence))
         for eye, view in result.views.items()
@@ -94,5 +94,5 @@ def unsure(result: FrameResult) -> FrameResult:
 
 
 def _at_most(confidence: F32) -> F32:
-    """Confidences as they may be stated where the scale is a guess."""
+    """Confidences limited to the highest allowed where the scale is a guess."""
     return np.minimum(confidence, np.float32(MOST))

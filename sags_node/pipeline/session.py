@@ -1,4 +1,4 @@
-"""From a launch file to the three things the node runs on: configuration, rig and source."""
+"""Open what a launch file names, and the node needs: configuration, rig and source."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,12 +26,12 @@ from sags_node.sources.robot import Posed
 from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
 
-Guess = Callable[[schema.Source], StereoRig]  # from the pictures of a source
+Guess = Callable[[schema.Source], StereoRig]  # makes a rig from the pictures of a source
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What a node needs. The source brings no truth with its frames; measuring opens its own."""
+    """What a node needs. The source gives no ground truth; evaluation opens a source of its own."""
 
     name: str  # of the launch file or folder
     config: LaunchConfig
@@ -59,7 +59,7 @@ def open_session(
 
     Args:
         progress: called with (frames done, frames in all) while the phantom is rendered for the first time.
-        guess: makes a calibration where none is named; None: that is an error.
+        guess: makes a calibration where none is named; None: a missing one is an error.
 
     Raises:
         UsageError: a wrong key, value or path.
@@ -89,7 +89,7 @@ def open_posed(config: LaunchConfig, rig: StereoRig, references: bool = True) ->
     """The frames of a launch file, with the robot's poses where it names one.
 
     Args:
-        references: read the recording's truth with each frame. Only measuring needs it.
+        references: read the recording's ground truth with each frame. Only evaluation needs it.
 
     Raises:
         UsageError, SagsError: see `open_source` and `Posed`.
@@ -108,14 +108,14 @@ def _name(launch: Path | str | None) -> str:
 
 def lacks_rig(config: LaunchConfig) -> bool:
     """Tell whether `open_session` would guess the calibration."""
-    opens = isinstance(config.source, RecordedSource | V4l2Source | GstSource)  # by itself: nobody must send
+    opens = isinstance(config.source, RecordedSource | V4l2Source | GstSource)  # these need no sender
     return config.rig is None and opens and recorded_rig(config.source, judged=False) is None
 
 
 def rig_to_play(
     config: LaunchConfig, progress: Callable[[int, int], None] | None = None, guess: Guess | None = None
 ) -> StereoRig:
-    """The calibration that `open_session` plays with, its arguments as there."""
+    """Return the calibration that `open_session` uses with the same arguments."""
     if isinstance(config.source, PhantomSource):
         from sags_node.phantom import cached_session
 
@@ -124,14 +124,14 @@ def rig_to_play(
 
 
 def rig_of(config: LaunchConfig) -> StereoRig:
-    """The calibration that comes with the pictures, or the one that the launch file names; of pictures as
-    they come, rectified or not."""
+    """Return the calibration that comes with the pictures, or that the launch file names, adapted to whether
+    the pictures come rectified."""
     return as_pictures_come(_named_rig(config), config)
 
 
 def _named_rig(config: LaunchConfig) -> StereoRig:
     if config.rig is not None and isinstance(config.source, BagSource | Ros2Source):
-        return load_rig(config.rig)  # what drivers say is often uncalibrated, or of another day
+        return load_rig(config.rig)  # a driver's calibration is often missing or outdated
     recorded = recorded_rig(config.source)
     if recorded is not None and config.rig is not None:
         raise UsageError(f"rig: {config.rig} is one calibration too many: the recording brings its own")

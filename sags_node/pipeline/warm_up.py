@@ -24,17 +24,17 @@ from sags_node.vision.rectify import Rectifier
 from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue_classical import InstrumentFinder
 
-COMPILING = 600.0  # s that the vision's kernels may take on a slow machine
-# Large enough for work that is shared between threads: smaller pictures take other kernels.
+COMPILING = 600.0  # s, longest compilation of the vision's kernels on a slow machine
+# Pictures large enough for kernels of several threads: smaller ones use other kernels.
 _WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 240, 192, 225.0, 0.0043, 12
 
 
 def warm_up(config: LaunchConfig) -> None:
     """Run a few small made-up frames through a pipeline of the same kind.
 
-    Kernels do not depend on sizes, so this takes well under a second once they are in Numba's disk cache, and
-    about a minute the first time, in which a second process compiles those of the vision. With a GPU those of
-    the CPU are made ready too: it goes on where the GPU fails.
+    Kernels do not depend on sizes. This takes well under a second once they are in Numba's disk cache, and
+    about a minute the first time, when a second process compiles those of the vision. With a GPU those of
+    the CPU are prepared, too: the CPU goes on if the GPU fails.
 
     Raises:
         UsageError: a GPU is wanted and none can be used.
@@ -50,10 +50,10 @@ def warm_up(config: LaunchConfig) -> None:
     pipeline = Pipeline(small, _rig())
     right = config.publish.right is not False
     request = FrameRequest(left=True, right=right, instruments=True)  # somebody may look
-    budget = StepBudget(2)  # the first on the whole picture, the second where it is worst
+    budget = StepBudget(2)  # the first step covers the whole picture, the second where it is worst
     frames = _frames()
     with _vision_beside():
-        for frame in frames[:3]:  # with a depth of their own: stereo is left to the other process
+        for frame in frames[:3]:  # these bring their depth: the other process compiles stereo
             pipeline.process(frame, budget, request)
     for frame in frames[3:]:
         result = pipeline.process(frame, budget, request)
@@ -61,13 +61,13 @@ def warm_up(config: LaunchConfig) -> None:
 
 
 def prepare(config: LaunchConfig) -> None:
-    """Warm up, and let this thread's kernels use as many cores as the launch says."""
+    """Warm up, then let this thread's kernels use as many cores as the launch file says."""
     warm_up(config)
     configure_threads(config.engine.threads)
 
 
 def compile_vision() -> None:
-    """Compile and keep the kernels of flow and stereo, the one that is needed first before the other."""
+    """Compile and cache the kernels of optical flow and stereo, in the order in which they are needed."""
     rectifier = Rectifier(_rig(), _WIDTH, _HEIGHT)
     before, after = (rectifier(frame) for frame in _frames()[-2:])
     OpticalFlow(stride=4)(pyramids(before)[0], pyramids(after)[0])
@@ -78,8 +78,8 @@ def compile_vision() -> None:
 
 @contextmanager
 def _vision_beside() -> Iterator[None]:
-    """Find where nothing is compiled yet, another process does `compile_vision` meanwhile. It only saves
-    time: what it leaves undone is compiled here."""
+    """If nothing is compiled yet, run `compile_vision` in another process during the block. It only saves
+    time: what it does not finish is compiled here."""
     if not is_cold(spread_patches):
         yield
         return
@@ -97,8 +97,8 @@ def _vision_beside() -> Iterator[None]:
 
 
 def _frames() -> list[StereoFrame]:
-    """Six of a picture that moves by a pixel a frame. The first three bring their depth; in the last three
-    it is the scope that moves, and an instrument hides tissue."""
+    """Six frames of a picture that moves by a pixel per frame. The first three bring their depth. In the
+    last three the scope moves instead of the tissue, and an instrument hides tissue."""
     coarse: U8 = np.random.default_rng(0).integers(40, 220, (_HEIGHT // 4, _WIDTH // 4 + 16, 3), np.uint8)
     texture = cv2.resize(coarse, (_WIDTH + 64, _HEIGHT))
     tissue, free = np.ones((2, _HEIGHT, _WIDTH), np.bool_)

@@ -1,4 +1,4 @@
-"""How commands talk to people and programs: tables, progress, warnings, JSON.
+"""Output of commands for people and programs: tables, progress, warnings, JSON.
 
 Imports no other folder.
 """

@@ -1,4 +1,4 @@
-"""How the command line talks to people and programs: results on stdout, everything else on stderr."""
+"""Output of the command line for people and programs: results on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-WIDE = 10_000  # columns of a table that goes to a file or another program, and so is not cut to a screen
+WIDE = 10_000  # columns of a table for a file or another program, which is not fitted to a screen
 
-SAY_EVERY = 10.0  # s between two lines of progress, where no terminal shows a bar
-SAME_SIGNAL = 0.5  # s
-LOOK_AGAIN = 0.02  # s until a Ctrl-C that could not come through is tried again
-LONGEST_WAIT = 10.0  # s, after which it is tried whatever becomes of it
-_IMPORT = "<frozen importlib._bootstrap>"  # where the frames of an import are
-# Finalisers, what LLVM calls when it has compiled or loaded a kernel (the first Python code for long), and
-# the hook below, while it has a lost one sent again.
+SAY_EVERY = 10.0  # s between two lines of progress, if no terminal shows a bar
+SAME_SIGNAL = 0.5  # s in which a repeated signal counts as the same
+LOOK_AGAIN = 0.02  # s until a Ctrl-C that would have been lost is sent again
+LONGEST_WAIT = 10.0  # s after which `KeyboardInterrupt` is raised even where it may be lost
+_IMPORT = "<frozen importlib._bootstrap>"  # file name of the stack frames of an import
+# Functions that lose exceptions: finalisers, the callbacks of LLVM after it has compiled or loaded a kernel
+# (the first Python code for long), and the hook below that sends a lost Ctrl-C again.
 _LOSING = {"__del__", "_raw_object_cache_notify", "_raw_object_cache_getbuffer", "unraisable"}
 
 _CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x80-\x9f]")  # all but the end of a line
 
 
 def visible(said: str) -> str:
-    r"""Spell control characters out, tab and ESC as `\t` and `\x1b`: names of files and topics may hold some,
+    r"""Escape control characters (tab and ESC as `\t` and `\x1b`): names of files and topics may hold some,
     and a terminal would obey them."""
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), said)
 
 
 class _Console(Console):
     def render_str(self, text: str, **options: Any) -> Text:
-        """All text comes through here: lines, and the cells of tables."""
+        """Make text visible. All text comes through here: lines, and the cells of tables."""
         return super().render_str(visible(text), **options)
 
 
@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 
 
 class _Json(logging.Formatter):
-    """A line that is one JSON object."""
+    """Formats each log record as one JSON object in a line."""
 
     def format(self, record: logging.LogRecord) -> str:
         said = {
@@ -67,17 +67,17 @@ class _Json(logging.Formatter):
 
 
 class _Lines(logging.Handler):
-    """The log for people, in the form of `tell`."""
+    """Prints the log for people, in the form of `tell`."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
             _print(f"{record.levelname.lower()}: {self.format(record)}")
-        except OSError:  # the terminal is gone: no reason to end a thread that logs
+        except OSError:  # the terminal is gone, which must not end the thread that logs
             self.handleError(record)
 
 
 def log_handler() -> logging.Handler:
-    """Say for people; where the console is quiet, for machines."""
+    """Return a log handler for people, or, if the console is quiet, for programs."""
     if not console.quiet:
         return _Lines()
     handler = logging.StreamHandler()
@@ -86,28 +86,28 @@ def log_handler() -> logging.Handler:
 
 
 def tell(line: str) -> None:
-    """Something that a person should know: a line, or an event in the log."""
+    """Tell a person something: a line, or a log record if the console is quiet."""
     if console.quiet:
         log.warning("%s", line)
     _print(line)
 
 
 def _print(line: str) -> None:
-    """In a file with its time: nobody saw when it came."""
+    """Print a line; outside a terminal with its time, since nobody saw when it came."""
     when = "" if console.is_terminal else datetime.now().astimezone().isoformat(" ", "seconds") + " "
     console.print(when + line, markup=False, soft_wrap=True)
 
 
 @contextmanager
 def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[Callable[..., None]]:
-    """A progress bar that appears with its first advance(done, total=None, what=None); where there is no
-    terminal, a line now and then."""
+    """Show a progress bar, which appears at the first advance(done, total=None, description=None). Without a
+    terminal, print a line every `SAY_EVERY` s instead."""
     described = TextColumn("{task.description}", markup=False)
     columns = (described, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None, visible=False)
         said = began = now()
-        first, last, count = 0, 0, 0  # where the count that runs began and is, and of how many it is
+        first, last, count = 0, 0, 0  # start, present value and total of the running count
 
         def advance(done: int, total: int | None = None, description: str | None = None) -> None:
             nonlocal said, began, first, last, count
@@ -131,7 +131,7 @@ def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[C
 
 
 def time_text(seconds: float) -> str:
-    """How long something takes, as far as anybody can say beforehand."""
+    """A duration as text, rounded as an estimate."""
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
@@ -144,7 +144,7 @@ def show(result: Table | str | dict[str, Any] | list[dict[str, Any]]) -> None:
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """JSON, in a line without `indent`; a number that is not finite becomes null: others read no NaN."""
+    """Return JSON, in one line without `indent`. Numbers that are not finite become null: JSON has no NaN."""
     return json.dumps(json.loads(json.dumps(value), parse_constant=lambda name: None), indent=indent)
 
 
@@ -158,10 +158,10 @@ def _drawn(table: Table) -> str:
 
 
 class _Interrupt:
-    """Handler of Ctrl-C: `KeyboardInterrupt`, as soon as it can come through.
+    """Handler of Ctrl-C: raises `KeyboardInterrupt` as soon as it cannot get lost.
 
-    In the middle of an import it may come out of C code as an `ImportError`; finalisers and callbacks of C
-    code lose it.
+    During an import C code may turn it into an `ImportError`; finalisers and callbacks of C code lose
+    it.
     """
 
     def __init__(self) -> None:
@@ -177,14 +177,14 @@ class _Interrupt:
         raise KeyboardInterrupt
 
     def unraisable(self, lost: sys.UnraisableHookArgs) -> None:
-        """Send a Ctrl-C again that was lost all the same, as in ZeroMQ: for `sys.unraisablehook`."""
+        """Send a Ctrl-C again that was lost all the same, e.g. in ZeroMQ; a `sys.unraisablehook`."""
         if lost.exc_type is KeyboardInterrupt:
             self._again(signal.SIGINT)
         else:
             sys.__unraisablehook__(lost)
 
     def _again(self, number: int) -> None:
-        """To this thread, the main one: it may be waiting by then, and must wake."""
+        """Send the signal again to this thread, the main one: if it waits by then, it must wake."""
         again = threading.Timer(LOOK_AGAIN, signal.pthread_kill, (threading.get_ident(), number))
         again.daemon = True
         again.start()
@@ -202,10 +202,10 @@ interrupt = _Interrupt()
 
 
 def on_stop_signals(stop: Callable[[], None]) -> None:
-    """Let Ctrl-C, a service manager's stop and the end of the terminal call this; a second one breaks off.
+    """Call `stop` at Ctrl-C, a service manager's stop or the end of the terminal; a second signal interrupts.
 
-    For what runs until then: the exception that they raise otherwise is lost if it meets a finaliser. What
-    comes right after the first is the same one: a wrapper or a shell that hands it on sends it twice.
+    Long-running work needs this: an exception that is raised in a finaliser is lost. A signal within
+    `SAME_SIGNAL` s of the first is the same one: a wrapper or a shell that passes it on sends it twice.
     """
     first: dict[int, float] = {}
 
@@ -218,15 +218,15 @@ def on_stop_signals(stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGINT, handle)
     signal.signal(signal.SIGTERM, handle)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # it is ignored under nohup
         signal.signal(signal.SIGHUP, handle)
 
 
 @contextmanager
 def stop_signals() -> Iterator[threading.Event]:
-    """`on_stop_signals` for as long as something runs that has threads: they set the event.
+    """Give an event that is set by the signals of `on_stop_signals`, during the block.
 
-    Raised between two steps of its start or its end, an exception would leave threads and sockets behind.
+    For work with threads: an exception amid its start or end would leave threads and sockets behind.
     """
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     stop = threading.Event()

@@ -5,14 +5,14 @@ from collections.abc import Callable, Mapping
 
 
 class Notices:
-    """Tells what has changed since it was asked last."""
+    """Tells which warnings began or ended since the last update."""
 
     def __init__(self, tell: Callable[[str], object]) -> None:
         self._tell = tell
         self._since: dict[str, float] = {}  # code -> when it began
 
     def update(self, warnings: Mapping[str, str]) -> None:
-        """`warnings`: all that hold now, code -> what is wrong and how to fix it."""
+        """Tell the changes; `warnings`: all that hold now, code -> what is wrong and how to fix it."""
         now = time.monotonic()
         for code in [code for code in self._since if code not in warnings]:
             self._tell(f"over after {now - self._since.pop(code):.1f} s: {code}")

@@ -1,4 +1,4 @@
-"""What `sags topic` and `sags overlay` found, for people. Programs get the same records as JSON."""
+"""The results of `sags topic` and `sags overlay` as text. Programs get the same records as JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def table(*headings: str) -> Table:
 
 
 def rows_table(rows: Sequence[Record]) -> Table:
-    """Records that share their keys, which become the headings."""
+    """The table of records that share their keys, which become the headings."""
     made = table(*(rows[0] if rows else ()))
     for row in rows:
         made.add_row(*(str(value) for value in row.values()))
@@ -30,7 +30,7 @@ def rows_table(rows: Sequence[Record]) -> Table:
 
 
 def findings_table(rows: Sequence[Record]) -> Table:
-    """Return what was looked at, without what is for programs."""
+    """The table of the results of checks, without the keys that are for programs."""
     return rows_table([{k: row[k] for k in row if k not in ("figures", "launch")} for row in rows])
 
 
@@ -68,10 +68,10 @@ def bw_text(figures: Record) -> str:
 
 
 def yaml_text(value: Any, short_lines: bool = True) -> str:
-    """A value as YAML, without a last line that means nothing to people."""
+    """A value as YAML, without the end marker `...`."""
     import yaml  # only here: all commands load this file
 
-    flow = False if short_lines else None  # None: what has no parts stands in one line
+    flow = False if short_lines else None  # None: lists and mappings without nested parts stand in one line
     said: str = yaml.safe_dump(value, sort_keys=False, default_flow_style=flow, width=100)
     return said.removesuffix("...\n").rstrip()
 
@@ -129,7 +129,7 @@ def _ms(seconds: float) -> str:
 
 
 def _short(value: Any) -> Any:
-    """The same with six significant digits."""
+    """The value with its numbers rounded to six significant digits."""
     if isinstance(value, Mapping):
         return {key: _short(part) for key, part in value.items()}
     if isinstance(value, list):
