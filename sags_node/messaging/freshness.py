@@ -45,6 +45,11 @@ class Freshness:
         self._window: deque[Meta] = deque(maxlen=WINDOW)
         self._followed: deque[str] = deque(maxlen=SESSIONS)
         self._mixed = 0  # messages of one node still needed until it counts as the only one
+        self._asked_anew = False
+
+    def ask_anew(self) -> None:
+        """Begin again with the next message: those between were not subscribed to, so they are not lost."""
+        self._asked_anew = True
 
     def accept(self, meta: Meta) -> bool:
         """Note a message; False when it is not newer than the last one (a last value sent again)."""
@@ -52,15 +57,17 @@ class Freshness:
         if last is not None and meta.session == last.session:
             if meta.seq <= last.seq or meta.epoch < last.epoch:
                 return False
-            self.lost += meta.seq - last.seq - 1
+            if not self._asked_anew:
+                self.lost += meta.seq - last.seq - 1
         if last is not None and meta.session != last.session:
             if meta.session in self._followed:  # a restarted node has a new session: the old one still sends
                 self._mixed = WINDOW
             self._followed.append(last.session)
         elif self._mixed:
             self._mixed -= 1
-        if last is None or meta.session != last.session or meta.epoch != last.epoch:
+        if last is None or self._asked_anew or meta.session != last.session or meta.epoch != last.epoch:
             self._window.clear()
+        self._asked_anew = False
         self.last, self._came = meta, self._clock()
         self._window.append(meta)
         return True

@@ -205,7 +205,7 @@ class Receiver:
 
     def ask(self, names: Iterable[str]) -> None:
         """Receive only these of the topics, and `status`; the node then makes and sends nothing else for this
-        client. Takes effect within `POLL_MS`. What is not received meanwhile counts as `lost`."""
+        client. Takes effect within `POLL_MS`. What is not received meanwhile is not counted as `lost`."""
         self._asked = _ALWAYS | frozenset(names)
 
     def pause(self) -> None:
@@ -284,6 +284,7 @@ class Receiver:
             if (name in asked) != (name in self._subscribed):
                 option = zmq.SUBSCRIBE if name in asked else zmq.UNSUBSCRIBE
                 socket.setsockopt_string(option, full)
+                self._fresh[name].ask_anew()
         self._subscribed = asked
 
     def _look_for_node(self) -> None:

@@ -66,6 +66,15 @@ def test_losses_do_not_stretch_the_period_but_count() -> None:
     assert fresh.period == pytest.approx(0.033) and fresh.lost == 3
 
 
+@pytest.mark.parametrize("rate_hz", [None, 30.0])
+def test_what_was_not_asked_for_is_not_lost(rate_hz: float | None) -> None:
+    fresh = followed([1, 2, 3], rate_hz=rate_hz)
+    fresh.ask_anew()
+    for seq in (900, 901, 903):
+        fresh.accept(meta(seq, seq * 33))
+        assert fresh.lost == (seq == 903) and (fresh.problem(round(seq * 33 * MS)) is None) == (seq != 903)
+
+
 @pytest.mark.fault("network: a fifth of the messages is lost")
 @pytest.mark.parametrize(("every", "stale"), [(12, False), (5, True)])
 def test_stale_under_ninety_percent(every: int, stale: bool) -> None:
