@@ -32,7 +32,7 @@ SAMPLE_MS = 1.9  # for one drawing with its gradients, in a loop, on the machine
 TRIES = 21
 
 LEAST_PIXELS = 2  # pixels of the picture for each Gaussian, where the number of steps is fixed
-FIELD_TIMES = 5.0  # times its price: first guess of the time of a frame of the paper's model
+FIELD_TIMES = 5.0  # factor on prices: first guess of what a frame of the paper's model takes
 GAUSSIANS_PER_MS = 1100  # of the frame's time, where the number of steps is fixed; see benchmarks/mapping.md
 
 
@@ -112,7 +112,7 @@ def make_budget(
 def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None) -> LaunchConfig:
     """The launch with a number for `vision.scale` where that is "auto".
 
-    In real time on a CPU it follows from this machine's speed, which is measured; else 1: results repeat.
+    In real time on a CPU it follows from the measured speed of this machine; else it is 1: results repeat.
 
     Args:
         width, height: px of the working size at scale 1.

@@ -41,7 +41,7 @@ def _or_on_the_cpu(
         if self.problem is None:
             try:
                 return method(self, *args, **names)
-            except RuntimeError as error:  # so Warp raises errors of the driver and of memory
+            except RuntimeError as error:  # what Warp raises if the driver fails, or memory is full
                 self._give_up(error)
         result: Result = getattr(self._cpu, method.__name__)(*args, **names)
         self.loss = self._cpu.loss
