@@ -41,7 +41,7 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
     new surfaces, then missing detail.
 
     A hole beside an instrument or in the strip that one eye does not see has no depth of its own; it borrows
-    that from around. Missing detail without a measured depth takes the model's, with the error of a borrowed.
+    that from around. Missing detail without measured depth takes the model's, with a borrowed error.
 
     Args:
         planes: [5, H, W] of the rasteriser: sums of w*rgb, w*z, w.

@@ -47,8 +47,8 @@ class FirstViews:
         self._kept.clear()
 
     def pose(self, observation: Observation, about: F64) -> F64 | None:
-        """The camera's pose [4, 4] by the oldest view with enough matches; None: none has. Later
-        views contain the error that the older ones left.
+        """The camera's pose [4, 4] by the oldest view with enough matches; None: none has. Later views
+        contain the error that the older ones left.
 
         Args:
             observation: a frame that was taken in; its camera says where the tissue is now.

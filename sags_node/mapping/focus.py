@@ -12,7 +12,7 @@ from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.types import F32, I32, U8, Bool
 
-EVERY = 2  # px: a quarter of the pixels tells enough
+EVERY = 2  # px between pixels that are compared: a quarter of them is enough
 REACH = 32  # px: few Gaussians are larger, and those are faint out there
 
 

@@ -16,7 +16,7 @@ from sags_node.vision.watch.picture_fit import MISFIT
 
 MIN_FIRST_DEPTHS = 200  # px with depth that a first model needs
 LOST_COVERAGE = 0.3  # of the tissue: a model that covers less is lost
-SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
+SETTLED = 10  # frames in which nothing moved, after which a model has little more to learn
 SETTLED_EVERY = 5  # frames: then it is refined in only one of so many
 SOME = slice(None, None, 8)  # rows and columns of a picture that are enough to judge by
 

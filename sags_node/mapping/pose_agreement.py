@@ -10,11 +10,11 @@ from sags_node.types import F32, U8, Bool, Camera, Observation, RenderedView
 WIDTH = 160  # px, about: of the shrunk pictures that are compared
 WINDOW = 9  # shrunk px: shading wider than that is the light's, which moves with the scope
 LEAST_VARIANCE = 1.0  # grey levels squared: less texture is noise
-LEAST_COVERED = 0.4  # of the tissue in view: so much of it must be known
+LEAST_COVERED = 0.4  # share of the tissue in view that must be known
 LEAST_CORRELATION = 0.5
 STEREO_ERROR = 0.35  # px: error of a measured disparity
 SPREAD = 3.0  # of these errors: what differs by more is another surface
-LEAST_NEAR = 0.6  # of the depths: so many must agree
+LEAST_NEAR = 0.6  # share of the depths that must agree
 LARGEST_OFFSET = 1.5  # of these errors: difference that is common to all depths
 LEAST_DEPTHS = 200  # shrunk px with depth that a comparison needs
 

@@ -16,7 +16,7 @@ from sags_node.vision.landmarks import APART, FEWEST, Features, agreeing, matche
 
 MOST_PICTURES = 12
 LIKE = 0.3  # share of features found again: a picture with fewer shows the tissue in another state
-NEAR = 0.3  # of the width: so far around an anchor features count
+NEAR = 0.3  # of the width: features within this distance of an anchor count
 MOST_AROUND = 30  # the nearest features around an anchor that are used
 SAME_MOTION = 0.01  # of the width: most that a feature may deviate from the common motion around the anchor
 SAME_SCALE = 1.25  # largest ratio of the scales by picture and by depth; its reciprocal is the smallest

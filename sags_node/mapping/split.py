@@ -22,7 +22,7 @@ GROWN = 0.8  # of the Gaussians that are allowed: below it, splitting adds Gauss
 SPLIT = 0.005  # of all, per frame: the most that are split where the parts take others' rows
 GROWTH = 0.03  # of all, per frame: the most that are split where there is room
 HARDLY = 0.15  # of the mean contribution: less hardly shows
-ENOUGH = 0.8  # of the mean contribution: what shows less is no worse than its neighbours
+ENOUGH = 0.8  # of the mean contribution: only what shows more is split
 APART = 1.1  # standard deviations of the whole, from its middle to that of an outer part
 PART_SIZE = 0.4  # of the whole, along its longest axis
 
