@@ -1,7 +1,7 @@
 """The model of SAGS (arXiv 2510.27318) in torch.
 
 To be read in this order: `hexplane`, `sampling`, `decoder`, `deformation`, `drawing`, `losses`, `model`,
-`window`. With cells on a GPU all else is there, too, and `canvas` draws it: `twins` says who computes what.
+`window`. If the cells are on a GPU, all else is, too, and `canvas` draws it. `twins` chooses the kernels.
 
 A model is canonical Gaussians in raw rows [N, 14] (`model.columns`) and a field that deforms them:
 
@@ -21,7 +21,7 @@ One step of learning, with any loss of the planes, or its gradient by them [5, H
     drawing.differentiate(found.loss, found.weight)                  then .contribution, .spread [N]
     model.descend([drawing], Rates(rows, FieldRates()))              Adam
 
-Importing it imports torch, which takes a second: only what fits imports it, and where it does.
+It imports torch, which takes a second. So only code that fits a model imports it, and only when it fits.
 
 Imports engine, kernels and model.
 """

@@ -1,5 +1,5 @@
-"""Adam on rows of a table of torch, as `engine.adam` describes it: its kernel on the host; where kernels
-cannot go, the same formula in torch, on all rows at once, which waits for no device."""
+"""Adam on rows of a torch table, as `engine.adam` describes it: by its kernel on the host, elsewhere by the
+same formula in torch on all rows at once, without waiting for the device."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ EPS = 1e-15
 
 @dataclass(frozen=True, slots=True)
 class RowAdam:
-    """What Adam remembers of a table of M rows and C columns, as `AdamState` has it."""
+    """The state of Adam for a table of M rows and C columns, as in `AdamState`."""
 
     moments: Tensor  # [M, C, 2]
     shares: Tensor  # [M, 2]
 
     @classmethod
     def of(cls, table: Tensor) -> RowAdam:
-        """Make that of a table [M, C] that was never touched, on its device."""
+        """Make the state of a table [M, C] that was never touched, on its device."""
         return cls(table.new_zeros((*table.shape, 2)), table.new_zeros((len(table), 2)))
 
     def rows(self, rows: slice | Tensor) -> RowAdam:
-        """The rows of some rows; a slice of them is the same memory."""
+        """The state of some rows; for a slice, it is the same memory."""
         return RowAdam(self.moments[rows], self.shares[rows])
 
     def grown(self, fresh: int) -> RowAdam:
-        """The same with rows that were never touched after its own."""
+        """The same state, with `fresh` rows appended that were never touched."""
         new = [
             torch.cat([each, each.new_zeros((fresh, *each.shape[1:]))])
             for each in (self.moments, self.shares)
@@ -41,7 +41,7 @@ class RowAdam:
         return RowAdam(*new)
 
     def step(self, values: Tensor, gradient: Tensor, rates: Tensor, taken: Tensor) -> None:
-        """Move rows of a table against their gradient. One that is not finite sits out, and begins anew.
+        """Move rows of a table against their gradient. A row that is not finite stays; its state is reset.
 
         Args:
             values: [M, C] changed in place.

@@ -12,10 +12,10 @@ from sags_node.types import Camera
 
 
 class Canvas:
-    """Do as `interface.Rasterizer`, on tensors. Not for two threads."""
+    """A rasteriser like `interface.Rasterizer`, on tensors. Not thread-safe."""
 
     def __init__(self, width: int, height: int, device: torch.device, antialias: bool = True) -> None:
-        """Pictures of `width` x `height` px on a device of torch's: a GPU, or the CPU, which is slow."""
+        """Draw pictures of `width` x `height` px on a torch device: a GPU, or the CPU, which is slow."""
         from sags_node.engine.gpu import runtime
 
         on_device = runtime.device_named(str(device))
@@ -24,14 +24,14 @@ class Canvas:
         from sags_node.engine.gpu.rasterizer import KINDS, DeviceRasterizer
 
         self._warp, self._kinds = warp, KINDS
-        # Warp's work goes where torch's does, so that neither waits for the other
+        # Warp works on torch's stream, so that neither waits for the other
         self._stream = None if device.type == "cpu" else warp.stream_from_torch(device)
         with self._on_the_stream():
             self._rasterizer = DeviceRasterizer(width, height, on_device, antialias)
 
     def forward(self, tables: Mapping[str, Tensor], camera: Camera) -> Tensor:
-        """Planes [5, H, W], overwritten by the next drawing. `tables`: means, quats, scales, opacities,
-        colors, slopes and smoothing, as `types.Gaussians` has them."""
+        """Draw planes [5, H, W], which the next drawing overwrites. `tables`: means, quats, scales,
+        opacities, colors, slopes and smoothing, as `types.Gaussians` has them."""
         with self._on_the_stream():
             given = {
                 name: self._warp.from_torch(
@@ -43,7 +43,7 @@ class Canvas:
         return planes
 
     def backward(self, v_planes: Tensor, weight: Tensor) -> dict[str, Tensor]:
-        """`interface.Gradients` by their names, overwritten by the next `backward`."""
+        """Return `interface.Gradients` by their names, overwritten by the next `backward`."""
         with self._on_the_stream():
             arrays = (self._warp.from_torch(each.contiguous()) for each in (v_planes, weight))
             found = self._rasterizer.backward(*arrays)
@@ -57,7 +57,7 @@ class Canvas:
 
 
 def smoothing(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """`alias_free.smoothing_variances` of means [N, 3] on their device, [N] m^2."""
+    """Compute `alias_free.smoothing_variances` of means [N, 3] on their device, [N] m^2."""
     intervals = means.new_full((len(means),), torch.inf)
     for camera in cameras:
         view = torch.tensor(camera.viewmat[:3]).to(means, non_blocking=True)

@@ -25,15 +25,15 @@ from sags_node.errors import UsageError
 Tokens = Literal["self", "nodes"]
 
 # What stands between the first layer and the heads. `adaptive`: the block of SAGS. `mlp`: only its linear
-# layers learn, an MLP of its size with residual connections: the gates stay 1, the adaptations hand on.
+# layers learn, an MLP of its size with residual connections: gates stay 1, adaptations the identity.
 # `none`: nothing is learnt there, as in EndoGaussian.
 Block = Literal["adaptive", "mlp", "none"]
 
 HEADS = {"mean": 3, "log_scale": 3, "quat": 4, "color": 3, "logit": 1}  # as in `model.columns`
 MAX_NODES = 1024
 INITIAL_GATE = 1e-4
-PART = 8192  # tokens decoded at a time, if they do not attend to each other: all at once leave the cache
-FIRST_HEAD = 0.01  # largest first weight of a last layer that has been awoken
+PART = 8192  # tokens decoded at a time, if they do not attend to each other: all do not fit the cache
+FIRST_HEAD = 0.01  # largest initial weight of the last layers after `awaken`
 
 
 class Adaptation(nn.Module):
@@ -74,7 +74,7 @@ class Attention(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Features [N, F] to changes [N, 14] of the raw parameters (`model.columns`), in the decoder's units."""
+    """Maps features [N, F] to changes [N, 14] of raw parameters (`model.columns`), in the decoder's units."""
 
     def __init__(
         self,
@@ -137,15 +137,15 @@ class Decoder(nn.Module):
             gamma.requires_grad_(block == "adaptive")
 
     def awaken(self, seed: int) -> None:
-        """Give the last layers weights. Of a difference between two times, the gradient by weights of 0 is 0
-        while all times have the same features, and so is that by the features while the weights are 0: the
-        field would never begin to learn. There is still no change at first, as the times do not differ."""
+        """Give the last layers weights other than 0, so that a model of differences between two times begins
+        to learn. While all times have the same features, its gradient by the weights is 0; while the weights
+        are 0, its gradient by the features is, too. At first nothing changes, as the times do not differ."""
         generator = torch.Generator().manual_seed(seed)
         for weights in self.head_out.parameters():
             nn.init.uniform_(weights, -FIRST_HEAD, FIRST_HEAD, generator=generator)
 
     def forward(self, features: Tensor) -> Tensor:
-        """UsageError: too many nodes."""
+        """Decode features [N, F]. UsageError: too many nodes."""
         if self._most is None:
             part = PART if features.device.type == "cpu" else max(1, len(features))
             decode = self._folded()
@@ -175,8 +175,8 @@ class Decoder(nn.Module):
         return last
 
     def _folded(self) -> Callable[[Tensor], Tensor]:
-        """`_decode` of tokens that attend to themselves alone: what is affine between two GELUs is multiplied
-        once, instead of for every token. What it makes of unit vectors and of 0 says all."""
+        """`_decode` of tokens that attend to themselves alone: the affine maps between two GELUs are
+        multiplied once, instead of for every token. Their values at unit vectors and at 0 determine them."""
         unit = self.gamma_1.new_zeros(len(self.gamma_1) + 1, len(self.gamma_1)).fill_diagonal_(1)
         mixed = self._mixed(unit)
         first, second, skip = self.mlp[0](mixed), self.gamma_2 * self.mlp[2](unit), mixed + unit

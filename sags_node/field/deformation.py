@@ -1,18 +1,18 @@
-"""The deformation field: HexPlane and decoder, asked by Gaussians or by control nodes.
+"""The deformation field: HexPlane and decoder, evaluated at Gaussians or at control nodes.
 
     G(t) = G + D(f(x, y, z, t))         SAGS: mean, scale, rotation, colour and opacity of G
 
-`PointField`: every Gaussian asks at its own canonical mean, as in the paper. `NodeField`: a few hundred nodes
-ask, and Gaussians follow them, rotation included (embedded deformation: Sumner et al., SIGGRAPH 2007). With
-what the decoder says of its nodes n_k, a shift t_k and a rotation dq_k, and weights w_k, a Gaussian becomes
+`PointField`: it is evaluated at the canonical mean of every Gaussian, as in the paper. `NodeField`: at a few
+hundred nodes, which Gaussians follow, rotation included (embedded deformation: Sumner et al., SIGGRAPH 2007).
+With nodes n_k, their weights w_k, and the decoder's shift t_k and rotation dq_k of each, a Gaussian becomes
 
     x' = x + sum_k w_k (A_k (x - n_k) + t_k)        A_k = R_k - 1, R_k of the unit quaternion of 1 + dq_k
     q' = (1 + sum_k w_k dq_k) q
     everything else: + sum_k w_k delta_k
 
-All sums are linear in what a node alone determines, [A_k | t_k - A_k n_k] and its other deltas: this is its
-record, and a Gaussian blends the records of its nodes. Places are measured from the middle of the nodes: far
-from it A_k x and A_k n_k would cancel in many digits.
+All sums are linear in a node's record: [A_k | t_k - A_k n_k] and its other deltas, which that node alone
+determines. So a Gaussian blends the records of its nodes. Places are measured from the middle of the nodes:
+far from it A_k x and A_k n_k would cancel in many digits.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SHORTEST = 1e-12  # a shorter quaternion has no direction
 class FieldRates:
     """Learning rates of Adam."""
 
-    cells: float = 1.6e-2  # EndoGaussian and SAGS; of the planes in space
+    cells: float = 1.6e-2  # of the planes in space; as in EndoGaussian and SAGS
     decoder: float = 1.6e-3
     lines: float = 1.6e-2  # of the lines in time
 
@@ -72,11 +72,11 @@ class Deltas:
         return deltas
 
     def step(self, rates: FieldRates) -> None:
-        """Move cells and decoder against their gradients, which are forgotten. If one of the decoder is not
-        finite, it stays as it is."""
+        """Move cells and decoder against their gradients, and clear these. If a gradient of the decoder is
+        not finite, the decoder stays as it is."""
         found = [each.grad.ravel() for each in self.decoder.parameters() if each.grad is not None]
         if found:
-            # torch's fused Adam leaves everything as it is where this is 1, and nobody has to wait for it
+            # If this is 1, torch's fused Adam changes nothing; the host need not wait for the value
             self.optimizer.found_inf = (~torch.cat(found).isfinite().all()).float()  # type: ignore[attr-defined]
             self.optimizer.param_groups[0]["lr"] = rates.decoder
             self.optimizer.step()
@@ -90,15 +90,15 @@ class Field(Protocol):
     deltas: Deltas
 
     def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:
-        """Canonical rows [N, 14] at one time, differentiable in the rows and in the field. `which` [N]: those
-        of them that `follow` was told of; None: all."""
+        """Deform canonical rows [N, 14] to one time, differentiable in the rows and in the field. `which`
+        [N]: their indices among the means given to `follow`; None: they are all of them."""
 
     def follow(self, means: F32) -> None:
-        """The canonical means [N, 3] m are these now."""
+        """Take the canonical means [N, 3] m as they are now."""
 
 
 class PointField:
-    """Every Gaussian asks the field at its own canonical mean."""
+    """The field, evaluated at every Gaussian's own canonical mean."""
 
     def __init__(self, deltas: Deltas) -> None:
         self.deltas = deltas
@@ -107,14 +107,14 @@ class PointField:
         return rows + self.deltas(rows[:, columns.MEAN], t_ns)
 
     def follow(self, means: F32) -> None:
-        """Nothing to do: every Gaussian asks for itself."""
+        """Do nothing: the field is evaluated at the rows themselves."""
 
 
 class NodeField:
-    """Control nodes ask the field; each Gaussian follows its four nearest ones."""
+    """The field, evaluated at control nodes; each Gaussian follows its four nearest ones."""
 
     def __init__(self, deltas: Deltas, nodes: F32) -> None:
-        """Nodes [M, 3] m are places among the canonical Gaussians; they stay where they are."""
+        """`nodes` [M, 3] m are fixed places among the canonical Gaussians."""
         self.deltas, self.nodes = deltas, np.ascontiguousarray(nodes)
         self._device = deltas.hexplane.cells.device
         self._asked = torch.from_numpy(self.nodes).to(self._device)
@@ -125,7 +125,7 @@ class NodeField:
         self.attach(torch.from_numpy(index.astype(np.int64)), torch.from_numpy(weight))
 
     def attach(self, index: Tensor, weight: Tensor) -> None:
-        """Which nodes each Gaussian follows, [N, K], and their weights."""
+        """Set which nodes each Gaussian follows, [N, K], and their weights."""
         self.index, self.weight = index.to(self._device), weight.to(self._device)
 
     def deform(self, rows: Tensor, t_ns: int, which: Tensor | None = None) -> Tensor:

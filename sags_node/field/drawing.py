@@ -1,7 +1,7 @@
 """From raw rows to a picture, as one differentiable step: activation, 3D filter, rasteriser.
 
 The 3D filter comes after the deformation, where a Gaussian's depth is known (`model.alias_free`); its
-variance is a constant of the gradient, as in Mip-Splatting. The 2D filter is part of the rasteriser.
+variance has no gradient, as in Mip-Splatting. The 2D filter is part of the rasteriser.
 """
 
 from collections.abc import Sequence
@@ -17,19 +17,19 @@ from sags_node.field.decoder import HEADS
 from sags_node.model.alias_free import smoothing_variances
 from sags_node.types import F32, I64, Camera, Gaussians
 
-# What is drawn, by its name in `types.Gaussians`; the first five have the gradients of a row
+# What is drawn, by its name in `types.Gaussians`; the first five make up a row
 TABLES = ("means", "quats", "scales", "opacities", "colors", "slopes")
 
 
 def activate(rows: Tensor) -> tuple[Tensor, ...]:
-    """Means [N, 3] m, quats [N, 4], scales [N, 3] m, opacities [N] and colours [N, 3] of raw rows [N, 14]."""
-    # Split at once: parts taken one by one would each have a gradient of whole rows
+    """Turn rows [N, 14] into means [N, 3] m, quats [N, 4], scales [N, 3] m, opacities [N], colours [N, 3]."""
+    # Split at once: for parts taken one by one, autograd would make a gradient of whole rows each
     means, log_scales, quats, colors, logits = torch.split(rows, list(HEADS.values()), 1)
     return means, quats, log_scales.exp(), logits[:, 0].sigmoid(), colors
 
 
 def deactivate(gaussians: Gaussians) -> F32:
-    """Raw rows [N, 14] of Gaussians: the inverse of `activate`."""
+    """Return raw rows [N, 14] of Gaussians: the inverse of `activate`."""
     opacities = np.clip(gaussians.opacities, 1e-6, 1 - 1e-6)
     logits = np.log(opacities / (1 - opacities))[:, None]
     parts = [gaussians.means, np.log(gaussians.scales), gaussians.quats, gaussians.colors, logits]
@@ -39,8 +39,8 @@ def deactivate(gaussians: Gaussians) -> F32:
 def to_gaussians(
     activated: Sequence[Tensor], slopes: Tensor | None, ids: I64, cameras: Sequence[Camera] | None
 ) -> Gaussians:
-    """What `activate` returns and slopes [N, 3], as they are drawn; `cameras`: those they were fitted to, for
-    the 3D filter; None: no filter."""
+    """Make Gaussians to draw of what `activate` returns and slopes [N, 3]. `cameras`: those they were fitted
+    to, for the 3D filter; None: no filter."""
     means, quats, scales, opacities, colors = (
         np.ascontiguousarray(part.detach().cpu().numpy()) for part in activated
     )
@@ -94,14 +94,14 @@ class Drawing:
             self.planes.backward(torch.from_numpy(loss))  # type: ignore[no-untyped-call]
 
     def gradients(self, loss: Tensor, weight: Tensor, leaves: Sequence[Tensor]) -> Sequence[Tensor | None]:
-        """Find the gradients of a loss as `differentiate` does, and add them to nothing: threads that draw at
-        the same time would add at the same time. None: the drawing does not come from that leaf."""
+        """Return the gradients of a loss by `leaves`. Unlike `differentiate`, this adds them to nothing, so
+        that several threads may draw at once. None: the drawing does not come from that leaf."""
         self.weight = weight
         return torch.autograd.grad(loss, leaves, allow_unused=True)
 
 
 class _Rasterize(torch.autograd.Function):
-    """The rasteriser, whichever stands behind `Rasterizer`."""
+    """The rasteriser, of either kind, as a torch function."""
 
     @staticmethod
     def forward(

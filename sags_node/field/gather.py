@@ -1,7 +1,7 @@
 """Weighted sums of a table's rows: what bilinear sampling and following nodes have in common.
 
-torch's own gradient of it sorts all indices and takes several times as long as the kernels here. They are for
-float32 on the CPU; a test compares them with torch's.
+torch's own gradient of it sorts all indices and takes several times as long as the kernels here. The kernels
+are for float32 on the CPU; a test compares them with torch.
 """
 
 from typing import Any
@@ -22,7 +22,7 @@ PIECE = 512  # bags a thread takes at a time
 
 
 def gather(table: Tensor, index: Tensor, weight: Tensor) -> Tensor:
-    """Sums over k of weight[b, k] * table[index[b, k]].
+    """Compute the sums over k of weight[b, k] * table[index[b, k]].
 
     Args:
         table: [M, C]
@@ -62,7 +62,7 @@ class _Gather(torch.autograd.Function):
 
 
 def filled(table: Tensor) -> Tensor:
-    """[M] which rows of a table hold anything but zeros."""
+    """Return [M] which rows of a table hold anything but zeros."""
     if not twins.by_kernels(table):
         return (table != 0).any(1)
     found = np.empty(len(table), np.bool_)

@@ -41,7 +41,7 @@ class HexPlane:
 
     Attributes:
         cells: [M, C], differentiable.
-        adam: what the optimiser of the cells remembers, row by row. A row that is copied takes it along.
+        adam: the state of the cells' optimiser, row by row. Where a row is copied, so is its state.
         box: [2, 3] m.
         nodes: [levels, 3] nodes along x, y, z.
         newest: number of the newest slot.
@@ -135,7 +135,7 @@ class HexPlane:
         return slice(first, first + self._slot_rows)
 
     def locate(self, t_ns: int) -> tuple[int, int, float]:
-        """The slots around a time, held within the window, and the share of the later one."""
+        """The slots around a time, which is clamped to the window, and the share of the later one."""
         number, rest = divmod(int(t_ns) - self.t0_ns, self.slot_ns)
         if not self.oldest <= number < self.newest:
             number = min(max(number, self.oldest), self.newest)
@@ -157,7 +157,7 @@ class HexPlane:
         planes = [int(level[a] * level[b]) for level in self.nodes for a, b in PAIRS]
         parts = torch.split(self.cells, planes + [self._slot_rows] * self.slots)  # at once: one gradient
         slots = parts[len(planes) :]
-        # as float32: what has no share in it then gets no gradient, of which Adam would make a whole step
+        # as float32: a slot whose share rounds to 0 then gets no gradient; Adam would make a whole step of it
         share = float(np.float32(share))
         at = torch.lerp(slots[before % self.slots], slots[after % self.slots], share)
         lines = torch.split(at, self.nodes.ravel().tolist())
@@ -181,7 +181,7 @@ class HexPlane:
         return Places(node, shares, torch.from_numpy(first), step)
 
     def step(self, planes: float, lines: float) -> None:
-        """Adam on the cells that the last backward pass touched, against their gradient; both rates."""
+        """Take a step of Adam on the cells with a gradient; `planes`, `lines`: their learning rates."""
         gradient = self.cells.grad
         if gradient is not None:
             touched, space = filled(gradient), slice(0, self._space_rows)
@@ -196,8 +196,8 @@ class HexPlane:
         Args:
             t_ns: the time that is to lie within the window. An earlier one changes nothing.
             retire: called with the time (ns) of every slot that has to go, oldest first, while the field can
-                still be sampled there: to fold what the field says there into the canonical Gaussians. After
-                a gap longer than the window all slots go; those of the gap were never there.
+                still be sampled there, to fold that into the canonical Gaussians. After a gap longer than the
+                window all slots go; there never were slots for the gap.
         """
         newest = -((self.t0_ns - int(t_ns)) // self.slot_ns)
         if newest <= self.newest:

@@ -26,7 +26,7 @@ def compare_by_kernels(
     """The terms of a loss, and its gradient. They do not depend on the number of threads.
 
     Args:
-        planes, image, tissue, depth, unseen, softness: as of `losses.compare`.
+        planes, image, tissue, depth, unseen, softness: as in `losses.compare`.
         weights: [5] of TERMS.
 
     Returns:
@@ -48,7 +48,7 @@ def compare_by_kernels(
 
 @kernel
 def _normalise_row(y: Any, planes: F32, tissue: Bool, depth: F32, drawn: F32, weight: F32, sums: F64) -> None:
-    """Colours and depth of a row's pixels over their coverage, which is -1 where a plane is not finite."""
+    """Divide colours and depth of a row's pixels by the coverage; it becomes -1 if a plane is not finite."""
     used = measured = explained = 0
     for k in range(planes.shape[2]):
         x = u8(k)
@@ -92,8 +92,8 @@ def _sign(value: Any) -> Any:
 
 @inlined
 def _pull(drawn: F32, y: Any, x: Any, v: Any, u: Any, slopes: F32, by: F32) -> Any:
-    """Add what a neighbour (v, u), one of both unseen, does to a pixel's gradient by its colours and depth;
-    return what the pair adds to both kinds of smoothness."""
+    """For a pixel and its neighbour (v, u), one of them unseen: add their smoothness to the gradient by the
+    pixel's colours and depth, and return what the pair adds to both kinds of smoothness."""
     least = min(drawn[COVERAGE, y, x], drawn[COVERAGE, v, u])
     of_color = of_depth = ZERO
     if least > COVERED:
@@ -113,8 +113,8 @@ def _differentiate_row(
     y: Any, drawn: F32, image: U8, tissue: Bool, depth: F32, unseen: Bool, weight: F32, slopes: F32,
     softness: Any, v_planes: F32, sums: F64,
 ) -> None:  # fmt: skip
-    """Write the gradient of a row's pixels by their planes, and add up its terms. `slopes` [5]: of each term,
-    by what one pixel adds to it."""
+    """Write the gradient of a row's pixels by their planes, and add up its terms. `slopes` [5]: derivative of
+    the loss by the sum over pixels of each term."""
     height, width = tissue.shape
     by, found = stack_floats(4), np.zeros(5)
     for x in range(width):

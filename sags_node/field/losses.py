@@ -70,14 +70,14 @@ def compare(
 
     Args:
         planes: [5, H, W] of `Rasterizer.forward`.
-        image: [H, W, 3] RGB; above, its bytes over 255.
+        image: [H, W, 3] RGB, bytes; the loss compares colours with them over 255.
         tissue: [H, W] True where the pixel is to be explained.
         depth: [H, W] m, 0 unknown. For a monocular network, whose inverse depth has an unknown scale and
             offset: 1 / that, and the term `correlation`.
         unseen: [H, W] where the two kinds of smoothness apply.
         weights: of the terms.
-        softness: s of sqrt(d^2 + s^2) - s, which is what a difference d of colours counts (Charbonnier et
-            al. 1994): where it is smaller than s by its square, as in PSNR. 0, as in the paper: |d|.
+        softness: s of sqrt(d^2 + s^2) - s, the loss of a difference d of colours (Charbonnier et al. 1994).
+            Well below s it follows d^2, as PSNR does. 0, as in the paper: |d|.
     """
     if twins.by_kernels(planes) and not (weights.correlation or weights.similarity):
         return _by_kernels(planes, image, tissue, depth, unseen, weights, softness)
@@ -103,7 +103,7 @@ def compare(
             terms["correlation"] = 1 - correlation(inverse_drawn[measured], inverse_given[measured])
     if weights.similarity:
         terms["similarity"] = dissimilarity(color, truth, used) / (3 * count)
-    if isinstance(unseen, Tensor) or unseen.any():  # to ask a tensor would be to wait for it
+    if isinstance(unseen, Tensor) or unseen.any():  # testing a tensor would wait for the device
         region = torch.as_tensor(unseen, device=device)
         terms["smoothness"] = total_variation(color, region, covered) / (3 * region.numel())
         terms["depth_smoothness"] = total_variation(distance[None], region, deep) / region.numel()
@@ -129,7 +129,7 @@ def _by_kernels(
 
 
 class _Known(torch.autograd.Function):
-    """A value of planes whose gradient is known already."""
+    """A function of the planes whose value and gradient are known already."""
 
     @staticmethod
     def forward(ctx: Any, planes: Tensor, value: Tensor, gradient: Tensor) -> Tensor:
@@ -146,7 +146,7 @@ def _charbonnier(difference: Tensor, softness: float) -> Tensor:
 
 
 def correlation(drawn: Tensor, given: Tensor) -> Tensor:
-    """Pearson's; 1 where one of both is flat, so that there is nothing to learn."""
+    """The Pearson correlation; 1 if either is flat, so that there is nothing to learn."""
     a, b = drawn - drawn.mean(), given - given.mean()
     least = FLAT * len(drawn) ** 0.5
     if not (a.norm() > least * drawn.mean().abs() and b.norm() > least * given.mean().abs()):
@@ -156,7 +156,7 @@ def correlation(drawn: Tensor, given: Tensor) -> Tensor:
 
 
 def total_variation(picture: Tensor, region: Tensor, known: Tensor) -> Tensor:
-    """Sum of |a - b| over neighbours in `picture` [K, H, W], both known, one of them in the region."""
+    """The sum of |a - b| over neighbours in `picture` [K, H, W], both known, at least one in the region."""
     across = (region[:, 1:] | region[:, :-1]) & known[:, 1:] & known[:, :-1]
     down = (region[1:] | region[:-1]) & known[1:] & known[:-1]
     rows = ((picture[:, :, 1:] - picture[:, :, :-1]).abs() * across).sum()
@@ -164,8 +164,8 @@ def total_variation(picture: Tensor, region: Tensor, known: Tensor) -> Tensor:
 
 
 def dissimilarity(picture: Tensor, truth: Tensor, counted: Tensor) -> Tensor:
-    """Sum of 1 - SSIM (Wang et al. 2004, equation 13) over the counted pixels [H, W] and the channels of
-    pictures [3, H, W]. Pixels that do not count are set to the truth in both pictures."""
+    """The sum of 1 - SSIM (Wang et al. 2004, equation 13) over the counted pixels [H, W] and the channels
+    of pictures [3, H, W]. Pixels that do not count are set to the truth in both pictures."""
     offsets = torch.arange(-5, 6, dtype=picture.dtype, device=picture.device)
     profile = torch.exp(-0.5 * (offsets / 1.5) ** 2)
     window = torch.outer(profile, profile) / profile.sum() ** 2

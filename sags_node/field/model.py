@@ -17,8 +17,8 @@ from sags_node.model import columns
 from sags_node.model.exposure import Exposure
 from sags_node.types import F32, I64, Bool, Camera, Gaussians
 
-LOOK_BACK_NS = 200_000_000  # a prediction's velocity is the mean over this time
-FADE_NS = 150_000_000  # in which it falls to 1/e
+LOOK_BACK_NS = 200_000_000  # ns: a prediction's velocity is the mean over this time
+FADE_NS = 150_000_000  # ns in which that velocity falls to 1/e
 COLOR_DAMPING = 0.3  # px: a barely seen Gaussian changes its colour slowly
 
 
@@ -31,7 +31,7 @@ class Rates(NamedTuple):
 
 
 class DeformableModel:
-    """Canonical Gaussians with their optimiser, and a field. Not for two threads.
+    """Canonical Gaussians with their optimiser, and a field. Not thread-safe.
 
     Attributes:
         rows: [N, 14] canonical (`model.columns`), differentiable.
@@ -80,15 +80,15 @@ class DeformableModel:
         return np.ascontiguousarray(self.table[:, columns.MEAN])
 
     def rows_at(self, t_ns: int, deformed: bool = True) -> Tensor:
-        """Rows [N, 14] at one time, without exposure; `deformed`: False leaves the field out."""
+        """The rows [N, 14] at one time, without exposure; `deformed`: False leaves the field out."""
         return self.field.deform(self.rows, t_ns) if deformed else self.rows
 
     def draw(
         self, rasterizer: Rasterizer | Canvas, t_ns: int, camera: Camera, deformed: bool = True,
         whole: Camera | None = None,
     ) -> Drawing:  # fmt: skip
-        """The model at one time, drawn for a camera it is fitted to, to learn from: `Drawing.differentiate`,
-        then `descend`. `whole`: that camera with all its pixels, for the 3D filter; None: it has them."""
+        """Draw the model at one time for a camera it is fitted to. To learn from it: `Drawing.differentiate`,
+        then `descend`. `whole`: the camera of the whole picture, for the 3D filter; None: `camera`."""
         return self._drawn(rasterizer, self.rows_at(t_ns, deformed), t_ns, camera, whole)
 
     def _drawn(
@@ -105,15 +105,15 @@ class DeformableModel:
 
     @torch.no_grad()
     def between(self, t_ns: int, before_ns: int, after_ns: int, cameras: Sequence[Camera]) -> Gaussians:
-        """The Gaussians at a time between two that were learnt, on straight lines from the one to the other:
-        in between the field was given nothing to learn."""
+        """The Gaussians at a time between two that were learnt, by linear interpolation: in between, the
+        field had nothing to learn from."""
         share = (t_ns - before_ns) / (after_ns - before_ns)
         return self._shown(torch.lerp(self.rows_at(before_ns), self.rows_at(after_ns), share), t_ns, cameras)
 
     @torch.no_grad()
     def predict(self, t_ns: int, last_ns: int, cameras: Sequence[Camera]) -> Gaussians:
-        """The Gaussians at a time after the last that was learnt: they go on as the field moved them just
-        before, slower and slower; all else stays as it was last."""
+        """The Gaussians at a time after the last that was learnt. They go on with the field's last velocity,
+        which decays; all else stays as it was last."""
         deform, rows = self.field.deform, self.rows_at(last_ns).clone()
         moved = deform(self.rows, last_ns) - deform(self.rows, last_ns - LOOK_BACK_NS)
         ahead = FADE_NS * -math.expm1((last_ns - t_ns) / FADE_NS)
@@ -167,19 +167,19 @@ class DeformableModel:
         self._take(np.flatnonzero(kept), self.table[:0], np.zeros(0, np.int64))
 
     def append(self, rows: F32, parents: I64) -> None:
-        """Add Gaussians [M, 14], canonical, that otherwise do as their parents, rows [M] of the model."""
+        """Add canonical Gaussians [M, 14]; all else they take from their parents, rows [M] of the model."""
         self._take(np.arange(len(self)), rows, parents)
 
     def arrange(self) -> None:
-        """Order Gaussians by the cells of the field that they stand in: neighbours then find the same ones in
-        the processor's cache."""
+        """Order Gaussians by the cells of the field that they lie in, so that neighbours in the table use the
+        same cells in the processor's cache."""
         hexplane = self.field.deltas.hexplane
         low, high = hexplane.box
         x, y, z = ((self.means - low) / (high - low) * hexplane.nodes[0]).astype(np.int64).T
         self._take(np.lexsort((z, x, y)), self.table[:0], np.zeros(0, np.int64))
 
     def _take(self, kept: I64, rows: F32, parents: I64) -> None:
-        """The Gaussians in `kept`, then new ones, which have the slopes of their parents."""
+        """Keep the Gaussians in `kept`, then append `rows`, with the slopes of their parents."""
         ids = np.arange(self.next_id, self.next_id + len(rows))
         self.ids, self.next_id = np.concatenate([self.ids[kept], ids]), self.next_id + len(rows)
         self.rows = self._leaf(np.concatenate([self.table[kept], rows]))

@@ -1,7 +1,7 @@
-"""What the HexPlane says of places: bilinear samples of six planes, multiplied.
+"""Sampling of the HexPlane at places: bilinear samples of six planes, multiplied.
 
-`by_planes` is the formula in torch. It keeps six samples of every place, and as much for the gradient. For
-float32 on the CPU, `sample` is kernels that keep none: a test compares both.
+`by_planes` is the formula in torch. It stores six samples of every place, and as much for the gradient. For
+float32 on the CPU, `sample` uses kernels that store none; a test compares both.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,8 +19,8 @@ from sags_node.kernels.jit import add_lanes, copy, inlined, kernel, parallel_ker
 from sags_node.types import F32, I64
 
 PAIRS = ((0, 1), (0, 2), (1, 2))  # the planes in space: xy, xz, yz
-OUTER = (0, 0, 1, 3, 3, 3)  # of x, y, z, t: what counts the rows of the planes xy, xz, yz, tx, ty, tz
-INNER = (1, 2, 2, 0, 1, 2)  # what counts the columns
+OUTER = (0, 0, 1, 3, 3, 3)  # axis of x, y, z, t along the rows of the planes xy, xz, yz, tx, ty, tz
+INNER = (1, 2, 2, 0, 1, 2)  # axis along their columns
 LANES = 16  # channels that a loop takes at a time
 PIECE = 512  # places that a thread takes at a time
 
@@ -50,13 +50,13 @@ def has_kernels(cells: Tensor) -> bool:
 
 
 def sample(cells: Tensor, places: Places) -> Tensor:
-    """Features [N, L * C] of places in a table of planes [M, C], differentiable in cells and shares."""
+    """Sample features [N, L * C] of places from a table [M, C], differentiable in cells and shares."""
     features: Tensor = _Sample.apply(cells, *places)  # type: ignore[no-untyped-call]
     return features
 
 
 def by_planes(levels: Sequence[Level], within: Tensor) -> Tensor:
-    """Features as of `sample`, of places [N, 3] in the box, 0..1, differentiable in tables and places."""
+    """Sample the features of places [N, 3] in the box, 0..1, differentiable in tables and places."""
     x, y, z = (2 * within - 1).unbind(1)
     pairs = [y, x, z, x, z, y, x, x, y, y, z, z]  # column and row of each; a line has one row
     grids = torch.split(torch.stack(pairs, 1).view(1, -1, 6, 2), 1, dim=2)
@@ -100,8 +100,7 @@ def _arrays(cells: Tensor, places: Sequence[Tensor]) -> Iterator[NDArray[Any]]:
 def _corner(
     node: I64, share: F32, first: I64, step: I64, channels: Any, block: Any, i: Any, level: Any, plane: Any
 ) -> Any:
-    """Find where a place's cells lie in a plane, in the row before it and in the row after; its two
-    shares."""
+    """Offsets of a place's cells in a plane, in the row before and the row after it; and its two shares."""
     outer, inner = OUTER[plane], INNER[plane]
     row = first[level, plane] + node[i, level, outer] * step[level, plane] + node[i, level, inner]
     low, high = u8(row * channels + block), u8((row + step[level, plane]) * channels + block)
@@ -169,7 +168,7 @@ def _differentiate_block(
     level: Any, block: Any, cells: F32, node: I64, share: F32, first: I64, step: I64, channels: Any,
     v_features: F32, v_cells: F32, v_share: F32,
 ) -> None:  # fmt: skip
-    """All places' gradients by some channels of a level: its cells have one writer."""
+    """Add up all places' gradients for a block of channels of a level, so that its cells have one writer."""
     by, v, right = stack_floats(96), stack_floats(16), u8(channels)
     for i in range(len(node)):
         of_xy, of_xz, of_yz, of_tx, of_ty, of_tz = _corners(

@@ -1,4 +1,4 @@
-"""Which of two twins computes: a kernel of Numba's, or the same formula in torch."""
+"""The choice between two implementations of a formula: a Numba kernel, or torch."""
 
 import torch
 from torch import Tensor

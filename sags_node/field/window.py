@@ -52,19 +52,19 @@ class AnchoredField:
         return _passed(rows, self._pose_at(self.anchor_ns), self._pose_at(t_ns))
 
     def follow(self, means: F32) -> None:
-        """Nothing to do: places stay."""
+        """Do nothing: places stay."""
 
     @torch.no_grad()
     def carry(self, rows: F32, from_ns: int, to_ns: int, which: Tensor | None = None) -> F32:
-        """State [N, 14] at one time from that at another, both held within the window; `which` [N]: of those
-        Gaussians; None: of all."""
+        """Compute the state [N, 14] at one time from that at another, both clamped to the window. `which`
+        [N]: indices of these Gaussians; None: they are all."""
         # In float64: the roundings of ten thousand quotients near 1 would add up.
         before, after = (self._pose_at(t_ns, which).double() for t_ns in (from_ns, to_ns))
         carried: F32 = _passed(torch.from_numpy(rows).double(), before, after).float().numpy()
         return carried
 
     def place(self, places: F32) -> None:
-        """Places [N, 3] m of all Gaussians."""
+        """Set the places [N, 3] m of all Gaussians."""
         self.places = np.ascontiguousarray(places)
         reference = np.zeros((len(places), columns.COUNT), np.float32)
         reference[:, columns.MEAN] = places
@@ -92,7 +92,7 @@ class WindowModel(DeformableModel):
     def __init__(self, rows: F32, field: Field) -> None:
         """
         Args:
-            rows: [N, 14] of the first frame; where they are now become their places.
+            rows: [N, 14] of the first frame; their means become the fixed places.
             field: its HexPlane has a window that slides.
         """
         neutral = Exposure(np.zeros(1, np.int64), np.ones((1, 3), np.float32))
@@ -103,7 +103,7 @@ class WindowModel(DeformableModel):
         """Let the window reach `t_ns`. Every slot that leaves it is folded into the canonical rows.
 
         Returns:
-            How many left it.
+            How many slots left it.
         """
         hexplane = self.field.deltas.hexplane
         retired: list[int] = []
@@ -116,8 +116,8 @@ class WindowModel(DeformableModel):
         return len(retired)
 
     def settle(self, t_ns: int, change: Callable[[], None]) -> None:
-        """Change the field. Gaussians stay as they are at `t_ns`, within the ranges of `columns`: there they
-        are brought, at all times alike. At other times of the window they are as the field says now."""
+        """Change the field, and keep the Gaussians at `t_ns` as they are, but clamped to the ranges of
+        `columns`. At other times of the window they differ from that as the changed field says."""
         anchored = self._anchored
         state = columns.bounded(anchored.carry(self.table, anchored.anchor_ns, t_ns))
         change()
@@ -129,9 +129,9 @@ class WindowModel(DeformableModel):
         super().keep(kept)
 
     def insert(self, rows: F32, t_ns: int) -> None:
-        """Add Gaussians that are as `rows` [M, 14] say at `t_ns`.
+        """Add Gaussians whose state at `t_ns` is `rows` [M, 14].
 
-        They get places as if they had been there from the start, moved by what moved their neighbours.
+        Their places are where they would have been at first, had they moved as their neighbours since.
         """
         count, anchored = len(self), self._anchored
         means = np.ascontiguousarray(rows[:, columns.MEAN])

@@ -1,9 +1,9 @@
 """Points pinned to the tissue by a user and followed through its deformation.
 
-An anchor moves with the Gaussians around it, known by their ids: these follow the control nodes, also under
-an instrument. What is seen corrects it. Sideways, the patch of the picture that surrounded it at first is
-found again, so that nothing drifts; along the ray, it keeps its distance to the drawn surface. One that was
-out of sight for long is found by what surrounded it (`recall`).
+An anchor moves with the Gaussians around it, also while an instrument hides them: they follow the control
+nodes. The picture corrects it. Across the ray, the patch of the picture that surrounded the anchor at first
+is found again, so that it does not drift; along the ray, it keeps its distance to the drawn surface. An
+anchor that was out of sight for long is found by what surrounded it (`recall`).
 """
 
 from dataclasses import dataclass, fields, replace
@@ -40,29 +40,29 @@ SOFT = 1e-4  # m; Gaussians nearer than this weigh the same
 RENEW_BELOW = 0.8  # share of the weight still there: below it new neighbours are taken
 RENEWED_PER_FRAME = 8  # anchors; taking neighbours costs a third of a millisecond
 
-POINTING = 4  # px: a place is not pointed at more exactly; a speck without depth is smaller
+POINTING = 4  # px around a pixel in which its depth is looked for: nobody points more exactly
 SEEN_RADIUS = 2  # px around the anchor that must be free for it to be fully visible
 PATCH_RADIUS = 10  # px
-SEARCH_RADIUS = 4  # px, of an anchor found in the frame before
+SEARCH_RADIUS = 4  # px, for an anchor that was found in the frame before
 SEARCH_GROWTH = 30.0  # px/s since it was found last
 MAX_SEARCH_RADIUS = 16  # px
 FOUND_AGREEMENT = 0.8  # normalised cross-correlation from which on the patch counts as found
-APART = 4  # px: a place so far from the best one is another
-CLEARER = RATIO**2  # 1 - agreement is a squared distance: of the best place, to that of the second best
-ALONE_AGREEMENT = 0.9  # where nothing else tells that it is the same place: other tissue has reached 0.82
+APART = 4  # px: a match farther than this from the best one is another place
+CLEARER = RATIO**2  # ratio test on 1 - agreement, a squared distance: the best place to the second best
+ALONE_AGREEMENT = 0.9  # needed where nothing else says that it is the place; other tissue reached 0.82
 SEARCHED_PER_FRAME = 32  # anchors, in turn
 DEPTH_PULL = 0.1  # share of the depth error taken per frame
 DEPTH_GATE = 0.05  # of the depth: a larger error is another surface
-HALF_LIFE = 2.0  # s: confidence halves in so long without a sight of the patch
-HALF_WAY = 0.005  # m: and as often as it is carried so far out of sight
-IN_SIGHT = 0.02  # of that way counts where the picture shows it: optical flow errs by so much
-UNWATCHED = 10.0  # times as fast while no frame is taken in: nothing carries an anchor then
+HALF_LIFE = 2.0  # s without a sight of the patch in which the confidence halves
+HALF_WAY = 0.005  # m of motion out of sight in which the confidence halves, too
+IN_SIGHT = 0.02  # share of the motion that counts while in sight: the error of optical flow
+UNWATCHED = 10.0  # factor on the time while no frame is taken in: nothing carries an anchor then
 RECALL_EVERY = 0.5  # s, while an anchor is lost: it costs some milliseconds
-REMEMBER_EVERY = 2.0  # s, while none is
-RECALL_RADIUS = 10  # px, around where the tissue around it says that it is
-SURE = 0.3  # s: what was found so lately is remembered
-LOST = 1.0  # s out of sight from which on an anchor is looked for everywhere
-TOLD = 0.2  # s that one is reported lost before it may be found again: clients miss frames
+REMEMBER_EVERY = 2.0  # s, while no anchor is lost
+RECALL_RADIUS = 10  # px, searched around the place that the surrounding tissue predicts
+SURE = 0.3  # s: anchors that were found within this time are remembered
+LOST = 1.0  # s out of sight, after which an anchor is searched in the whole picture
+TOLD = 0.2  # s: an anchor is reported lost for at least this long, since clients miss frames
 
 _NOBODY = -1  # in the place of a Gaussian's id
 _SIDE = 2 * PATCH_RADIUS + 1
@@ -81,20 +81,20 @@ class _Table:
     depths: F64  # [A] m, camera z
     visibility: F64  # [A] 0..1
     patches: U8  # [A, _SIDE, _SIDE] gray, around the anchor when it was first seen clearly
-    depth_offsets: F64  # [A] m, drawn surface minus anchor at that time; NaN: there was none yet
+    depth_offsets: F64  # [A] m, drawn surface minus anchor at that time; NaN: not seen clearly yet
     agreement: F64  # [A] 0..1, of the patch when it was found last
-    unseen: F64  # [A] s since it was found last; more, the farther it was carried
+    unseen: F64  # [A] s since it was found last, and a penalty for the way it was carried since
     searched: I64  # [A] number of the frame in which it was searched last
-    found: I64  # [A] the same of the last search that found it
+    found: I64  # [A] number of the frame in which a search found it last
     ages: F64  # [A] s since it was pinned
     depth_confidence: F64  # [A] 0..1, of the depth of its carriers
 
 
 class Anchors:
-    """All anchors of one node. Their ids are never used again.
+    """The anchors of one node. Ids are never reused.
 
     Args:
-        usable: as of `TissueMask`, to say why a pixel cannot be pinned; None: all of the picture is.
+        usable: `TissueMask.usable`, to say why a pixel cannot be pinned; None: the whole picture is usable.
     """
 
     def __init__(self, usable: Bool | None = None) -> None:
@@ -170,14 +170,14 @@ class Anchors:
         return anchor_id
 
     def look_ahead(self, anchor_id: int, seconds: float | None) -> None:
-        """Say of an anchor also where it is expected so much later; None: later by the latency."""
+        """Report also where the anchor is expected after `seconds`; None: after the latency."""
         self._wanted[anchor_id] = seconds
 
     def ahead(self, states: AnchorStates, snapshot: Snapshot, latency_s: float) -> AnchorStates:
-        """The states with where those who want it are expected, as far ahead as motion is predicted.
+        """The states, with predicted places of the anchors of `look_ahead`, as far as motion is predicted.
 
         Args:
-            latency_s: from capture to what shows it, as it was lately.
+            latency_s: recent time from the capture of a frame to the display of it.
         """
         if not self._wanted or snapshot.forecast is None or len(states) == 0:
             return states
@@ -191,7 +191,7 @@ class Anchors:
         return replace(states, ahead=AnchorsAhead(seconds, points, pixels))
 
     def depth_confidence(self, anchor_id: int) -> float:
-        """How far to trust the depth of an anchor that is there, 0..1."""
+        """The confidence in the depth of an anchor, which must exist, 0..1."""
         return float(self._table.depth_confidence[self._table.ids == anchor_id][0])
 
     def remove(self, anchor_id: int) -> None:
@@ -217,7 +217,7 @@ class Anchors:
 
         Args:
             snapshot: the model at that frame.
-            view: it drawn for the left eye.
+            view: that model, drawn for the left eye.
             clear: the picture shows well how the tissue moves.
         """
         self._frames += 1
@@ -234,7 +234,7 @@ class Anchors:
 
         Args:
             held: the frame is not taken in.
-            equal: its picture is that of the frame before: what was found there would be found again.
+            equal: its picture equals that of the frame before, so that the same anchors would be found.
         """
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         passed = 0.0 if before is None else max(0.0, (stamp_ns - before) * 1e-9)
@@ -257,7 +257,7 @@ class Anchors:
         )
 
     def _find(self, observation: Observation) -> None:
-        """Search the picture for the patches of visible anchors, in turn; what is found moves its anchor."""
+        """Search the picture for the patches of visible anchors, in turn, and move the anchors there."""
         table = self._table
         seen = np.flatnonzero((table.visibility == 1) & np.isfinite(table.depth_offsets))
         for i in seen[np.argsort(table.searched[seen], kind="stable")][:SEARCHED_PER_FRAME]:
@@ -320,8 +320,8 @@ def _put_back(
 def _depth_at(
     table: _Table, i: int, pixel: F64, observation: Observation, view: RenderedView
 ) -> float | None:
-    """Camera z (m) of the anchor in row i at a pixel: by the drawn surface or what is measured there. Where
-    both know nothing, its own, if it was carried to that place; None: unknown."""
+    """Camera z (m) of the anchor in row i at a pixel: from the drawn surface or the measured depth. Where
+    neither is known: the anchor's own z, if it was carried to that place; None: unknown."""
     column, row = np.rint(pixel).astype(np.intp)
     surface = float(view.depth[row, column]) or float(observation.depth[row, column])
     if surface > 0:
@@ -331,8 +331,8 @@ def _depth_at(
 
 
 def _carry(table: _Table, gaussians: Gaussians) -> F64:
-    """Move each anchor by the mean displacement of its Gaussians since the last snapshot; how far [A], m. It
-    knows its depth as well as they do."""
+    """Move each anchor by the mean displacement of its Gaussians since the last snapshot; return how far it
+    moved [A], m. The confidence in its depth follows from theirs."""
     order = np.argsort(gaussians.ids, kind="stable")  # nearly sorted already: cheap
     ids = np.append(gaussians.ids[order], np.iinfo(np.int64).max)
     places = np.searchsorted(ids, table.carriers)
@@ -341,7 +341,7 @@ def _carry(table: _Table, gaussians: Gaussians) -> F64:
     table.weights[~alive] = 0
     share = table.weights.sum(1)
     lost = share == 0
-    table.unseen[lost & np.isfinite(table.points).all(1)] = 0  # from now on: for how long it is lost
+    table.unseen[lost & np.isfinite(table.points).all(1)] = 0  # from now on it counts for how long it is lost
     means = gaussians.means[rows].astype(np.float64) if len(gaussians) else table.means
     displacements = (table.weights[..., None] * (means - table.means)).sum(1)
     displacements /= np.where(lost, np.nan, share)[:, None]
@@ -358,7 +358,7 @@ def _carry(table: _Table, gaussians: Gaussians) -> F64:
 
 
 def _look(table: _Table, observation: Observation, view: RenderedView) -> None:
-    """Find where each anchor is and how much of it is seen; it keeps its distance to the drawn surface."""
+    """Compute each anchor's pixel and visibility; pull it to its distance from the drawn surface."""
     pixels, depths = project(observation.camera, table.points)
     table.pixels[:], table.depths[:] = pixels, depths
     # What lies under tissue, as a vessel does, is not hidden by the tissue that carries it.
@@ -395,7 +395,7 @@ def _carriers(point: F64, gaussians: Gaussians) -> tuple[I64, F64, F64]:
 
 
 def _hold(table: _Table, i: int, carriers: tuple[I64, F64, F64]) -> None:
-    """Let some Gaussians carry the anchor in row i, if there are any."""
+    """Let the given Gaussians, if there are any, carry the anchor in row i."""
     count = len(carriers[0])
     if count:
         table.carriers[i], table.weights[i] = _NOBODY, 0
@@ -448,8 +448,8 @@ def _selected(table: _Table, kept: Bool) -> _Table:
 
 
 def _seen(pixels: F64, depths: F64, tissue: Bool, drawn: F32) -> F64:
-    """Share [A] of the pixels around each anchor that show tissue, none of it in front of its own, which is
-    expected at `depths` [A] (m)."""
+    """Share [A] of the pixels around each anchor that show tissue and no surface in front of the anchor's
+    own, which is expected at `depths` [A] (m)."""
     height, width = tissue.shape
     around = np.arange(-SEEN_RADIUS, SEEN_RADIUS + 1)
     known: Bool = np.asarray(np.isfinite(pixels).all(1))
@@ -464,7 +464,7 @@ def _seen(pixels: F64, depths: F64, tissue: Bool, drawn: F32) -> F64:
 
 
 def _patch(observation: Observation, pixel: F64, radius: int) -> U8 | None:
-    """The gray picture around a place, to a part of a pixel; None where not all of it is tissue."""
+    """The gray picture around a place, with subpixel precision; None where not all of it is tissue."""
     height, width = observation.tissue.shape
     column, row = (round(float(x)) for x in pixel)
     reach = radius + 1
@@ -477,7 +477,7 @@ def _patch(observation: Observation, pixel: F64, radius: int) -> U8 | None:
 
 
 def _window(observation: Observation, pixel: F64, radius: int) -> tuple[U8, Bool]:
-    """The gray picture around a place, to a part of a pixel, and where all that it was made of is tissue."""
+    """The gray picture around a place (subpixel), and where all pixels that it is sampled from are tissue."""
     size = 2 * radius + 1
     gray = cv2.getRectSubPix(observation.gray, (size, size), (float(pixel[0]), float(pixel[1])))
     height, width = observation.tissue.shape
@@ -486,15 +486,15 @@ def _window(observation: Observation, pixel: F64, radius: int) -> tuple[U8, Bool
     rows, columns = slice(max(0, top), min(height, top + size)), slice(max(0, left), min(width, left + size))
     inner = observation.tissue[rows, columns]
     tissue[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = inner
-    if not tissue.all():  # a part of a pixel beside it
+    if not tissue.all():  # bilinear sampling reaches one pixel farther
         tissue = cv2.erode(tissue.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
     return np.asarray(gray, np.uint8), tissue
 
 
 def _match(window: U8, tissue: Bool, patch: U8, carried: bool = False) -> tuple[F64, float] | None:
-    """Find where [2] (x, y) in the window the patch begins, to a part of a pixel, and how well it fits; None
-    where it is not found on tissue. Nor where it fits nearly as well elsewhere, as along an edge: then one
-    that was `carried` to the middle is there, if it fits nearly as well as anywhere."""
+    """Find where [2] (x, y) in the window the patch begins (subpixel), and how well it fits, 0..1. None: it
+    is not found on tissue, or fits nearly as well elsewhere, as along an edge. In the latter case a `carried`
+    patch is taken to be in the middle, if it fits there nearly as well as at the best place."""
     scores: F32 = np.asarray(cv2.matchTemplate(window, patch, cv2.TM_CCOEFF_NORMED))
     if not tissue.all():
         on_tissue = cv2.erode(tissue.view(np.uint8), np.ones((_SIDE, _SIDE), np.uint8))

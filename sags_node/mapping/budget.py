@@ -10,18 +10,18 @@ from sags_node.mapping.ladder import EVERYTHING, Ladder, Rung
 from sags_node.types import RungState
 
 LEARNING = 0.2  # share of a new measurement in a running mean
-FORGET = 0.95  # of the cost of a step, per frame in which it seemed not to fit
-LEAST_FIRST_STEPS = 3  # of a new model in its first frame, whatever the time
-FIRST_SECONDS = 0.1  # of its first frame, after which the rest is left to those that follow
+FORGET = 0.95  # factor on the learnt cost of a step, for each frame in which no further step fitted
+LEAST_FIRST_STEPS = 3  # steps of a new model in its first frame, however long they take
+FIRST_SECONDS = 0.1  # s, after which a new model's first frame leaves the other first steps to later frames
 
 
 @dataclass(frozen=True, slots=True)
 class FramePlan:
     """What one frame gets, decided when it begins."""
 
-    rung: Rung  # at most
+    rung: Rung  # the best that the frame may use
     state: RungState | None  # which rung that is and why; None: there is no ladder
-    depth: bool  # may be matched
+    depth: bool  # whether depth may be matched
 
 
 class Budget(Protocol):
@@ -29,29 +29,29 @@ class Budget(Protocol):
 
     @property
     def speed(self) -> float:
-        """How long this machine takes, see `Ladder`."""
+        """The time that this machine takes, in units of the prices' machine; see `Ladder`."""
 
     @property
     def plan(self) -> FramePlan:
         """The plan of the current frame."""
 
     def start(self, waited: float = 0.0) -> FramePlan:
-        """A new frame begins, `waited` seconds after it came."""
+        """Begin a new frame, `waited` seconds after it came; returns its plan."""
 
     def more_at_first(self, steps: int) -> bool:
-        """True when a new model that has had so many steps may have one more in its first frame."""
+        """Tell whether a new model that has had `steps` steps may have one more in its first frame."""
 
     def more(self) -> bool:
-        """True when one more step may be taken."""
+        """Tell whether one more step may be taken."""
 
     def step(self) -> None:
-        """A step begins."""
+        """Begin a step."""
 
     def end_steps(self) -> None:
-        """The frame gets no more steps: what follows is drawn and shown."""
+        """End the steps of the frame: what follows only draws and shows the model."""
 
     def finish(self, gaussians: int, matched: bool = False) -> None:
-        """The frame is done; the model has so many, and depth was matched."""
+        """End the frame, in which the model has that many Gaussians and depth was `matched` or not."""
 
 
 class StepBudget:
@@ -135,11 +135,11 @@ class TimeBudget:
 
     def end_steps(self) -> None:
         self._note_step()
-        if self._steps == 1:  # nothing is learnt of a step that is never taken: try one again some day
+        if self._steps == 1:  # no further step was measured: expect less, so that one is tried again
             self._step_cost.value *= FORGET
 
     def _note_step(self) -> None:
-        """Learn what the step before took; the first, and what follows it, say nothing of a further one."""
+        """Learn the duration of the last step, unless it is the frame's first, which includes other work."""
         now = self._clock()
         if self._steps > 1:
             self._step_cost.add(now - self._stepped)

@@ -12,13 +12,13 @@ from sags_node.kernels.jit import inlined, kernel
 from sags_node.types import F32, F64, Camera, Observation
 
 ROUNDS = 8
-SPREADS = 2.0  # spreads of the residuals beyond which a point counts less than a quarter
-SMALLEST_SCALE = 0.3  # px: better than this no flow is
+SPREADS = 2.0  # standard deviations of the residuals beyond which a point counts less than a quarter
+SMALLEST_SCALE = 0.3  # px: optical flow is no more exact
 FIRST_SCALE = 8.0  # px: so that the start may be that far off
 INLIER = 0.25  # weight: the residual is below the scale
-DAMPING = 1e-6  # of the largest diagonal element: a direction nothing says anything of is left alone
+DAMPING = 1e-6  # of the largest diagonal element: directions that no residual constrains stay at rest
 CONVERGED = 1e-6  # m and rad
-NEAREST = 1e-3  # m
+NEAREST = 1e-3  # m: nearer points have no weight
 LARGEST = 1e12  # px^2: no honest residual comes near
 
 
@@ -66,7 +66,7 @@ def fit_pose(points: F32, pixels: F32, disparities: F32, camera: Camera, baselin
         widest, scale = scale, min(max(scale / 2, spread, SMALLEST_SCALE), FIRST_SCALE)
         if scale >= 0.9 * widest and np.abs(twist).max() < CONVERGED:
             break
-    view[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(view[:3, :3])[0])[0]  # poses are chained: no error may grow
+    view[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(view[:3, :3])[0])[0]  # orthonormal again: poses are chained
     return PoseFit(invert(view), weights, scale)
 
 
@@ -79,7 +79,7 @@ def at_pixels(picture: NDArray[Any], pixels: F32) -> NDArray[Any]:
 def disparities_at(observation: Observation, pixels: F32) -> F32:
     """Disparities [N] px that were measured at pixels [N, 2]; 0: none was."""
     depths, focal = at_pixels(observation.depth, pixels), float(observation.camera.K[0, 0])
-    return disparity_to_depth(depths, focal, observation.baseline)  # its own inverse
+    return disparity_to_depth(depths, focal, observation.baseline)  # the formula is its own inverse
 
 
 def exponential(twist: F64) -> F64:
@@ -88,11 +88,11 @@ def exponential(twist: F64) -> F64:
 
 
 def towards(start: F64, end: F64, share: float) -> F64:
-    """The pose [4, 4] at a share of the way to one that is near."""
+    """The pose [4, 4] at a share of the way from `start` to `end`, which lie near each other."""
     motion = invert(start) @ end
     twist = np.concatenate([motion[:3, 3], cv2.Rodrigues(motion[:3, :3])[0][:, 0]])
     pose: F64 = start @ exponential(share * twist)
-    pose[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(pose[:3, :3])[0])[0]  # poses are chained: no error may grow
+    pose[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(pose[:3, :3])[0])[0]  # orthonormal again: poses are chained
     return pose
 
 
@@ -102,8 +102,7 @@ def _normal_equations(
     scale2: float, weights: F32, squares: F32,
 ) -> tuple[F64, F64]:  # fmt: skip
     """J^T W J [6, 6] and J^T W r [6] for a twist on the left of the view matrix; writes each point's weight
-    and squared residual (px^2). What lies behind the camera or is not finite has
-    no weight."""
+    and squared residual (px^2). What lies behind the camera or is not finite has no weight."""
     normal, gradient = np.zeros((6, 6)), np.zeros(6)
     jacobian, residual, p = np.zeros((3, 6)), np.zeros(3), np.zeros(3)
     fx, fy, cx, cy, focal_baseline = intrinsics
@@ -143,7 +142,7 @@ def _normal_equations(
 
 @inlined
 def _chain(row: F64, p: F64, gx: float, gy: float, gz: float) -> None:
-    """Derivative [6] by a twist of the view of what changes by g when the point p (camera axes) moves:
+    """Chain rule: the derivative [6] by a twist of the view, given the gradient g by a point p (camera axes):
     g . (t + w x p) = t . g + w . (p x g)."""
     row[0], row[1], row[2] = gx, gy, gz
     row[3], row[4], row[5] = p[1] * gz - p[2] * gy, p[2] * gx - p[0] * gz, p[0] * gy - p[1] * gx

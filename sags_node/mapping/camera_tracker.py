@@ -19,14 +19,14 @@ from sags_node.types import F64, Camera, Observation, RenderedView
 from sags_node.vision.watch.standing import watched_ns
 
 HOLD = 0.2  # share of the way to the pose against the tissue at rest, per frame: keeps it from drifting
-LARGEST_JUMP = 8e-3  # m, as `keyframes.distance` counts, between frames: faster, it must be verified
+LARGEST_JUMP = 8e-3  # m between frames, as `keyframes.distance` counts: a larger jump must be verified
 TRIAL = 6  # frames in which a pose that was found again must agree with picture and depth
-TRIED = 3  # candidates for such a pose per frame
-LOOK_NS = 150_000_000  # between two looks whether a frame agrees with the keyframes
-DISAGREEING = 5  # looks in a row: then the pose that was found again was wrong
-PROBATION_NS = 3_000_000_000  # after a pose was found again: no new keyframes, what is learnt can be undone
-GIVE_UP_NS = 3_000_000_000  # of lit frames that show one scene: then a new model is begun
-SAME_SCENE = 0.7  # correlation of a lit frame with the one before, shrunk
+TRIED = 3  # poses by the keyframes that are tried per frame
+LOOK_NS = 150_000_000  # ns between checks of a frame against the keyframes
+DISAGREEING = 5  # failed checks in a row, after which the pose that was found again counts as wrong
+PROBATION_NS = 3_000_000_000  # ns after a pose was found again: no new keyframes, learning can be undone
+GIVE_UP_NS = 3_000_000_000  # ns of lit frames that show one other scene: then a new model is begun
+SAME_SCENE = 0.7  # correlation of a lit frame with the one before, both shrunk
 LIT = 4.0  # grey levels, standard deviation over the tissue: a covered or dark picture has less
 
 
@@ -71,19 +71,19 @@ class CameraTracker:
         self._trial: _Candidate | None = None
         self._passed = 0  # frames that the trial's pose has agreed with
         self._unknown: Observation | None = None  # the last frame that showed something else
-        self._unknown_ns = 0  # for how long frames have
+        self._unknown_ns = 0  # ns for which frames have shown it
         self._found_ns: int | None = None  # when the camera was found again, during the probation
-        self._before: Learnt | None = None  # what was known then
+        self._before: Learnt | None = None  # the map as it was then
         self._looked_ns = 0
         self._disagreed = 0  # looks in a row
 
     def guess(self, given: F64 | None) -> F64 | None:
-        """The pose of a frame before it is looked at, whatever its session says."""
+        """The expected pose of a frame: that of the last one, whatever pose the session gives."""
         return self.pose
 
     def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
-        """Find the pose of a frame, whatever its camera says, or be `lost`; returns `tracks`, or those from
-        where the camera was found again."""
+        """Find the pose of a frame, whatever its camera says, or set `lost`. Returns `tracks`, or those from
+        where the camera was found again; None: it is lost, or there is no model yet."""
         if self._map.model.count == 0:
             self.lost, self._motion = None, np.eye(4)
             return None  # the model begins where the camera was last
@@ -134,7 +134,7 @@ class CameraTracker:
         return True
 
     def _find_again(self, observation: Observation) -> Tracks | None:
-        """Find where the Gaussians are, once the camera is verified to be where it was found."""
+        """Search for the camera; return tracks once the pose that was found is verified, else None."""
         tried = None if self._trial is None else self._tried(observation, self._trial.drawn)
         if tried is None or tried.agreement.problem:
             self._passed = 0
@@ -178,7 +178,7 @@ class CameraTracker:
             self._keyframes.offer(observation, view)
 
     def _best_candidate(self, observation: Observation) -> _Candidate | None:
-        """Find where the model agrees best with a frame: near the last pose or those by the keyframes."""
+        """Find the pose at which the model agrees best with a frame, near the last one or the keyframes'."""
         starts = [self.pose, *self._keyframes.find(observation)[:TRIED]]
         tried = [self._tried(observation, self._seen_from(observation, start)) for start in starts]
         found = [each for each in tried if each is not None]
@@ -189,8 +189,7 @@ class CameraTracker:
         return best
 
     def _tried(self, observation: Observation, before: Drawn) -> _Candidate | None:
-        """Find where the camera is if it was there before from where the model is drawn; None: not near
-        it."""
+        """Fit the camera's pose, starting from the pose that `before` is drawn from; None: it is not near."""
         tracks = self._surface.track(self._map.model.means, before, observation)
         fit = self._tissue.fit(observation, before, tracks, before.view.camera.T_world_cam)
         if isinstance(fit, str):
@@ -202,7 +201,7 @@ class CameraTracker:
         return _Candidate(now, agrees, fit.at_rest)
 
     def _seen_from(self, observation: Observation, pose: F64) -> Drawn:
-        """The model as a frame that was taken from there would have shown it."""
+        """The model drawn from a pose, in the form of a frame that was taken there."""
         view = self._draw(replace(observation.camera, T_world_cam=pose))
         gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
         shown = replace(observation, camera=view.camera, gray=gray, tissue=view.alpha > 0.5)
@@ -215,7 +214,7 @@ class _Candidate:
 
     drawn: Drawn
     agreement: Agreement
-    T_world_rest: F64  # [4, 4] the pose against the tissue at rest: it may have moved since it was seen
+    T_world_rest: F64  # [4, 4] the pose against the tissue at rest: the tissue may have moved since
 
 
 def _is_lit(observation: Observation) -> bool:

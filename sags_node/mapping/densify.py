@@ -24,11 +24,11 @@ RESIDUAL_NEW_SURFACE = 0.2  # RGB residual, summed: above it a pixel nearer than
 RESIDUAL_DETAIL = 0.45  # summed over RGB: with the right depth, detail is missing
 GRID = 4  # px between candidates
 MAX_INSERTED = 1500  # per frame: a budget, and a brake on runaway insertion
-FRONT_TOLERANCE = 0.065  # of the depth: so far in front of the measured surface is free space
-FRONT_FRAMES = 3  # in a row, since stereo is wrong now and then
+FRONT_TOLERANCE = 0.065  # of the depth: farther in front of the measured surface is free space
+FRONT_FRAMES = 3  # frames in a row, since stereo is wrong now and then
 MIN_OPACITY = 0.03
-CROWDED = 0.9  # share of the cap above which what does not show is given up
-SHED = 0.03  # of all, per frame: so many are given up while there are more than the machine can afford
+CROWDED = 0.9  # share of the cap above which Gaussians that do not show are removed
+SHED = 0.03  # share of all Gaussians that is given up per frame while the machine cannot afford them
 LITTLE = 0.35  # of the mean contribution: what shows more would leave a hole
 HOLES = 200  # Gaussians per frame that are exchanged for new ones when the model is full
 ADDED = 500  # Gaussians per frame that may be added even when there are as many as the machine affords
@@ -37,11 +37,11 @@ LARGEST = 1e6  # metres, colours, quaternions: no honest value comes near
 
 
 def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, F32, F32]:
-    """Pixels [M, 2] (x, y) that want a Gaussian, their depths and the errors of those [M] m: holes, then new
-    surfaces, then missing detail.
+    """Return pixels [M, 2] (x, y) that need a Gaussian, with depths and their errors [M] m: holes first, then
+    new surfaces, then missing detail.
 
     A hole beside an instrument or in the strip that one eye does not see has no depth of its own; it borrows
-    that from around. Missing detail takes that of the model, and is no surer than if it were borrowed.
+    that from around. Missing detail without measured depth takes the model's, with a borrowed error.
 
     Args:
         planes: [5, H, W] of the rasteriser: sums of w*rgb, w*z, w.
@@ -58,7 +58,7 @@ def candidates(planes: F32, observation: Observation, phase: int) -> tuple[I32, 
 
 
 def prune(model: GaussianModel, surface: F32, observation: Observation, limit: int) -> int:
-    """Remove what `prune_mask` says and `prune_to_budget`; returns how many."""
+    """Remove what `prune_mask` selects, then what `prune_to_budget` does; returns how many."""
     remove = prune_mask(model, surface, observation.depth_is_new, limit)
     removed = model.remove(remove)
     if model.count > limit:
@@ -67,14 +67,14 @@ def prune(model: GaussianModel, surface: F32, observation: Observation, limit: i
 
 
 def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: int) -> Bool:
-    """[N] what to remove: in free space for several frames in a row, transparent or not finite; when N nears
-    its `limit` also what left the view, and what lies on the visible surface without showing. What an
-    instrument or other tissue hides is kept. Counts the frames in free space (`in_front`), by each measured
-    depth once.
+    """Return [N] which to remove: those in free space for several frames in a row, transparent or not finite;
+    when N nears its `limit` also those out of view, and those on the visible surface that do not show. What
+    an instrument or other tissue hides is kept. Counts the frames in free space (`in_front`), once for each
+    measured depth.
 
     Args:
         surface: [N, 3] of `surface_at`.
-        depth_is_new: it was not counted yet.
+        depth_is_new: this measured depth was not counted yet.
     """
     remove = np.zeros(model.count, np.bool_)
     _inspect(
@@ -86,14 +86,14 @@ def prune_mask(model: GaussianModel, surface: F32, depth_is_new: bool, limit: in
 
 
 def shown(model: GaussianModel, surface: F32, observation: Observation) -> F32:
-    """How much each Gaussian shows, [N] px; infinite where nobody knows yet.
+    """Return how much each Gaussian shows, [N] px; infinite: not known yet.
 
-    Of one that an instrument or other tissue hides, or that an instrument begins to hide, it is at least the
-    mean of all: it is seen again, and missed then.
+    A Gaussian that an instrument or other tissue hides, or that an instrument begins to hide, counts at least
+    as the mean of all: it would be missed when it comes into view again.
 
     Args:
         surface: [N, 3] of `surface_at`.
-        observation: of which that is.
+        observation: the frame of `surface`.
     """
     z, measured = surface[:, 0], surface[:, 1]
     behind = z > (1 + FRONT_TOLERANCE) * measured  # also where nothing is measured
@@ -146,7 +146,7 @@ def fill(
     model: GaussianModel, nodes: NodeDeformation, planes: F32, observation: Observation, phase: int,
     limit: int, smoothing: bool, give_up: Callable[[int], int],
 ) -> tuple[I32, int, int]:  # fmt: skip
-    """Insert what `candidates` want. A full model gives up what shows least for some of them.
+    """Insert Gaussians at the pixels of `candidates`. A full model first gives up some that show least.
 
     Args:
         planes: [5, H, W] of the model, drawn for the frame.
@@ -173,7 +173,7 @@ def give_up(model: GaussianModel, observation: Observation, count: int) -> int:
 
 
 def least_shown(contribution: F32, count: int) -> Bool:
-    """[N] those up to `count` that show least, and little, by the `contribution` of `shown`."""
+    """Return [N] which up to `count` Gaussians show least, and little, by the `contribution` of `shown`."""
     remove = np.zeros(len(contribution), np.bool_)
     little = LITTLE * mean_contribution(contribution)
     least = np.argpartition(contribution, count)[:count]
@@ -182,7 +182,7 @@ def least_shown(contribution: F32, count: int) -> Bool:
 
 
 def mean_contribution(contribution: F32) -> float:
-    """px, of those [N] whose contribution is known; 0: of none."""
+    """The mean, px, of those contributions [N] that are known; 0: none is."""
     known = contribution[contribution < np.inf]
     return float(known.mean()) if len(known) else 0.0
 
@@ -280,7 +280,7 @@ def _is_sound(
     slopes: F32,
     i: int,
 ) -> bool:
-    """Finite, and something to draw."""
+    """Tell whether a Gaussian is finite and opaque enough to be drawn."""
     held = abs(node_weight[i, 0]) + abs(node_weight[i, 1]) + abs(node_weight[i, 2]) + abs(node_weight[i, 3])
     size = abs(smoothing[i]) + abs(quats[i, 0]) + abs(quats[i, 1]) + abs(quats[i, 2]) + abs(quats[i, 3])
     for k in range(3):

@@ -1,10 +1,10 @@
-"""How wrong the depth of each Gaussian may be: by when it was measured, how well, and what moved since.
+"""The predicted depth error of each Gaussian: from when and how well it was measured, and how it moved since.
 
 A Gaussian begins with the error of the depth that it was placed at. Where a frame measures the surface that
-it lies on, it is moved there by a part (`motion.depth_pull`), and its error comes as near to that of the
-measurement. It comes no lower: the errors of frames after each other are those of the same texture and of the
-same calibration, and do not average out. Measurements that contradict it raise its error to the
-contradiction. While it is not measured, its error grows with the way that it is taken unseen.
+it lies on, it is moved there by a part (`motion.depth_pull`), and its error approaches the measurement's by
+the same part. It falls no lower: the errors of successive frames come from the same texture and the same
+calibration, and do not average out. Measurements that contradict it raise its error to the contradiction.
+While it is not measured, its error grows with the distance that it moves unseen.
 """
 
 from typing import Any
@@ -19,9 +19,9 @@ from sags_node.mapping.motion import DEPTH_GATE
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32
 
-DRIFT = 0.5  # of the way that tissue is taken: so much of it may lie along the ray, where nothing shows it
-UNSEEN = 1e-3  # m/s: what tissue moves by itself
-UNWATCHED = 2e-2  # m/s: what tissue moves at when it is pulled, and nobody looks
+DRIFT = 0.5  # share of an unmeasured Gaussian's motion that may be an error along the ray
+UNSEEN = 1e-3  # m/s: speed at which tissue may move by itself, unseen
+UNWATCHED = 2e-2  # m/s: speed of tissue that is pulled while no frame is mapped
 
 
 def remember(model: GaussianModel, surface: F32, pull: float, seconds: float) -> None:

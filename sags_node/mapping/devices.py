@@ -1,4 +1,4 @@
-"""What a launch means for the mapper: who refines, on which rungs, with how many Gaussians."""
+"""What a launch means for the mapper: which device refines, on which rungs, with how many Gaussians."""
 
 import time
 from dataclasses import dataclass, replace
@@ -28,17 +28,17 @@ from sags_node.types import Camera, Gaussians
 
 SAMPLE_SIZE = 320, 256  # px
 SAMPLE_GAUSSIANS = 8000
-SAMPLE_MS = 1.9  # of one drawing and its gradients, back to back, where live frames take their prices
+SAMPLE_MS = 1.9  # for one drawing with its gradients, in a loop, on the machine of the ladder's prices
 TRIES = 21
 
-LEAST_PIXELS = 2  # of the picture for each Gaussian, where time does not count
-FIELD_TIMES = 5.0  # as long as prices say, a frame of the paper's model takes: where its ladder begins
-GAUSSIANS_PER_MS = 1100  # of the budget, where the number of steps is fixed; see benchmarks/mapping.md
+LEAST_PIXELS = 2  # pixels of the picture for each Gaussian, where the number of steps is fixed
+FIELD_TIMES = 5.0  # factor on prices: first guess of what a frame of the paper's model takes
+GAUSSIANS_PER_MS = 1100  # of the frame's time, where the number of steps is fixed; see benchmarks/mapping.md
 
 
 @dataclass(frozen=True, slots=True)
 class Skips:
-    """What a frame may leave out. All of it, but in an ablation."""
+    """The work that a frame may leave out. All are on, except in an ablation."""
 
     duplicates: bool = True  # a frame equal to its predecessor is not mapped again
     depth: bool = True  # when time is short, depth is matched in some of the frames only
@@ -54,12 +54,12 @@ def device_of(config: LaunchConfig) -> Device:
 
 
 def backend_of(config: LaunchConfig) -> str:
-    """The rasteriser's backend on that device."""
+    """The rasteriser's backend on the launch's device."""
     return "warp" if device_of(config).kind == "cuda" else "numba"
 
 
 def affordable(config: LaunchConfig, width: int, height: int) -> int:
-    """How many Gaussians a model of pictures of this size may have on the launch's device."""
+    """The number of Gaussians that a model may have on the launch's device, for pictures of a size (px)."""
     if config.mapping.max_gaussians is not None:
         return config.mapping.max_gaussians
     on_gpu = device_of(config).kind == "cuda"
@@ -74,10 +74,10 @@ def affordable(config: LaunchConfig, width: int, height: int) -> int:
 
 
 def rungs_of(config: LaunchConfig, skips: Skips = ALL_SKIPS) -> tuple[Rung, ...]:
-    """The ladder's, from the cheapest to the best.
+    """The rungs of the ladder, from the cheapest to the best.
 
     Raises:
-        UsageError: `mapping.rung` names none.
+        UsageError: `mapping.rung` is not one of them.
     """
     number = config.mapping.rung
     rungs: tuple[Rung, ...] = RUNGS if device_of(config).kind == "cpu" else GPU_RUNGS
@@ -90,12 +90,12 @@ def make_budget(
     config: LaunchConfig, width: int, height: int, speed: float | None = None, rate: float | None = None,
     skips: Skips = ALL_SKIPS,
 ) -> Budget:  # fmt: skip
-    """Fixed steps where the configuration names them, else its time.
+    """Make the budget of frames: a fixed number of steps where the configuration sets one, else a time.
 
     Args:
         width, height: px of the working size.
         speed: see `Ladder`; None: it is measured.
-        rate: frames that come a second; None: they come when they are taken.
+        rate: frames per second of the source; None: frames come when they are taken.
     """
     mapping = config.mapping
     if mapping.iterations is not None:
@@ -110,13 +110,13 @@ def make_budget(
 
 
 def with_scale(config: LaunchConfig, width: int, height: int, rate: float | None) -> LaunchConfig:
-    """The launch with its `vision.scale` chosen, where that is still to be done.
+    """The launch with a number for `vision.scale` where that is "auto".
 
-    In real time on a CPU by the speed of this machine, which is measured; else 1, so that results repeat.
+    In real time on a CPU it follows from the measured speed of this machine; else it is 1: results repeat.
 
     Args:
         width, height: px of the working size at scale 1.
-        rate: frames that come a second.
+        rate: frames per second of the source.
     """
     if config.vision.scale != "auto":
         return config
@@ -149,7 +149,7 @@ def _measured_speed(config: LaunchConfig) -> float:
 
 
 def measured_speed(rasterizer: Rasterizer) -> float:
-    """`Ladder.speed` of this machine: the median of some drawings of made-up Gaussians with their gradients.
+    """Measure `Ladder.speed` of this machine: the median time of drawing made-up Gaussians with gradients.
 
     Args:
         rasterizer: for pictures of `SAMPLE_SIZE`.

@@ -8,18 +8,18 @@ from sags_node.engine.losses.pieces import LEVEL
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, U8, Bool
 
-EVERY = 8  # px
-COVERED = 0.5
-DARK, BRIGHT = 0.05, 0.95  # beyond, a pixel tells noise or saturation
-LEAST_PIXELS = 50
+EVERY = 8  # px between pixels that are compared
+COVERED = 0.5  # coverage above which a pixel is compared
+DARK, BRIGHT = 0.05, 0.95  # of full scale: beyond, a pixel shows noise or saturation
+LEAST_PIXELS = 50  # with fewer, the gain is 1
 LARGEST = 1.5  # a larger change within one frame is another scene, not another exposure
 
 
 def exposure_gain(planes: F32, image: U8, tissue: Bool) -> F32:
-    """Factor [3] by which a picture is brighter than the model, for each channel.
+    """The factor [3] by which a picture is brighter than the model, for each channel.
 
-    An endoscope's exposure follows what comes near, and all colours change at once; taking that as one gain
-    spares the model to learn it Gaussian by Gaussian. The median does not see highlights and what is new.
+    An endoscope's exposure follows what comes near, and all colours change at once. With one gain for that,
+    the model need not learn it Gaussian by Gaussian. The median ignores highlights and new tissue.
 
     Args:
         planes: [5, H, W] of the rasteriser, drawn for that picture.
@@ -37,7 +37,7 @@ def exposure_gain(planes: F32, image: U8, tissue: Bool) -> F32:
 
 @kernel
 def _ratios(planes: F32, image: U8, tissue: Bool, ratios: F32) -> Any:
-    """Picture over model of every so many fair pixels, ratios [3, M] written; returns how many."""
+    """Write the ratios [3, M] of picture to model at fair pixels of a grid; returns how many there are."""
     height, width = tissue.shape
     dark, bright = np.float32(DARK), np.float32(BRIGHT)
     n = 0

@@ -1,7 +1,7 @@
-"""What the tissue looked like when it was seen first: that says where the camera is, however long ago.
+"""Pictures of the tissue as it was first seen: from them the camera's pose is found without drift.
 
-Places at rest of the model follow the flow, whose errors add up. So some pictures are kept, with the places
-at rest of what has texture in them.
+The model's places at rest follow optical flow, whose errors add up. So some pictures are kept, with the
+places at rest of their corners.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F32, F64, U8, Camera, Observation
 
 MOST = 16  # pictures
-FAR = 0.01  # m, as `keyframes.distance` counts: from there another picture is kept
+FAR = 0.01  # m, as `keyframes.distance` counts: a picture this far from all others is kept
 REACH = 0.025  # m, the same: from farther away too little of a picture is found again
 CORNERS = 300
 CORNER_QUALITY = 0.005
@@ -24,8 +24,8 @@ CORNER_DISTANCE = 8 / 640  # of the width
 WINDOW = (21, 21)  # px
 ASIDE = 0.02  # of the width, from where it is expected: a corner found farther is another one
 LEAST_CORNERS = 40
-LEAST_INLIERS = 0.5  # of those found
-LARGEST_SCALE = 6 / 640  # of the width: of the residuals; right ones reached 5
+LEAST_INLIERS = 0.5  # share of the corners found
+LARGEST_SCALE = 6 / 640  # of the width: scale of the residuals; that of correct fits reached 5 / 640
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +47,12 @@ class FirstViews:
         self._kept.clear()
 
     def pose(self, observation: Observation, about: F64) -> F64 | None:
-        """The camera's pose [4, 4] by the oldest view with enough matches; None: none has. Later ones hold
-        what the older ones left over.
+        """The camera's pose [4, 4] by the oldest view with enough matches; None: none has. Later views
+        contain the error that the older ones left.
 
         Args:
             observation: a frame that was taken in; its camera says where the tissue is now.
-            about: `T_world_cam` [4, 4] against the tissue at rest, about.
+            about: a rough `T_world_cam` [4, 4] against the tissue at rest.
         """
         camera = replace(observation.camera, T_world_cam=about)
         near = (view for view in self._kept if distance(view.camera, camera) < REACH)
@@ -60,7 +60,7 @@ class FirstViews:
         return next((pose for pose in poses if pose is not None), None)
 
     def offer(self, observation: Observation, at_rest: F64) -> None:
-        """Keep the picture of a frame that was taken in, where there is none near.
+        """Keep the picture of a frame that was taken in, if no kept one is near.
 
         Args:
             observation: its camera says where the tissue is now.

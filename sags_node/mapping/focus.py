@@ -12,15 +12,15 @@ from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.types import F32, I32, U8, Bool
 
-EVERY = 2  # px: a quarter of the pixels tells enough
+EVERY = 2  # px between pixels that are compared: a quarter of them is enough
 REACH = 32  # px: few Gaussians are larger, and those are faint out there
 
 
 def largest(residuals: F32, share: float) -> Bool:
     """The tiles [rows, columns] of a picture with the largest squared colour residuals.
 
-    PSNR counts squares, and most of them stand in few tiles: a step on a sixth of the picture gains half of
-    what a step on all of it does.
+    PSNR counts squared residuals, and most of their sum lies in few tiles: a step on a sixth of the picture
+    gains half of what a step on all of it does.
 
     Args:
         residuals: [rows, columns] of `sum_residuals`.
@@ -58,8 +58,8 @@ def sum_residuals(
     planes: F32,  # [5, H, W]
     image: U8,  # [H, W, 3]
     tissue: Bool,  # [H, W]
-    tiles: Bool,  # [rows, columns] of which
-    sums: F32,  # [rows, columns] squared colour residuals, written for those
+    tiles: Bool,  # [rows, columns] which to sum
+    sums: F32,  # [rows, columns] squared colour residuals, written for those tiles
 ) -> None:
     for row in prange(sums.shape[0]):
         _sum_row(planes, image, tissue, tiles, sums, np.int64(row))

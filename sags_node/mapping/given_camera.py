@@ -1,4 +1,4 @@
-"""Where the camera is: what says so, and the simplest that does: its poses are given, or it stands still."""
+"""The interface of camera localisation, and its simplest form: given poses, or a camera that stands still."""
 
 from typing import Protocol
 
@@ -13,9 +13,9 @@ class Localizer(Protocol):
 
     Attributes:
         lost: why the camera is lost; None: it is not.
-        unsure: why the picture could not tell in the last frame; empty: it could, or it was not asked.
+        unsure: why the last picture did not determine the pose; empty: it did, or it was not used.
         pose: `T_world_cam` [4, 4] of the last frame.
-        by_picture: the pose follows from the pictures, so that it tells nothing that they do not.
+        by_picture: the pose is estimated from the pictures, so that it is no evidence beside them.
     """
 
     lost: str | None
@@ -24,14 +24,14 @@ class Localizer(Protocol):
     by_picture: bool
 
     def guess(self, given: F64 | None) -> F64 | None:
-        """The pose of a frame before it is looked at; None: that of a camera that stands still.
+        """The expected pose of a frame, before its picture is used; None: the camera stands still.
 
         Args:
-            given: what its session says.
+            given: the pose that the session gives for the frame.
         """
 
     def locate(self, observation: Observation, last: Drawn | None, tracks: Tracks | None) -> Tracks | None:
-        """Find the pose of a frame whose camera is as guessed, or be `lost`.
+        """Find the pose of a frame whose camera has the guessed pose, or set `lost`.
 
         Args:
             last: the frame before, and `tracks` from it to this one; None: there is no model yet.
@@ -65,4 +65,4 @@ class GivenCamera:
         return tracks
 
     def learn(self, observation: Observation, view: RenderedView) -> None:
-        """Nothing is learnt."""
+        """Do nothing: poses are given."""

@@ -14,11 +14,11 @@ from sags_node.types import F32, I32, Observation
 from sags_node.vision.depth_grid import depth_at, grid_of
 
 SCALE_PER_SPACING = 0.4  # of the distance between neighbours; measured best (0.3-0.5), 0.8 loses 4 dB
-FILTERED = 0.45  # px, in quadrature: filters take so much opacity from small ones that gaps were left
+FILTERED = 0.45  # px, in quadrature: else the filters make small Gaussians so faint that gaps are left
 FLATNESS = 0.5  # the extent along the ray against the extent across it
 OPACITY = 0.9
-LEAST_SHARE = 0.3  # of the drawn scale that is left when the 3D filter's share is taken off
-LARGEST_ERROR = 0.05  # m of depth: more says no more
+LEAST_SHARE = 0.3  # of the drawn scale: at least so much is left without the 3D filter's share
+LARGEST_ERROR = 0.05  # m of depth: predicted errors are capped here
 INITIAL_SHARE = 0.75  # of the cap used by the first frame; the rest is for what appears later
 
 
@@ -34,7 +34,7 @@ def insert(
     """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the picture, at depth `z` [M] m.
 
     Args:
-        errors: [M] m, predicted, of the depths; infinite: as large as the model's are on the whole.
+        errors: [M] m, predicted, of the depths; infinite: unknown, then the median of the model's is taken.
         spacing: px between neighbouring pixels of the list; it sets the scales as they are drawn.
         smoothing: give them the 3D filter.
 
@@ -63,7 +63,7 @@ def first_pixels(observation: Observation, limit: int) -> tuple[I32, F32, F32, f
     """A regular grid of at most about `limit` tissue pixels: pixels [M, 2], depths and their predicted errors
     [M] m, spacing px.
 
-    Pixels without depth borrow it from around; without any they are left out.
+    Pixels without depth borrow it from around; where there is none to borrow, they are left out.
     """
     tissue = observation.tissue
     spacing = max(1.0, float(np.sqrt(np.count_nonzero(tissue) / limit)))

@@ -1,4 +1,4 @@
-"""Pictures of the model from where the camera was, to find it again when it is lost."""
+"""Frames whose camera poses are known, to find the camera again when it is lost."""
 
 from dataclasses import replace
 from functools import cached_property
@@ -12,16 +12,16 @@ from sags_node.types import F32, F64, U8, Bool, Camera, Observation, RenderedVie
 from sags_node.vision.landmarks import Features, features_in, matched
 
 MOST = 8
-PERIOD_NS = 500_000_000  # between keyframes
+PERIOD_NS = 500_000_000  # ns between keyframes
 APART = 4e-3  # m: a nearer keyframe is replaced, since tissue changes
-LEVER = 0.08  # m: what an endoscope looks at; a turn moves it by the angle times this
+LEVER = 0.08  # m, working distance of an endoscope: a rotation counts as its angle times this
 FEATURES = 800
 FAST_THRESHOLD = 7  # grey levels: tissue has few corners
-REPROJECTION = 4 / 640  # of the width
+REPROJECTION = 4 / 640  # of the width: largest reprojection error of an inlier
 LEAST_MATCHES = 15
 WITNESSES = 2  # keyframes, the nearest, that a frame is compared with
-EVERY = 2  # shrunk px that are compared
-LEAST_OVERLAP = 0.4  # of a keyframe in a frame: what shows less of it says nothing
+EVERY = 2  # shrunk px between pixels that are compared
+LEAST_OVERLAP = 0.4  # share of a keyframe that a frame must show to be compared with it
 
 
 class _Keyframe:
@@ -33,7 +33,7 @@ class _Keyframe:
 
     @cached_property
     def small(self) -> tuple[Small, F32]:
-        """A few pixels of it, and where [h, w, 3] (m, world) the tissue in them was."""
+        """The keyframe shrunk, and the points [h, w, 3] (m, world) of the tissue in its pixels."""
         there = self.observation
         fine = shrunk(there.gray, self.depth, there.tissue & (self.depth > 0))
         small = Small(fine.gray[::EVERY, ::EVERY], fine.depth[::EVERY, ::EVERY], fine.where[::EVERY, ::EVERY])
@@ -72,9 +72,8 @@ class Keyframes:
         self._kept.append(_Keyframe(observation, view.depth))
 
     def find(self, observation: Observation) -> list[F64]:
-        """`T_world_cam` [4, 4] from which the picture may have been taken: one for each keyframe that
-        shows some of it, that with most matching features that agree first (ORB; perspective from points in
-        RANSAC)."""
+        """Find poses `T_world_cam` [4, 4] from which the picture may have been taken: one for each keyframe
+        that shows some of it, the one with most inliers first (ORB features, PnP in RANSAC)."""
         features = _features(observation.gray, observation.tissue)
         if len(features.codes) < LEAST_MATCHES:
             return []
@@ -83,8 +82,8 @@ class Keyframes:
         return [pose for _, pose in sorted(poses, key=lambda pose: pose[0], reverse=True)]
 
     def agree(self, observation: Observation) -> Agreement | None:
-        """How well a frame agrees with the better of the nearest keyframes, where its pose says that their
-        tissue is; None: it shows too little of them."""
+        """The agreement of a frame, at its pose, with the best of the nearest keyframes; None: it shows too
+        little of them."""
         frame = small_frame(observation)
         near = sorted(self._kept, key=lambda each: distance(observation.camera, each.observation.camera))
         best: Agreement | None = None
@@ -96,7 +95,7 @@ class Keyframes:
 
 
 def _warped(there: Small, points: F32, frame: Small, observation: Observation) -> Agreement | None:
-    """Of a frame with a keyframe, pixel by pixel of the keyframe."""
+    """The agreement of a frame with a keyframe, whose pixels are projected into the frame."""
     step = observation.gray.shape[1] // frame.gray.shape[1]
     height, width = frame.gray.shape
     pixels, depth = project(observation.camera, points)
@@ -138,7 +137,7 @@ def _features(gray: U8, where: Bool) -> Features:
 
 
 def distance(a: Camera, b: Camera) -> float:
-    """How far apart two cameras are, m: what they look at shifts by about as much."""
+    """The distance between two cameras, m: about how far what they look at shifts from one to the other."""
     motion = invert(a.T_world_cam) @ b.T_world_cam
     turn = cv2.Rodrigues(motion[:3, :3])[0]
     return float(np.linalg.norm(motion[:3, 3]) + LEVER * np.linalg.norm(turn))

@@ -1,9 +1,9 @@
-"""The rungs of quality on which a frame can be worked, what each costs, and which one a machine affords.
+"""The rungs of quality on which a frame can be mapped, what each costs, and which one a machine affords.
 
-A rung says how much of everything a frame gets. Gaussians do not care for the size of the picture that they
-are drawn in, so a model goes on when the rung changes. Prices are times on one machine; only their ratios
-count, since every machine measures how long its own frames take. `benchmarks/ladder.md` has each rung's price
-and what it gives.
+A rung says how much of everything a frame gets. Gaussians do not depend on the size of the picture that they
+are drawn in, so a model is kept when the rung changes. Prices are times on one machine; only their ratios
+count, since every machine measures how long its own frames take. `benchmarks/ladder.md` has the price and
+the quality of each rung.
 """
 
 from collections import deque
@@ -65,32 +65,32 @@ GPU_RUNGS = (
 class Prices:
     """What a frame costs on one machine, ms; only ratios count."""
 
-    every_frame: float  # what depends on nothing: the camera's pictures, watches, tracks
-    depth: float  # matched once
-    worked: float  # pictures of `FULL` px: flow, masks
-    drawn: float  # a picture of `FULL` px drawn
-    stepped: float  # a step on one
-    per_thousand: float  # Gaussians
+    every_frame: float  # whatever rung and size: the camera's pictures, watchers, tracks
+    depth: float  # one match of depth
+    worked: float  # flow and masks of pictures of `FULL` px
+    drawn: float  # drawing a picture of `FULL` px
+    stepped: float  # a step on a picture of `FULL` px
+    per_thousand: float  # ms per 1,000 Gaussians
 
 
-USED = 0.82  # of the Gaussians that a rung allows: so many a model has, the rest is room for what appears
-# Two cores of one machine, live with somebody looking, at three working sizes (`benchmarks/ladder.md`).
+USED = 0.82  # of the Gaussians that a rung allows: what a model has; the rest is room for what appears
+# Measured on two cores of one machine, live with a viewer, at three working sizes (`benchmarks/ladder.md`).
 ON_CPU = Prices(every_frame=10.0, depth=3.0, worked=2.2, drawn=3.6, stepped=2.4, per_thousand=0.33)
-# One H200 beside 16 cores, by five runs (`benchmarks/gpu.md`), which took 1.07 to 1.12 times as long. Not run
-# on a card since.
+# From five runs on one H200 with 16 cores (`benchmarks/gpu.md`), which took 1.07 to 1.12 times as long. Not
+# measured on a GPU since.
 ON_GPU = Prices(every_frame=8.5, depth=5.0, worked=0.8, drawn=3.6, stepped=1.2, per_thousand=0.08)
 FULL = 640 * 512  # px
 
 AVERAGED = 12  # frames behind the measured speed; the two slowest of them are left out
-LATE, LATE_OF = 4, 60  # so many frames of so many may take longer than a frame's time
-LATE_HIGHER = 1  # so many would have, on a higher rung, before it is tried
-SPARE = 0.2  # of the frame's time, at most, is left free for late frames: the five after one that is late by
-# a whole frame make up for it
+LATE, LATE_OF = 4, 60  # frames that may take longer than a frame's time, of so many in a row
+LATE_HIGHER = 1  # frames of these that may be late on a higher rung, as predicted, for it to be tried
+SPARE = 0.2  # of the frame's time, at most, is left free for late frames: five frames then make up for one
+# that is late by a whole frame
 FIRST_AIM = 0.8  # of the frame's time: what the first rung may take, by a guess before the first frame
 AIM = 0.92  # of the frame's time: what a rung may take, since costs vary
 CLIMB = 0.9  # of the frame's time: what a higher rung may take, with the late frames, before it is tried
-SETTLING = 4  # frames after a change of the rung before the next
-PATIENCE = 10  # frames times higher rungs that would have fitted before one is tried; doubled when it did not
+SETTLING = 4  # frames from one change of the rung to the next, at least
+PATIENCE = 10  # sum over frames of the higher rungs that fit, before one is tried; doubled if it failed
 LONGEST_PATIENCE = 960
 FIRST_LOOKS = (4, 8, 16, 30)  # frames after which the rung may jump; later it goes by single steps
 FIRST_FRAMES = FIRST_LOOKS[-1]
@@ -98,16 +98,16 @@ FIRST_FRAMES = FIRST_LOOKS[-1]
 
 SCALES = (1.0, 0.75, 0.5, 0.375, 0.25)  # of the working size, that a machine may choose from
 SMALLEST = 480 * 360  # px, that it may choose: less saves nothing
-ROOMY = 3  # the rung that must fit: what the lower ones save is for what else the machine does
-PIXELS_PER_GAUSSIAN = 4  # fewer pixels have no more to tell of its colour, slopes and place
-WITH_OTHERS = 1.1  # times as long as prices say, for what else the machine does: a guess before frames tell
+ROOMY = 3  # number of the rung that must fit; lower ones are a reserve for other work on the machine
+PIXELS_PER_GAUSSIAN = 4  # fewer pixels do not determine its colour, slopes and place
+WITH_OTHERS = 1.1  # factor on prices for other work on the machine: a guess until frames are measured
 
 
 def price(rung: Rung, gaussians: float, pixels: int, prices: Prices = ON_CPU) -> float:
-    """Return what a frame costs, ms on the machine of the prices.
+    """Return the time that a frame takes, ms on the machine of the prices.
 
     Args:
-        gaussians: that the model has.
+        gaussians: how many the model has.
         pixels: of the working size.
     """
     pictures = pixels / FULL
@@ -142,7 +142,7 @@ class Ladder:
 
     Attributes:
         rung: of the next frame.
-        speed: how long the machine takes, in units of the prices' machine.
+        speed: the time that the machine takes, in units of the prices' machine.
         reason: why it is that one, for people.
     """
 
@@ -155,7 +155,7 @@ class Ladder:
             rungs: from the cheapest to the best.
             pixels: of the working size.
             seconds: that a frame may take.
-            speed: how long the machine takes, in units of the prices' machine.
+            speed: the time that the machine takes, in units of the prices' machine.
             prices: what frames cost there.
             fixed: the rung that it stays on.
         """
@@ -165,10 +165,10 @@ class Ladder:
         self._pixels = pixels
         self.speed = speed
         self._took: deque[float] = deque(maxlen=AVERAGED)  # frames, in units of their prices
-        self._beyond: deque[float] = deque(maxlen=LATE_OF)  # ms, of what was expected of frames
+        self._beyond: deque[float] = deque(maxlen=LATE_OF)  # ms by which frames took longer than expected
         self._frames = 0
         self._since = 0  # frames since the rung changed
-        self._fitted = 0  # higher rungs that would have fitted, over frames in a row
+        self._fitted = 0  # sum over frames in a row of the higher rungs that would have fitted
         self._patience = PATIENCE
         self._climbed = False  # whether the last change was up
         self.seconds = seconds
@@ -182,14 +182,14 @@ class Ladder:
 
     @property
     def state(self) -> RungState:
-        """Say for people."""
+        """The rung and why it is that one, for people."""
         rung = self.rung
         return RungState(
             self.place, len(self._rungs), self.reason, rung.gaussians, rung.scale, rung.depth_every
         )
 
     def learn(self, seconds: float, gaussians: int) -> None:
-        """A frame took so long, further steps left out, with so many Gaussians."""
+        """Learn that a frame took `seconds`, without its further steps, with that many Gaussians."""
         usual_ms = price(self.rung, gaussians, self._pixels, self._prices)
         took = 1e3 * seconds / usual_ms
         self._frames += 1
@@ -224,15 +224,15 @@ class Ladder:
         return self.speed * price(rung, USED * rung.gaussians, self._pixels, self._prices)
 
     def _tail(self, late: int, frames: int) -> float:
-        """ms beyond what was expected: all but `late` of the last so many frames stayed below."""
+        """ms above the expected time that all but `late` of the last `frames` frames stayed below."""
         return sorted([0.0] * (late + 1) + list(self._beyond)[-frames:])[-late - 1]
 
     def _most(self, beyond: float) -> float:
-        """ms that are expected at most of a frame which may take so many more."""
+        """The most ms that a frame may be expected to take, if late ones take `beyond` ms more."""
         return 1e3 * self.seconds - min(beyond, SPARE * 1e3 * self.seconds)
 
     def _best(self, share: float, beyond: float = 0.0) -> int:
-        """The highest rung that takes no more than this share of the time that so many ms leave."""
+        """The highest rung whose expected time is within a share of the time that `beyond` ms leave."""
         most = share * self._most(beyond)
         return max((i for i in range(len(self._rungs)) if self._expected(i) <= most), default=0)
 

@@ -1,4 +1,4 @@
-"""What every mapper makes of a frame, and how it judges one."""
+"""What all mappers share: the result of a frame, and how a frame is judged."""
 
 import math
 from collections.abc import Mapping
@@ -14,10 +14,10 @@ from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, Forecast, Observation, RenderedView, Snapshot
 from sags_node.vision.watch.picture_fit import MISFIT
 
-MIN_FIRST_DEPTHS = 200  # px
-LOST_COVERAGE = 0.3  # of the tissue
-SETTLED = 10  # frames: a model that has not changed for so long has little more to learn
-SETTLED_EVERY = 5  # frames: then it is refined so rarely
+MIN_FIRST_DEPTHS = 200  # px with depth that a first model needs
+LOST_COVERAGE = 0.3  # of the tissue: a model that covers less is lost
+SETTLED = 10  # frames in which nothing moved, after which a model has little more to learn
+SETTLED_EVERY = 5  # frames: then it is refined in only one of so many
 SOME = slice(None, None, 8)  # rows and columns of a picture that are enough to judge by
 
 
@@ -35,7 +35,7 @@ def can_start(observation: Observation) -> bool:
 
 
 def most_steps(still: int, frames: int) -> float:
-    """How many steps the frame of that number may have at most, after so many still ones."""
+    """The most steps that frame number `frames` may have, after `still` frames in which nothing moved."""
     if still <= SETTLED:
         return math.inf
     return 0 if frames % SETTLED_EVERY else 1
@@ -50,9 +50,9 @@ def is_lost(planes: F32, observation: Observation) -> bool:
 
 
 def is_worse_than_one_colour(planes: F32, observation: Observation) -> bool:
-    """Tell whether one colour would show the tissue of this frame better than the model does, and the model's
-    are wrong on the whole. If it has just learnt from the frame, it is broken, and beside it every later
-    picture seems to show another scene."""
+    """Tell whether one colour would show the tissue of this frame better than the model, whose colours are
+    wrong on the whole. A model that has just learnt from the frame is then broken: compared with it, every
+    later picture would seem to show another scene."""
     tissue = observation.tissue[SOME, SOME]
     if not tissue.any():
         return False
@@ -62,7 +62,7 @@ def is_worse_than_one_colour(planes: F32, observation: Observation) -> bool:
 
 
 def as_view(planes: F32, model: GaussianModel, observation: Observation) -> RenderedView:
-    """Planes [5, h, w] of the model, drawn for a frame at any size, as they are published."""
+    """Make the view to publish of the model's planes [5, h, w], drawn for a frame at any size."""
     view = to_view(planes, observation.camera, observation.frame_id, observation.t_capture_ns)
     return with_confidence(view, model.gaussians(), observation.grid)
 
@@ -71,7 +71,7 @@ def snapshot_of(
     model: GaussianModel, observation: Observation, step: int, loss: float, counts: Mapping[str, int],
     right: bool, forecast: Forecast | None = None,
 ) -> Snapshot:  # fmt: skip
-    """The model as it is at the time of a frame; `right`: also what the right eye sees more."""
+    """Copy the model as it is at the time of a frame; `right`: also how the right eye's colours differ."""
     return Snapshot(
         frame_id=observation.frame_id,
         t_capture_ns=observation.t_capture_ns,

@@ -23,13 +23,13 @@ from sags_node.types import F32, Bool, Forecast, Observation, RenderedView
 from sags_node.vision.observe import resized
 
 CONTROL_NODES = 512
-FIRST_STEPS = 30  # of a new model: long ones, in its first frame or, where time is short, in the next ones
+FIRST_STEPS = 30  # longer steps of a new model, in its first frame or, where time is short, the next ones
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
-FOCUS = 0.2  # of the picture: shows most for its time on pulled tissue and on a beating heart
+FOCUS = 0.2  # share of the picture: best quality for its time on pulled tissue and a beating heart
 FIRST_RATES = LearningRates().scaled(4.0)
-UNHURRIED_RATES = 0.6  # measured with six steps: +0.3 dB; with one step a frame it loses as much
-NODE_STEP_PX = 0.08
+UNHURRIED_RATES = 0.6  # factor: with six steps a frame it gains 0.3 dB, with one it loses as much
+NODE_STEP_PX = 0.08  # px at the tissue's median depth: length of one step of the nodes
 
 
 class Mapper:
@@ -66,10 +66,10 @@ class Mapper:
         self.pace(False)
         self._view: RenderedView | None = None  # the model as it was drawn last
         self._scale = 1.0  # of the pictures' size: at which the model was drawn last
-        self._first_steps = 0  # that a new model has had
-        self._split = False  # whether Gaussians were, since the model was drawn
+        self._first_steps = 0  # steps that a new model has had
+        self._split = False  # whether Gaussians were split since the model was drawn
         self._frames = 0
-        self._frames_to_depth = 0  # since depth was known last
+        self._frames_to_depth = 0  # frames since depth was known last
         self._metres_per_px = 0.0  # at the tissue's median depth
 
     def update(
@@ -84,10 +84,10 @@ class Mapper:
         """Take one frame in.
 
         Args:
-            tracks: where the Gaussians are found in it; None: where they are.
+            tracks: where the Gaussians are found in it; None: they have not moved.
             still: for how many frames, this one included, nothing has moved.
-            learn: else the model only follows the motion: the picture's colours are not the tissue's.
-            right: somebody looks at the right eye: the snapshot says what that eye sees more.
+            learn: False: the picture's colours are not the tissue's, and the model only follows the motion.
+            right: somebody looks at the right eye: the snapshot has what its colours differ by.
         """
         self._frames += 1
         before, self._scale = self._scale, budget.plan.rung.scale
@@ -112,7 +112,7 @@ class Mapper:
         return mapped
 
     def pace(self, unhurried: bool) -> None:
-        """Tell whether there is time for several steps a frame. They are shorter then."""
+        """Set the length of steps: shorter if `unhurried`, when there is time for several a frame."""
         self._rates = LearningRates().scaled(UNHURRIED_RATES) if unhurried else LearningRates()
 
     @property
@@ -201,8 +201,8 @@ class Mapper:
         return {"inserted": 0, "removed": 0, "iterations": 0}
 
     def _touch_up(self, observation: Observation, budget: Budget, most: float) -> dict[str, int]:
-        """Nothing moved: what was drawn last shows where steps pay, and only there the picture changes. There
-        are at most so many steps."""
+        """Refine where nothing moved, by `most` steps at most. The last drawing shows where steps pay, and
+        only those tiles are drawn anew."""
         surface, is_new = surface_at(self.model.means, observation), observation.depth_is_new
         prune_mask = densify.prune_mask(self.model, surface, is_new, self._limit(budget))
         if np.count_nonzero(prune_mask) > TORN * self.model.count:
@@ -249,7 +249,7 @@ class Mapper:
         return slice(0, self.model.count)
 
     def _predict(self, observation: Observation, tracks: Tracks | None) -> F32:
-        """Move all Gaussians to where flow and depth saw the tissue go; `surface_at` there."""
+        """Move all Gaussians to where flow and depth saw the tissue go; returns `surface_at` there."""
         if tracks is None:
             self.model.velocities[:] = 0
             return surface_at(self.model.means, observation)
@@ -277,8 +277,7 @@ class Mapper:
             self._metres_per_px = float(np.median(known)) / observation.camera.K[0, 0]
 
     def _forecast(self, t_ns: int, still: bool) -> Forecast | None:
-        """Return what the remembered motion, with the nodes' places at the end of this frame, expects
-        next."""
+        """Add the nodes' places in this frame to the remembered motion; return what it predicts next."""
         motion, deformation, model = self.map.motion, self.map.deformation, self.model
         if motion is None or deformation is None:
             return None

@@ -15,16 +15,15 @@ from sags_node.vision.margin import ClearOfInstruments
 from sags_node.vision.pyramid import pyramid_of
 
 DEPTH_GATE = 0.13  # of the depth: a larger innovation is another surface, not this one
-SEEN_ALPHA = 0.3
-HALVINGS = 1  # of the masks: finer than the flow that they guard
+SEEN_ALPHA = 0.3  # coverage below which a Gaussian counts as not seen
+HALVINGS = 1  # how often the masks' size is halved: they stay finer than the flow that they guard
 DEPTH_PULL = 0.4  # share of the depth innovation taken per frame; measured best 0.3-0.5
 FINE_FLOW, COARSE_FLOW = 4, 6  # px between patches
-MOST_FRAMES = 4  # without depth, after which the pull is not stronger any more
+MOST_FRAMES = 4  # frames without depth, after which the pull does not grow any more
 
 
 def depth_pull(frames: int) -> float:
-    """Share of the depth innovation to take when depth is known again after `frames` frames: as much as if it
-    had been known in each."""
+    """The share of the depth innovation to take after `frames` frames, as if depth was known in each."""
     return float(1 - (1 - DEPTH_PULL) ** min(frames, MOST_FRAMES))
 
 
@@ -40,7 +39,7 @@ class Tracks(NamedTuple):
     """Where Gaussians are found in a frame."""
 
     pixels: F32  # [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now
-    seconds: float  # since they were where they are in the model
+    seconds: float  # from the frame that the model shows to this one
 
 
 class SurfaceTracker:
@@ -51,15 +50,16 @@ class SurfaceTracker:
         self.pace(False)
 
     def pace(self, unhurried: bool) -> None:
-        """Tell whether there is time for a finer flow."""
+        """Set how fine the flow is: finer if `unhurried`, when there is time."""
         self._flow = OpticalFlow(FINE_FLOW if unhurried else COARSE_FLOW)
 
     def track(self, means: F32, last: Drawn, observation: Observation, guess: F32 | None = None) -> Tracks:
-        """
+        """Find the Gaussians of an earlier frame in this one.
+
         Args:
             means: [N, 3] m, world, at the earlier frame.
             last: that frame, and the model drawn for it, to know what was hidden.
-            guess: [rows, columns, 2] px, of square cells over the picture, from where to search.
+            guess: [rows, columns, 2] px, flow of square cells over the picture to start the search from.
         """
         before = last.observation
         flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
@@ -74,7 +74,7 @@ def found(means: F32, before: RenderedView, clear_before: Bool, flow: F32, clear
     Args:
         means: [N, 3] m, world, at the earlier frame.
         before: the model drawn at the earlier frame, to know what was hidden.
-        clear_before, clear_after: [h, w] tissue far enough from instruments, after so many `HALVINGS`.
+        clear_before, clear_after: [h, w] tissue far enough from instruments, halved in size `HALVINGS` times.
         flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
     """
     pixels = np.full((len(means), 2), np.float32(np.nan))
@@ -83,13 +83,13 @@ def found(means: F32, before: RenderedView, clear_before: Bool, flow: F32, clear
 
 
 def scene_flow(means: F32, pixels: F32, after: Observation, pull: float) -> tuple[F32, F32]:
-    """Displacement of each Gaussian to where it was found.
+    """Return the displacement of each Gaussian to where it was found.
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
         pixels: [N, 2] in the later one, as `Tracks.pixels`.
         after: the later frame; its depth pulls the Gaussian along the ray.
-        pull: by which share of the difference; see `depth_pull`.
+        pull: share of the difference in depth that is taken; see `depth_pull`.
 
     Returns:
         displacements [N, 3] m, world, and seen [N]: 1 where the displacement was observed, else 0.
@@ -187,7 +187,7 @@ def _advect_rows(
 
 @inlined
 def _bilinear(flow: F32, u: Any, v: Any, channel: int) -> Any:
-    """Flow at a place in the picture; beyond the outermost centres of pixels it goes on as there."""
+    """Flow at a place in the picture; beyond the outermost pixel centres it is constant."""
     height, width, _ = flow.shape
     one = np.float32(1)
     u = min(max(u, np.float32(0)), np.float32(width - 1))

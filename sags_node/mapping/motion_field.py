@@ -1,10 +1,10 @@
-"""How tissue moves again and again: what followed the last times that it moved as it does now.
+"""Prediction of repeated motion: what followed the last times that the tissue moved as it does now.
 
 The method of analogues (E. N. Lorenz, J. Atmos. Sci. 1969), on the motion of the control nodes: past moments
 at which all nodes moved as in the last frames say what comes next. Heart and breathing need no model of their
-own for that. What is recalled is mixed with the last velocities by weights that the last half second of
-predictions would have wanted. Where such moments do not come again and again, only the last velocity is
-believed. A HexPlane field learnt beside the video was compared; see `benchmarks/motion_field.md`.
+own for that. The recalled motion is mixed with the last velocities by the weights that would have predicted
+the last half second best. Where such moments do not recur, only the last velocity is believed. A HexPlane
+field that is learnt beside the video was compared; see `benchmarks/motion_field.md`.
 """
 
 from collections import deque
@@ -16,20 +16,20 @@ from sags_node.types import F32, I64, MotionState
 HISTORY = 300  # frames: two breaths at 30 Hz
 HORIZONS = 4  # frames ahead
 MATCHED = 3  # frames in a row that are compared
-NEAREST = 0.3  # s: what lies less far back is this motion itself; no heart beats faster
-LIKENESS = 0.1  # of the motion's energy: a moment that differs by so much more counts 1/e of another
+NEAREST = 0.3  # s: more recent moments belong to this motion itself; no heart beats faster
+LIKENESS = 0.1  # of the motion's energy: a moment that differs by this much more weighs 1/e of another
 UNLIKE = float(np.exp(-1 / LIKENESS))  # weight of the hypothesis that nothing moves
-MEMORY = 0.93  # of the mixing weights and of how long ago moments like now were, per frame: half a second
-SKILL_MEMORY = 0.97  # a second
+MEMORY = 0.93  # factor per frame on what mixing weights and the period are learnt from: half a second
+SKILL_MEMORY = 0.97  # the same for the errors of predictions: a second
 PRIOR = 0.5  # pulls the mixing weights to equal shares, in energies of one frame's motion
-SHARE = 0.3  # of each: together a little less than all, since tissue slows down
-STEADY = 0.8  # times the last velocity: what is said without a memory
-LEAST_SKILL = 0.2  # of the motion's energy: what explains less does not pay for being wrong
+SHARE = 0.3  # prior of each mixing weight: their sum is a little below 1, since tissue slows down
+STEADY = 0.8  # factor on the last velocity in a prediction without a memory
+LEAST_SKILL = 0.2  # of the motion's energy: a prediction that explains less is not used
 LONGEST_GAP = 4  # frames that may be missing: a straight line fills them
 LEAST_PROBES = 8  # probed nodes that must be seen: fewer say little of the rest
 PERIOD_EVERY = 10  # frames: a period does not change faster
-LEAST_WEIGHT = 1e-3  # of a past frame
-PROBED = 4  # one of so many nodes is compared and learnt from: over a hundred tell what all do
+LEAST_WEIGHT = 1e-3  # of a past frame that is used
+PROBED = 4  # one of so many nodes is compared and learnt from: a hundred or more stand for all
 KNOWN = 0.5  # weight of what was seen around a node: below it nothing is known of it
 
 
@@ -40,7 +40,7 @@ class MotionField:
         self.forget()
 
     def forget(self) -> None:
-        """The nodes are others now, or have moved unseen."""
+        """Forget all motion, when the nodes are others now or have moved unseen."""
         self._count = 0  # frames in the history
         self._places: F32 = np.zeros((0, 0, 3), np.float32)  # [2 HISTORY, M, 3] m
         self._steps: F32 = self._places  # from the frame before
@@ -54,12 +54,12 @@ class MotionField:
         self._normal = np.zeros((HORIZONS, 3, 3))
         self._wanted = np.zeros((HORIZONS, 3))
         self._errors = np.zeros((HORIZONS, 3))  # m^2, running: of the mix, of resting, of the last velocity
-        self._lags = np.zeros(2 * HISTORY)  # frames -> how often the tissue moved as so long ago
-        self._trust = 0.0  # 0..1: lately there were such moments
+        self._lags = np.zeros(2 * HISTORY)  # by frames back: weight of the moments like now
+        self._trust = 0.0  # 0..1, running: weight of all such moments
 
     def recalled(self, motion: F32, seen: F32) -> F32 | None:
         """The motion [M, 3] m of all nodes in this frame, hidden ones too, as it was when the seen ones moved
-        so before; None: they never did, or not again and again.
+        like this before; None: they never did, or their motion does not repeat.
 
         Args:
             motion: [M, 3] m since the last frame, where it is known.
@@ -80,7 +80,7 @@ class MotionField:
         return prior
 
     def take(self, nodes: F32, seen: F32, t_ns: int) -> None:
-        """The places [M, 3] m of all nodes at the end of a frame; new ones come last."""
+        """Add the places [M, 3] m of all nodes at the end of a frame; new nodes come last."""
         seconds = (t_ns - self._stamp_ns) * 1e-9
         self._stamp_ns = t_ns
         if self._count and len(nodes) > self._places.shape[1]:
@@ -103,8 +103,8 @@ class MotionField:
         self._add(nodes, seen)
 
     def forecast(self) -> tuple[F32, float, MotionState] | None:
-        """How far [HORIZONS, M, 3] m each node will have moved after 1, 2, ... frames, the time of one (s),
-        and how far to believe it; None: too little is known yet."""
+        """Predict how far [HORIZONS, M, 3] m each node will have moved after 1, 2, ... frames; with the time
+        of a frame (s), and how far to believe it. None: too little is known yet."""
         if self._count <= MATCHED or self._frame_s == 0:
             return None
         mixed, rested, steady = self._errors.T
@@ -121,12 +121,12 @@ class MotionField:
 
     @property
     def _nearest(self) -> int:
-        """Frames."""
+        """`NEAREST` in frames."""
         return int(np.ceil(NEAREST / self._frame_s))
 
     def _found_period(self) -> float | None:
-        """s after which the tissue moves as before, if most of the moments like now lie so far back, or a
-        multiple of it."""
+        """The period (s) of the motion: most moments like now lie a multiple of it back. None: there is no
+        such period."""
         often, total = self._lags, float(self._lags.sum())
         if self._trust < 0.5 or not total > 0:
             return None
@@ -135,14 +135,14 @@ class MotionField:
         longest, most = None, 0.5 * total
         for lag in peaks[often[peaks] > 0.3 * often.max()]:
             near = (np.abs(lags - lag * np.rint(lags / lag)) <= max(1.0, 0.05 * lag)) & (2 * lags > lag)
-            # Of two periods that explain as much it is the longer one: it holds whole cycles of the other.
+            # Of two periods that explain as much the longer one is right: it holds whole cycles of the other.
             if often[near].sum() >= most:
                 once = near & (2 * lags < 3 * lag)
                 longest, most = float((often[once] * lags[once]).sum() / often[once].sum()), often[near].sum()
         return None if longest is None else longest * self._frame_s
 
     def _grow(self, nodes: F32) -> None:
-        """New nodes have always moved as their nearest neighbour did."""
+        """Add new nodes, as if they had always moved as their nearest neighbours did."""
         old = self._places.shape[1]
         far = np.square(nodes[old:, None] - nodes[:old]).sum(2)
         like = np.concatenate([np.arange(old), far.argmin(1)])
@@ -171,7 +171,7 @@ class MotionField:
             self._say()
 
     def _learn(self, known: I64) -> None:
-        """Return what was said of this frame against what came, at probed nodes [K] that were seen."""
+        """Compare what was predicted for this frame with what happened, at the probed nodes [K] seen."""
         if len(known) == 0:
             return
         now = self._count - 1
@@ -188,7 +188,7 @@ class MotionField:
             self._errors[back] = SKILL_MEMORY * self._errors[back] + np.array(errors) / len(known)
 
     def _say(self) -> None:
-        """Expect the next frames, from all that is remembered."""
+        """Predict the next frames from all that is remembered."""
         last = self._count - 1
         nodes = self._places.shape[1]
         frames = np.arange(1, HORIZONS + 1, dtype=np.float32)[:, None, None]
@@ -210,8 +210,8 @@ class MotionField:
         self._mixed.appendleft(mixed)
 
     def _followed(self, last: int) -> tuple[F32, float]:
-        """[HORIZONS, M, 3] m: how far nodes went after moments like this one, less, the less alike; and how
-        alike they were, 0..1."""
+        """How far [HORIZONS, M, 3] m nodes went after moments like this one, weighted by likeness; and the
+        sum of the weights, 0..1."""
         nodes = self._places.shape[1]
         weights = self._likeness(last, self._probes[last], None)
         weights = weights[: last - HORIZONS]  # what came after must be known
@@ -229,12 +229,12 @@ class MotionField:
 
     def _likeness(self, newest: int, motion: F32, known: I64 | None) -> F32:
         """Weight [newest] of each past frame, by how alike the nodes moved in it and in those just before.
-        Together they weigh less than 1: resting takes part.
+        The sum is below 1: the hypothesis that nothing moves has a weight, too.
 
         Args:
             newest: number of the frame that is compared, which need not be in the history yet.
             motion: [P, 3] m, of the probed nodes in that frame.
-            known: those of them that count in it, None: all; in the frames before all do.
+            known: indices of the probed nodes that count in that frame, None: all; before it, all count.
         """
         first = max(MATCHED, newest - HISTORY)
         weights = np.zeros(newest, np.float32)

@@ -30,13 +30,13 @@ class LearningRates:
 
     @property
     def of_columns(self) -> list[float]:
-        """Those of each of Adam's columns of a row."""
+        """The lengths for the columns of a row that Adam steps on."""
         return [self.mean_px] * 3 + [self.quat] * 4 + [self.log_scale] * 3 + [self.opacity_logit]
 
 
 COLOUR_RELAXATION = 0.9  # of the SIRT step on colours and slopes
 SLOPE_DECAY = 0.99  # per step: what the picture does not ask for fades
-STEEPEST = 0.25  # for each standard deviation
+STEEPEST = 0.25  # largest slope: change of a colour 0..1 for each standard deviation
 COLOUR_DAMPING = 0.3  # px of coverage: a barely seen Gaussian changes its colour slowly
 BETA1, BETA2 = 0.5, 0.99  # low momentum: a few steps per frame must not coast
 MIN_CONTRIBUTION = 1e-3  # px: rows that were not seen are not touched
@@ -48,9 +48,9 @@ LARGEST_RAW = 100.0  # sum of a row's log scales and logit: no honest value come
 class Optimiser:
     """Adam (Kingma & Ba, 2015) on geometry and a SIRT step on colours and slopes.
 
-    The colour step solves for the colours in closed form as far as one simultaneous iterative
-    reconstruction step goes: each colour moves by the mean residual of the pixels it covers, weighted by
-    its share in them, and each slope by the mean of residual times place. It replaces many gradient steps.
+    The colour step is one step of the simultaneous iterative reconstruction technique, in closed form: each
+    colour moves by the mean residual of the pixels it covers, weighted by its share in them, and each slope
+    by the mean of residual times place. It replaces many gradient steps.
 
     Let w be a Gaussian's share in a pixel's colour, sum w = 1, e the pixel's place in its standard
     deviations, c and a changes of colours and slopes, and m the mean of |e|^2 under w (`spread` over
@@ -159,7 +159,7 @@ def _step_rows(
 def _fix(
     log_scale: F32, opacity_logits: F32, scale: F32, opacities: F32, adam_m: F32, adam_v: F32, g: F32, i: int
 ) -> None:
-    """Make a row's hidden state anew from what is drawn of it, which is known to be sound."""
+    """Rebuild a row's raw parameters and Adam's state from its drawn values, which are known to be sound."""
     for k in range(ADAM_PARAMETERS):
         adam_m[k] = 0
         adam_v[k] = g[k] * g[k] if abs(g[k]) < np.inf else np.float32(0)

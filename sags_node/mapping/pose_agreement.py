@@ -10,13 +10,13 @@ from sags_node.types import F32, U8, Bool, Camera, Observation, RenderedView
 WIDTH = 160  # px, about: of the shrunk pictures that are compared
 WINDOW = 9  # shrunk px: shading wider than that is the light's, which moves with the scope
 LEAST_VARIANCE = 1.0  # grey levels squared: less texture is noise
-LEAST_COVERED = 0.4  # of the tissue in view
+LEAST_COVERED = 0.4  # share of the tissue in view that must be known
 LEAST_CORRELATION = 0.5
-STEREO_ERROR = 0.35  # px: of disparities that are believed
+STEREO_ERROR = 0.35  # px: error of a measured disparity
 SPREAD = 3.0  # of these errors: what differs by more is another surface
-LEAST_NEAR = 0.6  # of the depths
-LARGEST_OFFSET = 1.5  # of these errors: what all depths differ by
-LEAST_DEPTHS = 200  # shrunk px
+LEAST_NEAR = 0.6  # share of the depths that must agree
+LARGEST_OFFSET = 1.5  # of these errors: difference that is common to all depths
+LEAST_DEPTHS = 200  # shrunk px with depth that a comparison needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,18 +39,18 @@ class Agreement:
 
     @property
     def is_contradiction(self) -> bool:
-        """Tell whether it is below half of what is accepted at first: moved tissue agrees better."""
+        """Tell whether the agreement is below half of what a new pose needs: moved tissue agrees better."""
         unlike = self.correlation < LEAST_CORRELATION / 2
         return unlike or (self.near is not None and self.near < LEAST_NEAR / 2)
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """Larger is better."""
+        """The order of agreements: larger is better."""
         return not self.problem, self.correlation
 
     @property
     def problem(self) -> str:
-        """Return what disagrees; empty: nothing."""
+        """Say what disagrees; empty: nothing does."""
         if self.covered < LEAST_COVERED:
             return "hardly any known tissue in view"
         if self.correlation < LEAST_CORRELATION:
@@ -63,7 +63,7 @@ class Agreement:
 
 
 def shrunk(gray: U8 | F32, depth: F32, where: Bool) -> Small:
-    """To about `WIDTH`, by a whole number; depths are picked, not averaged, as edges must not blur."""
+    """Shrink to about `WIDTH` by a whole number; depths are picked, not averaged, as edges must not blur."""
     step = max(1, round(gray.shape[1] / WIDTH))
     rows, columns = gray.shape[0] // step, gray.shape[1] // step
 
@@ -74,12 +74,12 @@ def shrunk(gray: U8 | F32, depth: F32, where: Bool) -> Small:
 
 
 def small_frame(observation: Observation) -> Small:
-    """Return what a frame shows."""
+    """Shrink what a frame shows."""
     return shrunk(observation.gray, observation.depth, observation.tissue)
 
 
 def small_view(view: RenderedView) -> Small:
-    """Return what the model shows."""
+    """Shrink what the model shows."""
     gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     return shrunk(gray, view.depth, (view.alpha > 0.5) & (view.depth > 0))
 
@@ -88,7 +88,7 @@ def agreement(expected: Small, frame: Small, camera: Camera, baseline: float) ->
     """The agreement of a frame with what is expected, pixel by pixel; exposure and wide shading do not count.
 
     Args:
-        camera: of the pictures before they were shrunk, for what a disparity is.
+        camera: of the pictures before they were shrunk, to compute disparities in px.
         baseline: m.
     """
     where = expected.where & frame.where
@@ -105,7 +105,7 @@ def agreement(expected: Small, frame: Small, camera: Camera, baseline: float) ->
 
 
 def local_correlation(a: F32, b: F32, where: Bool) -> float:
-    """Zero-mean correlation of two pictures [h, w] within windows, all windows together by their texture."""
+    """The zero-mean correlation of two pictures [h, w] in small windows, which weigh by their texture."""
     weight = where.astype(np.float32)
     count = _sum(weight)
     inside = where & (count > WINDOW)

@@ -10,7 +10,7 @@ from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F64, Observation, RenderedView
 from sags_node.vision.watch.standing import watched_ns
 
-SECONDS = 10.0  # over which the correction follows the picture: longer than a breath
+SECONDS = 10.0  # s over which the correction follows the picture: longer than a breath
 
 
 class PoseRefiner:
@@ -36,7 +36,7 @@ class PoseRefiner:
         self._stamp_ns: int | None = None  # of the last frame
 
     def guess(self, given: F64 | None) -> F64 | None:
-        """The pose of a frame before it is looked at."""
+        """The expected pose of a frame: the given one, corrected."""
         if given is None:
             return None
         self._given = given

@@ -1,4 +1,4 @@
-"""Where anchors are that were out of sight for long: what surrounded them is recognised.
+"""Anchors that were out of sight for long are found again by recognising what surrounded them.
 
 Pictures are remembered in which anchors were seen, in several states of the tissue. In a later picture their
 features (ORB, `vision.landmarks`) are looked for again. Around an anchor they tell how the tissue was moved,
@@ -16,10 +16,10 @@ from sags_node.vision.landmarks import APART, FEWEST, Features, agreeing, matche
 
 MOST_PICTURES = 12
 LIKE = 0.3  # share of features found again: a picture with fewer shows the tissue in another state
-NEAR = 0.3  # of the width: so far around an anchor features count
-MOST_AROUND = 30  # of the nearest
-SAME_MOTION = 0.01  # of the width: so well each must follow the motion of all around the anchor
-SAME_SCALE = 1.25  # between the picture's and the depth's, and its reciprocal
+NEAR = 0.3  # of the width: features within this distance of an anchor count
+MOST_AROUND = 30  # the nearest features around an anchor that are used
+SAME_MOTION = 0.01  # of the width: most that a feature may deviate from the common motion around the anchor
+SAME_SCALE = 1.25  # largest ratio of the scales by picture and by depth; its reciprocal is the smallest
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Place:
 
     @property
     def scale(self) -> float:
-        """The scale of the picture: above 1 it came nearer."""
+        """The scale of the picture: above 1, the tissue came nearer."""
         return float(np.sqrt(abs(np.linalg.det(self.linear))))
 
 
@@ -73,8 +73,8 @@ class Recall:
         self._pictures.append(_Remembered(features, ids, pixels.copy(), depths.copy(), patches.copy()))
 
     def look(self, features: Features, lost: I64) -> list[Place]:
-        """Find where some of the lost anchors may be in a picture, by one of those remembered that show any:
-        each time by another one."""
+        """Find where lost anchors may be in a picture, by one remembered picture that shows any of them; each
+        call takes the next one."""
         shows = [kept for kept in reversed(self._pictures) if np.isin(kept.ids, lost).any()]
         if not shows:
             return []
@@ -118,8 +118,8 @@ def fits_depth(place: Place, depth: float) -> bool:
 
 
 def straightened(gray: U8, tissue: Bool, place: Place, radius: int) -> tuple[U8, Bool]:
-    """The picture around a place as it would look turned and scaled back, a square of 2 radius + 1 px; and
-    where all that it was made of is tissue."""
+    """Turn and scale the picture around a place back to the remembered view, a square of 2 radius + 1 px;
+    returns it, and where all pixels that it is sampled from are tissue."""
     size = 2 * radius + 1
     back = np.concatenate([place.linear, (place.pixel - place.linear @ [radius, radius])[:, None]], axis=1)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -1,4 +1,4 @@
-"""What is done to the model many times per frame, behind one small interface; here on the CPU."""
+"""What is done to the model many times per frame, behind one small interface, and its form for the CPU."""
 
 from collections.abc import Callable
 from functools import cache
@@ -25,7 +25,7 @@ class Refiner(Protocol):
     the nodes, is seen in the model only after `download`. Rows may be appended meanwhile (`take`).
 
     Attributes:
-        loss: mean absolute colour residual before the last step that was given back.
+        loss: mean absolute colour residual before the last step, as of `download`.
         share: how much of the model's capacity it can refine, 0..1.
         problem: what is wrong with it and how to fix it; None: nothing. May be read from any thread.
     """
@@ -44,7 +44,7 @@ class Refiner(Protocol):
         """
 
     def take(self, rows: slice) -> None:
-        """Take these rows of the model, which the host has written; nodes that were added as well."""
+        """Take these rows of the model, which the host has written, and nodes that were added."""
 
     def download(self) -> None:
         """Write what was refined into the model and the nodes."""
@@ -54,19 +54,19 @@ class Refiner(Protocol):
 
         Args:
             tiles: [rows, columns] that are drawn; the others keep what was drawn before. None: all are drawn.
-            share: of the picture, drawn too, where it was worst before the steps; 1: all of it.
+            share: of the picture, where it was worst before the steps, that is drawn too; 1: all of it.
         """
         if tiles is not None and share > 0:
             tiles = None if share >= 1 else tiles | self._worst_tiles(share)
         self._forward(tiles)
 
     def planes(self) -> F32:
-        """[5, H, W] as they were drawn last; overwritten by the next drawing."""
+        """The planes [5, H, W] as they were drawn last; overwritten by the next drawing."""
 
     def refine(self, rates: LearningRates) -> None:
-        """One step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians.
+        """Take one step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians.
 
-        Teaches the model what each Gaussian contributes to the picture, too; a part of it would not tell.
+        Stores each Gaussian's contribution in the model, too, so the whole picture must have been drawn.
         """
 
     def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
@@ -84,8 +84,8 @@ class Refiner(Protocol):
         return tiles
 
     def show(self, gaussians: Gaussians, camera: Camera) -> F32:
-        """Planes [5, H, W] of any Gaussians for any camera, in memory of their own; overwritten by the next
-        `show`. As `Rasterizer.forward`."""
+        """Draw planes [5, H, W] of any Gaussians for any camera, in memory of their own, which the next
+        `show` overwrites. As `Rasterizer.forward`."""
 
     def _forward(self, tiles: Bool | None) -> None:
         """Draw these tiles."""
@@ -104,7 +104,7 @@ class CpuRefiner(Refiner):
     """The refiner that works on the model's own arrays."""
 
     def __init__(self, make_rasterizer: MakeRasterizer) -> None:
-        """`make_rasterizer`: one for pictures of that width and height, px."""
+        """`make_rasterizer` makes a rasteriser for pictures of a width and height, px."""
         self._rasterizer_of, self._viewer_of = cache(make_rasterizer), cache(make_rasterizer)
         self._optimiser = Optimiser()
         # [5, H, W] and [H, W]; the planes are the rasteriser's memory: what it drew last
@@ -117,7 +117,7 @@ class CpuRefiner(Refiner):
         self._model, self._deformation, self._observation = model, deformation, observation
         self._node_step = node_step
         self._rasterizer = self._rasterizer_of(observation.camera.width, observation.camera.height)
-        # [rows, columns] what `focus.sum_residuals` says of each tile, and where it is of an older drawing
+        # [rows, columns] tiles drawn since `focus.sum_residuals` looked at them, and the sums that it found
         self._old: Bool = ~tile_grid(observation.tissue)
         self._sums: F32 = np.zeros(self._old.shape, np.float32)
 
@@ -141,7 +141,7 @@ class CpuRefiner(Refiner):
         self._old |= True if tiles is None else tiles
 
     def _worst_tiles(self, share: float) -> Bool:
-        """Only tiles that were drawn since are looked at again."""
+        """As in `Refiner`; sums again only over tiles that were drawn since the last time."""
         if self._old.any():
             seen = self._observation
             sum_residuals(self._planes, seen.image, seen.tissue, self._old, self._sums)

@@ -13,17 +13,17 @@ from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F32, F64, I64, U8, Bool, Observation
 from sags_node.vision.watch.standing import watched_ns
 
-CANDIDATES = 2000  # Gaussians, of those found
+CANDIDATES = 2000  # Gaussians that are considered, of those found
 POINTS = 300  # of them, those with most texture; measured: one in each cell of a grid is worse
 WINDOW = (15, 15)  # px
-LARGEST_CORRECTION = 3 / 640  # of the width
+LARGEST_CORRECTION = 3 / 640  # of the width: most that Lucas-Kanade may move a pixel found by dense flow
 LEAST_POINTS = 40
-REST_SECONDS = 60.0  # over which a place at rest follows the tissue: ten breaths and more
-CALM = 3.0  # of the usual way from its place at rest: tissue that is farther from it moves by itself
-LOOK_NS = 200_000_000  # between two looks at how the tissue was seen first
+REST_SECONDS = 60.0  # s over which a place at rest follows the tissue: ten breaths and more
+CALM = 3.0  # times the median distance from the place at rest: tissue farther away moves by itself
+LOOK_NS = 200_000_000  # ns between comparisons with the first views
 LEAST_INLIERS = 0.35  # of the points
 LEAST_AGREEMENT = 0.5  # correlation of the picture with the colours of the Gaussians found in it
-LARGEST_SCALE = 4 / 640  # of the width: of the residuals
+LARGEST_SCALE = 4 / 640  # of the width: scale of the residuals
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class TissueFit:
 
 
 class RestingTissue:
-    """The tissue has a place at rest, which follows it slowly."""
+    """The places where the tissue rests, which follow it slowly."""
 
     def __init__(self, tissue_map: TissueMap) -> None:
         self._map = tissue_map
@@ -44,7 +44,7 @@ class RestingTissue:
         self._seconds = 0.0  # that the model has been learnt for
         self._first_views = FirstViews(tissue_map)
         self._at_rest: F64 | None = None  # pose of the last frame against the tissue at rest; None: not known
-        self._correction: F64 | None = None  # [4, 4] of a pose, from the left; None: first pictures tell none
+        self._correction: F64 | None = None  # [4, 4] of a pose, from the left; None: no first view gives one
         self._looked_ns = 0
 
     def fit(self, observation: Observation, last: Drawn, tracks: Tracks, start: F64) -> TissueFit | str:
@@ -100,14 +100,14 @@ class RestingTissue:
             self._at_rest = self._correction = None
         before, self._stamp_ns = self._stamp_ns, observation.t_capture_ns
         passed = watched_ns(before, self._stamp_ns) * 1e-9
-        # A model that is younger than a breath rests where it was on average until now.
+        # A model that is younger than `REST_SECONDS` rests where it was on average until now.
         self._seconds = min(self._seconds + passed, REST_SECONDS)
         share = passed / max(self._seconds, passed, 1e-9)
         self._map.settle(share)
         self._look(observation)
 
     def _look(self, observation: Observation) -> None:
-        """Let the first pictures say how far the pose of a frame is off."""
+        """Correct the pose of a frame by the first views."""
         now, pose = observation.t_capture_ns, observation.camera.T_world_cam
         at_rest = self._at_rest
         if at_rest is None:
@@ -131,8 +131,8 @@ def _is_inside(pixels: F32, picture: U8) -> Bool:
 
 
 def _most_textured(gray: U8, pixels: F32) -> I64:
-    """Indices of those of the pixels [N, 2] that are followed best (J. Shi and C. Tomasi, CVPR 1994), looked
-    for at half the size."""
+    """Indices of the pixels [N, 2] that can be tracked best (J. Shi and C. Tomasi, CVPR 1994), computed at
+    half the size."""
     small = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     texture = np.asarray(cv2.cornerMinEigenVal(small, 3))
     height, width = texture.shape

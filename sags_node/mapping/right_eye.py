@@ -5,7 +5,7 @@ import numpy as np
 from sags_node.types import F32, Bool
 
 FAR_MARGIN = 0.1  # of the disparity, below the furthest tissue drawn
-COARSE = 4  # px: a mask this coarse keeps within the margins
+COARSE = 4  # px: the error of a mask this coarse is within the margins
 NEAR_MARGIN = 0.5  # of the disparity, above the nearest: instruments come in between tissue and camera
 
 
@@ -40,7 +40,7 @@ def right_eye_mask(tissue: Bool, depths: F32, focal_px: float, baseline: float) 
 
 
 def coarse_right_eye_mask(tissue: Bool, depth: F32, focal_px: float, baseline: float) -> Bool:
-    """`right_eye_mask` of every `COARSE` th pixel along both axes, [h, w].
+    """The `right_eye_mask` of every `COARSE`-th pixel along both axes, [h, w].
 
     Args:
         depth: [H, W] m, as it is drawn for the left eye; 0 unknown.

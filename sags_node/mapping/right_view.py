@@ -24,9 +24,9 @@ from sags_node.model.gaussians import GaussianModel, for_right_eye
 from sags_node.types import F32, U8, Bool, Camera, Colours, Gaussians, RenderedView
 
 LEARN_EVERY = 2  # frames
-LEARNING = 0.5  # of what a Gaussian lacks in the right eye, taken in from such a frame
-FADING = 0.94  # from one to the next, of what was not seen again: a highlight lies elsewhere after a second
-SAME = 0.03  # of the depth: nearer to each other, two depths are of one surface
+LEARNING = 0.5  # share of what a Gaussian lacks in the right eye, learnt from such a frame
+FADING = 0.94  # factor between such frames on what was not seen again: highlights move within a second
+SAME = 0.03  # of the depth: two depths that differ by less are of one surface
 f4 = np.float32
 u8 = np.uint64
 
@@ -38,11 +38,11 @@ class RightView:
         self._missed = 0  # frames in which nobody looked
 
     def miss(self) -> None:
-        """Nobody looks at this frame."""
+        """Note that nobody looks at this frame."""
         self._missed += 1
 
     def wake(self, model: GaussianModel) -> None:
-        """Somebody looks at this frame: what was learnt is older by the frames that were missed."""
+        """Note that somebody looks at this frame: what was learnt fades by the frames that were missed."""
         if self._missed:
             model.right_colors[:] *= f4(FADING ** (self._missed / LEARN_EVERY))
             self._missed = 0
@@ -64,7 +64,7 @@ class RightView:
         self, view: RenderedView, shown: U8, mapped: Mapped, model: GaussianModel, picture: U8, tissue: Bool,
         baseline: float,
     ) -> None:  # fmt: skip
-        """Take in what the right eye saw of a frame, for the frames after it; of every `LEARN_EVERY` th.
+        """Learn what the right eye saw of a frame, for later frames; for every `LEARN_EVERY`-th frame.
 
         Args:
             view: as it was drawn for that frame.

@@ -48,24 +48,24 @@ from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, F64, Camera, Gaussians, Observation, RenderedView
 from sags_node.vision.observe import resized
 
-WINDOW_NS = 2_000_000_000  # that the field remembers
-SLOT_NS = 100_000_000  # from one of its times to the next
-# So far back frames are learnt again. Measured: from the whole window, the newest frame is 0.6 dB worse and
-# the window no better.
+WINDOW_NS = 2_000_000_000  # ns that the field remembers
+SLOT_NS = 100_000_000  # ns from one slot of the field to the next
+# Frames of the last KEPT_NS are learnt again. Measured: with those of the whole window, the newest frame is
+# 0.6 dB worse and the window no better.
 KEPT_NS = 700_000_000
-MOST_KEPT = 24  # of them, at any frame rate
-# Only differences of what the field says at two times of its window are seen in pictures. What moves all
-# times alike walks at random: without forgetting, features of about 1 are up to 130 after 1200 frames, a step
+MOST_KEPT = 24  # of these frames, at any frame rate
+# Pictures depend only on differences of the field between two times of its window. What changes all times
+# alike walks at random: without forgetting, features of about 1 are up to 130 after 1200 frames, a step
 # changes scales by powers of e, and at last a scale is 0 or covers the picture.
-FORGOTTEN_NS = 2 * WINDOW_NS  # in which its cells go all but 1/e of the way back to their first values
-NODES = 128  # that ask the field; 512 take twice the time of a step, and show no more with few steps
-CELLS, CHANNELS = 32, 16  # of the HexPlane; twice as many of both show no more either
+FORGOTTEN_NS = 2 * WINDOW_NS  # ns in which its cells go all but 1/e of the way back to their first values
+NODES = 128  # at which the field is evaluated; 512 double the time of a step, and gain nothing with few steps
+CELLS, CHANNELS = 32, 16  # of the HexPlane; twice as many of both gain nothing either
 OUTLIERS = 1e-3  # of the Gaussians, on each side of the field's box: strays must not blow it up
 LEAST_SIDE = 1e-3  # m, of that box
 # Lengths of a step of Adam on the canonical Gaussians. Positions: px at the tissue's median depth. Colours
 # take a step in closed form instead (`_refine`).
 MEAN_PX, LOG_SCALE, QUAT, LOGIT = 0.08, 5e-3, 1e-3, 0.05
-FIRST_SPEED = 4.0  # times as long, in the first steps of a model
+FIRST_SPEED = 4.0  # factor on the lengths of a model's first steps
 # A larger change of the gain makes what is kept useless; smaller ones are left to the colour steps, as a
 # model that does not fit yet seems to be darker or brighter by some per cent.
 EXPOSURE_JUMP = 0.05
@@ -84,8 +84,8 @@ class Kept:
 
 
 class FrameDeltas(Deltas):
-    """Asks HexPlane and decoder once for each time, but for gradients: a frame wants the nodes at the same
-    few times again and again. Its box may not grow."""
+    """Evaluates HexPlane and decoder once for each time, except for gradients: a frame needs the same nodes
+    at the same few times again and again. The HexPlane's box must not grow."""
 
     def __init__(self, hexplane: HexPlane, decoder: Decoder) -> None:
         super().__init__(hexplane, decoder)
@@ -106,9 +106,9 @@ class FrameDeltas(Deltas):
 
     @torch.no_grad()
     def fade(self, share: float) -> None:
-        """The cells go a share of the way back to their first values; the decoder, which takes shorter steps,
-        a share as much smaller (decoupled weight decay: Loshchilov & Hutter, ICLR 2019). The lines in time go
-        together, by their mean over the window: they differ as before."""
+        """Move the cells a share of the way back to their first values, and the decoder by a share that is
+        smaller as its rate is (decoupled weight decay: Loshchilov & Hutter, ICLR 2019). The lines in time
+        move together, by their mean over the window, so that their differences stay."""
         rates, first_line = FieldRates(), self.hexplane.slot(0).start
         cells = self.hexplane.cells
         lines = cells[first_line:].view(self.hexplane.slots, -1, cells.shape[1])
@@ -119,23 +119,23 @@ class FrameDeltas(Deltas):
         self.forget()
 
     def forget(self) -> None:
-        """Ask anew."""
+        """Forget the values of all times, so that they are evaluated anew."""
         self._said = {}
 
 
 class SagsMapper:
-    """Canonical Gaussians, field and decoder of SAGS over a window that slides with the video. To be used as
-    `Mapper` is; where tissue went is said by the field, not by optical flow.
+    """Canonical Gaussians, field and decoder of SAGS over a window that slides with the video. It is used
+    like `Mapper`; the field, not optical flow, says where tissue went.
 
     Attributes:
-        map: what is published of it.
+        map: the tissue map, which is published.
         step: how many steps were taken.
         field: of a map that has tissue; its rows are the map's, by their ids.
         kept: frames that are learnt again, oldest first; the newest is always there.
     """
 
     def __init__(self, tissue_map: TissueMap) -> None:
-        torch.set_num_threads(1)  # results do not depend on it then; so few nodes gain little from more
+        torch.set_num_threads(1)  # results then do not depend on it; so few nodes gain little from more
         self.map = tissue_map
         self.step = 0
         self.kept: deque[Kept] = deque()
@@ -167,7 +167,7 @@ class SagsMapper:
         return Mapped(snapshot, self._view)
 
     def pace(self, unhurried: bool) -> None:
-        """See `Mapper.pace`: steps are as long whatever time there is."""
+        """Do nothing: the length of steps does not depend on time, unlike in `Mapper.pace`."""
 
     @property
     def model(self) -> GaussianModel:
@@ -265,7 +265,7 @@ class SagsMapper:
         return self._initialise(observation, frame, budget) | {"restarted": 1}
 
     def _exposed(self, frame: Kept) -> F32:
-        """The map drawn for a frame, in its exposure."""
+        """Draw the map for a frame; if the exposure jumped, change the map's colours first."""
         planes = self._draw(frame)
         gain = exposure_gain(planes, frame.drawn.image, frame.drawn.tissue)
         if np.abs(gain - 1).max() > EXPOSURE_JUMP:
@@ -297,7 +297,7 @@ class SagsMapper:
         self._first_steps += 1
 
     def _write(self, frame: Kept) -> None:
-        """The map becomes what the field says of a frame's time."""
+        """Write the state of the field at a frame's time into the map."""
         model, now = self.model, self.field.at(frame.t_ns, [frame.camera])
         self.map.nodes.accompany(model, now.means - model.means)
         model.means[:], model.quats[:], model.colors[:] = now.means, now.quats, now.colors
@@ -310,8 +310,8 @@ class SagsMapper:
         self._written = rows_of(model)
 
     def _take_over(self, t_ns: int) -> None:
-        """Do to the field what was done to the map since `_write`: what was changed, rotations apart, changes
-        at all times alike; what is new was there all the time, moved as its neighbours."""
+        """Apply to the field what was done to the map since `_write`: changes, except of rotations, at all
+        times alike; new Gaussians as if they had always been there, moving as their neighbours."""
         model, field = self.model, self.field
         model.reorder(np.argsort(model.ids))  # as in the field: the oldest first
         kept = np.isin(self._ids, model.ids, assume_unique=True)
@@ -333,13 +333,13 @@ class SagsMapper:
         return velocities
 
     def _time_of(self, observation: Observation) -> int:
-        """On the field's clock, which stands still where a camera's goes back."""
+        """The frame's time on the field's clock, ns, which stands still where a camera's goes back."""
         self._ahead_ns = max(self._ahead_ns, self._now_ns - observation.t_capture_ns)
         self._now_ns = observation.t_capture_ns + self._ahead_ns
         return self._now_ns
 
     def _keep(self, frame: Kept) -> None:
-        """Also this one; forget what is too old, and what is closer to the next than memory allows."""
+        """Keep this frame; drop those that are too old, and the one before if it came too soon."""
         kept = self.kept
         if len(kept) > 1 and kept[-1].t_ns - kept[-2].t_ns < KEPT_NS // MOST_KEPT:
             kept.pop()
@@ -348,7 +348,7 @@ class SagsMapper:
             kept.popleft()
 
     def _show(self, observation: Observation, frame: Kept) -> F32:
-        """Return what is drawn."""
+        """Draw the map to be shown; returns the planes."""
         planes = self._draw(frame)
         self._view = as_view(planes, self.model, observation)
         return planes
@@ -363,7 +363,7 @@ class SagsMapper:
 
 
 def rows_of(model: GaussianModel) -> F32:
-    """Raw rows [N, 14] (`columns`) of a map's Gaussians, copies."""
+    """Copy a map's Gaussians into raw rows [N, 14] (`columns`)."""
     logits = model.opacity_logits[:, None]
     parts = [model.means, model.log_scales, model.quats, model.colors, logits]
     rows: F32 = np.concatenate(parts, axis=1, dtype=np.float32)

@@ -1,8 +1,8 @@
-"""Where one Gaussian has to show what several could show better, it is split in three. The outer parts take
-the rows of Gaussians that hardly show, so that their number, and what they cost, stays.
+"""Splitting: where several Gaussians could show the tissue better than one, it is split in three. The outer
+parts take the rows of Gaussians that hardly show, so that the number of Gaussians and their cost stay.
 
 A split changes the picture less than a new Gaussian does, which covers what was there. The middle part stays
-where the whole was, under its id: who follows the tissue by ids sees nothing jump.
+where the whole was, under its id, so that nothing jumps for who follows the tissue by ids.
 """
 
 from typing import Any
@@ -18,11 +18,11 @@ from sags_node.mapping.densify import FRONT_TOLERANCE, HOLES, mean_contribution
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import F32, I64, U8, Bool, Observation, RenderedView
 
-GROWN = 0.8  # of the Gaussians that are allowed: up to there splitting adds some
-SPLIT = 0.005  # of all, per frame: at most so many are split, where the parts take others' rows
-GROWTH = 0.03  # of all, per frame: the same where there is room
+GROWN = 0.8  # of the Gaussians that are allowed: below it, splitting adds Gaussians
+SPLIT = 0.005  # of all, per frame: the most that are split where the parts take others' rows
+GROWTH = 0.03  # of all, per frame: the most that are split where there is room
 HARDLY = 0.15  # of the mean contribution: less hardly shows
-ENOUGH = 0.8  # of the mean contribution: what shows less is no worse than its neighbours
+ENOUGH = 0.8  # of the mean contribution: only what shows more is split
 APART = 1.1  # standard deviations of the whole, from its middle to that of an outer part
 PART_SIZE = 0.4  # of the whole, along its longest axis
 
@@ -77,7 +77,7 @@ def _split(model: GaussianModel, wholes: I64, spare: I64) -> None:
     variance, part = scale**2 + smoothing, (PART_SIZE * scale) ** 2 + smoothing  # as they are drawn
     size = np.sqrt(variance)
     offsets = (np.float32(APART) * size)[:, None] * axes
-    # A part shows what the whole showed there, and gets brighter by as much a metre.
+    # Each part has the colour that the whole had there, and the same change of colour per metre.
     brighter = (np.float32(APART) * model.slopes[wholes, longest] * scale / size)[:, None]
     model.slopes[wholes, longest] *= part / (np.float32(PART_SIZE) * variance)
     model.scales[wholes, longest] *= np.float32(PART_SIZE)
@@ -108,8 +108,8 @@ def _look_at_rows(
     means: F32, contribution: F32, cam: F32, rgb: U8, drawn: F32, image: U8, tissue: Bool,
     hardly: Any, enough: Any, score: F32, spare: Bool, first: Any, end: Any,
 ) -> None:  # fmt: skip
-    """Look at the Gaussians on the visible tissue, marks those that are to spare, and writes how much those
-    that may be split have to do with residuals of the colour."""
+    """Of the Gaussians on the visible tissue, mark those that can be spared. For those that may be split,
+    write a score: contribution times squared colour residual."""
     height, width = tissue.shape
     across, down = np.float32(rgb.shape[1] / width), np.float32(rgb.shape[0] / height)
     for i in range(first, end):

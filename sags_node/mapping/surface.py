@@ -1,4 +1,4 @@
-"""What is measured where each Gaussian is seen: found once a frame, for all who ask."""
+"""The measured surface where each Gaussian is seen, looked up once per frame."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ from sags_node.vision.depth_grid import grid_of
 
 
 def surface_at(means: F32, observation: Observation) -> F32:
-    """[N, 3] m, of Gaussians at `means` [N, 3]: their depth (0: behind the camera or not in the picture), the
-    depth that is measured in their pixel of the tissue (0: none), and the error of that."""
+    """Return [N, 3] m for Gaussians at `means` [N, 3]: their depth (0: behind the camera or not in the
+    picture), the depth of tissue that is measured in their pixel (0: none), and its error."""
     surface = np.empty((len(means), 3), np.float32)
     grid = grid_of(observation)
     _find_surface(

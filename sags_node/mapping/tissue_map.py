@@ -54,7 +54,7 @@ class TissueMap:
         """Make the first model of a map from a frame; returns the depths of its Gaussians [N] m.
 
         Args:
-            limit: Gaussians that there may be.
+            limit: the most Gaussians that the map may have.
             nodes: how many move them.
             smoothing: give them the 3D filter.
         """
@@ -75,22 +75,22 @@ class TissueMap:
         self.restarts += 1
 
     def remember_motion(self) -> None:
-        """From now on. Any thread may call this."""
+        """Remember motion from now on. Any thread may call this."""
         if self.motion is None:
             self.motion = MotionField()
 
     def learnt(self) -> Learnt:
-        """Return what is known now."""
+        """Copy what is known now."""
         return Learnt(*deepcopy((self.model, self.deformation)), self.lamp)
 
     def go_back(self, learnt: Learnt) -> None:
-        """Forget what was learnt since."""
+        """Restore `learnt`, and forget what was learnt since."""
         learnt.model.never_reuse(self.model)
         self.model, self.deformation, self.lamp = learnt.model, learnt.deformation, learnt.lamp
         self._forget_motion()
 
     def relight(self, camera: Camera) -> Gaussians:
-        """The Gaussians as the scope's light shows them from there; views, for drawing now."""
+        """The Gaussians as the scope's light shows them from `camera`; views, for drawing now."""
         gaussians, lamp = self.model.gaussians(), self.lamp
         if lamp is None or self.deformation is None or np.array_equal(lamp, camera.T_world_cam):
             return gaussians
@@ -101,7 +101,7 @@ class TissueMap:
         return replace(gaussians, colors=model.colors * gain, slopes=model.slopes * gain)
 
     def move_light(self, camera: Camera) -> None:
-        """Let the colours be those that the scope's light shows from where it is now."""
+        """Change the colours to those that the scope's light gives from where it is now."""
         if self.lamp is None or not is_near(self.lamp, camera.T_world_cam):
             lit = self.relight(camera)
             assert lit.slopes is not None
@@ -109,25 +109,25 @@ class TissueMap:
             self.lamp = camera.T_world_cam
 
     def away(self, rows: I64) -> F32:
-        """How far [K, 3] m from where they rest the Gaussians in `rows` are now."""
+        """The displacement [K, 3] m of the Gaussians in `rows` from where they rest."""
         if self.deformation is None:
             return np.zeros((len(rows), 3), np.float32)
         return self.deformation.away(self.model.node_index[rows], self.model.node_weight[rows])
 
     def displacement_at(self, points: F32) -> F32:
-        """How far [K, 3] m from where it rests the tissue at places [K, 3] is now."""
+        """The displacement [K, 3] m of the tissue now at places [K, 3] from where it rests."""
         if self.deformation is None:
             return np.zeros_like(points)
         index, weight, _ = nearest_nodes(points, self.deformation.nodes)
         return self.deformation.away(index, weight)
 
     def settle(self, share: float) -> None:
-        """Let where the tissue rests follow where it is now, by a share of the way."""
+        """Move the places where the tissue rests a share of the way to where it is now."""
         if self.deformation is not None:
             self.deformation.settle(share)
 
     def doubt(self, error: float) -> None:
-        """The depth of all Gaussians may be wrong by so much more, m, until it is measured again."""
+        """Raise the predicted depth error of all Gaussians by `error` (m), until depth is measured again."""
         self.model.depth_errors[:] = np.minimum(
             self.model.depth_errors + np.float32(error), initialise.LARGEST_ERROR
         )

@@ -23,14 +23,14 @@ UNSEEN = np.float32(np.inf)
 
 
 def smoothing_variances(means: F32, cameras: Sequence[Camera]) -> F32:
-    """Variance of the 3D filter, [N] m^2.
+    """Compute the variance of the 3D filter, [N] m^2.
 
     Args:
         means: [N, 3] m, world, after deformation.
         cameras: those the Gaussians were fitted to. A camera that only looks at the result does not belong
             here: from nearer by it would ask for detail that nothing was ever measured of, and the picture
-            loses 2 dB at four times the size (`benchmarks alias`). The mapper's is that of the whole picture,
-            also while it fits to one of half the size (benchmarks/mapping.md).
+            loses 2 dB at four times the size (`benchmarks alias`). The mapper gives the camera of the whole
+            picture, also while it fits to one of half the size (benchmarks/mapping.md).
 
     Gaussians that no camera sees take the largest variance of the seen ones.
     """
@@ -43,8 +43,8 @@ def smoothing_variances(means: F32, cameras: Sequence[Camera]) -> F32:
 
 
 def narrow(variances: F32, means: F32, camera: Camera) -> None:
-    """The variances [N] m^2 of Gaussians that are fitted to one camera more, in place: what it sees finer
-    than any before gets less, and what it does not see keeps its own."""
+    """Update the variances [N] m^2 of Gaussians, in place, for one more camera that they are fitted to: what
+    it samples more finely than all before gets a smaller one, and what it does not see keeps its own."""
     intervals = np.full(len(means), UNSEEN, np.float32)
     _sampling_intervals(means, pack(camera), camera.width, camera.height, intervals)
     np.minimum(variances, np.float32(FILTER_VARIANCE) * intervals * intervals, out=variances)

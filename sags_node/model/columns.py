@@ -16,15 +16,15 @@ COLOR = slice(10, 13)  # RGB 0..1
 LOGIT = 13  # of the opacity
 COUNT = 14
 
-# Where an optimiser may take them. What no picture tells, as how thin a Gaussian is along the ray, walks at
-# random: without bounds a scale gets to 0, or as large as the scene.
+# Bounds for optimisers. What no picture determines, such as how thin a Gaussian is along the ray, walks at
+# random: without bounds a scale reaches 0, or the size of the scene.
 LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
 COLOR_RANGE = (-0.5, 1.5)  # wider than what can be shown
 LOGIT_RANGE = (-6.0, 6.0)
 
 
 def bounded(rows: F32) -> F32:
-    """Rows [N, 14] within these ranges, with quaternions of length 1; what is not a number stays so."""
+    """Clamp rows [N, 14] to these ranges, and normalise their quaternions; NaN stays NaN."""
     within = rows.copy()
     within[:, LOG_SCALE] = rows[:, LOG_SCALE].clip(*LOG_SCALE_RANGE)
     within[:, COLOR] = rows[:, COLOR].clip(*COLOR_RANGE)

@@ -9,16 +9,16 @@ from sags_node.geometry import quat_to_matrix
 from sags_node.types import Gaussians
 
 APART = np.float32(0.6)  # standard deviations of the whole from its middle to that of a half; measured best
-LEAST = np.float32(0.01)  # a gentler slope is left out: 2.5 grey levels for each standard deviation
+LEAST = np.float32(0.01)  # a gentler slope is dropped: 2.5 grey levels for each standard deviation
 
 
 def with_constant_colours(gaussians: Gaussians) -> Gaussians:
-    """Nearly the same picture without slopes: a Gaussian with one is split in two along the axis on which it
-    is steepest. The two together are as wide as the whole, and as opaque where one lies over the other: in
-    its middle less, beside it more. Both have its id. The 3D filter is folded in.
+    """Make Gaussians without slopes that give nearly the same picture. One with a slope is split in two along
+    its steepest axis. Together the halves are as wide as the whole, less opaque in its middle and more
+    beside it. Both have its id. The 3D filter is folded in.
 
-    D4D, 26,000 Gaussians, against the picture: 38.1 dB with slopes, 34.7 so, 32.3 without slopes, 34.1 with
-    the best colours without them (`benchmarks/slopes.md`).
+    PSNR on D4D with 26,000 Gaussians: 38.1 dB with slopes, 34.7 with such halves, 32.3 with slopes dropped,
+    34.1 with the best colours without slopes (`benchmarks/slopes.md`).
     """
     gaussians = bake_filter(gaussians)
     if gaussians.slopes is None:

@@ -1,5 +1,4 @@
-"""How the tissue moves: what was observed of some Gaussians becomes a motion of all of them, the hidden ones
-too."""
+"""How the tissue moves: the observed motion of some Gaussians becomes a motion of all, hidden ones too."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,9 +12,9 @@ from sags_node.types import F32, F64, I32, I64
 
 _SMOOTHING_ROUNDS = 3  # how far, in nodes, motion spreads into hidden tissue per frame
 LEAST_SEEN = 0.5  # weight of what was seen around a node: below it nothing is known of it
-_LEAST_STIFFNESS = 0.2  # in squared node spacings: what little is known of a gradient is not believed
-# No gradients give more momentum than 1.57 times the root of the variance (Cauchy-Schwarz over both running
-# means), where that is far above the smallest float.
+_LEAST_STIFFNESS = 0.2  # in squared node spacings: draws gradients that little determines to 0
+# Largest momentum over the root of the variance: more is damage. Gradients give at most 1.57 (Cauchy-Schwarz
+# over both running means), where the variance is far above the smallest float.
 STEEPEST = 2.0
 INERTIA, CALM = 0.2, 0.05  # how fast momentum and variance follow the gradient
 NODE_EPS = 1e-12  # keeps a node that nothing pulls where it is
@@ -78,8 +77,8 @@ class NodeDeformation:
             model: its `means` and `quats` are changed.
             displacements: [N, 3] m, observed where `seen`.
             seen: [N] weight of the observation, 0 = not seen.
-            recall: what all nodes are expected to do, given the motion of those that were seen. What that
-                misses of the seen ones is spread to the hidden ones.
+            recall: predicts the motion of all nodes from the motion of the seen ones. Its error at the seen
+                nodes is spread to the hidden ones.
         """
         motion, weight = _average(displacements, seen, model.node_index, model.node_weight, len(self.nodes))
         self.seen = weight
@@ -126,22 +125,22 @@ class NodeDeformation:
         _skin(motion, model.node_index, model.node_weight, model.means)
 
     def accompany(self, model: GaussianModel, displacements: F32) -> None:
-        """Let the nodes go with their Gaussians, which somebody else moves by `displacements` [N, 3] m."""
+        """Move the nodes with their Gaussians, which the caller moves by `displacements` [N, 3] m."""
         all_seen = np.ones(len(displacements), np.float32)
         motion, _ = _average(displacements, all_seen, model.node_index, model.node_weight, len(self.nodes))
         self.nodes += motion
 
     def settle(self, share: float) -> None:
-        """Let where the tissue rests follow where it is now, by a share of the way."""
+        """Move the places where the tissue rests a share of the way to where it is now."""
         self.rest += np.float32(share) * (self.nodes - self.rest)
 
     def away(self, index: I32, weight: F32) -> F32:
-        """How far [N, 3] m from where it rests tissue is now, by its nodes [N, 4] and their weights."""
+        """The displacement [N, 3] m of tissue from where it rests, by its nodes [N, 4] and their weights."""
         return np.asarray(np.einsum("nk,nka->na", weight, (self.nodes - self.rest)[index]), np.float32)
 
     def normals(self, towards: F64) -> F32:
-        """Unit normals [M, 3] of the tissue at the nodes, to the side of a place [3] (m, world): of the plane
-        through each node's neighbours."""
+        """The unit normals [M, 3] of the tissue at the nodes, on the side of a place [3] (m, world). Each is
+        the normal of the plane through the node's neighbours."""
         around = self.nodes[self._neighbours] - self.nodes[:, None]
         spread = np.einsum("mka,mkb->mab", around, around)
         normals = np.linalg.eigh(spread)[1][:, :, 0]
@@ -150,7 +149,7 @@ class NodeDeformation:
         return np.asarray(normals, np.float32)
 
     def _add_nodes(self, nodes: F32) -> None:
-        """New tissue is taken to be as far from where it rests as the tissue next to it."""
+        """Add nodes. New tissue is taken to be displaced from rest as the tissue next to it."""
         zeros = np.zeros_like(nodes)
         index, weight, _ = nearest_nodes(nodes, self.nodes)
         self.rest = np.concatenate([self.rest, nodes - self.away(index, weight)])
@@ -167,14 +166,14 @@ class NodeDeformation:
 
 
 def skinned(moves: F32, index: I32, weight: F32, points: F32) -> F32:
-    """Points [N, 3] m moved by the weighted motion [M, 3] m of their nodes, in a fresh array."""
+    """Return points [N, 3] m, moved by the weighted motion [M, 3] m of their nodes, as a new array."""
     moved = points.copy()
     _skin(np.ascontiguousarray(moves), index, weight, moved)
     return moved
 
 
 def spread_nodes(means: F32, count: int) -> F32:
-    """About `count` places [M, 3] m spread evenly over points [N, 3] m."""
+    """Choose about `count` places [M, 3] m, spread evenly over points [N, 3] m."""
     return cell_centres(means, _spacing_for(means, count))
 
 
@@ -190,7 +189,7 @@ def _spacing_for(means: F32, count: int) -> float:
 
 
 def cell_centres(means: F32, cell: float) -> F32:
-    """Mean of the points in each occupied cell of a cubic grid, [M, 3]."""
+    """The mean of the points in each occupied cell of a cubic grid, [M, 3]."""
     _, inverse, counts = np.unique(_cells(means, cell), return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(inverse, means[:, k]) for k in range(3)], 1)
     return (sums / counts[:, None]).astype(np.float32)
@@ -207,7 +206,7 @@ def _cells(means: F32, cell: float) -> I64:
 
 
 def nearest_nodes(points: F32, nodes: F32) -> tuple[I32, F32, F32]:
-    """Indices [N, 4], skinning weights [N, 4] and distance [N] of the nearest nodes.
+    """Find the nearest nodes: indices [N, 4], skinning weights [N, 4], and distance [N] of the nearest one.
 
     The weights fall off as a Gaussian whose width is the mean distance, so they are smooth and scale-free.
     """
@@ -263,7 +262,7 @@ def _average(values: F32, seen: F32, index: I32, weight: F32, nodes: int) -> tup
             for k in range(NEIGHBOURS):
                 w = weight[i, k] * seen[i]
                 if not (w >= 0 and w <= 1):
-                    continue  # damaged: it is removed with what it moves to
+                    continue  # damaged: this Gaussian is removed later
                 j = index[i, k]
                 mass[j] += w
                 for a in range(3):
@@ -276,7 +275,7 @@ def _average(values: F32, seen: F32, index: I32, weight: F32, nodes: int) -> tup
 
 @kernel
 def _spread(motion: F32, mass: F32, neighbours: I32, rounds: int) -> None:
-    """Nodes that nothing was seen of take the mean motion of the neighbours that have one."""
+    """Give nodes of which nothing was seen the mean motion of the neighbours that have one."""
     known = mass > np.float32(LEAST_SEEN)
     for _ in range(rounds):
         reached = known.copy()
@@ -299,8 +298,8 @@ def _spread(motion: F32, mass: F32, neighbours: I32, rounds: int) -> None:
 
 @kernel
 def _motion_gradients(places: F32, motion: F32, neighbours: I32, least: Any) -> F32:
-    """Gradient [M, 3, 3] of the motion around each place: least squares over its neighbours, drawn to 0 by
-    `least` (m^2). Row a is the gradient of the motion along axis a."""
+    """Gradient [M, 3, 3] of the motion around each place: least squares over its neighbours, regularised
+    towards 0 by `least` (m^2). Row a is the gradient of the motion along axis a."""
     gradients = np.zeros((len(places), 3, 3), np.float32)
     moments, products = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
     count = neighbours.shape[1]

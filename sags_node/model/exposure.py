@@ -27,6 +27,6 @@ class Exposure:
         self.gains = np.where(lit[:, None], brightness / reference, 1.0).astype(np.float32)
 
     def at(self, t_ns: int) -> F32:
-        """Gain [3] at one time."""
+        """The gain [3] at one time."""
         gain = [np.interp(t_ns, self.times_ns, self.gains[:, channel]) for channel in range(3)]
         return np.array(gain, np.float32)

@@ -9,8 +9,8 @@ from sags_node.types import F32, F64, Forecast, Gaussians, Snapshot
 
 
 def reached(snapshot: Snapshot, seconds: float) -> float:
-    """How far ahead, s, a snapshot can be moved when `seconds` are wanted: never further than the forecast
-    has skill for; 0: not at all."""
+    """The time, s, that a snapshot can be moved ahead when `seconds` are wanted: no more than the forecast
+    has skill for; 0: no prediction."""
     forecast = snapshot.forecast
     return 0.0 if forecast is None else float(min(max(seconds, 0.0), forecast.state.reach))
 
@@ -26,7 +26,7 @@ def gaussians_ahead(snapshot: Snapshot, seconds: float) -> Gaussians:
 
 
 def points_ahead(forecast: Forecast, points: F32 | F64, seconds: float) -> F32:
-    """Points [A, 3] m of the tissue, world, `seconds` later; NaN stays NaN."""
+    """The points [A, 3] m of the tissue, world, `seconds` later; NaN stays NaN."""
     moved = np.array(points, np.float32)
     known = np.isfinite(moved).all(1)
     index, weight, _ = nearest_nodes(moved[known], forecast.nodes)
@@ -35,7 +35,7 @@ def points_ahead(forecast: Forecast, points: F32 | F64, seconds: float) -> F32:
 
 
 def _moves(forecast: Forecast, seconds: float) -> F32:
-    """[M, 3] m of the nodes after any time: straight from one frame to the next, from the last two beyond."""
+    """Motion [M, 3] m of the nodes after a time: linear between frames, extrapolated from the last two."""
     moves = np.concatenate([np.zeros_like(forecast.moves[:1]), forecast.moves])
     frames = seconds / forecast.frame_s
     before = min(max(int(frames), 0), len(moves) - 2)

@@ -48,7 +48,7 @@ class GaussianModel:
     opacities = _Column(np.float32)  # before the 3D filter
     colors = _Column(np.float32, 3)
     slopes = _Column(np.float32, 3)  # of the luminance, see `types.Gaussians`
-    right_colors = _Column(np.float32, 3)  # what the right eye sees more, see `mapping.right_view`
+    right_colors = _Column(np.float32, 3)  # the right eye's colours less `colors`, see `mapping.right_view`
     velocities = _Column(np.float32, 3)  # m/s, world
     depth_errors = _Column(np.float32)  # m, predicted, see `mapping.depth_memory`
     ids = _Column(np.int64)
@@ -65,7 +65,7 @@ class GaussianModel:
         self.count = 0
         self._next_id = 0
         columns = ((name, column) for name, column in vars(type(self)).items() if isinstance(column, _Column))
-        # [capacity, ...] by the column's name: also the rows that hold nothing now.
+        # [capacity, ...] by the column's name, with the rows that are not used now.
         self.rows: dict[str, NDArray[Any]] = {
             name: np.zeros((capacity, *column.shape), column.kind) for name, column in columns
         }
@@ -101,8 +101,8 @@ class GaussianModel:
         return added
 
     def extend(self, count: int) -> I64:
-        """Rows for so many Gaussians, or as many as fit; what is in them must be written at once, by
-        `replace`."""
+        """Add rows for `count` Gaussians, or as many as fit; returns them. They hold nothing useful: write
+        them at once, by `replace`."""
         rows = np.arange(self.count, self.count + min(count, self.free))
         self.count += len(rows)
         return rows
@@ -113,7 +113,7 @@ class GaussianModel:
             values[rows] = self._new_ids(len(rows)) if name == "ids" else values[others]
 
     def never_reuse(self, later: GaussianModel) -> None:
-        """Give new ids after those of a model that was in use since this one."""
+        """Continue with ids after those of `later`, a model that was in use since this one."""
         self._next_id = max(self._next_id, later._next_id)
 
     def clear(self) -> None:
@@ -134,18 +134,18 @@ class GaussianModel:
         return removed
 
     def reorder(self, order: I64) -> None:
-        """Row k becomes what row `order[k]` was."""
+        """Reorder the rows: row k becomes what row `order[k]` was."""
         for values in self.rows.values():
             values[: self.count] = values[order]
 
     def grow(self, factor: float) -> None:
-        """Make all as much larger; what they show gets no steeper by it, per metre."""
+        """Scale all Gaussians by `factor`; their change of colour per metre stays."""
         self.slopes[:] *= np.float32(factor)
         self.scales[:] *= np.float32(factor)
         self.log_scales[:] += np.float32(np.log(factor))
 
     def gaussians(self) -> Gaussians:
-        """Views of the live rows, for drawing now."""
+        """The live rows as views, for drawing now."""
         return Gaussians(
             self.means,
             self.quats,
@@ -160,7 +160,7 @@ class GaussianModel:
         )
 
     def snapshot(self) -> Gaussians:
-        """Copies of the live rows, for publishing, with the 3D filter folded in: any renderer draws the same
+        """Copy the live rows, for publishing, with the 3D filter folded in: any renderer draws the same
         picture."""
         drawn = bake_filter(self.gaussians())
         return Gaussians(
@@ -180,7 +180,7 @@ class GaussianModel:
 
 
 def for_right_eye(gaussians: Gaussians, snapshot: Snapshot) -> Gaussians:
-    """A snapshot's Gaussians, there or moved, in the colours that the right eye sees; in their own where that
-    is not known."""
+    """The Gaussians of a snapshot, perhaps moved since, in the colours that the right eye sees; in their own
+    colours if those are not known."""
     more = snapshot.right_colors
     return gaussians if more is None else replace(gaussians, colors=gaussians.colors + more)

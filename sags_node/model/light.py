@@ -10,13 +10,13 @@ from sags_node.types import F32, F64, I32
 
 GAMMA = 2.2  # of video: colours are display values, light is not
 BEAM = 1.0  # exponent of the fall-off towards the rim of the lamp's beam
-LEAST_COSINE = 0.15  # light that leaks and bounces reaches what faces away
+LEAST_COSINE = 0.15  # lower bound: stray and reflected light reaches what faces away
 STEP_M, STEP_RAD = 0.5e-3, 0.01  # motion that changes no colour by as much as a grey level
-LARGEST = 3.0  # of a colour: beyond it the normal is not to be believed
+LARGEST = 3.0  # factor on a colour: beyond it the normal cannot be right
 
 
 def light_gain(means: F32, normals: F32, index: I32, weight: F32, before: F64, after: F64) -> F32:
-    """By what factor [N] colours and slopes change, as a lamp shows them after it has moved.
+    """Compute the factors [N] by which colours and slopes change when the lamp has moved.
 
     The light that a matt surface sends back falls with the square of the lamp's distance, with the cosine of
     the angle at which it arrives (Lambert) and towards the rim of the beam. Gleams and shadows are left out.

@@ -18,8 +18,8 @@ def write_ply(path: Path, gaussians: Gaussians, force: bool = False, metric: boo
     """Write a binary PLY in the layout of 3D Gaussian Splatting (Kerbl et al., 2023): log scales, opacity
     logits, quaternions wxyz, colours as degree-0 spherical harmonics; metres. The 3D filter and slopes are
     folded in (`model.constant_colours`): viewers know neither. Where the errors of depth are known,
-    `confidence` comes last, see `sags_node.confidence`; readers take properties by name. Returns how many it
-    holds: one with slopes is written as several.
+    `confidence` comes last, see `sags_node.confidence`; readers take properties by name. Returns how many
+    Gaussians the file holds: one with slopes is written as two.
 
     Args:
         metric: False: lengths have no unit, which a comment says.

@@ -1,8 +1,8 @@
-"""How the surface is stretched since a moment: principal strains, from how Gaussians lie to each other.
+"""How the surface is stretched since a moment: principal strains, from the relative places of Gaussians.
 
-Of each patch of the surface the affine map is sought that takes its Gaussians from where they lay to where
-they lie (least squares). In the patch's tangent plane that is a deformation gradient F [3, 2]; the roots of
-the eigenvalues of F^T F are the principal stretches, and a strain is a stretch less 1 (Biot's, nominal).
+For each patch of the surface, least squares find the affine map that takes its Gaussians from where they were
+to where they are. In the patch's tangent plane that is a deformation gradient F [3, 2]; the roots of the
+eigenvalues of F^T F are the principal stretches, and a strain is a stretch less 1 (Biot's, nominal).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ PATCH = 0.004  # m between patches: each has the Gaussians of about twice that
 FEWEST = 12  # Gaussians of a patch
 LEAST_SPREAD = 0.25  # of `PATCH`, standard deviation of them along each direction of the surface
 LEAST_OPACITY = 0.1
-SURE = 2e-3  # m, error of a depth: what may be further off tells no strain
+SURE = 2e-3  # m: depths with a larger predicted error are not used
 FULL = 0.3  # strain with the brightest colour
 UNKNOWN = (0.35, 0.35, 0.35)  # RGB
 
@@ -32,7 +32,7 @@ class Strain:
         snapshot: the model at that moment.
 
     Attributes:
-        since_ns: when it was, by the clock as it is now.
+        since_ns: that moment, by the clock as it is now.
     """
 
     def __init__(self, snapshot: Snapshot) -> None:
@@ -48,12 +48,12 @@ class Strain:
 
     @property
     def knows_nothing(self) -> bool:
-        """True where no depth was sure at that moment, so that all strain stays unknown."""
+        """Tell whether no depth was sure at that moment, so that all strain stays unknown."""
         return len(self._ids) == 0
 
     def followed(self, snapshot: Snapshot) -> Strain:
-        """It in the next frame. What was not sure by itself, as behind an instrument, may have slid, however
-        sure it is again. Where most is not, as after a gap, tissue in sight is found again by its motion."""
+        """The strain after one more frame. What is not sure in it, as behind an instrument, may have slid and
+        is dropped. If most is not sure, as after a gap, none is: motion finds tissue in sight again."""
         at, rows = self._found(snapshot.gaussians)
         sure = _is_sure(snapshot.gaussians)[rows]
         if 2 * np.count_nonzero(sure) < len(sure) or sure.all():
@@ -64,14 +64,14 @@ class Strain:
         return after
 
     def set_back(self, ns: int) -> Strain:
-        """It since the same moment, after the clock was set back by so much."""
+        """The same strain, after the clock was set back by `ns`."""
         after = copy(self)
         after.since_ns -= ns
         return after
 
     def at(self, gaussians: Gaussians) -> F32:
-        """The largest and the smallest strain [N, 2] where each Gaussian of this frame is; NaN: not known, as
-        it is new, or its depth or too much around it is not `SURE`, then, now or under way."""
+        """The largest and the smallest strain [N, 2] where each Gaussian of this frame is; NaN: not known: it
+        is new, or its depth, or too many around it, were not `SURE` at that moment, now or in between."""
         found = np.full((len(gaussians), 2), np.nan, np.float32)
         at, rows = self._found(gaussians)
         sure = self._followed[at] & _is_sure(gaussians)[rows]
@@ -95,7 +95,7 @@ class Strain:
         return at[rows], rows
 
     def _of_patches(self, at: I64, now: F32) -> F64:
-        """[M, 2] of all patches, by the Gaussians that are known: their numbers [K] and places [K, 3]."""
+        """Strains [M, 2] of all patches, by the known Gaussians: numbers [K] and places now [K, 3]."""
         near, count = self._index[at].ravel(), len(self._patches)
         own = self._patches[near]
         before = np.repeat(self._places[at], self._index.shape[1], 0) - own
@@ -119,7 +119,7 @@ class Strain:
 
 
 def painted(gaussians: Gaussians, strain: Strained) -> Gaussians:
-    """The Gaussians in the colours of their largest strain: dark at 0, yellow at `FULL`; grey: not known."""
+    """Colour the Gaussians by their largest strain: dark at 0, yellow at `FULL`; grey: not known."""
     largest = strain.at(gaussians)[:, 0]
     levels = np.nan_to_num(np.clip(largest / FULL, 0, 1) * 255).astype(np.uint8)
     colors = cv2.applyColorMap(levels[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1].astype(np.float32) / 255

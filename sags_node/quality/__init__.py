@@ -1,4 +1,4 @@
-"""How right images and depth are: the metrics, and the tiles that show it.
+"""The quality of images and depth: metrics, and tiles that show it.
 
 Imports no other folder.
 """

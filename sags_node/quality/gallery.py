@@ -9,7 +9,7 @@ import numpy as np
 
 from sags_node.types import F32, U8, Bool
 
-EVENLY_SPACED = 3
+EVENLY_SPACED = 3  # frames of a run
 TILE_WIDTH = 360  # px
 ERROR_AT_TOP = 0.15  # of full scale: the brightest colour of an error picture
 _UNKNOWN = (60, 60, 60)
@@ -37,7 +37,7 @@ class Gallery:
         self.worst: Picture | None = None
 
     def offer(self, place: int, picture: Picture) -> None:
-        """Look at the frame processed as number `place`; NaN is never the worst."""
+        """Consider the frame processed as number `place`; a PSNR of NaN is never the worst."""
         if place in self._places:
             self._spaced.append(picture)
         if not math.isnan(picture.psnr) and (self.worst is None or picture.psnr < self.worst.psnr):
@@ -45,13 +45,13 @@ class Gallery:
 
     @property
     def pictures(self) -> list[Picture]:
-        """In order of time, each once."""
+        """The kept frames in order of time, each once."""
         unique = {picture.frame_id: picture for picture in (*self._spaced, self.worst) if picture}
         return [unique[frame_id] for frame_id in sorted(unique)]
 
 
 def depth_range(pictures: Sequence[Picture]) -> tuple[float, float]:
-    """Nearest and furthest depth (m) worth a colour: all but one in two hundred at either end."""
+    """The nearest and furthest depth (m) to show: all but one in two hundred at either end lie between."""
     known = [picture.depth[picture.tissue & (picture.depth > 0)] for picture in pictures]
     depths = np.concatenate(known) if known else np.zeros(0, np.float32)
     if depths.size == 0:
@@ -61,7 +61,7 @@ def depth_range(pictures: Sequence[Picture]) -> tuple[float, float]:
 
 
 def tiles(picture: Picture, near: float, far: float) -> list[U8]:
-    """Input, render, depth and error of one frame, each `TILE_WIDTH` wide, RGB."""
+    """The tiles of one frame: input, render, depth and error, each `TILE_WIDTH` wide, RGB."""
     return [
         shrunk(picture.truth),
         shrunk(picture.render),
@@ -71,14 +71,14 @@ def tiles(picture: Picture, near: float, far: float) -> list[U8]:
 
 
 def depth_tile(picture: Picture, near: float, far: float) -> U8:
-    """Depth of one frame, near is warm."""
+    """The depth of one frame in colours; near is warm."""
     share = 1 - (picture.depth - near) / (far - near)
     tile = shrunk(_coloured(share, cv2.COLORMAP_TURBO, picture.tissue & (picture.depth > 0)))
     return _with_bar(tile, cv2.COLORMAP_TURBO, f"{far * 1e3:.0f} mm", f"{near * 1e3:.0f} mm")
 
 
 def error_tile(picture: Picture) -> U8:
-    """Difference of render and input on the tissue of one frame."""
+    """The difference of render and input on the tissue of one frame, in colours."""
     difference = cv2.absdiff(picture.truth, picture.render).astype(np.float32).mean(-1) / 255
     tile = shrunk(_coloured(difference / ERROR_AT_TOP, cv2.COLORMAP_INFERNO, picture.tissue))
     return _with_bar(tile, cv2.COLORMAP_INFERNO, "0", f"{ERROR_AT_TOP:.0%}")
@@ -92,14 +92,14 @@ def _coloured(share: F32, colormap: int, known: Bool) -> U8:
 
 
 def shrunk(picture: U8) -> U8:
-    """`TILE_WIDTH` wide."""
+    """Shrink a picture to a width of `TILE_WIDTH`."""
     height = max(1, round(picture.shape[0] * TILE_WIDTH / picture.shape[1]))
     resized: U8 = cv2.resize(picture, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
     return resized
 
 
 def _with_bar(tile: U8, colormap: int, low: str, high: str) -> U8:
-    """The colour scale along the lower edge, its ends labelled."""
+    """Draw the colour scale along the lower edge, with labels at its ends."""
     length, thickness, margin, size = TILE_WIDTH // 3, 10, 6, 0.55
     bar = _coloured(
         np.linspace(0, 1, length, dtype=np.float32)[None].repeat(thickness, 0), colormap, np.array(True)

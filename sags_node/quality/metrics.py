@@ -14,27 +14,27 @@ import numpy as np
 from sags_node.types import F32, F64, I64, U8, Bool
 
 Plane = TypeVar("Plane", F32, Bool)
-BEST_PSNR = 100.0  # dB, of identical pictures: the mean over frames stays a number
+BEST_PSNR = 100.0  # dB, of identical pictures, so that the mean over frames stays finite
 
 
 def as_float(picture: U8) -> F32:
-    """uint8 0..255 as float32 0..1."""
+    """Convert uint8 0..255 to float32 0..1."""
     return picture.astype(np.float32) / np.float32(255)
 
 
 def psnr(picture: F32, truth: F32, tissue: Bool) -> float:
-    """Peak signal to noise ratio (dB) over tissue pixels only: "PSNR*"."""
+    """The peak signal-to-noise ratio (dB) over tissue pixels only: "PSNR*"."""
     return _decibel(_squared_error(picture, truth, tissue))
 
 
 def paper_psnr(picture: F32, truth: F32, tissue: Bool) -> float:
-    """PSNR (dB) in the literature's convention: both pictures are multiplied by the mask, without a margin,
+    """The PSNR (dB) as in the literature: both pictures are multiplied by the mask, without a margin,
     and all pixels are averaged: masked ones count as perfect (EndoGaussian, SAGS: `metrics.py`)."""
     return _decibel(_squared_error(picture, truth, tissue) * float(tissue.mean()))
 
 
 def paper_ssim(picture: F32, truth: F32, tissue: Bool) -> float:
-    """`ssim` in the literature's convention: both pictures are black where masked, and all pixels count."""
+    """The `ssim` as in the literature: both pictures are black where masked, and all pixels count."""
     black = tissue[..., None].astype(np.float32)
     return ssim(picture * black, truth * black, np.ones_like(tissue))
 
@@ -68,7 +68,7 @@ def ssim(picture: F32, truth: F32, tissue: Bool) -> float:
 
 
 def fit_gain_offset(picture: F32, truth: F32, mask: Bool) -> F32:
-    """`gain * picture + offset`, each per channel, nearest to `truth` in least squares over `mask`.
+    """Fit `gain * picture + offset` to `truth`, each per channel, by least squares over `mask`.
 
     Two cameras of a rig differ in exposure and white balance; the model only ever saw the left one.
     A channel without contrast keeps gain 1. The result [H, W, 3] is not clipped.
@@ -87,7 +87,7 @@ def fit_gain_offset(picture: F32, truth: F32, mask: Bool) -> F32:
 
 
 def fitted_psnr(picture: F32, truth: F32, mask: Bool) -> float:
-    """`psnr` (dB) over `mask` of a picture of another exposure, after `fit_gain_offset`."""
+    """The `psnr` (dB) over `mask` of a picture of another exposure, after `fit_gain_offset`."""
     return psnr(fit_gain_offset(picture, truth, mask), truth, mask)
 
 
@@ -102,7 +102,7 @@ class DepthErrors:
 
 
 def depth_errors(depth: F32, reference: F32, tissue: Bool) -> DepthErrors:
-    """Absolute differences of `depth` [H, W] from `reference` [H, W], both in metres with 0 unknown."""
+    """Compute the errors of `depth` [H, W] against `reference` [H, W], both in metres with 0 unknown."""
     comparable = tissue & (reference > 0)
     given = comparable & (depth > 0)
     coverage = float(given.sum() / comparable.sum()) if comparable.any() else float("nan")
@@ -118,7 +118,7 @@ def depth_errors(depth: F32, reference: F32, tissue: Bool) -> DepthErrors:
 
 
 def resample_nearest(picture: Plane, width: int, height: int) -> Plane:
-    """`picture` [h, w] looked up at the pixel centres of a `height` x `width` grid over the same view.
+    """Look up `picture` [h, w] at the pixel centres of a `height` x `width` grid over the same view.
 
     Pixel centres are integers, so centre u of the new grid lies at (u + 0.5) * w / width - 0.5 of the old
     one. Depth is never interpolated: a mean across an edge is a surface that does not exist.
@@ -136,7 +136,7 @@ def _nearest_centres(size: int, old_size: int) -> I64:
 
 
 def percentiles(values: Sequence[float] | F64) -> dict[str, float] | None:
-    """p50, p90, p99 and max; None of nothing."""
+    """The p50, p90, p99 and max of `values`; None: there are none."""
     if len(values) == 0:
         return None
     p50, p90, p99 = np.percentile(values, [50, 90, 99])

@@ -14,7 +14,7 @@ from sags_node.model.deformation import NodeDeformation
 from sags_node.model.gaussians import GaussianModel
 from sags_node.types import I32, Camera
 
-# Rows of the model, 120 bytes a Gaussian. The first come back, 84 bytes.
+# Columns of the model on the GPU, 124 bytes a Gaussian. `REFINED` come back, 88 bytes a Gaussian.
 REFINED: dict[str, Any] = {
     "means": wp.vec3, "quats": wp.vec4, "log_scales": wp.vec3, "opacity_logits": float, "scales": wp.vec3,
     "opacities": float, "colors": wp.vec3, "slopes": wp.vec3, "contribution": float,
@@ -44,7 +44,7 @@ class DeviceMap:
         self._steps = 0
 
     def begin(self, model: GaussianModel, deformation: NodeDeformation) -> None:
-        """Take all of it. New nodes remember nothing."""
+        """Take the whole model and its nodes. New nodes begin without momentum and variance."""
         if self._model is not model:
             self._adopt(model)
         if self._deformation is not deformation:
@@ -74,11 +74,11 @@ class DeviceMap:
         self._deformation.nodes[:] = nodes
 
     def drawn(self) -> dict[str, wp.array]:
-        """Return what `DeviceRasterizer.forward` takes."""
+        """Return the columns that `DeviceRasterizer.forward` takes."""
         return {name: self._live(name) for name in KINDS}
 
     def descend(self, gradients: dict[str, wp.array], step: float) -> None:
-        """`NodeDeformation.descend`."""
+        """Do as `NodeDeformation.descend`."""
         self._total.zero_()
         self._mass.zero_()
         follow = [self._live("node_index"), self._live("node_weight")]
@@ -89,7 +89,7 @@ class DeviceMap:
         self._launch(kernels.skin, len(gradients["means"]), [self._motion, *follow, self._live("means")])
 
     def optimise(self, gradients: dict[str, wp.array], rates: LearningRates, camera: Camera) -> None:
-        """`optimiser.Optimiser.step`."""
+        """Do as `optimiser.Optimiser.step`."""
         self._steps += 1
         corrections = [1.0 / (1.0 - beta**self._steps) for beta in (BETA1, BETA2)]
         names = [name for name in REFINED if name != "contribution"]
@@ -100,12 +100,12 @@ class DeviceMap:
         ])  # fmt: skip
 
     def note_contribution(self, contribution: wp.array) -> None:
-        """Teach the model what each Gaussian contributes [N] px."""
+        """Store each Gaussian's contribution [N] px."""
         wp.copy(self.rows["contribution"], contribution, count=len(contribution))
 
     def _adopt(self, model: GaussianModel) -> None:
-        """Make room for a model whose Gaussians Adam knows nothing of. Its rows move to memory that the GPU
-        reads by itself."""
+        """Allocate memory for a model, with Adam's moments at 0. The model's columns move to pinned memory,
+        which the GPU reads directly."""
         self._model = model
         model.origin[:] = 0
         for name, kind in (REFINED | GIVEN).items():
@@ -130,7 +130,7 @@ class DeviceMap:
         self._launch(kernels.carry_moments, len(origin), [sent, *moments])
 
     def _hold_nodes(self, count: int) -> None:
-        """Make room for so many nodes; those that are here keep what they remember."""
+        """Make room for `count` nodes; those that are here keep momentum and variance."""
         old: list[wp.array] = [] if count == 0 else [self.momentum, self.variance]
         room = [wp.zeros(count, dtype=wp.vec3, device=self._device) for _ in range(5)]
         self.momentum, self.variance, self.nodes, self._motion, self._total = room

@@ -29,7 +29,7 @@ from sags_node.model.gaussians import ADAM_PARAMETERS
 
 wp.set_module_options({"enable_backward": False})
 
-PIXELS = 256  # of a block, whose losses are summed before they are added
+PIXELS = 256  # of a block, whose losses are summed before they are added to the total
 LEVEL = 1.0 / 255.0
 INFINITE = 3.0e38  # beyond is no finite float32
 COVERED, DEPTH_COVERED, FULL = float(tissue.COVERED), float(tissue.DEPTH_COVERED), float(tissue.FULL)
@@ -49,7 +49,7 @@ def tissue_loss(
     depth: wp.array2d(dtype=float), depth_weight: float, depth_scale: float,
     v_planes: wp.array3d(dtype=float), weight: wp.array2d(dtype=float), sums: wp.array(dtype=wp.vec2),
 ):  # fmt: skip
-    """Launched for whole blocks: `sums` gets the absolute colour residuals and the pixels behind them."""
+    """Launched for whole blocks: `sums` gets the absolute colour residuals and the number of their pixels."""
     p = wp.tid()
     width, height = weight.shape[1], weight.shape[0]
     y, x = p // width, p % width
@@ -209,7 +209,7 @@ def optimise(
     rows = log_scales[i]
     hidden = wp.abs(raw) + wp.abs(rows[0]) + wp.abs(rows[1]) + wp.abs(rows[2])
     if not (size < LARGEST and hidden < LARGEST_RAW):
-        fresh = parameters()  # the hidden state is made anew from what is drawn of it
+        fresh = parameters()  # raw parameters and Adam's state are rebuilt from the drawn values
         for k in range(ADAM_PARAMETERS):
             if wp.abs(g[k]) < INFINITE:
                 fresh[k] = g[k] * g[k]

@@ -34,14 +34,14 @@ Result = TypeVar("Result")
 def _or_on_the_cpu(
     method: Callable[Concatenate[GpuRefiner, Given], Result],
 ) -> Callable[Concatenate[GpuRefiner, Given], Result]:
-    """Find where the GPU fails, and ever after, the CPU's method of that name does it."""
+    """Wrap a method so that the CPU's method of that name runs instead once the GPU has failed."""
 
     @functools.wraps(method)
     def guarded(self: GpuRefiner, /, *args: Given.args, **names: Given.kwargs) -> Result:
         if self.problem is None:
             try:
                 return method(self, *args, **names)
-            except RuntimeError as error:  # Warp raises the driver's errors so, and those of memory
+            except RuntimeError as error:  # what Warp raises if the driver fails, or memory is full
                 self._give_up(error)
         result: Result = getattr(self._cpu, method.__name__)(*args, **names)
         self.loss = self._cpu.loss
@@ -54,18 +54,18 @@ class GpuRefiner(Refiner):
     """The refiner on the current GPU.
 
     A frame in which the GPU fails is finished on the CPU, which goes on for good: a CUDA error cannot be
-    recovered from in the same process. The model still stands there as it was before the frame's steps, so
-    nothing but these is lost, and what Adam remembers.
+    recovered from in the same process. The host still has the model as it was before the frame's steps, so
+    only these and Adam's state are lost.
 
     Attributes:
-        on_gpu: the model as it stands there.
+        on_gpu: the copy of the model on the GPU.
     """
 
     def __init__(self, cpu: CpuRefiner, cpu_share: float) -> None:
         """
         Args:
             cpu: goes on where the GPU fails.
-            cpu_share: how much of the model's capacity it can refine, 0..1.
+            cpu_share: how much of the model's capacity the CPU can refine, 0..1.
 
         Raises:
             UsageError: no GPU can be used.
@@ -135,7 +135,7 @@ class GpuRefiner(Refiner):
         self._picture.is_fetched = False
 
     def _step(self, rates: LearningRates, nodes: bool = True) -> wp.array:
-        """A step on what was drawn last: `CpuRefiner._step`.
+        """Take a step on what was drawn last, as `CpuRefiner._step`.
 
         Returns:
             [N] px, what each Gaussian contributes.
@@ -153,7 +153,7 @@ class GpuRefiner(Refiner):
 
 
 class Picture:
-    """Pictures of one size.
+    """Draws pictures of one size on the GPU, and compares them with a frame.
 
     Attributes:
         rasterizer: draws them.
@@ -172,7 +172,7 @@ class Picture:
         self._residuals = wp.zeros(shape, dtype=float, device=device)
 
     def show(self, image: U8, tissue: Bool, depth: F32) -> None:
-        """From now on it should show that: RGB [H, W, 3], where that counts [H, W], and m [H, W]."""
+        """Set the frame to compare with: RGB [H, W, 3], where it counts [H, W], and depth [H, W] m."""
         self._seen = [
             wp.array(image, dtype=wp.uint8, device=self._device),
             wp.array(tissue, dtype=wp.bool, device=self._device),
@@ -180,7 +180,7 @@ class Picture:
         self._depth = wp.array(depth, dtype=float, device=self._device)
 
     def fetched(self, anew: bool = False) -> F32:
-        """The planes [5, H, W] as they were drawn last, on the host; overwritten by the next that are."""
+        """The planes [5, H, W] as they were drawn last, on the host; the next `fetched` overwrites them."""
         if anew or not self.is_fetched:
             wp.copy(self._planes, self.rasterizer.planes)
             wp.synchronize_device(self._device)
@@ -189,8 +189,8 @@ class Picture:
         return planes
 
     def compare(self) -> tuple[wp.array, wp.array]:
-        """`engine.losses.tissue.tissue_loss` of what was drawn last: the gradient by its planes [5, H, W] and
-        the pixels' weight [H, W]."""
+        """Compute `engine.losses.tissue.tissue_loss` of what was drawn last; returns the gradient by its
+        planes [5, H, W] and the pixels' weight [H, W]."""
         self._sums.zero_()
         blocks = -(-self._weight.size // kernels.PIXELS)
         self._launch(kernels.tissue_loss, blocks * kernels.PIXELS, [
@@ -205,7 +205,7 @@ class Picture:
         return residuals / (3.0 * pixels) if pixels > 0 else 0.0
 
     def residuals(self) -> F32:
-        """`focus.sum_residuals` of all tiles, on the host."""
+        """Compute `focus.sum_residuals` of all tiles, on the host."""
         found = self._residuals
         self._launch(kernels.sum_residuals, found.shape, [self.rasterizer.planes, *self._seen, found])
         sums: F32 = found.numpy()
