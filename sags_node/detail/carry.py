@@ -41,7 +41,7 @@ LANES, HALVES = u8(0x00FF00FF00FF00FF), u8(0x0080008000800080)
 
 
 def coarse_camera(camera: Camera) -> Camera:
-    """The camera with one pixel for each block of 4 x 4 of another's; the last blocks may reach past its edge."""
+    """The camera with one pixel for each 4 x 4 block of another's; the last blocks may exceed its edge."""
     width, height = -(-camera.width // EVERY), -(-camera.height // EVERY)
     whole = Camera(EVERY * width, EVERY * height, camera.K, camera.T_world_cam)
     return resized_camera(whole, width, height)
@@ -57,8 +57,8 @@ class Trace:
 
 
 def every_fourth(depth: F32, small: Camera) -> F32:
-    """Return the depth [h, w] of a view at its coarse camera's pixels. Small holes are filled from around: where
-    few Gaussians are drawn there is tissue all the same."""
+    """Return the depth [h, w] of a view at its coarse camera's pixels. Small holes are filled from around:
+    even where few Gaussians are drawn there is tissue."""
     height, width = depth.shape
     rows = ((2 * np.arange(small.height) + 1) * height) // (2 * small.height)
     columns = ((2 * np.arange(small.width) + 1) * width) // (2 * small.width)

@@ -223,8 +223,8 @@ def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool
 
 
 def _loss_by_pixel(frame: SeenFrame, drawn: U8) -> float:
-    """The error of a picture one pixel out of place over the model's error: the RMS difference of neighbouring
-    pixels over the RMS error of `drawn`, on tissue. Its square is the ratio of what they add to the error."""
+    """The error of a picture one pixel out of place over the model's error: RMS difference of neighbouring
+    pixels over RMS error of `drawn`, on tissue. Its square is the ratio of what they add to the error."""
     height, width = drawn.shape[:2]
     size = -(-width // COMPARED), -(-height // COMPARED)
     where = cv2.resize(frame.sure_tissue, size, interpolation=cv2.INTER_NEAREST).astype(f4)
