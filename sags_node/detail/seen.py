@@ -65,7 +65,7 @@ class SeenFrame:
 
     @cached_property
     def surface(self) -> F32:
-        """[h, w] m, the model's depth corrected by what stereo measured; 0 unknown. Few Gaussians are flatter
+        """[h, w] m, the model's depth corrected by what stereo measured; 0 unknown. A small model is flatter
         than the tissue, and seen from the side a millimetre of depth shifts the picture by a pixel."""
         if self.matched is None:
             return self.depth

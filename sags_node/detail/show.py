@@ -30,9 +30,9 @@ f4 = np.float32
 class Lessons:
     """The learnt trust in pictures. One thread teaches; any may ask."""
 
-    moved: Share = field(default_factory=Share)  # of the expected motion, against none
-    ahead: Share = field(default_factory=Share)  # of the picture in the next frame, against the model
-    aside: Share = field(default_factory=Share)  # of the left picture as the right eye sees it
+    moved: Share = field(default_factory=Share)  # of the expected motion, against no motion
+    ahead: Share = field(default_factory=Share)  # of the picture carried to the next frame, against the model
+    aside: Share = field(default_factory=Share)  # of the left picture carried to the right eye, likewise
 
 
 class Detail:
@@ -141,7 +141,7 @@ class Detail:
         return Shown(rgb, taken, now.oldest_ns)
 
     def tint(self, snapshot: Snapshot, gaussians: Gaussians, camera: Camera) -> F32 | None:
-        """Draw what the right eye sees more of the tissue, [m, n, 3]; None where nobody knows.
+        """Draw how much brighter the right eye sees the tissue, [m, n, 3]; None: not known.
 
         Args:
             gaussians: those of the snapshot, at its moment or moved to a later one.

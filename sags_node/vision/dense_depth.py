@@ -161,7 +161,7 @@ def _enlarge(
     between = np.empty(
         3 * line, np.float32
     )  # a row of weights times disparity, weights, trust; ends repeated
-    found = np.empty((2, scale * width), np.float32)  # a row of the result, first every scale-th pixel of it
+    found = np.empty((2, scale * width), np.float32)  # a row of either result, phase by phase
     spare = np.empty(scale * width, np.float32)
     zero, one = np.float32(0), np.float32(1)
     last = high * scale if high < depth.shape[0] // scale else depth.shape[0]

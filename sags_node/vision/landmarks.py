@@ -71,7 +71,7 @@ def matched(before: Features, after: Features) -> tuple[I64, I64]:
 
 
 def features_of(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
-    """Find features of a picture, in px of the whole one, where `tissue` [H, W] is (None: everywhere)."""
+    """Find features of a picture, px of the whole one, where `tissue` [H, W] is True (None: everywhere)."""
     halves = [inner(half) for half in pyramid.halves]
     small = next((half for half in halves if half.shape[1] <= WIDTH), halves[-1]).astype(np.uint8)
     width = pyramid.full.shape[1]

@@ -13,7 +13,7 @@ from sags_node.errors import UsageError
 from sags_node.types import F32, F64, Bool
 from sags_node.vision.onnx_session import DepthNetworkError
 
-MEASURE_EVERY = 5  # frames from one match of the eyes that is made for the scale alone to the next
+MEASURE_EVERY = 5  # frames: how often the eyes are matched for the scale alone
 LARGEST_ERROR = 0.15  # of the depth, median: here the confidence has fallen to its least
 DECLARED_ERROR = 0.5 * LARGEST_ERROR  # taken for a declared scale, whose error is not known
 LEAST_CONFIDENCE = 0.05

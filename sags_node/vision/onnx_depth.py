@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 MOST_FAILURES = 3  # in a row, after which the network is not tried any more
 MOST_CHANNELS = 4  # of an output that is maps; more are features
-FEWEST_FINITE = 0.5  # of the output's numbers
+FEWEST_FINITE = 0.5  # of the output's numbers must be finite
 ALIKE = 0.1  # of the depth: depths that differ by less agree; a wrong scale, sign or eye makes more
 FEWEST_ALIKE = 0.5  # of the places with a measured depth must agree with it
 MEANINGS = {True: ("disparity", "depth"), False: ("inverse_depth", "depth")}  # by whether it is stereo
@@ -61,7 +61,7 @@ class DepthNetwork:
         self._check_description()
         self._size, self._focal_baseline = size, focal_baseline
         self._output = self._said.output or session.outputs[0]
-        self._normalization = self._said.normalization or NORMALIZATIONS["unit"]  # bytes have none
+        self._normalization = self._said.normalization or NORMALIZATIONS["unit"]  # bytes need none
         self._fits = [one.fit(size, self._said.multiple or 1) for one in self._inputs]
         try:
             log.info("%s", self._described(self._warm_up()))

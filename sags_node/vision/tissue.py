@@ -78,7 +78,7 @@ class TissueMask:
 
     @property
     def instruments(self) -> Bool | None:
-        """Return what shows an instrument in the newest frame [H, W], before it grows; None: nobody looks."""
+        """Return where the newest frame shows instruments [H, W], without the margin; None: nobody looks."""
         return None if self._found is None else ~self._found & self.usable
 
     @property

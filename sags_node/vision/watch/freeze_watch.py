@@ -18,9 +18,7 @@ from sags_node.vision.watch.judgement import Evidence, Judgement
 
 LONGEST_NS = 300_000_000  # a converter of frame rates repeats a picture for 0.1 s at most (10 Hz given as 30)
 LONGEST_STILL_NS = 2_000_000_000  # living tissue moves within a heartbeat, or a breath
-GROUP_NS = (
-    190_000_000  # least time between key frames of a frozen picture; at 5 Hz pictures change sooner
-)
+GROUP_NS = 190_000_000  # least time between key frames of a frozen picture; at 5 Hz pictures change sooner
 EVERY = 2  # px between the pixels that are compared
 CELLS = 40  # across the picture
 CAPTIONS = 0.04  # of the cells, all outside the middle half of the picture, may change
@@ -64,7 +62,7 @@ class FreezeWatch:
         self.findings: tuple[Finding, ...] = ()
         self._captions = captions
         self._last_ns = 0  # stamp of the frame before
-        self._shown: Eyes = ()  # what has been shown since
+        self._shown: Eyes = ()  # the frame that has been repeated since
         self._changed: list[Bool] = []  # cells of each eye that captions have changed since
         self._group_ns = 0  # for how long that has been shown, by the stamps
         self._unchanged_ns = 0  # the same, with the groups of pictures before that differ only in coding

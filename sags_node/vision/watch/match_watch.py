@@ -20,7 +20,7 @@ from sags_node.vision.watch.standing import Debounced, watched_ns
 
 STRIDE = 4  # px between patches of the flow
 WINDOW_NS = 200_000_000  # ns of motion that are compared with row errors
-FEWEST_FIELDS, LONGEST_WINDOW_NS = 3, 1_000_000_000  # for fewer fields than this, longer (ns)
+FEWEST_FIELDS, LONGEST_WINDOW_NS = 3, 1_000_000_000  # with fewer fields the window is longer (ns)
 FEWEST_LATE = 2  # fields that show it, each by itself: one alone was tissue that slips or a match gone wrong
 SHORTEST_STEP_NS = 50_000_000  # between two frames: in less time tissue moves less than the flow's error
 LONGEST_STEP_NS = 200_000_000  # between two frames: longer motion is not followed in so small pictures

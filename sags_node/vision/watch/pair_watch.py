@@ -78,7 +78,7 @@ class PairWatch(Debounced):
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Hold a frame with a bad left picture; match nothing with a bad right one."""
+        """Hold a frame with a bad left picture or exchanged eyes; do not match eyes of which one is bad."""
         frame = evidence.frame
         found = self._look(frame, evidence.pair)
         learn = not any(code.startswith("picture") for code, _ in found)
@@ -143,7 +143,7 @@ def _small(image: U8) -> Small:
 
 
 def _emptiness(rgb: U8) -> str:
-    """The fault of the middle, where every scope shows something: black, white, plain (one colour) or none."""
+    """The fault of the middle, where scopes show something: black, white, plain (one colour), or none."""
     height, width = rgb.shape[:2]
     middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4]
     dark, bright = _ends(middle, round(OUTLIERS * middle.shape[0] * middle.shape[1])).tolist()

@@ -33,7 +33,7 @@ RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
 LEAST_KEPT = 0.3  # of what is known must be in view after motion
 LARGEST_GAIN = 1.5  # over the model's exposure; a picture with more is brought to that exposure
 STEADY = 1.2  # factor to the gain before: if it stays smaller, the exposure has changed for good
-FOLLOWED = 0.9  # of the gain's logarithm is still taken out after that, in each frame, of the one before
+FOLLOWED = 0.9  # of the gain's logarithm that the frame before took out is taken out after that
 STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.001, a bleeding 0.04 in its first frame
 LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}  # what lasts is usual
 NEW_SCENE_NS = 3_000_000_000  # ns: an unknown scene that lasts begins a new model
@@ -251,7 +251,7 @@ def _after_motion(
     """The fit after the motion between the pictures is taken out; `fit` if that is no better. The motion is
     searched from a guess [rows, columns, 2] px of the way back."""
     few = narrowed(now)
-    px = np.float32(now.full.shape[1] / (2 * inner(few.halves[0]).shape[1]))  # of the picture in one of these
+    px = np.float32(now.full.shape[1] / (2 * inner(few.halves[0]).shape[1]))  # picture px per flow px
     flow = _FLOW(few, narrowed(before), None if guess is None else guess / px)
     flow = cv2.resize(flow, known.shape[::-1], interpolation=cv2.INTER_AREA) * (px / np.float32(step))
     columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in known.shape[::-1]))
