@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from sags_node.types import Finding
 
 WINDOW_NS = 250_000_000  # ns: half of the time within which a person must be warned
-BEGINS, ENDS = 0.6, 0.3  # of the frames in that time: from the first on a finding stands, until the second
+BEGINS, ENDS = 0.6, 0.3  # of the frames in that time: a finding begins at the first and ends below the second
 FEWEST = 2  # frames that must show a finding
 LONGEST_STEP_NS = 1_000_000_000  # ns: of a longer gap between two frames only so much counts as watched
 
