@@ -2,9 +2,9 @@
 
 A view's pixel at depth z is a point of tissue. Less its motion since the source's moment, in the source's
 camera, that point falls on a pixel of the source's picture. It counts where the source showed tissue, and
-where the surface that it showed was as deep. That place changes slowly over a view: it is worked out for
-every fourth pixel along both axes (`trace`), and lies on straight lines between. What the picture shows there
-is looked up for each pixel that has none yet (`carry`): of a left view these are few.
+where the surface that it showed was as deep. That place changes slowly over a view: it is computed for every
+fourth pixel along both axes (`trace`) and interpolated linearly between. What the picture shows there is
+looked up for each pixel that has no detail yet (`carry`): in a left view these are few.
 """
 
 from dataclasses import dataclass
@@ -20,28 +20,28 @@ from sags_node.geometry import resized_camera, scale_intrinsics
 from sags_node.kernels.jit import inlined, kernel, parallel_kernel, read_only
 from sags_node.types import F32, I32, I64, U8, Camera
 
-EVERY = 4  # px of the view
+EVERY = 4  # px of the view from one coarse pixel to the next
 EVERYWHERE = np.ones((1, 1), np.uint8)
 WHOLLY = np.ones((1, 1), np.float32)
 NO_GAIN = np.ones(3, np.float32)
 NEAREST = 1e-3  # m: no tissue is nearer
-AROUND = (9, 9)  # of the places, from which a hole is filled
-LEAST_KNOWN = 0.5  # of them, to fill it
-COVERED = 0.3  # by Gaussians whose motion is known
-NOWHERE = -1e6  # px
-FINDINGS = 3  # of a ray's place in the source, each from where the last one met its surface
-CLOSE = 1e-3  # of the depth: nearer to that surface it is found
-LITTLE = 3.0  # px of motion from one frame to the next: depths at edges differ by more than SAME all the same
+AROUND = (9, 9)  # coarse pixels: the window from which a hole is filled
+LEAST_KNOWN = 0.5  # share of that window whose depth must be known to fill a hole
+COVERED = 0.3  # least coverage by Gaussians whose motion is known
+NOWHERE = -1e6  # px: the place of what is not in the source's picture
+FINDINGS = 3  # steps of the search for a ray's place in the source, each from the surface that the last met
+CLOSE = 1e-3  # of the depth: the search ends this close to that surface
+LITTLE = 3.0  # px of motion: below it a steady view's depths are not compared, which differ at edges anyway
 _STILL = np.zeros((4, 1, 1), np.float32)
 f4 = np.float32
 u8 = np.uint64
 ONE, BYTE = u8(1), u8(255)
-G, B = u8(32), u8(16)  # bits: their lanes
+G, B = u8(32), u8(16)  # bits at which their lanes begin
 LANES, HALVES = u8(0x00FF00FF00FF00FF), u8(0x0080008000800080)
 
 
 def coarse_camera(camera: Camera) -> Camera:
-    """The camera whose pixels are the middles of 4 x 4 pixels of another's, also across its far edges."""
+    """The camera with one pixel for each 4 x 4 block of another's; the last blocks may exceed its edge."""
     width, height = -(-camera.width // EVERY), -(-camera.height // EVERY)
     whole = Camera(EVERY * width, EVERY * height, camera.K, camera.T_world_cam)
     return resized_camera(whole, width, height)
@@ -57,8 +57,8 @@ class Trace:
 
 
 def every_fourth(depth: F32, small: Camera) -> F32:
-    """Depth [h, w] of a view for its coarse camera, small holes filled from around: where few Gaussians show,
-    tissue shows all the same."""
+    """Return the depth [h, w] of a view at its coarse camera's pixels. Small holes are filled from around:
+    even where few Gaussians are drawn there is tissue."""
     height, width = depth.shape
     rows = ((2 * np.arange(small.height) + 1) * height) // (2 * small.height)
     columns = ((2 * np.arange(small.width) + 1) * width) // (2 * small.width)
@@ -78,15 +78,15 @@ def trace(
     """Find where the tissue of a view was in a source's picture.
 
     Args:
-        depth: [m, n] m of the view, as `every_fourth` has it; 0 unknown.
+        depth: [m, n] m, the view's depth from `every_fourth`; 0 unknown.
         small: the coarse camera of the view.
-        lent: of `SeenFrame.lent`.
-        motion: [4, m, n] of `SmallDrawings.motion`; None: nothing has moved.
-        tiles: [rows, columns] 0..1 over the source's picture: the share that it deserves.
-        unsure: of each pixel that the tissue has moved, so many are doubtful: the share falls with them.
-        steady: it is a moment ago. If the cameras are one, too, the surface is the same where tissue moved
-            little, and where the model tells no depth or motion the picture is taken unmoved.
-        wanted: [m, n] 0 where nothing is to be carried, nor beside it.
+        lent: the picture from `SeenFrame.lent`.
+        motion: [4, m, n] from `SmallDrawings.motion`; None: nothing has moved.
+        tiles: [rows, columns] 0..1 over the source's picture: how far each tile of it is trusted.
+        unsure: the doubt for each px that the tissue has moved: the share falls by 1 / (1 + doubt^2).
+        steady: the source is a moment ago. If the camera is also the same, depths are not compared where the
+            tissue moved little, and where the model tells no depth or motion the picture is taken unmoved.
+        wanted: [m, n] 0 where nothing is to be carried.
     """
     T = source.camera.viewmat @ small.T_world_cam
     size = lent.shape[1] - 2, lent.shape[0] - 2
@@ -159,7 +159,7 @@ def _trace_row(
             off = _between(source_depth, across, down) - c
             if was == f4(0) or not f4(CLOSE) * c < abs(off) < f4(SAME) * c:
                 break
-            z += off  # the source knows its surface finer: look again where the ray meets that
+            z += off  # the source's depth is finer: look again from where the ray meets it
         if not near:
             u = v = f4(NOWHERE)
         elif (unmoved and lag < f4(LITTLE)) or was == f4(0) or abs(was - c) < f4(SAME) * c:
@@ -171,7 +171,7 @@ def _trace_row(
 
 @inlined
 def _between(tiles: F32, across: Any, down: Any) -> Any:
-    """A map at a place 0..1 of it, on straight lines between the middles of its cells."""
+    """The value of a map at a place 0..1 of its width and height, bilinear between the cells' middles."""
     rows, columns = tiles.shape
     x = min(max(across * f4(columns) - f4(0.5), f4(0)), f4(columns - 1))
     y = min(max(down * f4(rows) - f4(0.5), f4(0)), f4(rows - 1))
@@ -185,14 +185,14 @@ def _between(tiles: F32, across: Any, down: Any) -> Any:
 def carry(
     shown: U8, taken: U8, traced: Trace, lent: U8, gain: F32 = NO_GAIN, tint: F32 | None = None
 ) -> None:
-    """Blend the picture of a source into a view, where most of what a pixel is made of is tissue.
+    """Blend a source's picture into a view, where most of what a pixel is interpolated from is tissue.
 
     Args:
         shown: [H, W, 3] RGB of the view; written.
         taken: [H, W] the share that each pixel got, 0..255; written. Pixels that have one already stay.
-        lent: of `SeenFrame.lent`.
+        lent: the picture from `SeenFrame.lent`.
         gain: [3] factor that brings the source's light to that of the view, at most 100.
-        tint: [m, n, 3] for the coarse camera: added to the picture, in the place of colours 0..1.
+        tint: [m, n, 3] for the coarse camera: added to the picture's colours 0..1.
     """
     _, row, _, rows = cv2.boundingRect(traced.share)
     if not rows:
@@ -201,7 +201,7 @@ def carry(
     if tint is not None:
         planes.append(f4(255) * np.pad(tint, ((1, 1), (1, 1), (0, 0)), mode="edge"))
     coarse = np.rint(256 * np.concatenate(planes, axis=2, dtype=f4)).astype(np.int32)
-    first, end = EVERY * (row - 1) - EVERY // 2, EVERY * (row + rows) - EVERY // 2  # that they reach
+    first, end = EVERY * (row - 1) - EVERY // 2, EVERY * (row + rows) - EVERY // 2  # rows reached
     _carry(
         shown, taken, read_only(coarse), read_only(lent).view(np.uint32)[..., 0],
         np.rint(256 * gain).astype(np.int64), max(first, 0), min(end, len(shown)),
@@ -212,15 +212,15 @@ def carry(
 def _carry(shown: U8, taken: U8, coarse: I32, lent: Any, gain: I64, first: Any, end: Any) -> None:
     for number in prange(end - first):
         y = np.int64(first + number)
-        row = (y + EVERY // 2) // EVERY  # of the two that it lies between
-        down = 2 * (y + EVERY // 2 - EVERY * row) + 1  # eighths of the way from one to the other
+        row = (y + EVERY // 2) // EVERY  # the upper of the two coarse rows that y lies between
+        down = 2 * (y + EVERY // 2 - EVERY * row) + 1  # eighths of the way to the lower one
         _carry_row(shown[y].reshape(-1), taken[y], coarse[row], coarse[row + 1], down, lent, gain)
 
 
 @kernel
 def _carry_row(shown: U8, taken: U8, above: I32, below: I32, down: Any, lent: Any, gain: I64) -> None:
-    """Each group of pixels lies between two coarse ones. From one pixel to the next all grows by the same, in
-    units of 2**-14: the place u, v, the share, and the tint. All are whole numbers, for any machine alike."""
+    """Carry one row. In each group of four pixels, between two coarse ones, the place u, v, the share and the
+    tint grow by constant steps, in units of 2**-14. Integers make the result the same on every machine."""
     wide, high = (lent.shape[1] - 1) << 14, (lent.shape[0] - 1) << 14
     tinted, red, green, blue = above.shape[1] > 3, gain[0], gain[1], gain[2]
     lit = red != 256 or green != 256 or blue != 256
@@ -236,7 +236,7 @@ def _carry_row(shown: U8, taken: U8, above: I32, below: I32, down: Any, lent: An
             r, more_r = _growing(above, below, c, u8(3), down)
             g, more_g = _growing(above, below, c, u8(4), down)
             b, more_b = _growing(above, below, c, u8(5), down)
-        u, v = u + 32, v + 32  # the nearest 256th
+        u, v = u + 32, v + 32  # to round to the nearest 256th of a pixel
         for x in range(EVERY * group - EVERY // 2, EVERY * group + EVERY // 2):
             if 0 <= x < len(taken) and taken[u8(x)] == 0 and 0 <= u < wide and 0 <= v < high:
                 i, j, right, under = u8(v >> 14), u8(u >> 14), u8(u >> 6) & BYTE, u8(v >> 6) & BYTE
@@ -262,7 +262,7 @@ def _carry_row(shown: U8, taken: U8, above: I32, below: I32, down: Any, lent: An
 
 @inlined
 def _growing(above: I32, below: I32, c: Any, plane: Any, down: Any) -> Any:
-    """What a plane of coarse pixels is at a group's first pixel, and by how much it grows to the next."""
+    """A coarse plane's value at a group's first pixel, and its step from pixel to pixel, both times 64."""
     before = np.int64(above[c, plane]) * (8 - down) + np.int64(below[c, plane]) * down
     after = np.int64(above[c + ONE, plane]) * (8 - down) + np.int64(below[c + ONE, plane]) * down
     return 7 * before + after, 2 * (after - before)
@@ -277,7 +277,7 @@ def _lanes(pixel: Any) -> Any:
 
 @inlined
 def _mixed(a: Any, b: Any, part: Any) -> Any:
-    """`a` with `part` of 256 of `b`, lane by lane."""
+    """The mix of `a` and `b`, lane by lane: `part` / 256 of it is `b`."""
     return ((a * (u8(256) - part) + b * part + HALVES) >> u8(8)) & LANES
 
 
@@ -288,18 +288,18 @@ def _rgb(r: Any, g: Any, b: Any) -> Any:
 
 @inlined
 def _tinted(lane: Any, tint: Any) -> Any:
-    """The lowest lane with a tint, in units of 2**-14."""
+    """The lowest lane plus a tint in units of 2**-14."""
     return u8(min(max(np.int64(lane & BYTE) + ((tint + 8192) >> 14), 0), 255))
 
 
 @inlined
 def _lit(lane: Any, gain: Any) -> Any:
-    """The lowest lane times a gain, in units of 2**-8."""
+    """The lowest lane times a gain in units of 2**-8."""
     return u8(min((np.int64(lane & BYTE) * gain + 128) >> 8, 255))
 
 
 def paste(picture: U8, share: U8, shown: U8) -> None:
-    """Blend the `share` [H, W] 0..255 of a picture [H, W, 3] into `shown`, of that size, which is written."""
+    """Blend a picture [H, W, 3] into `shown` [H, W, 3], which is written, by `share` [H, W] 0..255."""
     _paste(read_only(picture), read_only(share), shown)
 
 

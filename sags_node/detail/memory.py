@@ -11,14 +11,14 @@ from sags_node.types import F32, Gaussians
 EVERY = 0.2  # s between frames that are kept
 MOST = 10  # frames kept
 OLDEST = 10.0  # s: what nobody has seen for longer is drawn as the model has it
-NEARLY = 0.5  # of what the best of them saw: a newer one is taken that saw more
-WORTH = 0.05  # of the hidden Gaussians: with fewer, a frame is not worth its drawing
-MATCHED = 0.2  # s that the model's error of depth is taken for the same
-BRIGHTER = 2.0  # at most, between a source's light and that of the view
+NEARLY = 0.5  # of what the best frame saw: a newer frame that saw more than this is taken instead
+WORTH = 0.05  # of the hidden Gaussians: a frame that saw fewer is not used
+MATCHED = 0.2  # s for which a measured error of the model's depth is taken to hold
+BRIGHTER = 2.0  # largest factor between the light of a source and of the view
 
 
 class Memory:
-    """Keeps frames, close to each other lately and sparser before.
+    """Keeps frames: recent ones close in time, older ones farther apart.
 
     Attributes:
         frames: the newest first.
@@ -28,33 +28,33 @@ class Memory:
         self.frames: tuple[SeenFrame, ...] = ()
 
     def forget(self) -> None:
-        """Begin anew: Gaussians mean others now."""
+        """Drop all frames: ids now stand for other Gaussians."""
         self.frames = ()
 
     def add(self, frame: SeenFrame) -> None:
-        """Keep a frame, if none so new is kept yet."""
+        """Keep a frame, unless one from less than `EVERY` before it is kept."""
         now = frame.t_capture_ns
         kept = [one for one in self.frames if 0 <= now - one.t_capture_ns <= OLDEST * 1e9]
         if kept and now - kept[0].t_capture_ns < EVERY * 1e9:
             return
-        picture = frame.picture()  # now: it is made of a frame of which nothing else is needed
+        picture = frame.picture()  # made now, so that the rest of the frame it is made from can be freed
         kept.insert(0, replace(frame, picture=lambda: picture, matched=None))
         if len(kept) > MOST:
             ages = [EVERY + (now - one.t_capture_ns) * 1e-9 for one in kept]
-            # The one whose neighbours in time are nearest to each other, by their ages, is missed least.
+            # The frame whose neighbours in time have the smallest ratio of ages is missed least.
             del kept[min(range(1, len(kept) - 1), key=lambda i: ages[i + 1] / ages[i - 1])]
         self.frames = tuple(kept)
 
 
 class Matched:
-    """Keeps what stereo measured last, beside what the model had there: not every frame is matched."""
+    """Keeps the depth that stereo measured last, and the model's depth then: not every frame is matched."""
 
     def __init__(self) -> None:
         self._last: MatchedDepth | None = None
         self._when_ns = 0
 
     def __call__(self, now_ns: int, drawn: F32, measured: F32) -> MatchedDepth | None:
-        """The newest of both, for `SeenFrame.matched`; None: there is none of a moment ago.
+        """Return the newest pair of both, for `SeenFrame.matched`; None: it is older than `MATCHED`.
 
         Args:
             drawn, measured: [h, w] m of this frame, 0 unknown.
@@ -69,12 +69,12 @@ class HiddenSource:
     """A frame that saw tissue which is hidden now."""
 
     frame: SeenFrame
-    gain: F32  # [3] the light of now, as factors of that frame's
+    gain: F32  # [3] light now over the light in that frame
 
 
 def hidden_source(hidden: Gaussians, now_ns: int, frames: Sequence[SeenFrame]) -> HiddenSource | None:
-    """Choose the newest of the frames that saw most of what is hidden; None: none saw enough. A second one
-    beside it would add less than 0.05 dB.
+    """Choose the newest frame that saw more than `NEARLY` of what the best one saw of the hidden Gaussians.
+    None: none saw enough. A second frame beside it would add less than 0.05 dB.
 
     Args:
         hidden: the Gaussians there, in the light of now.

@@ -1,4 +1,4 @@
-"""What a view's tissue has in common over many pixels, drawn small: how far it moved since another moment."""
+"""Small drawings of what changes slowly over a view: how far its tissue moved since another moment."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +12,7 @@ from sags_node.engine.rasterizer.rasterize import Rasterizer, make_rasterizer
 from sags_node.types import F32, I64, U8, Camera, Gaussians
 
 LEAST_COVERED = 0.05
-SIZES = 4  # of views, for which rasterisers are kept
+SIZES = 4  # view sizes for which rasterizers are kept
 
 
 class SmallDrawings:
@@ -24,7 +24,7 @@ class SmallDrawings:
         self.rasterizer = lru_cache(SIZES)(partial(make_rasterizer, "numba"))
 
     def __call__(self, gaussians: Gaussians, values: F32, camera: Camera) -> F32:
-        """Draw `values` [N, 3] in the place of colours, for a camera of the view's size.
+        """Draw `values` [N, 3] instead of colours, at a quarter of the size of the view's `camera`.
 
         Returns:
             [4, h, w]: their means, 0 where little is covered, and the coverage.
@@ -48,7 +48,7 @@ class SmallDrawings:
 
         Returns:
             [4, h, w]: metres along the axes of that frame's camera, and the coverage by tissue that it knew;
-            None: not at all.
+            None: nothing has moved, or that frame has no Gaussians.
         """
         if gaussians.means is since.gaussians.means or not len(since.gaussians):
             return None
@@ -63,7 +63,7 @@ class SmallDrawings:
 
 
 def gaussians_at(gaussians: Gaussians, camera: Camera, wanted: U8) -> Gaussians:
-    """Those whose means fall on pixels `wanted` [h, w] of a camera."""
+    """Return the Gaussians whose means fall on a camera's pixels where `wanted` [h, w] is not 0."""
     P = (camera.K @ camera.viewmat[:3]).astype(np.float32)
     x, y, z = P[:, :3] @ gaussians.means.T + P[:, 3:]
     z = np.maximum(z, np.float32(NEAREST))
@@ -74,7 +74,7 @@ def gaussians_at(gaussians: Gaussians, camera: Camera, wanted: U8) -> Gaussians:
 
 
 def _some(gaussians: Gaussians, rows: I64) -> Gaussians:
-    """Their places, shapes, colours and ids [M]."""
+    """The Gaussians of these rows [M], with places, shapes, colours and ids only."""
     smoothing = gaussians.smoothing
     return Gaussians(
         gaussians.means[rows], gaussians.quats[rows], gaussians.scales[rows], gaussians.opacities[rows],

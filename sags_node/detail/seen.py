@@ -10,10 +10,10 @@ import numpy as np
 from sags_node.geometry import project
 from sags_node.types import F32, I64, U8, Bool, Camera, Gaussians, Shown
 
-MARGIN = np.ones((5, 5), np.uint8)  # px of the working size: nearer to a mask's edge an instrument may shine
-SAME = 0.04  # of the depth: nearer to each other, two depths are of one surface
-FINER = 2  # px of the working size: of every so many along both axes the model's error of depth is known,
-AROUND = (5, 5)  # and averaged over so many of these
+MARGIN = np.ones((5, 5), np.uint8)  # px of the working size around a pixel that must all be tissue
+SAME = 0.04  # of the depth: two depths that differ by less are of one surface
+FINER = 2  # px of the working size between the places where the error of the model's depth is sampled
+AROUND = (5, 5)  # such places: the window over which that error is averaged
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MatchedDepth:
 
     @cached_property
     def finer(self) -> F32:
-        """[h / FINER, w / FINER] the factors that bring the one to the other, averaged."""
+        """[h / FINER, w / FINER] the measured depth over the drawn one, averaged over `AROUND`."""
         height, width = self.drawn.shape
         size = -(-width // FINER), -(-height // FINER)
         drawn, measured = (
@@ -40,7 +40,7 @@ class MatchedDepth:
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """A mapped frame, as far as its picture can be carried from it."""
+    """A mapped frame, with what is needed to carry its picture to other views."""
 
     t_capture_ns: int
     camera: Camera  # left eye, working size
@@ -48,8 +48,8 @@ class SeenFrame:
     picture: Callable[[], U8]  # [H, W, 3] RGB of the left eye as it is published; made when it is asked for
     mask: Bool  # [h, w] tissue
     depth: F32  # [h, w] m, of the model drawn for it; 0 unknown
-    matched: MatchedDepth | None = None  # of a moment ago
-    whole: Shown | None = None  # its left view: lends what is hidden, too
+    matched: MatchedDepth | None = None  # what stereo measured last, in this frame or a moment before
+    whole: Shown | None = None  # its left view as consumers were shown it: lends hidden tissue, too
     _lent: dict[tuple[int, bool], U8] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
@@ -59,14 +59,14 @@ class SeenFrame:
 
     @cached_property
     def sure_tissue(self) -> U8:
-        """[h, w] 1: tissue, and no edge of an instrument beside it."""
+        """[h, w] 1: tissue, at some distance from instruments (`MARGIN`)."""
         eroded: U8 = cv2.erode(self.tissue, MARGIN, borderType=cv2.BORDER_REPLICATE)
         return eroded
 
     @cached_property
     def surface(self) -> F32:
-        """[h, w] m, the depth with what stereo saw finer than the model; 0 unknown. Few Gaussians are flat
-        where tissue is not, and from aside a millimetre of depth is a pixel."""
+        """[h, w] m, the model's depth corrected by what stereo measured; 0 unknown. A small model is flatter
+        than the tissue, and seen from the side a millimetre of depth shifts the picture by a pixel."""
         if self.matched is None:
             return self.depth
         size = self.depth.shape[::-1]
@@ -75,12 +75,12 @@ class SeenFrame:
 
     @cached_property
     def pixels(self) -> F32:
-        """[N, 2] of its Gaussians; NaN behind the camera."""
+        """[N, 2] px where its Gaussians lie in the picture; NaN behind the camera."""
         return np.asarray(project(self.camera, self.gaussians.means)[0], np.float32)
 
     @cached_property
     def shows(self) -> Bool:
-        """[N] which Gaussians its picture shows."""
+        """[N] True: its picture shows that Gaussian."""
         z = project(self.camera, self.gaussians.means)[1]
         height, width = self.depth.shape
         inside = np.all((self.pixels > -0.5) & (self.pixels < (width - 0.5, height - 0.5)), axis=1)
@@ -90,12 +90,12 @@ class SeenFrame:
         return found
 
     def lent(self, focal_px: float, sure: bool = False) -> U8:
-        """Its picture with the tissue that it shows, [1 + H + 1, 1 + W + 1, 4]: RGB, and 255: tissue.
-        Around it the colours of its edge are repeated, and there is no tissue.
+        """Return its picture with its tissue mask, [1 + H + 1, 1 + W + 1, 4]: RGB, and 255: tissue. In the
+        border of one pixel the edge colours are repeated, and there is no tissue.
 
         Args:
-            focal_px: of a view: no finer than that shows is the picture.
-            sure: tissue beside an instrument is none.
+            focal_px: of the view: the picture is shrunk to about the view's resolution.
+            sure: tissue beside an instrument does not count.
         """
         picture, tissue = self.picture(), self.sure_tissue if sure else self.tissue
         height, width = picture.shape[:2]
@@ -118,11 +118,11 @@ class SeenFrame:
 
     @property
     def oldest_ns(self) -> int:
-        """When the oldest of what it lends was captured."""
+        """The capture time of the oldest picture that it lends."""
         return self.t_capture_ns if self.whole is None else self.whole.oldest_ns
 
     def rows_of(self, ids: I64) -> tuple[I64, Bool]:
-        """Find where Gaussians with these `ids` [M] stand among its own: rows [M], and which it has [M]."""
+        """Find the rows [M] of its Gaussians that have these `ids` [M], and which of the ids it has [M]."""
         own = self.gaussians.ids
         if ids is own:
             return np.arange(len(ids)), np.ones(len(ids), np.bool_)

@@ -1,7 +1,7 @@
 """How far to trust what is carried: learnt from how well it did in the frames before.
 
-For each tile of a source's picture: of what the one guess lacked, how much lay along the other guess's
-difference from it (least squares). Where highlights jump, or the motion is wrong, it is little.
+For each tile of a source's picture, least squares give the share of the second guess in the mix of both that
+comes closest to the truth. Where highlights jump, or the motion is wrong, it is small.
 """
 
 import numpy as np
@@ -10,8 +10,8 @@ from sags_node.detail.seen import SeenFrame
 from sags_node.types import F32, F64, U8, Bool
 
 TILES = 16  # along the longer side of a picture
-REMEMBERED = 0.8  # of the sums, from one lesson to the next
-BELIEVED = 1e-3  # of squared colours 0..1: lessons as small as this change little at first
+REMEMBERED = 0.8  # part of the sums that is kept from one lesson to the next
+BELIEVED = 1e-3  # squared colours 0..1 that both sums begin with: the share begins at 1
 
 
 class Share:
@@ -21,11 +21,11 @@ class Share:
         self._sums: F64 | None = None  # [2, rows, columns]: lacking times difference, difference squared
 
     def learn(self, first: U8, second: U8, truth: U8, where: Bool) -> None:
-        """Take a lesson in.
+        """Learn from one picture how far to trust the second guess of it.
 
         Args:
             first, second: [h, w, 3] the two guesses.
-            truth: [h, w, 3] what was seen then.
+            truth: [h, w, 3] the picture that was then seen.
             where: [h, w] which pixels count.
         """
         height, width = where.shape
@@ -42,14 +42,14 @@ class Share:
         self._sums = REMEMBERED * self._sums + tiles
 
     def tiles(self) -> F32:
-        """[rows, columns] 0..1 as it was learnt; [1, 1] of 1 before."""
+        """Return the learnt share 0..1 of each tile [rows, columns]; before the first lesson [1, 1] of 1."""
         if self._sums is None:
             return np.ones((1, 1), np.float32)
         lacking, squared = self._sums
         return np.asarray(np.clip(lacking / squared, 0, 1), np.float32)
 
     def of_gaussians(self, source: SeenFrame) -> F32:
-        """[N] for the Gaussians of a frame, where its picture shows them."""
+        """Return the share [N] of each Gaussian of a frame: that of the tile of the picture where it lies."""
         tiles = self.tiles()
         factors = tiles.shape[1] / source.camera.width, tiles.shape[0] / source.camera.height
         places = np.clip(

@@ -16,23 +16,23 @@ from sags_node.mapping.right_eye import coarse_right_eye_mask
 from sags_node.model.gaussians import for_right_eye
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 
-LESSON_EVERY = 4  # frames: what lessons teach changes slowly, and each costs a small view
-ASIDE_EVERY = 12  # frames: the same of what another eye teaches
-LOOKED_AT = 4  # px: every so many along both axes tell how well pictures are carried
-COMPARED = 8  # px, how sharp a picture is beside the model
-AROUND = np.ones((5, 5), np.uint8)  # px of the working size: what is seen there is made as if hidden, too
-UNSURE = 0.2  # of the way that hidden tissue has moved: so much of it nobody saw
-ANOTHER_EYE = 0.5  # of what the right eye taught: it has a light of its own, which no other view has
+LESSON_EVERY = 4  # frames between lessons: what they teach changes slowly, and each costs a small view
+ASIDE_EVERY = 12  # frames between lessons from the right eye
+LOOKED_AT = 4  # px, along both axes, between the pixels that a lesson compares
+COMPARED = 8  # px between the pixels at which a picture's sharpness is compared with the model's error
+AROUND = np.ones((5, 5), np.uint8)  # px of the working size: around hidden tissue, also filled as if hidden
+UNSURE = 0.2  # share of hidden tissue's motion that is doubtful, for nobody saw it
+ANOTHER_EYE = 0.5  # exponent of the right eye's lesson one baseline aside: no other view has that eye's light
 f4 = np.float32
 
 
 @dataclass(frozen=True, slots=True)
 class Lessons:
-    """What was learnt of the trust in pictures. One thread teaches; any may ask."""
+    """The learnt trust in pictures. One thread teaches; any may ask."""
 
-    moved: Share = field(default_factory=Share)  # of the expected motion, against none
-    ahead: Share = field(default_factory=Share)  # of the picture in the next frame, against the model
-    aside: Share = field(default_factory=Share)  # of the left picture as the right eye sees it
+    moved: Share = field(default_factory=Share)  # of the expected motion, against no motion
+    ahead: Share = field(default_factory=Share)  # of the picture carried to the next frame, against the model
+    aside: Share = field(default_factory=Share)  # of the left picture carried to the right eye, likewise
 
 
 class Detail:
@@ -41,9 +41,9 @@ class Detail:
     def __init__(self, lessons: Lessons) -> None:
         self._lessons = lessons
         self._small = SmallDrawings()
-        self._newest: SeenFrame | None = None  # of the frames from which was chosen
-        self._chosen: SeenFrame | None = None  # of them: shows what is hidden
-        self._unsure = 0.0  # of each pixel that hidden tissue has moved, the part that nobody saw
+        self._newest: SeenFrame | None = None  # the newest older frame at the last choice
+        self._chosen: SeenFrame | None = None  # the older frame that shows what is hidden
+        self._unsure = 0.0  # the doubt for each px that hidden tissue has moved, as in `trace`
 
     # ---- views -----------------------------------------------------------------------------------------
 
@@ -54,7 +54,7 @@ class Detail:
 
         Args:
             drawn: [H, W, 3] RGB, the model for that eye.
-            depth: [h, w] m of it, of any size; 0 unknown.
+            depth: [h, w] m, the model's depth for that eye, in any size; 0 unknown.
             camera: of that eye, in the size that is shown.
             older: frames that may have seen what is hidden now, the newest first.
         """
@@ -71,14 +71,14 @@ class Detail:
         self, rgb: U8, taken: U8, hidden: U8, depth: F32, camera: Camera, now: SeenFrame,
         older: Sequence[SeenFrame],
     ) -> int:  # fmt: skip
-        """Carry what an older frame saw to where nothing is taken yet, which lies in `hidden` [h, w]; returns
-        when that was, or now."""
+        """Carry what an older frame saw to pixels of `hidden` [h, w] where nothing is taken yet. Returns the
+        capture time of that frame, or that of `now` if nothing was carried."""
         now_ns = now.t_capture_ns
         small = coarse_camera(camera)
         free = cv2.resize(255 * hidden, (small.width, small.height), interpolation=cv2.INTER_AREA)
         if not len(older) or not free.any():
             return now_ns
-        wanted = cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3])  # pixels lie between two places
+        wanted = cv2.dilate((free > 0).view(np.uint8), AROUND[:3, :3])  # pixels lie between coarse ones
         there = gaussians_at(now.gaussians, small, wanted)
         source = self._source(there, now, older, rgb)
         if source is None:
@@ -93,8 +93,8 @@ class Detail:
     def _source(
         self, hidden: Gaussians, now: SeenFrame, older: Sequence[SeenFrame], drawn: U8
     ) -> HiddenSource | None:
-        """`hidden_source`, chosen anew with every frame that is new to the memory: looking into all of them
-        takes as long as drawing the motion."""
+        """The `hidden_source`, chosen anew only with a new frame in the memory or if the last choice fails:
+        looking into all frames takes as long as drawing the motion."""
         source = None
         if self._newest is older[0] and self._chosen is not None:
             source = hidden_source(hidden, now.t_capture_ns, [self._chosen])
@@ -121,11 +121,11 @@ class Detail:
             drawn: [H, W, 3] RGB, the model for that camera.
             depth: as for `left`.
             camera: in the size that is shown.
-            gaussians: those of the frame, there or moved.
+            gaussians: those of the frame, at its moment or moved to a later one.
             now: the frame.
             baseline: m between the eyes.
-            frames_ahead: how far it is after the frame, in steps between frames.
-            tint: of `tint`, which the view has and no picture of the left eye.
+            frames_ahead: how long the view is after the frame, in frame intervals.
+            tint: from `tint`: the colours that this view has and the left picture has not.
         """
         rgb, taken = drawn.copy(), _nothing(camera)
         aside = float(np.linalg.norm(camera.T_world_cam[:3, 3] - now.camera.T_world_cam[:3, 3])) / baseline
@@ -141,10 +141,10 @@ class Detail:
         return Shown(rgb, taken, now.oldest_ns)
 
     def tint(self, snapshot: Snapshot, gaussians: Gaussians, camera: Camera) -> F32 | None:
-        """Draw what the right eye sees more of the tissue, [m, n, 3]; None where nobody knows.
+        """Draw how much brighter the right eye sees the tissue, [m, n, 3]; None: not known.
 
         Args:
-            gaussians: of the snapshot, there or moved.
+            gaussians: those of the snapshot, at its moment or moved to a later one.
         """
         more = snapshot.right_colors
         return None if more is None else self._small(gaussians, more, camera)[:3].transpose(1, 2, 0)
@@ -170,7 +170,7 @@ class Detail:
         lessons.ahead.learn(drawn, carried(lessons.moved.of_gaussians(before)), truth, where)
 
     def learn_aside(self, now: SeenFrame, snapshot: Snapshot, right: U8, baseline: float) -> None:
-        """Learn from the right eye how well the left picture says what another eye sees.
+        """Learn from the right eye how well the left picture, carried there, shows what another eye sees.
 
         Args:
             snapshot: of that frame.
@@ -197,7 +197,7 @@ def _carried(
     drawn: U8, depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None, steady: bool = False,
     tint: F32 | None = None,
 ) -> U8:  # fmt: skip
-    """A drawn picture with all that a source has for it."""
+    """A drawn picture with all the detail that a source can lend it."""
     rgb, lent, small = drawn.copy(), source.lent(np.inf), coarse_camera(camera)
     traced = trace(every_fourth(depth, small), small, source, lent, motion, steady=steady)
     carry(rgb, _nothing(camera), traced, lent, tint=tint)
@@ -223,8 +223,8 @@ def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool
 
 
 def _loss_by_pixel(frame: SeenFrame, drawn: U8) -> float:
-    """How much worse than the model a picture is one pixel out of place: its change by pixel over the model's
-    error, root mean squares over tissue. Squared, it is the ratio of what either adds to the error."""
+    """The error of a picture one pixel out of place over the model's error: RMS difference of neighbouring
+    pixels over RMS error of `drawn`, on tissue. Its square is the ratio of what they add to the error."""
     height, width = drawn.shape[:2]
     size = -(-width // COMPARED), -(-height // COMPARED)
     where = cv2.resize(frame.sure_tissue, size, interpolation=cv2.INTER_NEAREST).astype(f4)

@@ -1,8 +1,8 @@
 """How far away an instrument is: patches along its midline, found again in the right picture.
 
-A shaft is smooth, black or mirrors, so one patch alone is often wrong. But along a straight instrument the
-inverse depth, and so the disparity, is linear in the picture: of all such lines the one is taken that most
-patches agree with.
+A shaft is smooth, and black or reflecting, so one patch alone is often wrong. But along a straight instrument
+the inverse depth, and so the disparity, is linear in the picture: of all such lines the one is taken with
+which most patches agree.
 """
 
 from typing import NamedTuple
@@ -14,51 +14,51 @@ from sags_node.instruments.outlines import Outline
 from sags_node.kernels.jit import kernel, read_only
 from sags_node.types import F32, F64, I64, U8, Bool
 
-PATCHES = 12
-FEWEST = 4  # that agree
-RADIUS = (7, 24)  # px, of a patch: half of the instrument's width, and what is beside it
-SAMPLES = 7  # to each side of the middle, at least as many
-BESIDE = 0.3  # of its width
-MARGIN = 3  # px of what lies around it, whose edge tells where it is
-COARSE = 2.0  # px, of the disparities that are tried
-FINE = 3  # px around the line that is found
-REFINED = 2  # times
-FITS = 8
-TILT = 0.3  # of its disparity: by so much it usually changes along what is seen of an instrument
-CORE = 0.15  # of the width, around the midline, that is instrument where it is not between jaws
+PATCHES = 12  # along a midline, at most
+FEWEST = 4  # patches that must agree
+RADIUS = (7, 24)  # px, smallest and largest radius of a patch
+SAMPLES = 7  # to each side of a patch's middle, at most; twice as many in the fine search
+BESIDE = 0.3  # of the instrument's width, which a patch covers to each side of it
+MARGIN = 3  # px around an instrument that are compared, too: its edge tells where it is
+COARSE = 2.0  # px between the disparities of the coarse search
+FINE = 3  # px to each side of the line that the fine search covers
+REFINED = 2  # fine searches
+FITS = 8  # iterations of a line's fit
+TILT = 0.3  # of the disparity: its usual change along the visible part of an instrument
+CORE = 0.15  # of the width: half the side of the square that must be instrument, not a gap between jaws
 AGREES = 0.6  # zero-mean normalised cross-correlation (ZNCC) from which on a patch counts
-LEAST_SPREAD = 0.25  # px, of the patches around their line: fewer would be chance
-BIAS = 0.3  # px, of each end: what lies behind an edge, and a mirror, moves a patch
-FLAT = 1.0  # grey levels^4, of patches in which nothing is seen
-HALF_SEEN = 127  # of a mask
+LEAST_SPREAD = 0.25  # px, smallest scatter of the patches around their line: less would be chance
+BIAS = 0.3  # px, error of each end that all patches share: background behind edges and reflections shift them
+FLAT = 1.0  # grey levels^4: floor of the product of two variances, for patches without structure
+HALF_SEEN = 127  # of 255: a mask's pixel above it counts
 
 
 class Disparities(NamedTuple):
-    """Along an instrument, px, and how sure they are."""
+    """The disparities at both ends of an instrument (px), and their covariance (px^2)."""
 
     tip_and_back: F64  # [2]
     covariance: F64  # [2, 2]
 
 
 class Eyes(NamedTuple):
-    """What is compared."""
+    """The pictures in which disparities are measured."""
 
     left: U8  # [H, W] gray
     right: U8  # [H, W] gray
     tools: U8  # [H, W] 255: instrument
     counts: U8  # [H, W] 255: what shows an instrument or lies close beside it
-    row_error: float  # px, by which the right picture is too low
+    row_error: float  # px by which the right picture is too low
 
 
 def eyes(left: U8, right: U8, tools: Bool, row_error: float) -> Eyes:
-    """Both gray pictures [H, W], and the instruments [H, W] in the left one."""
+    """Prepare both gray pictures [H, W] and the instruments [H, W] in the left one for `disparities`."""
     around = np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)
     shown = tools.view(np.uint8) * np.uint8(255)
     return Eyes(read_only(left), read_only(right), shown, cv2.dilate(shown, around), float(row_error))
 
 
 def disparities(seen: Eyes, outline: Outline, limits: tuple[float, float]) -> Disparities | None:
-    """The disparities of an instrument; None: too few patches agree.
+    """Measure the disparities of an instrument; None: too few patches agree.
 
     Args:
         limits: the smallest and the largest disparity, px.
@@ -92,7 +92,7 @@ def disparities(seen: Eyes, outline: Outline, limits: tuple[float, float]) -> Di
 
 
 def _is_solid(tools: U8, centre: F64, width: float) -> bool:
-    """Tell whether there is instrument around a place of the midline: not between open jaws."""
+    """Tell whether a place of the midline lies on the instrument, not between open jaws."""
     side = 2 * round(CORE * width) + 1
     core = cv2.getRectSubPix(tools, (side, side), (float(centre[0]), float(centre[1])))
     return float(core.mean()) > 127
@@ -107,7 +107,7 @@ def _scores(seen: Eyes, centre: F64, radius: int, tried: F64, every: int) -> F32
 
 @kernel
 def _taken(picture: U8, u: float, v: float, radius: int, every: int, patch: F64) -> None:
-    """Fill a patch [n, n] around a place, bilinear; beyond the picture its edge goes on."""
+    """Fill a patch [n, n] around a place, bilinear; beyond the picture its edge is repeated."""
     height, width = picture.shape
     column, row = int(np.floor(u)), int(np.floor(v))
     fx, fy = u - column, v - row
@@ -126,14 +126,14 @@ def _taken(picture: U8, u: float, v: float, radius: int, every: int, patch: F64)
 def agreements(
     left: U8, right: U8, counts: U8, u: float, v: float, row_error: float, radius: int, every: int, tried: F64
 ) -> F32:
-    """Zero-mean normalised cross-correlation (ZNCC) [D] with the patches at disparities [D] that are tried;
-    -1: beyond the right picture.
+    """Return the zero-mean normalised cross-correlation (ZNCC) [D] of a left patch with the right ones at the
+    disparities `tried` [D]; -1: beyond the right picture.
 
     Args:
         left, right: gray pictures [H, W].
         counts: [H, W] 255: what is compared of the left patch.
-        u, v: its middle, px; row_error: by so much the right picture is too low.
-        radius, every: every so many rows and columns of so many px around the middle are compared.
+        u, v: its middle, px; row_error: px by which the right picture is too low.
+        radius, every: half the side of the patch, and the step between the rows and columns compared, px.
     """
     side = 2 * radius // every + 1
     patch, there, share = np.empty((side, side)), np.empty((side, side)), np.empty((side, side))
@@ -155,7 +155,7 @@ def agreements(
 
 
 def _best_line(scores: F32, places: F64) -> I64:
-    """Which [2] of the disparities tried, at the tip and at the back, most patches [S, D] agree with."""
+    """The line with the best sum of scores [S, D]: the indices [2] of its disparities at tip and back."""
     count = scores.shape[1]
     tip, back = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
     total = np.zeros((count, count), np.float32)
@@ -165,8 +165,8 @@ def _best_line(scores: F32, places: F64) -> I64:
 
 
 def _vertices(scores: F32, best: I64) -> tuple[F64, F64]:
-    """The vertices of the parabola through the best score and both beside it: the place of its vertex from
-    the best, and how sharp it is [S]."""
+    """For each patch [S], the parabola through the best score and both beside it: the offset of its vertex
+    from the best, and how sharp it is."""
     rows = np.arange(len(best))
     before, middle, after = (scores[rows, best + step].astype(np.float64) for step in (-1, 0, 1))
     bend = np.maximum(2 * middle - before - after, 1e-6)
@@ -174,7 +174,7 @@ def _vertices(scores: F32, best: I64) -> tuple[F64, F64]:
 
 
 def _fitted(places: F64, found: F64, sharpness: F64) -> tuple[F64, F64]:
-    """The line (at the tip, at the back) through disparities [S], and its covariance [2, 2] (px^2)."""
+    """The line fitted to disparities [S] (its values at tip and back), and its covariance [2, 2] (px^2)."""
     ways = np.stack([1 - places, places], -1)
     level, scale = np.array([[1.0, -1.0], [-1.0, 1.0]]), LEAST_SPREAD
     known = sharpness / sharpness.max()

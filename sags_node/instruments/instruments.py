@@ -1,4 +1,4 @@
-"""Which instruments there are, as consumers are told of them: looked for in some frames a second."""
+"""The instruments as they are published to consumers: looked for in some frames a second."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from sags_node.instruments.kinematics import NINE_OF_TEN, Arm, seen_as
 from sags_node.instruments.outlines import Outline, outlines
 from sags_node.types import F32, F64, I64, U8, Bool, Camera, InstrumentStates, RenderedView, ToolPose
 
-PERIOD_NS = 100_000_000  # a hand, and who reads a distance, are not quicker; each look costs the mapping time
-NEAREST, FARTHEST = 0.02, 0.2  # m, that an instrument may be away
-HALF = 0.75  # of the spread of its end, by which the tip of open jaws or of a hook is uncertain
-ENTANGLED = 1.5  # times the error, where another one lies over it
-AXIS_ERROR = np.radians(25.0)  # nine of ten are smaller, or there is no axis
-AXIS_BIAS = np.radians(8.0)  # nine of ten of the phantom's graspers are below: jaws are not in line
+PERIOD_NS = 100_000_000  # no hand and no reader of a distance is quicker; each look takes time from mapping
+NEAREST, FARTHEST = 0.02, 0.2  # m, depths at which an instrument may be
+HALF = 0.75  # of the spread of its end: the error of the tip of open jaws or of a hook
+ENTANGLED = 1.5  # factor on the error where another instrument lies over it
+AXIS_ERROR = np.radians(25.0)  # rad: an axis is given if nine of ten are expected to be off by less
+AXIS_BIAS = np.radians(8.0)  # rad: nine of ten graspers of the phantom are off by less: jaws are not in line
 AHEAD, STEP = 0.15, 5e-4  # m, along the axis: how far tissue is looked for, and how finely
-EVERY = 4  # px, of the surface of which the nearest point is sought
-KEPT = 0.5  # s, that a number is kept for an instrument that is not found
-SAME = 0.2  # of the picture's width: farther from where it was it is another
-BY_PICTURE, BY_ROBOT, CORRECTED = 1, 2, 3  # who tells of an instrument
+EVERY = 4  # px between the pixels of the tissue among which the nearest is sought
+KEPT = 0.5  # s for which the number of an instrument that is not found is kept
+SAME = 0.2  # of the picture's width: an instrument that is farther from where it was is another
+BY_PICTURE, BY_ROBOT, CORRECTED = 1, 2, 3  # what tells of an instrument
 
 
 @dataclass(frozen=True, slots=True)
 class _One:
-    """One row of `InstrumentStates`, but for its number; NaN where it is not known."""
+    """One row of `InstrumentStates` without its number; NaN: not known."""
 
     end: F64  # [2] px, where the mask ends
     tip: F64 = field(default_factory=lambda: np.full(3, np.nan))
     axis: F64 = field(default_factory=lambda: np.full(3, np.nan))
-    others: tuple[F64, ...] = ()  # axes that may be as well
+    others: tuple[F64, ...] = ()  # axes at the limits of its error
     pixel: F64 = field(default_factory=lambda: np.full(2, np.nan))
     error: float = np.inf  # m, of the tip
     distance: float = np.nan
@@ -44,11 +44,11 @@ class _One:
     clearance_error: float = np.inf
     nearest: F64 = field(default_factory=lambda: np.full(3, np.nan))  # m, of the tissue
     source: int = BY_PICTURE
-    tilt: float = AXIS_BIAS  # of its axis, nine of ten are below
+    tilt: float = AXIS_BIAS  # rad, error of its axis; nine of ten are below
 
 
 class _Tissue(NamedTuple):
-    """The model as the left eye sees it, made ready once for all instruments of a frame."""
+    """The model as the left eye sees it, prepared once for all instruments of a frame."""
 
     camera: Camera
     depth: F32  # [H, W] m, 0: none
@@ -63,15 +63,15 @@ class _Tissue(NamedTuple):
         return cls(view.camera, view.depth, view.confidence, at, np.asarray(places, np.float32))
 
     def error(self, row: int, column: int) -> float:
-        """Of its depth there, m."""
+        """Return the error of its depth at a pixel, m."""
         return 0.0 if self.confidence is None else float(error_of(self.confidence[row, column]))
 
 
 class Instruments:
-    """All instruments of one node; their numbers are never used again.
+    """The instruments of one node. No number is given to a second instrument.
 
     Args:
-        usable: as of `TissueMask`.
+        usable: as in `TissueMask`.
     """
 
     def __init__(self, usable: Bool) -> None:
@@ -85,11 +85,11 @@ class Instruments:
         self, tools: Bool | None, left: U8, right: U8 | None, camera: Camera, baseline: float,
         tissue: RenderedView, row_error: float = 0.0, robot: Sequence[ToolPose] = (),
     ) -> InstrumentStates | None:  # fmt: skip
-        """Those of one frame; None: they were looked for less than `PERIOD_NS` before, on the average.
+        """Return the instruments of one frame; None: the last look was less than `PERIOD_NS` ago, on average.
 
         Args:
-            tools: [H, W] what shows an instrument; None: nobody looks for any.
-            left, right: gray pictures [H, W]; no right one: it must not be used.
+            tools: [H, W] True: the pixel shows an instrument; None: nobody looks for any.
+            left, right: gray pictures [H, W]; right is None where it must not be used.
             tissue: the model as the left eye sees it.
             row_error: by how much the right picture is too low, px.
             robot: where it says that its tools are.
@@ -102,7 +102,7 @@ class Instruments:
             both = eyes(left, right, tools, row_error)
         found = [_placed(outline, both, camera, baseline) for outline in shown]
         arms = self._moved(robot, tissue.t_capture_ns)
-        numbers = dict[int, int]()  # of what is found, where the robot tells which it is
+        numbers = dict[int, int]()  # by row of `found`, where the robot tells which instrument it is
         seen = seen_as(arms, shown, camera)
         for place, arm in enumerate(arms):
             row = seen.get(place)
@@ -122,7 +122,7 @@ class Instruments:
         return _states(self._numbers([one.end for one in found], numbers, tissue.t_capture_ns), found)
 
     def _is_due(self, now_ns: int) -> bool:
-        """Keeps the rate also where frames do not come at multiples of the period."""
+        """Tell whether to look now. Keeps the mean rate if the period is not a whole number of frames."""
         late = now_ns - self._due_ns
         if -PERIOD_NS <= late < 0:  # earlier still: the clock was set back
             return False
@@ -130,7 +130,7 @@ class Instruments:
         return True
 
     def _moved(self, robot: Sequence[ToolPose], now_ns: int) -> list[Arm]:
-        """The arms of which the robot tells now."""
+        """The arms whose poses the robot tells now, moved there."""
         arms = []
         for tool in robot:
             if tool.T_cam_tool is None:
@@ -143,8 +143,8 @@ class Instruments:
         return arms
 
     def _doubted(self, one: _One, arm: Arm, tissue: RenderedView) -> _One:
-        """What the robot alone tells of: where it should be in sight, and no mask shows it, the correction is
-        not believed."""
+        """An instrument that only the robot tells of. Where it should be in sight, but no mask shows it, its
+        error is at least the robot's: the correction is not believed."""
         if not _is_inside(one.pixel, tissue.camera):
             return one
         u, v = np.rint(one.pixel).astype(int)
@@ -153,7 +153,7 @@ class Instruments:
         return replace(one, error=max(one.error, arm.error)) if seen else one
 
     def _numbers(self, ends: list[F64], given: dict[int, int], now_ns: int) -> list[int]:
-        """Each keeps the number of the one that was the nearest before; some are given."""
+        """The number of each instrument: the given one, else that of the nearest before, else a new one."""
         gate = SAME * self._usable.shape[1]
         self._known = {k: v for k, v in self._known.items() if 0 <= now_ns - v[1] < 1e9 * KEPT}
         pairs = sorted(
@@ -194,7 +194,7 @@ def _placed(outline: Outline, both: Eyes | None, camera: Camera, baseline: float
 
 
 def _told(arm: Arm, camera: Camera, end: F64 | None) -> _One:
-    """Where the robot says that one is, corrected as far as that was learnt; `end` [2] of its mask."""
+    """An instrument where the robot says it is, with the learnt correction; `end` [2] px of its mask."""
     tip = np.asarray(transform(camera.T_world_cam, arm.tip), np.float64)
     axis, tilt = camera.T_world_cam[:3, :3] @ arm.axis, arm.axis_error
     pixel = np.asarray(project(camera, tip)[0], np.float64)
@@ -209,13 +209,13 @@ def _is_inside(pixel: F64, camera: Camera) -> bool:
 
 
 def _tip_and_axis(camera: Camera, ends: F64, depths: F64) -> tuple[F64, F64]:
-    """The tip [3] and the unit vector [3] that points out of it, of two pixels [2, 2] at depths [2]."""
+    """The tip [3] and the unit vector [3] out of it, from pixels [2, 2] and depths [2] of tip and back."""
     tip, back = np.asarray(unproject(camera, ends, depths), np.float64)
     return tip, (tip - back) / np.linalg.norm(tip - back)
 
 
 def _others(camera: Camera, ends: F64, scale: float, found: Disparities) -> tuple[F64, ...]:
-    """The axes at the edge of what both disparities may be; none: they may be anything."""
+    """The axes at the limits of error of both disparities; empty: the axis may be any."""
     spreads, directions = np.linalg.eigh(found.covariance)
     steps = NINE_OF_TEN * np.sqrt(spreads) * directions
     others = [found.tip_and_back + sign * step for step in steps.T for sign in (-1, 1)]
@@ -225,14 +225,14 @@ def _others(camera: Camera, ends: F64, scale: float, found: Disparities) -> tupl
 
 
 def _beside_tissue(one: _One, tissue: _Tissue) -> _One:
-    """How far the tissue is from a tip, and how sure that is."""
+    """The instrument with its distances from the tissue and their errors."""
     beyond = one.source != BY_PICTURE and not _is_inside(one.pixel, tissue.camera)
     if len(tissue.at) == 0 or beyond:  # tissue there is not seen
         return one
     apart = np.linalg.norm(tissue.places - one.tip.astype(np.float32), axis=1)
     nearest = int(apart.argmin())
     u, v = np.clip(np.rint(one.pixel), 0, [tissue.camera.width - 1, tissue.camera.height - 1]).astype(int)
-    if tissue.depth[v, u] > 0:  # what lies behind the tissue is hidden by it, or is not there
+    if tissue.depth[v, u] > 0:  # a tip behind the tissue would be hidden: its depth is wrong
         behind = max(0.0, float(project(tissue.camera, one.tip)[1]) - float(tissue.depth[v, u]))
         one = replace(one, error=float(np.hypot(one.error, behind)))
     error = float(np.hypot(one.error, tissue.error(*tissue.at[nearest])))
@@ -247,15 +247,15 @@ def _beside_tissue(one: _One, tissue: _Tissue) -> _One:
 
 
 def _tilted(axis: F64, tilt: float) -> list[F64]:
-    """An axis turned by an angle to four sides."""
+    """An axis tilted by an angle (rad) to each of four sides."""
     sides = np.linalg.svd(axis[None])[2][1:]
     turned = [axis + sign * np.tan(tilt) * side for side in sides for sign in (-1, 1)]
     return [each / np.linalg.norm(each) for each in turned]
 
 
 def _met(tip: F64, axes: F64, tissue: _Tissue) -> tuple[F64, I64]:
-    """How far along axes [A, 3] the tissue is ([A] m; inf: they meet none), and in which row and column the
-    first one meets it."""
+    """The distances along axes [A, 3] to the tissue ([A] m; inf: the axis meets none), and the row and column
+    where the first axis meets it."""
     along = np.arange(0, AHEAD, STEP)
     pixels, depths = project(tissue.camera, tip + along[:, None] * axes[:, None])
     at = np.rint(np.nan_to_num(pixels, nan=-1.0))[..., ::-1].astype(np.intp)

@@ -1,7 +1,7 @@
 """Where a robot says that a tool's tip is, and what the picture corrects of that.
 
 A robot knows well how a tip moves, and badly where it is: joints, base frames and hand-eye are off by some
-millimetres and degrees. Before the camera all of that together is one small rigid motion that changes slowly
+millimetres and degrees. In the camera's frame all of that is one small rigid motion that changes slowly
 (the lumped error of Richter, Lu, Orosco and Yip, 2021, "Robotic tool tracking under partially visible
 kinematic chain"). A Kalman filter learns it from the tips that both eyes see. How a tool points is not taken
 from the picture: the turn is learnt from how the tips are off in several places.
@@ -15,14 +15,14 @@ from sags_node.instruments.outlines import Outline
 from sags_node.types import F64, Camera
 
 NINE_OF_TEN = 1.645  # standard deviations
-TURN = np.radians(4.0)  # about each axis: standard deviation of what is not corrected yet
-DRIFT = np.array([*3 * [np.radians(0.2)], *3 * [5e-4]]) ** 2  # rad^2/s, m^2/s: what was learnt grows old
-ALIKE_NS = 1_000_000_000  # tips that are seen within this time are wrong alike: together they count as one
-ACROSS = 0.5  # of a seen tip's error, which is most in depth
-WRONG = 11.3  # squared standard deviations of three numbers, 1 of 100 is beyond: a tip so far off is no tip
+TURN = np.radians(4.0)  # rad, about each axis: standard deviation of the error before any correction
+DRIFT = np.array([*3 * [np.radians(0.2)], *3 * [5e-4]]) ** 2  # rad^2/s, m^2/s: process noise
+ALIKE_NS = 1_000_000_000  # tips seen within this time share their error: together they count as one
+ACROSS = 0.5  # error of a seen tip across the ray, over that along the ray
+WRONG = 11.3  # chi-squared of three numbers that 1 of 100 exceeds: a seen tip that is farther off is ignored
 SEEN = np.arange(0, 0.06, 5e-4)  # m from the tip, of the part of a tool that is looked for in the picture
-BESIDE = 0.005  # m, and the error: so far an outline may lie beside a tool
-NEAREST = 0.01  # m: what is nearer is not looked for
+BESIDE = 0.005  # m, plus the tip's error: how far an outline may lie beside a tool
+NEAREST = 0.01  # m: a tool that is nearer to the camera is not looked for
 
 
 class Arm:
@@ -46,7 +46,7 @@ class Arm:
         self._told_ns = self._learnt_ns = 0
 
     def move(self, T_cam_tool: F64, t_ns: int) -> None:
-        """It is there now, as the robot tells [4, 4]: the tip, out of which z points."""
+        """Take the pose [4, 4] that the robot tells now: that of the tip, out of which z points."""
         self._tip, self._axis = T_cam_tool[:3, 3], T_cam_tool[:3, 2]
         if np.isnan(self._pivot[0]):
             self._pivot, self._told_ns = self._tip, t_ns
@@ -57,27 +57,27 @@ class Arm:
 
     @property
     def tip(self) -> F64:
-        """[3] m, corrected."""
+        """The corrected tip [3], m."""
         return np.asarray(self._pivot + self._turn @ (self._tip - self._pivot) + self._off[3:], np.float64)
 
     @property
     def axis(self) -> F64:
-        """[3] unit, from the shaft to the tip, corrected."""
+        """The corrected unit vector [3] from the shaft to the tip."""
         return np.asarray(self._turn @ self._axis, np.float64)
 
     @property
     def tip_error(self) -> float:
-        """m; nine of ten are meant to be smaller."""
+        """The error (m) that nine of ten tips are expected to stay below."""
         ways = self._ways()
         return NINE_OF_TEN * float(np.sqrt(np.trace(ways @ self._spread @ ways.T)))
 
     @property
     def axis_error(self) -> float:
-        """rad; as `tip_error`."""
+        """The error (rad) that nine of ten axes are expected to stay below."""
         return NINE_OF_TEN * float(np.sqrt(np.linalg.eigvalsh(self._spread[:3, :3])[1:].sum()))
 
     def learn(self, tip: F64, error: float) -> None:
-        """Correct it by a tip [3] that is seen, with its error; not by one that is too far off."""
+        """Correct it by a tip [3] that the eyes saw, with its error (m). A tip too far off is ignored."""
         share = min(1.0, (self._told_ns - self._learnt_ns) / ALIKE_NS) if self.is_corrected else 1.0
         if share <= 0:
             return
@@ -98,13 +98,13 @@ class Arm:
         return np.asarray(cv2.Rodrigues(self._off[:3])[0], np.float64)
 
     def _ways(self) -> F64:
-        """How [3, 6] the tip moves with each number of what it is off by."""
+        """The Jacobian [3, 6] of the tip with respect to the correction (turn, shift)."""
         x, y, z = self.tip - self._pivot - self._off[3:]
         return np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
 
 
 def seen_as(arms: list[Arm], outlines: list[Outline], camera: Camera) -> dict[int, int]:
-    """Which arm is which outline: they lie in one line in the picture, the closest first."""
+    """Return the outline of each arm that has one: both lie along one line in the picture. Closest first."""
     here = Camera(camera.width, camera.height, camera.K, np.eye(4))
     pairs = []
     for number, arm in enumerate(arms):

@@ -1,8 +1,8 @@
 """The instruments of a mask, each with its midline in the picture.
 
-An instrument enters from the picture's edge. Its midline joins the middles of what is equally far from there,
-measured inside the mask (level sets of the geodesic distance), so that jaws may be open. Where it touches the
-edge in several places, several instruments lie over each other: each is followed straight from its entry.
+An instrument enters from the picture's edge. Its midline joins the middles of the pixels that are equally far
+from there inside the mask (level sets of the geodesic distance), so that jaws may be open. A region that
+touches the edge in several places is several instruments that overlap: each is followed straight on.
 """
 
 from dataclasses import dataclass, replace
@@ -14,20 +14,20 @@ from sags_node.kernels.jit import kernel
 from sags_node.types import F64, I32, U8, Bool
 
 WIDTH = 320  # px, of the mask in which midlines are sought
-MOST = 8  # instruments of a frame, and entries of a region
-SMALLEST = 0.002  # of the picture
-FRAME = 0.9  # of a row or column at the picture's edge: masked as a whole, it is no instrument
-GAP = 7  # px: what is cut by no more (a highlight, the window of a jaw) hangs together
+MOST = 8  # instruments of a frame, and entries of a region, at most
+SMALLEST = 0.002  # of the picture: smaller regions are left out
+FRAME = 0.9  # of a row or column at the picture's edge: if so much is masked, it is no instrument
+GAP = 7  # px: smaller gaps (a highlight, the window of a jaw) are closed
 APART = 21  # px: entries nearer than this are one
-BIN = 3  # px, of the distance from the entry
+BIN = 3  # px of the distance from the entry, for each point of a midline
 FEWEST = 4  # points of a midline
 WIDER = 1.4  # times as wide as at its entry: another instrument begins
-BAND = 0.75  # of its width, to each side of the line that an instrument is followed along
-STRAIGHT = 0.15  # of its width, that a straight midline may leave its line; and 1 px
-SIDEWAYS = 0.1  # of its area may: one jaw reaches farther than the other
-SHORTEST = 1.0  # times as long as wide: a corner of a shaft has no end
-MOSTLY = 0.5  # of an entry
-FITS = 4  # of a line, each without what was off
+BAND = 0.75  # of its width, to each side of the line along which an instrument is followed
+STRAIGHT = 0.15  # of its width, plus 1 px: so far a straight midline may lie off its line
+SIDEWAYS = 0.1  # of its area may lie farther off: one jaw reaches farther than the other
+SHORTEST = 1.0  # of its width: in a shorter part, such as the corner of a shaft, no end is seen
+MOSTLY = 0.5  # of an entry: where so much of it lies in another's band, that other leaves there
+FITS = 4  # iterations of a line's fit, each without the outliers of the one before
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +36,16 @@ class Outline:
 
     far: F64  # [2] u v, its end that is the farthest from the entry
     back: F64  # [2] u v, where the straight part that ends there begins
-    middles: F64  # [K, 2] u v, of what of that part lies on its line, from the far end
+    middles: F64  # [K, 2] u v, points of the midline of that part that lie on its line, from the far end
     widths: F64  # [K] there
-    spread: float  # of its far end to each side of the line: of open jaws, of a hook
+    spread: float  # how far its far end reaches to a side of the line: open jaws, a hook
     is_outside: bool  # its end is at the picture's edge, so the tip is beyond; or it is too short to tell
     is_alone: bool  # nothing else lies over it
 
 
 def outlines(tools: Bool, usable: Bool) -> list[Outline]:
-    """The instruments [H, W] that enter where the picture, or what is `usable` [H, W] of it, ends; those of
-    the largest regions first. What does not reach there is none."""
+    """Find the instruments in a mask [H, W] that enter at the edge of the picture, or of its `usable` part
+    [H, W]; those of the largest regions first. A region that does not touch this edge is no instrument."""
     scale = max(1.0, tools.shape[1] / WIDTH)
     size = round(tools.shape[1] / scale), round(tools.shape[0] / scale)
     small, inside = (_smaller(mask, size) for mask in (tools & usable, usable))
@@ -82,10 +82,10 @@ def _disc(side: int) -> U8:
 
 
 def _of_component(mask: U8, edge: U8) -> list[Outline]:
-    """The of component of one connected region [h, w]."""
+    """The outlines of the instruments in one connected region [h, w]."""
     count, entries = cv2.connectedComponents(cv2.dilate(mask & edge, _disc(APART)))
     entries *= mask & edge
-    found: dict[int, tuple[Outline, U8]] = {}  # by entry, and what of the region it was sought in
+    found: dict[int, tuple[Outline, U8]] = {}  # by entry: it, and the band it was sought in
     sizes = np.bincount(entries.ravel(), minlength=count)
     for entry in sorted(range(1, count), key=lambda i: -sizes[i])[:MOST]:
         start = (entries == entry).view(np.uint8)
@@ -103,7 +103,7 @@ def _of_component(mask: U8, edge: U8) -> list[Outline]:
 
 
 def _band(mask: U8, start: U8) -> U8 | None:
-    """Return what lies straight before an entry; None: too little tells which way that is."""
+    """Return the part of a region that lies straight ahead of an entry; None: no direction can be told."""
     middles, widths, _ = _midline(mask, start)
     if len(middles) < FEWEST:
         return None
@@ -146,8 +146,8 @@ def _of_band(mask: U8, start: U8, edge: U8, alone: bool) -> Outline | None:
 
 
 def _midline(mask: U8, start: U8) -> tuple[F64, F64, I32]:
-    """Middles [K, 2] (u v) and widths [K] (px) of what is ever farther from the start within a mask; and all
-    that is reached, [3, N]: row, column, steps."""
+    """Middles [K, 2] (u v) and widths [K] (px) of the bins of distance from the start within a mask, and all
+    pixels that are reached, [3, N]: row, column, steps."""
     reached = np.stack(geodesic(mask, start & mask))
     if reached.size == 0:
         return np.zeros((0, 2)), np.zeros(0), reached
@@ -160,13 +160,13 @@ def _midline(mask: U8, start: U8) -> tuple[F64, F64, I32]:
 
 @kernel
 def geodesic(inside: U8, start: U8) -> tuple[I32, I32, I32]:
-    """Rows, columns and steps from the start [K] of each pixel that is reached; the nearest first.
+    """Return row, column and steps from the start, each [K], of all pixels reached; the nearest first.
 
     Every other step goes to four neighbours, the others to eight: so the fronts are octagons, nearly round
     (Rosenfeld and Pfaltz, 1968, "Distance functions on digital pictures").
 
     Args:
-        inside, start: [h, w] 1: a way may lead there; all of the start is inside. It is at 1.
+        inside, start: [h, w] 1: where a way may lead, and where it begins (all of it inside), with step 1.
     """
     height, width = inside.shape
     rows, columns = np.empty(inside.size, np.int32), np.empty(inside.size, np.int32)
@@ -178,7 +178,7 @@ def geodesic(inside: U8, start: U8) -> tuple[I32, I32, I32]:
                 rows[count], columns[count], steps[count] = y, x, 1
                 left[y, x] = 0
                 count += 1
-    older, old, step = 0, 0, 1  # where the last two fronts begin: a corner is reached a step later
+    older, old, step = 0, 0, 1  # where the last two fronts begin: a corner may be reached a step later
     while old < count:
         end = count
         for i in range(older, end):
@@ -196,8 +196,8 @@ def geodesic(inside: U8, start: U8) -> tuple[I32, I32, I32]:
 
 
 def _line(points: F64, weights: F64, tolerance: float) -> tuple[F64, F64, Bool]:
-    """Direction [2], the way that the points [K, 2] go, the middle [2] of their line, and which points are
-    farther from it than the tolerance: these do not count (iterated least squares)."""
+    """The line fitted to points [K, 2] by iterated least squares: its direction [2] in the points' order, its
+    middle [2], and the outliers, which are farther off than the tolerance and hardly count."""
     off = np.zeros(len(points), np.bool_)
     for _ in range(FITS):
         share = np.where(off, 1e-3, 1.0) * weights

@@ -1,4 +1,4 @@
-"""What is right, odd or wrong with the numbers of a calibration. `rows` asks pictures."""
+"""What is right, odd or wrong with the numbers of a calibration. `tools.calibration.rows` checks pictures."""
 
 import logging
 import shlex
@@ -18,9 +18,9 @@ log = logging.getLogger(__name__)
 ENDOSCOPE_BASELINE = (0.003, 0.010)  # m
 LARGEST_BASELINE = 0.25  # m; more can only be another unit, as centimetres of an endoscope are
 SMALLEST_BASELINE = 1e-4  # m; less can only be a baseline that was not multiplied by fx
-OTHER_SIZES = (0.25, 1 / 3, 0.5, 2.0, 3.0, 4.0)  # of the picture that a calibration may have been made for
-SAME_CENTRE = 0.12  # of the ratio of principal point to middle: how well both axes and eyes must agree
-LARGEST_RADIUS, RADII = 4.0, 4001  # at distance 1: 76 degrees from the axis
+OTHER_SIZES = (0.25, 1 / 3, 0.5, 2.0, 3.0, 4.0)  # of the stated size: a calibration may have been made for it
+SAME_CENTRE = 0.12  # relative tolerance of principal point over middle, in which axes and eyes must agree
+LARGEST_RADIUS, RADII = 4.0, 4001  # at distance 1 (76 degrees from the axis), and how many are tried
 WIDE = 90  # degrees from corner to corner: beyond it lenses are often calibrated by fisheye models
 EXCHANGE_FILES = (
     "exchange left.yaml and right.yaml (of a bag or ROS 2: source.left_info and source.right_info)"
@@ -29,10 +29,10 @@ RECALIBRATE = "run the stereo calibration again and save both files from one run
 
 
 def accept_rig(rig: StereoRig, where: Path | str) -> StereoRig:
-    """A rig that is to be used: what is odd about it is said.
+    """Check a rig before use, log what is odd about it, and return it.
 
     Raises:
-        UsageError: it cannot be right.
+        UsageError: the check finds an error.
     """
     findings = check_rig(rig)
     refuse_errors(findings, where)
@@ -43,26 +43,26 @@ def accept_rig(rig: StereoRig, where: Path | str) -> StereoRig:
 
 
 def check_rig(rig: StereoRig, metres: float | None = None) -> list[Finding]:
-    """Look a calibration over: what is right, odd or wrong, each with a way to fix it.
+    """Return what is right, odd or wrong with a calibration, each with a way to fix it.
 
     Args:
-        metres: the unit that its lengths were told to be in; None: nobody said it.
+        metres: the unit that the user gave for its lengths; None: none was given.
     """
     return _until_wrong(rig, (check_eyes, partial(check_pair, metres=metres)))
 
 
 def check_eyes(rig: StereoRig) -> list[Finding]:
-    """Look at each eye and at what both must share: an error here leaves nothing to go on."""
+    """Check each eye and what both must share. After an error here nothing else can be checked."""
     return _until_wrong(rig, (_check_numbers, _check_eyes, _check_rows))
 
 
 def check_pair(rig: StereoRig, metres: float | None = None) -> list[Finding]:
-    """Look at which eye is which, and how far apart they are."""
+    """Check which eye is which, and how far apart they are."""
     return _check_unit(rig, metres) or _until_wrong(rig, (_check_order, _check_baseline))
 
 
 def _until_wrong(rig: StereoRig, looks: Sequence[Callable[[StereoRig], list[Finding]]]) -> list[Finding]:
-    """Take one look after the other. The first that finds an error is the last: more would only repeat it."""
+    """Run the checks in turn, up to the first that finds an error: more would only repeat it."""
     found: list[Finding] = []
     for look in looks:
         found += look(rig)
@@ -106,7 +106,7 @@ def _check_eyes(rig: StereoRig) -> list[Finding]:
 
 
 def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Finding]:
-    """Return what is odd or wrong with `K` [3, 3] px of a picture; `where` names it."""
+    """Return what is odd or wrong with the `K` [3, 3] (px) of a picture; `where` names it in the findings."""
     if np.any(K[2, :2] != 0):
         what = f"{where} is transposed: its last row is {K[2, 0]:g} {K[2, 1]:g} {K[2, 2]:g}, not 0 0 1"
         return [Finding("error", what, "write its columns as rows (MATLAB's cameraParameters are so)")]
@@ -126,7 +126,7 @@ def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Findin
 
 
 def _check_distortion(file: str, eye: Eye) -> list[Finding]:
-    """Tell whether the radial distortion reaches the picture's corners before it turns back."""
+    """Warn if the radial distortion turns back before it reaches the picture's corners."""
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(eye.distortion, (0, 8 - len(eye.distortion)))
     farthest = np.maximum(eye.K[:2, 2], [eye.width, eye.height] - eye.K[:2, 2]) / eye.K[[0, 1], [0, 1]]
     radius = np.linspace(0, LARGEST_RADIUS, RADII)
@@ -142,7 +142,7 @@ def _check_distortion(file: str, eye: Eye) -> list[Finding]:
 
 
 def _check_model(file: str, eye: Eye) -> list[Finding]:
-    """Four coefficients of a wide view may be those of a fisheye model, whose files look the same."""
+    """Warn if four coefficients of a wide view may be of a fisheye model, whose files look the same."""
     view = 2 * np.degrees(np.arctan(np.hypot(eye.width, eye.height) / (eye.K[0, 0] + eye.K[1, 1])))
     if view <= WIDE or len(eye.distortion) > 5 or eye.distortion[4] or not eye.distortion.any():
         return []
@@ -154,8 +154,8 @@ def _check_model(file: str, eye: Eye) -> list[Finding]:
 
 
 def size_made_for(rig: StereoRig) -> float | None:
-    """The size that `K` was probably made for, as a part of the size that the rig states: 0.5 for K of half
-    the pictures. None where the principal points lie near the middle, or do not agree on another size."""
+    """Return the picture size that `K` was probably made for, over the size that the rig states: 0.5 for half
+    the size. None: the principal points lie near the middle, or do not agree on another size."""
     ratios = [
         ratio
         for _, eye in _eyes(rig)
@@ -181,8 +181,8 @@ def _check_size(rig: StereoRig) -> list[Finding]:
 
 
 def wrong_size(path: Path | str, calibrated: tuple[int, int], size: tuple[int, int]) -> Finding | None:
-    """What is wrong where pictures of this `size` (width, height, px) come to the calibration at `path`; None
-    where they fit it."""
+    """Return what is wrong if pictures of this `size` (width, height, px) are used with the calibration at
+    `path`, which is of the `calibrated` size; None: nothing."""
     ratio, down = size[0] / calibrated[0], size[1] / calibrated[1]
     what = "the calibration is for {}x{} px, the pictures are {}x{}".format(*calibrated, *size)
     if ratio != down:
@@ -212,7 +212,7 @@ def _check_rows(rig: StereoRig) -> list[Finding]:
         if abs(a - b) > tolerance:
             what = f"rectified {name} differs: {a:g} px in left.yaml, {b:g} px in right.yaml"
             fix = "the files are not from one stereo calibration; " + RECALIBRATE
-            if name == "cy" and not found:  # all but the rows is of one calibration
+            if name == "cy" and not found:  # only the rows disagree
                 what += f": do the eyes' pictures begin {abs(a - b):g} rows apart (roi, y_offset, a crop)?"
                 fix = "read out the same rows of both eyes, or calibrate with these pictures and set rig"
             found.append(Finding("error", what, fix))
@@ -258,8 +258,7 @@ def _check_baseline(rig: StereoRig) -> list[Finding]:
 
 
 def _check_unit(rig: StereoRig, metres: float | None) -> list[Finding]:
-    """Tell whether lengths in the unit that was said are those of no endoscope, and in another one they
-    are."""
+    """Find out whether the given unit makes the baseline that of no endoscope, and another unit would fit."""
     said = next((unit for unit, each in UNITS.items() if each == metres), None)
     least, most = ENDOSCOPE_BASELINE
     baseline = rig.baseline

@@ -1,4 +1,4 @@
-"""How the camera sits on what the robot moves: `hand_eye.yaml` beside a rig's `left.yaml`."""
+"""The camera's pose on what the robot moves: `hand_eye.yaml` beside a rig's `left.yaml`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ LARGEST_DISTANCE = 2.0  # m, from the hand to the camera: a scope has half a met
 class HandEye:
     """A hand-eye calibration."""
 
-    T_hand_cam: F64  # [4, 4] m, the left raw camera in what the robot tells the pose of
-    offset_ns: int = 0  # robot's stamp - picture's stamp, of one moment
+    T_hand_cam: F64  # [4, 4] m, pose of the left raw camera in the frame whose pose the robot tells
+    offset_ns: int = 0  # robot's stamp - picture's stamp, at the same moment
 
 
 def read_hand_eye(file: Path) -> HandEye:
@@ -58,7 +58,7 @@ def read_hand_eye(file: Path) -> HandEye:
 
 
 def save_hand_eye(hand_eye: HandEye, folder: Path, figures: Mapping[str, Any]) -> None:
-    """Write `hand_eye.yaml` into a rig's folder; `figures` say how good it is, for people.
+    """Write `hand_eye.yaml` into a rig's folder; `figures` tell readers of the file how good it is.
 
     Raises:
         SagsError: it cannot be written.

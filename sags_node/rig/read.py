@@ -1,7 +1,7 @@
-"""One door for every form of stereo calibration: ROS files (`ros`), OpenCV's own, folders of scikit-surgery.
+"""Reads every form of stereo calibration: ROS files (`ros`), OpenCV's own, folders of scikit-surgery.
 
 OpenCV's (`cv2.FileStorage`, YAML or XML) are `intrinsics.yml` and `extrinsics.yml` as its sample stereo_calib
-writes them, or one file with all matrices under the names that are in use. They do not say the unit of T.
+writes them, or one file with all matrices under any usual names. They do not say the unit of T.
 
 Scikit-surgery's are text: `<prefix>.left.intrinsics.txt`, `.left.distortion.txt`, the same for the right eye,
 and `<prefix>.l2r.txt` [4, 4] from left to right camera coordinates, mm.
@@ -61,7 +61,7 @@ PATTERNS = {  # of text files
 
 
 class Form(Enum):
-    """How a calibration is kept."""
+    """The form in which a calibration is stored."""
 
     ROS_FOLDER = "ROS camera_info files left.yaml and right.yaml"
     ROS_ARCHIVE = "calibrationdata.tar.gz of ROS camera_calibration"
@@ -74,7 +74,7 @@ def load_rig(path: Path) -> StereoRig:
     """Read and check a calibration.
 
     Raises:
-        UsageError: it cannot be read, as `read_rig`, or `check_rig` finds an error.
+        UsageError: `read_rig` cannot read it, or `check_rig` finds an error.
     """
     return accept_rig(read_rig(path), path)
 
@@ -89,7 +89,7 @@ def load_camera(file: Path) -> StereoRig:
 
 
 def guessed_rig(width: int, height: int, pixel_aspect: float = 1.0) -> StereoRig:
-    """Eyes of usual optics for pictures of this size (px) that nobody has calibrated; not `metric`.
+    """Guess a rig of usual optics for uncalibrated pictures of this size (px); it is not `metric`.
 
     Args:
         pixel_aspect: width of a pixel over its height.
@@ -106,7 +106,7 @@ def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | No
 
     Args:
         size: width and height of the pictures, px, for the forms that do not say it.
-        metres: per unit of length, where it is another than usual: ROS and OpenCV 1, scikit-surgery 0.001.
+        metres: per unit of length, if not the usual one: 1 for ROS and OpenCV, 0.001 for scikit-surgery.
 
     Raises:
         UsageError: nothing known is there, or a file is missing or malformed.
@@ -131,14 +131,14 @@ def _read(path: Path, size: tuple[int, int] | None, metres: float | None) -> Ste
 
 
 def with_unit(rig: StereoRig, metres: float | None) -> StereoRig:
-    """The rig whose lengths were read in another unit than metres."""
+    """Return the rig in metres, its lengths given in units of `metres`; None: they are metres already."""
     factors = np.array([1.0, 1.0, 1.0, metres or 1.0])
     left, right = (replace(eye, P=eye.P * factors) for eye in (rig.left, rig.right))
     return replace(rig, left=left, right=right)
 
 
 def find_form(path: Path) -> Form | None:
-    """Which form of calibration a file or folder is; None: none that is known."""
+    """Return the form of calibration of a file or folder; None: none that is known."""
     is_folder = path.is_dir()
     folder = path if is_folder else path.parent
     if path.name in ros.SIDES or (is_folder and any((folder / side).is_file() for side in ros.SIDES)):
@@ -156,7 +156,7 @@ def find_form(path: Path) -> Form | None:
 
 
 def unknown_form(path: Path) -> str:
-    """Return what to say where there is no calibration."""
+    """Return the error message for a path that holds no calibration."""
     if not path.exists():
         what = f"no calibration: no {path / 'left.yaml'}; a rig is a folder with left.yaml and right.yaml"
         return f"{what}; {near(path)}"
@@ -170,7 +170,7 @@ def unknown_form(path: Path) -> str:
 def _rig(
     matrix: Callable[[str], F64], name: str, where: str, size: tuple[int, int] | None, R: F64, T: F64
 ) -> StereoRig:
-    """The rig of M1 D1 M2 D2, which `matrix` reads, and of R [3, 3] and T [3] m."""
+    """The rig made from M1 D1 M2 D2, which `matrix` reads, R [3, 3] and T [3] (m)."""
     K = matrix("M1").reshape(3, 3), matrix("M2").reshape(3, 3)
     left, right = (fit_distortion(matrix(key), f"{where}: {key}") for key in ("D1", "D2"))
     if size is None:
@@ -189,14 +189,14 @@ def is_text_folder(folder: Path) -> bool:
 
 
 def read_text_folder(folder: Path, size: tuple[int, int] | None, metres: float | None) -> StereoRig:
-    """The rig in a folder of text matrices, named after the folder.
+    """Read the rig in a folder of text matrices; it is named after the folder.
 
     Args:
         size: width and height of the pictures, px: the files do not say it.
         metres: per unit of the translation; default: millimetres.
 
     Raises:
-        UsageError: a file is missing, double or malformed, or the size is not given.
+        UsageError: a file is missing, there twice or malformed, or the size is not given.
     """
     l2r = _text_matrix(folder, "l2r").reshape(4, 4)
     T = l2r[:3, 3] * (metres or MILLIMETRE)
@@ -230,7 +230,7 @@ def _needed(key: str) -> str:
 
 
 def is_opencv(file: Path) -> bool:
-    """Tell whether a file looks like one of `cv2.FileStorage`."""
+    """Tell whether a file looks as if `cv2.FileStorage` wrote it."""
     if file.suffix.lower() not in SUFFIXES or not file.is_file():
         return False
     with open_file(file) as opened:
@@ -238,7 +238,7 @@ def is_opencv(file: Path) -> bool:
 
 
 def pair_in(folder: Path) -> list[Path]:
-    """The sample's `intrinsics` and `extrinsics` files of a folder, those that are there."""
+    """Return those of the sample's `intrinsics` and `extrinsics` files that a folder has."""
     names = [folder / f"{stem}{suffix}" for stem in ("intrinsics", "extrinsics") for suffix in SUFFIXES]
     return [file for file in names if file.is_file()]
 
@@ -246,9 +246,9 @@ def pair_in(folder: Path) -> list[Path]:
 def read_files(
     files: Sequence[Path], name: str, size: tuple[int, int] | None, metres: float | None
 ) -> StereoRig:
-    """The rig in files that together hold M1 D1 M2 D2 R T, or these under other usual names.
+    """Read the rig in files that together hold M1 D1 M2 D2 R T, or these under other usual names.
 
-    R1 R2 P1 P2, if they are there, are kept: what was rectified with them elsewhere looks the same here.
+    R1 R2 P1 P2, if they are there, are kept, so that pictures are rectified as other programs do with them.
 
     Args:
         size: width and height of the pictures, px, where the files do not say it.
@@ -274,7 +274,7 @@ def read_files(
 
 
 def _refuse_other_models(file: Path, node: cv2.FileNode, depth: int = 0) -> None:
-    """Raises UsageError for a file that says that it is of another lens model: its matrices look the same."""
+    """Raise UsageError for a file that names another lens model, whose matrices look the same."""
     for key in node.keys() if node.isMap() and depth < DEEPEST else ():
         value, name = node.getNode(key), _plain(key)
         said = value.string() if value.isString() else f"{value.real():g}"
@@ -294,7 +294,7 @@ Storages = Sequence[tuple[Path, cv2.FileStorage]]
 
 
 def open_storage(file: Path) -> cv2.FileStorage:
-    """A file of matrices.
+    """Open a file of matrices.
 
     Raises:
         UsageError: it is missing, too large, or not written by OpenCV.
@@ -302,7 +302,7 @@ def open_storage(file: Path) -> cv2.FileStorage:
     try:
         text = ros.content_of(file).decode("utf-8")
         directive, _, document = text.partition("\n")
-        if directive.startswith("%YAML"):  # of two keys OpenCV takes the first
+        if directive.startswith("%YAML"):  # of two equal keys OpenCV would take the first
             check_dialect(document, str(file))
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         has_names = storage.root().isMap()
@@ -340,15 +340,15 @@ def _matrix(storages: Storages, key: str) -> F64:
 
 
 def numbers_in(node: cv2.FileNode) -> F64 | None:
-    """The numbers of a matrix or list, as one row; None: it is neither, or too large for a calibration."""
+    """Return the numbers of a matrix or list as one row; None: it is neither, or is far too large."""
     if node.isSeq():
         return np.array([node.at(index).real() for index in range(min(node.size(), LARGEST_MATRIX))])
     if not node.isMap():
         return None
-    sizes = node.getNode("sizes")  # of one dimension, since OpenCV 5; in XML no list, but the number
+    sizes = node.getNode("sizes")  # OpenCV 5 writes it for one dimension; in XML it is a number, not a list
     size = sizes.at(0) if sizes.isSeq() and sizes.size() == 1 else sizes
     claimed = size.real() if size.isInt() else node.getNode("rows").real() * node.getNode("cols").real()
-    if not 0 < claimed <= LARGEST_MATRIX:  # what is claimed is what OpenCV makes room for
+    if not 0 < claimed <= LARGEST_MATRIX:  # OpenCV would allocate what is claimed
         return None
     try:
         matrix = node.mat()
@@ -371,5 +371,5 @@ def _size(storages: Storages) -> tuple[int, int] | None:
 
 
 def _pixels(number: float) -> int:
-    """0 for what is no number; it is refused with the size."""
+    """A number as whole pixels; 0 for NaN and infinity: the size is then refused."""
     return int(number) if np.isfinite(number) else 0

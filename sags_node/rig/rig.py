@@ -1,4 +1,4 @@
-"""Rigs made from what calibrations say: matrices of two cameras and how they stand to each other."""
+"""Rigs made from the numbers of calibrations: the matrices of two cameras and their relative pose."""
 
 from dataclasses import replace
 
@@ -12,11 +12,11 @@ from sags_node.types import F64, Camera, Eye, StereoRig
 LARGEST_SIDE = 16384  # px
 PLUMB_BOB = 5  # k1 k2 p1 p2 k3
 RATIONAL = 8  # and k4 k5 k6
-STILL = 1 / 180  # of the width, median: a calibration that moves no more is of pictures that were rectified
+STILL = 1 / 180  # of the width: if the median pixel moves by no more, the pictures were rectified already
 
 
 def rectified_rig(name: str, width: int, height: int, K: F64, baseline: float) -> StereoRig:
-    """A rig whose pictures are rectified already: both eyes have `K` [3, 3] px and no distortion.
+    """Make a rig whose pictures are rectified already: both eyes have `K` [3, 3] (px) and no distortion.
 
     Args:
         baseline: m.
@@ -28,7 +28,7 @@ def rectified_rig(name: str, width: int, height: int, K: F64, baseline: float) -
 
 
 def already_rectified(rig: StereoRig) -> StereoRig:
-    """The rig of pictures that were rectified with it: only P is true of them, as in ROS of `image_rect`."""
+    """Return the rig for pictures that `rig` rectified: only P holds for them, as for ROS's `image_rect`."""
     left, right = (
         replace(eye, K=eye.P[:, :3].copy(), distortion=np.zeros(PLUMB_BOB), R=np.eye(3))
         for eye in (rig.left, rig.right)
@@ -48,14 +48,14 @@ def rectifies(rig: StereoRig) -> bool:
 
 
 def part_of_sensor(eye: Eye, roi: tuple[int, int, int, int], binning: tuple[int, int], where: str) -> Eye:
-    """The eye of pictures that show a part of the sensor, binned: offset, then division (ROS, REP 104).
+    """Return the eye for pictures of a binned part of the sensor: offset, then division (ROS, REP 104).
 
     Args:
         roi: x, y, width and height of the part, px of the sensor; no width or height: all of it.
         binning: across and down; 0: none.
 
     Raises:
-        UsageError: this is no part of the sensor; `where` it is said.
+        UsageError: this is no part of the sensor; `where` names the source in the message.
     """
     x, y, *sides = roi
     across, down = max(binning[0], 1), max(binning[1], 1)
@@ -80,7 +80,7 @@ def part_of_sensor(eye: Eye, roi: tuple[int, int, int, int], binning: tuple[int,
 def rectify_eyes(
     name: str, size: tuple[int, int], K: tuple[F64, F64], distortion: tuple[F64, F64], R: F64, T: F64
 ) -> StereoRig:
-    """A rig from two cameras, rectified by `cv2.stereoRectify`: rows and zero disparity agree, and no
+    """Make a rig of two cameras, rectified by `cv2.stereoRectify`: rows and zero disparity agree, and no
     rectified pixel lies outside the raw pictures.
 
     Args:
@@ -116,7 +116,7 @@ def rectify_eyes(
 
 
 def fit_distortion(coefficients: F64, where: str) -> F64:
-    """Coefficients in OpenCV's order, padded with zeros to [5] (plumb_bob) or [8] (rational_polynomial).
+    """Pad coefficients in OpenCV's order with zeros to [5] (plumb_bob) or [8] (rational_polynomial).
 
     Raises:
         UsageError: there are more, and they are not zero.
@@ -132,7 +132,7 @@ def fit_distortion(coefficients: F64, where: str) -> F64:
 
 
 def resized_rig(rig: StereoRig, factor: float) -> StereoRig:
-    """The same rig for pictures that were resized by `factor`."""
+    """Return the rig for pictures that were resized by `factor`."""
     return replace(rig, left=_resized(rig.left, factor), right=_resized(rig.right, factor))
 
 
@@ -144,6 +144,6 @@ def _resized(eye: Eye, factor: float) -> Eye:
 
 
 def rectified_camera(rig: StereoRig, width: int, height: int) -> Camera:
-    """The left rectified camera resized to a working size, at the world's origin."""
+    """Return the left rectified camera, resized to a working size, at the world's origin."""
     eye = rig.left
     return geometry.resized_camera(Camera(eye.width, eye.height, eye.P[:, :3], np.eye(4)), width, height)

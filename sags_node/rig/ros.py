@@ -31,16 +31,16 @@ MATRICES = (
     "distortion_coefficients",
     "rectification_matrix",
     "projection_matrix",
-)  # k d r p
+)  # K D R P of the message
 SIDES = ("left.yaml", "right.yaml")
 NOT_THEIRS = "projection_by: cv2.stereoRectify\n"  # R and P stood in no file: see `StereoRig.says_P`
 
 
 def content_of(file: Path, fix: str = "check the path") -> bytes:
-    """The bytes of a file of a calibration.
+    """Read the bytes of a calibration file.
 
     Raises:
-        UsageError: it is missing, no plain file or too large; `fix` says what to do.
+        UsageError: it is missing, no plain file or too large; the message ends with `fix`.
     """
     try:
         return read_file(file, LARGEST_FILE)
@@ -49,7 +49,7 @@ def content_of(file: Path, fix: str = "check the path") -> bytes:
 
 
 def read_folder(folder: Path) -> StereoRig:
-    """The rig in `left.yaml` and `right.yaml`, named after the folder.
+    """Read the rig in `left.yaml` and `right.yaml`; it is named after the folder.
 
     Raises:
         UsageError: a file is missing or malformed.
@@ -62,10 +62,10 @@ def read_folder(folder: Path) -> StereoRig:
 
 
 def read_one(file: Path, baseline: float) -> StereoRig:
-    """The rig of one camera's camera_info file (`ost.yaml`, `left.yaml`), named after the file.
+    """Read the rig of one camera's camera_info file (`ost.yaml`, `left.yaml`); it is named after the file.
 
     Args:
-        baseline: m to a right eye that is not there; nothing may depend on it.
+        baseline: m, to a right eye that does not exist; nothing may depend on it.
 
     Raises:
         UsageError: the file is missing or malformed.
@@ -77,7 +77,7 @@ def read_one(file: Path, baseline: float) -> StereoRig:
 
 
 def read_archive(archive: Path) -> StereoRig:
-    """The rig in the `calibrationdata.tar.gz` of ROS camera_calibration; nothing is unpacked to disk.
+    """Read the rig in the `calibrationdata.tar.gz` of ROS camera_calibration; nothing is unpacked to disk.
 
     Raises:
         UsageError: it is no tar.gz, is damaged, or a file in it is missing or malformed.
@@ -109,7 +109,7 @@ def read_archive(archive: Path) -> StereoRig:
 
 
 class _Limited(gzip.GzipFile):
-    """Gives no more than a calibration needs: a forged header asks for any amount."""
+    """Reads no more than a calibration needs: a forged header may ask for any amount."""
 
     def read(self, size: int | None = -1) -> bytes:
         if size is None or not 0 <= size <= LARGEST_READ:
@@ -123,7 +123,7 @@ class _Limited(gzip.GzipFile):
 
 
 def eye_files(folder: Path) -> tuple[Path, Path]:
-    """The files of a rig's folder."""
+    """Return the paths of `left.yaml` and `right.yaml` in a rig's folder."""
     return folder / SIDES[0], folder / SIDES[1]
 
 
@@ -131,7 +131,7 @@ def save_rig(rig: StereoRig, folder: Path) -> None:
     """Write `left.yaml` and `right.yaml`; the folder is made when it is missing.
 
     Raises:
-        SagsError: they cannot be written. Both are as they were.
+        SagsError: they cannot be written; both stay as they were.
     """
     check_folder(folder)
     left_file, right_file = eye_files(folder)
@@ -142,7 +142,7 @@ def save_rig(rig: StereoRig, folder: Path) -> None:
 
 
 def eye_text(eye: Eye, name: str) -> str:
-    """The content of `left.yaml` or `right.yaml`: one eye as a ROS camera_info file."""
+    """Return the content of `left.yaml` or `right.yaml`: one eye as a ROS camera_info file."""
     text: str = yaml.safe_dump(_eye_to_tree(eye, name), sort_keys=False, default_flow_style=None)
     return text
 
@@ -201,7 +201,7 @@ def _read_yaml(content: bytes, file: str) -> dict[str, Any]:
 def _count(tree: Any, key: str, file: str) -> int:
     """A number of pixels of a region; 0 where it is not said."""
     value = tree.get(key, 0) if isinstance(tree, dict) else None
-    if type(value) is not int or not 0 <= value <= LARGEST_SIDE:  # a bool is one of int's kinds
+    if type(value) is not int or not 0 <= value <= LARGEST_SIDE:  # bool is a subclass of int
         raise UsageError(f"{file}: {key}: {brief(value)} is not a number of pixels up to {LARGEST_SIDE}")
     return value
 
@@ -251,7 +251,7 @@ def _numbers(tree: dict[str, Any], key: str, file: str) -> F64:
         data = data[0].split()  # without commas, as Kinetic wrote it
     try:
         numbers = np.array(data, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):  # the last: a whole number of hundreds of digits
+    except (TypeError, ValueError, OverflowError):  # OverflowError: an integer of hundreds of digits
         numbers = np.zeros(())
     if not isinstance(data, list) or numbers.ndim != 1 or bool in map(type, data):
         raise UsageError(f"{file}: {key}.data: {brief(data)} is not a list of numbers")

@@ -28,11 +28,11 @@ HALF = np.float32(0.5)  # of the patches over a pixel must be good
 
 @kernel
 def correlate(left: F32, seen: F32, agreement: F32) -> None:
-    """Zero-mean normalised cross-correlation (ZNCC) of the windows around each pixel.
+    """Compute the zero-mean normalised cross-correlation (ZNCC) of the windows around each pixel.
 
     Args:
         left: rows of the left picture with its border.
-        seen: [h, w] the right picture where each of their pixels is matched to; at least 16 px wide.
+        seen: [h, w] the right picture, warped by the matches to these rows; at least 16 px wide.
         agreement: [h, w] result, -1..1.
     """
     height, width = seen.shape
@@ -69,11 +69,11 @@ def correlate(left: F32, seen: F32, agreement: F32) -> None:
 
 @kernel
 def drop_wrong(agreement: F32, disparity: F32, good: F32, smallest: Any, largest: Any, trust: F32) -> None:
-    """How far to trust each match, [h, w]: in proportion to the agreement, from 0 at 0.57 to 1 at 1.
+    """Compute how far to trust each match, [h, w]: linear in the agreement, from 0 at 0.57 to 1 at 1.
 
-    0 too for disparities (px) that cannot be, where less than half of the patches are good, and where the
-    right eye's pixel is taken by a nearer surface: that is what is left of the left-right check when only the
-    left picture is matched.
+    It is also 0 for impossible disparities (px), where less than half of the patches are good, and where a
+    nearer surface is matched to the right eye's pixel. The last stands in for a left-right check, since only
+    the left picture is matched.
     """
     height, width = disparity.shape
     nearest = np.empty(width, np.float32)  # by right column

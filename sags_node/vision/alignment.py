@@ -1,5 +1,5 @@
 """Whether the rows of both eyes still agree while the node runs: a scope that was bumped, refocused or
-exchanged no longer fits its calibration, and stereo then fails bit by bit.
+exchanged no longer fits its calibration, and stereo then fails gradually.
 """
 
 import math
@@ -11,13 +11,13 @@ import numpy as np
 
 from sags_node.types import F32, Bool, Finding
 
-SAMPLES = 40  # of a field's width
-WINDOW = 60  # fields behind the slow median
+SAMPLES = 40  # across a field, at most
+WINDOW = 60  # fields over which medians are taken
 FEWEST_FIELDS = 10  # before anything is said
-FEWEST_KNOWN = 0.1  # of the samples, for a spread
+FEWEST_KNOWN = 0.1  # of the samples: if fewer are matched, their spread is not known
 LARGEST_MEDIAN = 1.0  # px of the working size
 LARGEST_SPREAD = 2.0  # px, from the tenth to the ninetieth percentile: a turn about the axis by 0.25 degrees
-BACK_AT = 0.8  # of the limits: a warning ends
+BACK_AT = 0.8  # of the limits: a warning ends below it
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Alignment:
 
 
 class RowErrors(NamedTuple):
-    """Some row errors of one frame, evenly over its picture."""
+    """Row errors of one frame, sampled evenly over its picture."""
 
     errors: F32  # [h, w] px of the working size
     matched: Bool  # [h, w]
@@ -78,7 +78,7 @@ class RowMonitor:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """That the rows differ, and what helps. May be read from any thread."""
+        """Return the warning that the rows differ, with what helps. May be read from any thread."""
         alignment = self.alignment
         return (Finding("rows_differ", alignment.warning),) if alignment and alignment.warning else ()
 

@@ -12,10 +12,10 @@ HALVINGS = 3  # 8x8 px are averaged: camera noise up to 4 grey levels stays belo
 SIDE = 32  # px of a block: the length over which something moves or does not
 BLOCK = SIDE >> HALVINGS  # shrunk px
 LARGEST_DIFFERENCE = 1.0  # grey levels, mean over a block
-LARGEST_SHARE = 0.005  # of the blocks that may differ more: a highlight flickers
-EVERY = 4  # px
-# Grey levels, of a picture that was sent twice. Over all: less than a codec's own noise (PSNR > 52 dB). In
-# each block: less than tissue that moved by half a pixel makes (3 to 5, the median). D4D's repeat has 1.5.
+LARGEST_SHARE = 0.005  # of the blocks may differ more: a highlight flickers
+EVERY = 4  # px between the pixels that `is_repeat` compares
+# Largest RMS difference of a picture sent twice, grey levels. Over all: below a codec's noise (PSNR > 52 dB).
+# In each block: below that of a shift by half a pixel (median 3 to 5). D4D's repeat has 1.5.
 REPEAT_RMS, REPEAT_BLOCK_RMS = 0.6, 2.0
 
 
@@ -33,8 +33,8 @@ class StillScene:
         self._eyes = None
 
     def __call__(self, pair: RectifiedPair) -> int:
-        """Count for how many frames, this one included, pictures and pose are the same; 0: something
-        moved."""
+        """Return for how many frames in a row, this one included, pictures and pose have stayed the same;
+        0: something moved."""
         eyes = [level(eye, min(HALVINGS, len(eye.halves))) for eye in pyramids(pair) if eye is not None]
         before, pose = self._eyes, pair.camera.T_world_cam
         stays = np.array_equal(pose, self._pose)
@@ -51,7 +51,7 @@ def _alike(a: F32, b: F32) -> bool:
 
 @kernel
 def _share_that_differs(a: F32, b: F32) -> Any:
-    """The share that differs of the blocks of two pictures with borders."""
+    """The share of blocks in which two pictures (with borders) differ."""
     height, width = a.shape[0] - 2 * BORDER, a.shape[1] - 2 * BORDER
     rows, columns = max(1, height // BLOCK), max(1, width // BLOCK)  # the last ones take the rest
     sums, counts = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
@@ -65,9 +65,9 @@ def _share_that_differs(a: F32, b: F32) -> Any:
 
 
 def is_repeat(a: RectifiedPair, b: RectifiedPair) -> bool:
-    """Tell whether two pairs show the same pictures: one was sent twice. Unlike in a `StillScene` nothing is
-    averaged before, for a camera's noise tells its pictures apart, and no block may differ: something small
-    may have moved."""
+    """Tell whether two pairs show the same pictures, one pair sent twice. Unlike in a `StillScene`, nothing
+    is averaged before, for a camera's noise tells its pictures apart; and no block may differ, for something
+    small may have moved."""
     return all(
         _are_same(x.full, y.full)
         for x, y in zip(pyramids(a), pyramids(b), strict=True)
@@ -82,7 +82,7 @@ def _are_same(a: U8, b: U8) -> bool:
 
 @kernel
 def _mean_squares(a: U8, b: U8) -> Any:
-    """The mean squares of the differences of every fourth pixel of every fourth row: over all, and the
+    """The mean squared difference over every fourth pixel of every fourth row: of the whole picture, and the
     largest of a block."""
     height, width = a.shape
     rows, columns = max(1, height // SIDE), max(1, width // SIDE)  # the last ones take the rest

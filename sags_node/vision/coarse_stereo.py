@@ -1,5 +1,5 @@
 """A dense guess of the disparity in a small picture, by semi-global matching (Hirschmueller, PAMI 2008) along
-rows and columns: right to a pixel or so of the small picture, and smooth where there is nothing to see."""
+rows and columns: right to a pixel or so of the small picture, and smooth where there is no texture."""
 
 from typing import Any
 
@@ -19,18 +19,18 @@ from sags_node.kernels.vectors import (
 from sags_node.types import F32
 from sags_node.vision.pyramid import inner
 
-STEP = 16  # disparities are searched in multiples of it, which vectors of any machine divide
-EVEN_WINDOW = 9  # px: brightness that is even over it does not count
-COST_WINDOW = 5  # px
-SMALL_STEP = 0.5  # cost of a disparity that differs by a pixel from its neighbour's, times the mean contrast
-LARGE_STEP = 2.0  # by more
-FLAT = 1.0  # grey levels: contrast that is only noise
+STEP = 16  # the number of disparities is a multiple of it, and so of any machine's vector length
+EVEN_WINDOW = 9  # px: the mean over it is subtracted from the brightness
+COST_WINDOW = 5  # px over which costs are summed
+SMALL_STEP = 0.5  # P1, over the mean contrast: penalty if a neighbour's disparity differs by a pixel
+LARGE_STEP = 2.0  # P2, over the mean contrast: penalty if it differs by more
+FLAT = 1.0  # grey levels of contrast that are added for noise
 ZERO = np.float32(0)
 FAR = np.float32(1e9)  # no disparity costs so much
 
 
 def coarse_disparity(left: F32, right: F32, least: float, most: float) -> F32:
-    """Disparity [h, w] (px) of small pictures with their borders.
+    """Estimate the disparity [h, w] (px) between small pictures, given with their borders.
 
     Args:
         least, most: disparities to search, px.
@@ -70,7 +70,7 @@ def _differences(left: F32, right: F32, first: int, cost: F32) -> None:
 
 @kernel
 def _sum_windows(cost: F32, sums: F32) -> None:
-    """Sums over windows of pixels; the pictures' edges are repeated. `cost` is used up."""
+    """Sums over windows of pixels; the pictures' edges are repeated. `cost` is overwritten."""
     height, width, count = cost.shape
     _sum_along(cost, width, count, height, width * count, sums)
     _sum_along(sums, height, width * count, width, count, cost)
@@ -79,7 +79,7 @@ def _sum_windows(cost: F32, sums: F32) -> None:
 
 @kernel
 def _sum_along(source: F32, length: int, step: int, lines: int, between: int, sums: F32) -> None:
-    """Over COST_WINDOW samples `step` apart, in `lines` lines of `length` samples, `between` apart."""
+    """Sums over COST_WINDOW samples, `step` apart, in `lines` lines of `length` samples, `between` apart."""
     half, count = COST_WINDOW // 2, source.shape[2]
     for line in range(lines):
         for d in range(0, count, LANES):
@@ -110,7 +110,7 @@ def _follow(
     cost: F32, start: int, step: int, length: int, between: int, lines: int, small_step: Any, large_step: Any,
     sums: F32,
 ) -> None:  # fmt: skip
-    """Along `lines` paths side by side: one alone would wait for each of its own steps."""
+    """Aggregates along `lines` paths side by side: a single path would wait for each of its steps."""
     count = cost.shape[2]
     line = count + 2 * LANES  # what is beyond either end costs too much
     paths = np.full((2, lines, line), FAR, np.float32)
@@ -139,7 +139,7 @@ def _follow(
 
 @kernel
 def _cheapest(sums: F32, used: int, first: int, disparity: F32) -> None:
-    """To a part of a pixel, by a parabola through the costs of the neighbours."""
+    """The disparity of least cost, to a fraction of a pixel by a parabola through the costs beside it."""
     for y in range(sums.shape[0]):
         for x in range(sums.shape[1]):
             best = 0

@@ -1,8 +1,8 @@
 """From matches to the depth of every pixel of the working picture.
 
-Each thread takes a band of rows, with as many around it as its windows need, through all stages: whole
-pictures in between take longer to hand over than to compute. The result is the same for any number of
-threads.
+Each thread takes a band of rows, with as many around it as its windows need, through all stages: to pass
+whole pictures from stage to stage would take longer than to compute them. The result is the same for any
+number of threads.
 """
 
 from typing import Any
@@ -22,8 +22,8 @@ from sags_node.vision.pyramid import BORDER
 from sags_node.vision.windows import chunk, chunks, inside, repeat_ends, window_row
 
 FEWEST_ROWS = 32  # of a band
-EDGE = np.float32(0.01)  # px: so far from the last pixel, that there is one beyond
-HALF = np.float32(0.5)  # of a pixel's neighbours know their disparity
+EDGE = np.float32(0.01)  # px kept from the last pixel, so that one beyond can be read
+HALF = np.float32(0.5)  # of a pixel's neighbours, by weight, must have a disparity
 SMOOTHING_VARIANCE = np.float32(0.2)  # px squared: disparity that varies less is noise on a smooth surface
 
 
@@ -35,12 +35,12 @@ def depth_of_patches(
     radius: int,
     focal_baseline: float,
 ) -> tuple[F32, F32]:
-    """Depth (m, 0 unknown) and confidence [H, W] (0..1, 0 where the depth is unknown).
+    """Compute depth (m, 0 unknown) and confidence [H, W] (0..1, 0 where the depth is unknown).
 
     Args:
-        clear: [h, w] where depth is asked for, of the matching picture.
-        size: width and height of the result, px; a multiple of the matching picture's, but for a remainder.
-        disparities: the smallest and largest that can be, px.
+        clear: [h, w] pixels of the matching picture for which depth is wanted.
+        size: width and height of the result, px; a multiple of the matching picture's, plus a remainder.
+        disparities: the smallest and the largest that are possible, px.
         radius: px, of the smoothing.
         focal_baseline: px m, of the matching picture.
     """
@@ -62,11 +62,11 @@ def depth_of_pixels(
     disparities: tuple[float, float],
     focal_baseline: float,
 ) -> tuple[F32, F32]:
-    """The same for a disparity of every pixel of the matching picture [h, w], where it is known.
+    """Do the same from a disparity at every pixel of the matching picture [h, w] where it is `known`.
 
     Args:
         left: the matching picture with its border.
-        seen: [h, w] the right picture where the left one's pixels are matched to.
+        seen: [h, w] the right picture, warped by the disparity to the left one.
     """
     depth, trust = np.empty((2, size[1], size[0]), np.float32)
     limits = np.array([*disparities, focal_baseline], np.float32)
@@ -113,7 +113,7 @@ def _band(
 
 @kernel
 def _fetch(right: F32, disparity: F32, down: F32, begin: int, seen: F32) -> None:
-    """The right picture where the left one's pixels are matched to, from row `begin` on."""
+    """The right picture, warped by the matches to the left one, from row `begin` on."""
     one, border = np.float32(1), np.float32(BORDER)
     last_x, last_y = np.float32(right.shape[1] - 1) - EDGE, np.float32(right.shape[0] - 1) - EDGE
     for y in range(disparity.shape[0]):
@@ -132,7 +132,7 @@ def _finish(
     left: F32, seen: F32, disparity: F32, good: F32, clear: Bool, limits: F32,
     begin: int, low: int, high: int, depth: F32, trust: F32,
 ) -> None:  # fmt: skip
-    """Rows `low` to `high` of the matching picture, given from row `begin` on."""
+    """Depth and trust of rows `low` to `high` of the matching picture; inputs begin at row `begin`."""
     believed, found = np.empty((2, *disparity.shape), np.float32)
     correlate(left, seen, found)
     drop_wrong(found, disparity, good, limits[0], limits[1], believed)
@@ -154,14 +154,14 @@ def _enlarge(
     depth: F32,
     trust: F32,
 ) -> None:
-    """Disparity is what is linear on a plane, so it is interpolated, and only between known neighbours."""
+    """Interpolates disparity, which is linear on a plane, between known neighbours; turns it into depth."""
     height, width = disparity.shape
     scale = depth.shape[1] // width
     line = width + 2
     between = np.empty(
         3 * line, np.float32
     )  # a row of weights times disparity, weights, trust; ends repeated
-    found = np.empty((2, scale * width), np.float32)  # a row of the result, first every scale-th pixel of it
+    found = np.empty((2, scale * width), np.float32)  # a row of either result, phase by phase
     spare = np.empty(scale * width, np.float32)
     zero, one = np.float32(0), np.float32(1)
     last = high * scale if high < depth.shape[0] // scale else depth.shape[0]
@@ -203,8 +203,8 @@ def _enlarge(
 
 @kernel
 def _interleave(phases: F32, count: int, spare: F32, row: F32) -> None:
-    """row[count x + k] = phases[k n + x] for `count` stretches of n, a power of two of them. The rest of the
-    row repeats its last. `phases` and `spare` are used up."""
+    """row[count x + k] = phases[k n + x] for `count` stretches of n samples; `count` is a power of two. The
+    rest of the row repeats its last sample. `phases` and `spare` are overwritten."""
     length = phases.size // count
     while count > 1:
         count //= 2
@@ -231,19 +231,19 @@ def _zip(even: F32, odd: F32, row: F32) -> None:
 
 @kernel
 def guided(field: F32, radius: int, variance: Any, smooth: F32) -> None:
-    """The guided filter (He et al., PAMI 2013) of a field [h, w] with the field as its own guide.
+    """Smooth a field [h, w] by the guided filter (He et al., PAMI 2013), with the field as its own guide.
 
     Planes and steps larger than the noise stay as they are.
 
     Args:
         field: contiguous, at least 16 px wide; its edge is repeated.
         radius: px, of the windows.
-        variance: float32; where the field varies less around, it is noise.
+        variance: float32; a field that varies less within a window is taken for noise.
         smooth: [h, w] result.
     """
     height, width = field.shape
     line = width + 2 * radius
-    # The share that a pixel keeps of itself, and the part that is the mean's.
+    # The filter's coefficients: smooth = mean(kept) * field + mean(rest).
     kept, rest = np.empty((2, height, width), np.float32)
     sums = np.empty(2 * line, np.float32)
     zero = spread(np.float32(0))

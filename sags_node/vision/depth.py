@@ -20,7 +20,7 @@ TOO_FEW = (
     "hardly anything matches between the eyes, so there is no depth: the tissue is too near, or beyond "
     "vision.stereo.max_depth, or the calibration is of another scope; sags calib check tells"
 )
-FARTHEST = 10.0  # m: what a session says to be beyond is no depth
+FARTHEST = 10.0  # m: a session's depth beyond it is taken for unknown
 _DECLARED = Finding(
     "scale_declared",
     "one camera alone: the scale is vision.onnx.declared_depth, which nothing measures, so no depth is sure; "
@@ -40,18 +40,18 @@ class Measured(NamedTuple):
 
     @classmethod
     def nothing(cls, shape: tuple[int, ...], why: str = "", hurried: bool = False) -> Self:
-        """No depth at all."""
+        """Return unknown depth everywhere; `why` is the reason."""
         depth, confidence = np.zeros((2, *shape), np.float32)
         return cls(depth, confidence, {"depth": why}, hurried=hurried)
 
     def handed_on(self, tissue: Bool) -> Self:
-        """To a frame in which nothing has moved since, where that shows `tissue` [H, W]."""
+        """Return it for a later frame, in which nothing has moved since and which shows `tissue` [H, W]."""
         skipped = dict.fromkeys(("depth", "motion"), "nothing moves")
         return type(self)(self.depth * tissue, self.confidence * tissue, skipped, is_new=False)
 
 
 class DepthChoice:
-    """Takes the depth that is the best to be had.
+    """Chooses the best depth that a frame can have.
 
     Attributes:
         stereo: matches the eyes, and judges a network's disparities.
@@ -68,8 +68,8 @@ class DepthChoice:
         if config.onnx.path is not None:
             self._network = NetworkDepth(config, self.stereo, camera, baseline)
         self._matches = MatchWatch()
-        self._was_sound = True  # what was matched last is depth
-        self._last: Measured | None = None  # of the last frame in which it was measured, or could not be
+        self._was_sound = True  # the last matches gave valid depth
+        self._last: Measured | None = None  # of the last frame that was not handed on
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -81,12 +81,12 @@ class DepthChoice:
 
     @property
     def scale_is_declared(self) -> bool:
-        """All depth is right up to a factor that nobody knows. May be read from any thread."""
+        """True: all depth is right only up to an unknown factor. May be read from any thread."""
         return self._network is not None and self._network.is_declared
 
     @property
     def eyes_are_late(self) -> bool:
-        """One eye showed another moment than the other when they were matched last."""
+        """True: when the eyes were matched last, one showed another moment than the other."""
         return self._matches.is_late
 
     def __call__(
@@ -98,11 +98,11 @@ class DepthChoice:
         has_time: bool = True,
         no_stereo: str = "",
     ) -> Measured:
-        """The depth of a frame where there is `tissue` [H, W].
+        """Return the depth of a frame where it shows `tissue` [H, W].
 
         Args:
             still: nothing has moved: what was measured before holds.
-            has_time: to compute it; what the session gives takes none.
+            has_time: there is time to compute it; the session's own depth needs none.
             no_stereo: why the eyes are not to be matched; empty: they are.
         """
         self._matches.see(pair.t_capture_ns, pyramids(pair)[0])
@@ -124,7 +124,7 @@ class DepthChoice:
         measure = cache(partial(self._judged, frame, pair, tissue))
         network, found, skipped = self._network, None, {}
         can = frame.depth is not None or pair.right is not None
-        # It is not laid onto matches that are no depth: it waits until they are.
+        # A monocular network is not fitted to matches that give no valid depth: it waits for valid ones.
         if network is not None and not (can and network.measures and measure().skipped):
             found = network(pair, tissue, lambda: measure().depth if can else None)
             if network.problem:
@@ -134,7 +134,7 @@ class DepthChoice:
         return known._replace(skipped={**known.skipped, **skipped}, found_out=found_out)
 
     def _judged(self, frame: StereoFrame, pair: RectifiedPair, tissue: Bool) -> Measured:
-        """What is known without the network; nothing where the eyes were matched and that is no depth."""
+        """Depth without the network; nothing if the eyes were matched and that gave no valid depth."""
         before = self.stereo.rows.newest
         depth, confidence = self._without_network(frame, pair, tissue)
         rows = self.stereo.rows.newest
@@ -146,7 +146,7 @@ class DepthChoice:
         return Measured(depth, confidence)
 
     def _unsound(self, stamp_ns: int, rows: RowErrors, depth: F32, tissue: Bool) -> str:
-        """Why the depth that was matched is none; empty: it is."""
+        """Why the matched depth is not valid; empty: it is."""
         why = self._matches(stamp_ns, rows)
         if self._matches.is_late:
             self.stereo.rows.withdraw()

@@ -1,14 +1,14 @@
 """What is known of the depth around each place: how good a measurement is, and what stands in for one.
 
-On a coarse grid, in inverse depth, in which stereo errs alike near and far. A measurement is as good as it
-agrees with those around it. Where matches are good, neighbouring cells lie on a smooth surface; where they
+The grid is coarse, and in inverse depth, in which stereo errs alike near and far. A measurement is as good as
+it agrees with those around it. Where matches are good, neighbouring cells lie on a smooth surface; where they
 are not, as in fog, on a wet spot or at a fold, neighbours differ, and on recordings with true depth the
 errors are in proportion to that. Few matches in a place where the tissue around has none are worth little,
 whatever their own windows look like.
 
-What was not measured is borrowed: from the cells around it that were, the better and nearer the more, by
-pushing and pulling through a pyramid (Gortler et al., The Lumigraph, 1996). A stray match so has no more say
-than the little that it is trusted.
+What was not measured is borrowed from measured cells around it, more from better and nearer ones, by
+push-pull through a pyramid (Gortler et al., The Lumigraph, 1996). So a stray match counts only as little as
+it is trusted.
 """
 
 from typing import Any
@@ -30,29 +30,29 @@ from sags_node.kernels.vectors import (
 from sags_node.types import F32, Bool, DepthGrid, Observation
 
 CELLS = 80  # across the picture
-AROUND = 4  # cells around one that are looked at
-EVERY = 2  # px between those that are looked at; depth is matched on no more
+AROUND = 4  # cells to each side of one that are looked at
+EVERY = 2  # px between the pixels that are read; depth is matched no finer
 WIDTH = 640  # px: the errors below are those of a picture so wide
-FLOOR = 0.25  # px of disparity: calibration, of which no match tells (principal points, rows, lenses)
-UNSUPPORTED = 1.0  # px: a match that no neighbour agrees with
+FLOOR = 0.25  # px of disparity: calibration error (principal points, rows, lenses), which no match shows
+UNSUPPORTED = 1.0  # px: error of a match with which no neighbour agrees
 ROUGHNESS = 3.5  # times how far cells lie from the mean of their neighbours: nine of ten errors are smaller
-AGREEING = 1.0  # px, beside what a slope explains: two cells of one surface
+AGREEING = 1.0  # px, plus what a slope explains: two cells that differ by less are of one surface
 STEEPEST = 1.0  # m deeper per m aside, 45 degrees: more is another surface
 SLOPE = 0.5  # m deeper per m aside: tissue mostly lies flatter
 LEAST_SUPPORT = 0.1  # of the tissue around, measured to be the same surface: less is a speck
 NOMINAL_BASELINE = 4e-3  # m: of depth that no pair of eyes measured; endoscopes have about that
-UNSURE = 1.1 * HALVING  # m, at least, of what was not measured: it decides nothing, however near it is
-JUMP = 0.06  # of the depth: what was not measured lies behind an edge or an instrument often enough
+UNSURE = 1.1 * HALVING  # m, least error of borrowed depth: it decides nothing, however near it is
+JUMP = 0.06  # of the depth: further error of borrowed depth, which often lies behind an edge or an instrument
 
 
 def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline: float) -> DepthGrid:
-    """The grid of a measured depth [H, W] (m, 0 unknown); specks are set to 0 in place, in the confidence
-    too.
+    """Make the grid of a measured depth [H, W] (m, 0 unknown). Specks are set to 0 in place, in the depth and
+    the confidence.
 
     Args:
         confidence: [H, W] 0..1, how far each depth is trusted by itself.
         focal: px.
-        baseline: m between the eyes; 0: there was one.
+        baseline: m between the eyes; 0: there was only one.
     """
     height, width = depth.shape
     side = max(1, round(width / CELLS))
@@ -66,7 +66,7 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
     sums = np.zeros((3, rows + 2 * AROUND, line), np.float32)  # nothing beyond the picture's edges
     _gather(depth, confidence, tissue, side, columns, sums)
     around = np.zeros((4, *sums.shape[1:]), np.float32)
-    aside = side / focal  # of a cell at a distance of 1
+    aside = side / focal  # width of a cell at a distance of 1
     _compare(sums, np.float32(AGREEING) * px, np.float32(STEEPEST * aside), around)
     _judge(sums, px, around)
     inverse, error = around[2:, AROUND:-AROUND, AROUND : AROUND + columns]
@@ -83,7 +83,7 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
 
 @kernel
 def depth_at(depth: F32, inverse: F32, error: F32, side: Any, x: int, y: int) -> Any:
-    """Depth and its error (m) at a pixel of the depth [H, W]: measured, else borrowed; (0, inf): unknown.
+    """Return depth and its error (m) at a pixel of `depth` [H, W]: measured or borrowed; (0, inf): unknown.
 
     Args:
         inverse, error, side: of the `DepthGrid`.
@@ -107,7 +107,7 @@ def depth_at(depth: F32, inverse: F32, error: F32, side: Any, x: int, y: int) ->
 
 
 def grid_of(observation: Observation) -> DepthGrid:
-    """That of a frame, made now where it does not bring one; then no speck is dropped."""
+    """Return the grid of a frame; if it brings none, it is made now, and no specks are dropped."""
     if observation.grid is not None:
         return observation.grid
     depth, confidence = observation.depth.copy(), observation.depth_confidence.copy()
@@ -116,8 +116,8 @@ def grid_of(observation: Observation) -> DepthGrid:
 
 
 def _borrowed(sums: F32) -> F32:
-    """Inverse depth and its squared error, [2, h, w], everywhere, from the weights of what is known, and
-    those times each, [3, h, w]; weight 1 is all that anybody asks for. 0: nothing is known at all."""
+    """Push-pull: inverse depth and its squared error, [2, h, w], everywhere, from the weights of known cells
+    and the weights times either, [3, h, w]. A weight of 1 suffices. 0: nothing is known at all."""
     _, rows, columns = sums.shape
     filled = np.empty((2, rows, columns), np.float32)
     if rows == columns == 1:
@@ -139,8 +139,8 @@ def _halve(sums: F32, half: F32) -> None:
 
 @kernel
 def _mix(sums: F32, coarse: F32, filled: F32) -> None:
-    """Return what the sums know themselves, and for what is missing of a weight of 1 what lies between the
-    cells of half the size."""
+    """Fill each cell with its own mean, and for what its weight lacks to 1 with the value interpolated from
+    the grid of half the size."""
     _, height, width = filled.shape
     _, rows, columns = coarse.shape
     one, near, far = np.float32(1), np.float32(0.75), np.float32(0.25)
@@ -164,8 +164,8 @@ def _mix(sums: F32, coarse: F32, filled: F32) -> None:
 
 @kernel
 def _gather(depth: F32, confidence: F32, tissue: Bool, side: int, columns: int, sums: F32) -> None:
-    """Gather for each cell the share of pixels that show tissue, that times trust, and the mean inverse
-    depth."""
+    """Gather for each cell the share of pixels that show tissue, the mean trust, and the mean inverse depth,
+    weighted by trust."""
     height, width = depth.shape
     line = np.empty((3, width), np.float32)  # sums over the pixels below each other in one row of cells
     for row in range(sums.shape[1] - 2 * AROUND):
@@ -244,7 +244,7 @@ def _compare(sums: F32, tolerance: Any, slope: Any, around: F32) -> None:
 
 @kernel
 def _judge(sums: F32, px: Any, around: F32) -> None:
-    """Inverse depth and error of the cells that are believed; of the others both are 0, and the error -1
+    """Inverse depth and error of the cells that are believed. For the others both are 0, but the error is -1
     where something was measured."""
     _, high, line = sums.shape
     plane = high * line
@@ -273,7 +273,7 @@ def _judge(sums: F32, px: Any, around: F32) -> None:
 
 @kernel
 def _drop_specks(error: F32, side: int, depth: F32, confidence: F32) -> None:
-    """Forget the depth in cells of error -1, which becomes 0."""
+    """Set depth and confidence to 0 in cells of error -1, and then that error to 0."""
     height, width = depth.shape
     for row in range(error.shape[0]):
         for column in range(error.shape[1]):

@@ -6,24 +6,24 @@ from sags_node.types import F32, GrayPyramid
 from sags_node.vision import inverse_search
 from sags_node.vision.pyramid import inner
 
-STEPS = 4  # of a patch
-COARSE_STRIDE = 4  # px, of patches in all but the largest of the pictures
+STEPS = 4  # of a patch's search, at most
+COARSE_STRIDE = 4  # px between patches in all but the largest picture
 
 
 class OpticalFlow:
-    """Inverse search from small pictures to those of half the size, without refinement: whoever asks takes
-    means over many places anyway. Costs nothing to make."""
+    """Inverse search from small pictures up to those of half the size. There is no refinement: callers
+    average over many places anyway. Making one costs nothing."""
 
     def __init__(self, stride: int) -> None:
         """`stride`: px between patches in the pictures of half the size, at most 8."""
         self._stride = stride
 
     def __call__(self, before: GrayPyramid, after: GrayPyramid, guess: F32 | None = None) -> F32:
-        """Flow [H // 2, W // 2, 2], in px of the whole pictures, from `before` to `after`.
+        """Estimate the flow [H // 2, W // 2, 2], in px of the whole pictures, from `before` to `after`.
 
         Args:
-            guess: [rows, columns, 2] px, of square cells over the picture, from where to search; None: from
-                the same places.
+            guess: [rows, columns, 2] px, motion in square cells over the picture, from which to search;
+                None: no motion.
         """
         guess = np.zeros((1, 1, 2), np.float32) if guess is None else guess
         scale = 0.5 ** (len(before.halves) + 1)

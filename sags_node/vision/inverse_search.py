@@ -29,26 +29,26 @@ from sags_node.vision.pyramid import BORDER
 
 PATCH = BLOCK_WIDTH  # px, 8: rows of a patch are those of a vector's block
 COUNT = PATCH * PATCH  # px
-ACROSS, DOWN = COUNT, 2 * COUNT  # where a patch's gradients stand behind it
+ACROSS, DOWN = COUNT, 2 * COUNT  # where a patch's gradients begin in `S`, after the patch
 BAND = 5  # rows of patches that are searched as one piece of work: places do not spread beyond it
 FEWEST_PATCHES = 300  # for a thread to take: waking it takes as long as searching them
 FEWEST_ROWS = 32  # of pixels, for a thread to take when patches are spread over them
 CENTRE = (PATCH - 1) / 2  # px, of a patch, from its first pixel
 AREA = np.float32(COUNT)
-SAME_PLACE = np.float32(0.2**2)  # px squared: a neighbour's place so near to the own one is not tried
-CONVERGED = np.float32(0.03**2)  # px squared, of a step
+SAME_PLACE = np.float32(0.2**2)  # px squared: a neighbour's place this near to the patch's own is not tried
+CONVERGED = np.float32(0.03**2)  # px squared: a shorter step is the last
 NOISE = np.float32(1.0)  # added to the Hessian: a patch without texture stays where it is
 CHANNELS = 4  # of a pixel while patches are spread over it: the weights' sum, and three weighted ones
 
 
 def grid_shape(picture: F32, stride: int) -> tuple[int, int]:
-    """Rows and columns of patches in a picture with its border, at least as large as a patch."""
+    """Return the rows and columns of patches in a picture with its border, at least as large as a patch."""
     rows, columns = (-(-(side - 2 * BORDER - PATCH) // stride) + 1 for side in picture.shape)
     return rows, columns
 
 
 def centres(picture: F32, stride: int) -> tuple[F32, F32]:
-    """Column and row (px) of the middle of each patch, both [rows, columns]."""
+    """Return column and row (px) of the middle of each patch, both [rows, columns]."""
     rows, columns = (
         np.minimum(np.arange(count) * stride, side - 2 * BORDER - PATCH) + np.float32(CENTRE)
         for count, side in zip(grid_shape(picture, stride), picture.shape, strict=True)
@@ -58,7 +58,7 @@ def centres(picture: F32, stride: int) -> tuple[F32, F32]:
 
 
 def start(picture: F32, stride: int, coarse: F32, coarse_stride: float, corner: float, scale: int) -> F32:
-    """A field to search from, taken from a coarser one.
+    """Interpolate a field to search from out of a coarser one.
 
     Args:
         picture: the one whose patches are to be searched.
@@ -95,7 +95,7 @@ def search(first: F32, second: F32, stride: int, begin: F32, steps: int, tether:
 
 
 def at_pixels(first: F32, second: F32, stride: int, field: F32) -> F32:
-    """The field at every pixel [H, W, 2]: the mean of the patches over it, by how well each agrees there."""
+    """Return the field at every pixel [H, W, 2]: the mean of its patches, weighted by their agreement."""
     flow = np.empty((first.shape[0] - 2 * BORDER, first.shape[1] - 2 * BORDER, 2), np.float32)
     bands = max(1, min(thread_count(), len(flow) // FEWEST_ROWS))
     _flow_at_pixels(first, second, stride, field, bands, flow)
@@ -152,8 +152,8 @@ def _search_patch(
     first: F32, second: F32, begin: F32, stride: int, tether: Any, steps: int,
     top: int, row: int, column: int, field: F32,
 ) -> None:  # fmt: skip
-    """Of where it is to begin and the places of its neighbours the best, then steps from there, while they
-    help. Patches to the left and above, down from row `top`, have been searched already."""
+    """Searches one patch: takes the best of its own start and its neighbours' places, then steps from there
+    while they help. Patches to the left and above, from row `top` on, have been searched already."""
     S = stack_floats(192)  # 3 COUNT
     line = first.shape[1]
     x = min(column * stride, line - 2 * BORDER - PATCH) + BORDER
@@ -232,8 +232,8 @@ def _prepare(picture: F32, at: int, S: F32) -> Any:
 
 @inlined
 def _place(picture: F32, x: Any, y: Any) -> Any:
-    """Index of the pixel at or before (x, y), or the nearest from which a patch fits, and the weights of the
-    four pixels around."""
+    """The index of the pixel at or before (x, y), or of the nearest one from which a patch fits, and the
+    bilinear weights of the four pixels around."""
     one, last = np.float32(1), PATCH + 1
     x = min(max(x, np.float32(0)), np.float32(picture.shape[1] - last) - np.float32(0.01))
     y = min(max(y, np.float32(0)), np.float32(picture.shape[0] - last) - np.float32(0.01))
@@ -245,7 +245,7 @@ def _place(picture: F32, x: Any, y: Any) -> Any:
 
 @inlined
 def _between_pixels(picture: F32, at: int, line: int, w00: Any, w01: Any, w10: Any, w11: Any) -> Any:
-    """A block of a picture, each pixel the mean of four by their weights."""
+    """A block of a picture, each pixel interpolated from four by their weights."""
     return (
         w00 * load_block(picture, at, line)
         + w01 * load_block(picture, at + 1, line)
@@ -256,8 +256,8 @@ def _between_pixels(picture: F32, at: int, line: int, w00: Any, w01: Any, w10: A
 
 @inlined
 def _difference(S: F32, picture: F32, x: Any, y: Any) -> Any:
-    """Sum of squared differences of a picture's 8x8 px from (x, y) on, of the picture with its border, and
-    the patch in `S`, after their mean is taken away."""
+    """Sum of squared differences, less their mean, between the patch in `S` and the 8x8 px of a picture from
+    (x, y) on, counted from its border's corner."""
     at, w00, w01, w10, w11 = _place(picture, x, y)
     line = picture.shape[1]
     total = squares = spread(np.float32(0))
@@ -271,7 +271,7 @@ def _difference(S: F32, picture: F32, x: Any, y: Any) -> Any:
 
 @inlined
 def _gradient(S: F32, picture: F32, x: Any, y: Any) -> Any:
-    """Sums of the same differences times the patch's gradients, of them, and of their squares."""
+    """Sums of these differences times the patch's gradients, of the differences, and of their squares."""
     at, w00, w01, w10, w11 = _place(picture, x, y)
     line = picture.shape[1]
     along = down = total = squares = spread(np.float32(0))
@@ -305,7 +305,7 @@ def _flow_rows(first: F32, second: F32, stride: int, field: F32, low: int, high:
 def spread_patches(
     first: F32, second: F32, stride: int, field: F32, good: Bool, low: int, planes: F32
 ) -> None:
-    """The mean of the patches over each pixel, by how well each agrees there.
+    """Average the patches over each pixel, weighted by how well each agrees there.
 
     Args:
         good: [rows, columns] of the patches.
@@ -333,7 +333,7 @@ def spread_patches(
 
 @kernel
 def _add_patch(first: F32, second: F32, left: int, top: int, u: Any, v: Any, good: Any, sums: F32) -> None:
-    """The weight of each pixel, and it times right, down and good."""
+    """Adds to `sums` the weight of each pixel of a patch, and the weight times right, down and good."""
     S = stack_floats(64)  # COUNT
     line, one = first.shape[1], np.float32(1)
     at, w00, w01, w10, w11 = _place(second, np.float32(left + BORDER) + u, np.float32(top + BORDER) + v)

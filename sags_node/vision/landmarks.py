@@ -1,9 +1,9 @@
 """Features of a picture that are recognised in another one, however far they moved.
 
 Oriented binary features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011), matched
-where the best is clearly better than the second (Lowe, IJCV 2004). Landmarks are those of tissue that are
-found again: what tells a scene that was lost from sight from another one. Tissue bends, so there is no common
-motion to vote for: a match counts when it moves as those around it do.
+where the best is clearly better than the second (Lowe, IJCV 2004). Landmarks are features of tissue that are
+found again: they tell a scene that was lost from sight from another one. Tissue bends, so there is no common
+motion to vote for: a match counts if it moves as those around it do.
 """
 
 from typing import NamedTuple
@@ -18,10 +18,10 @@ RATIO = 0.8  # of the distance to the second best match
 WIDTH = 360  # px, at most, of the picture in which they are looked for
 COUNT = 600  # features of a picture
 FAST_THRESHOLD = 5  # grey levels: tissue is smooth, and smoke takes contrast away
-LARGEST_TURN = 40.0  # degrees
-FARTHEST = 0.3  # of the width
+LARGEST_TURN = 40.0  # degrees by which a match may turn
+FARTHEST = 0.3  # of the width, which a match may move
 AROUND = 5  # matches nearby, whose median motion a match must follow
-APART = 0.03  # of the width, from that motion
+APART = 0.03  # of the width, by which it may differ from that motion
 # Of 600: the same tissue after up to two seconds of pulling, veiled, or covered by six tenths, has 12 to 390
 # such matches; other tissue, and the same turned or mirrored, up to 3.
 FEWEST = 8
@@ -46,7 +46,7 @@ class Landmarks(NamedTuple):
 
 
 def features_in(gray: U8, where: Bool | None, count: int, fast_threshold: int) -> Features:
-    """At most `count` features of a picture [H, W], where [H, W] it counts (None: everywhere).
+    """Find at most `count` features of a picture [H, W], where `where` [H, W] is True (None: everywhere).
 
     Args:
         fast_threshold: grey levels by which a corner differs from what surrounds it.
@@ -60,7 +60,7 @@ def features_in(gray: U8, where: Bool | None, count: int, fast_threshold: int) -
 
 
 def matched(before: Features, after: Features) -> tuple[I64, I64]:
-    """Rows [K] of both pictures' features that clearly look alike."""
+    """Return the rows [K] in both pictures' features of the pairs that clearly look alike."""
     none = np.zeros(0, np.int64)
     if min(len(before.codes), len(after.codes)) < 2:
         return none, none
@@ -71,7 +71,7 @@ def matched(before: Features, after: Features) -> tuple[I64, I64]:
 
 
 def features_of(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
-    """Features of a picture, px of the whole one, where `tissue` [H, W] is: everywhere by default."""
+    """Find features of a picture, px of the whole one, where `tissue` [H, W] is True (None: everywhere)."""
     halves = [inner(half) for half in pyramid.halves]
     small = next((half for half in halves if half.shape[1] <= WIDTH), halves[-1]).astype(np.uint8)
     width = pyramid.full.shape[1]
@@ -86,7 +86,7 @@ def features_of(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
 
 
 def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmarks | None:
-    """Landmarks of the earlier picture in the later one; None: so few that it may be another scene.
+    """Find landmarks of the earlier picture in the later one; None: so few that it may be another scene.
 
     Args:
         tissue: [H, W] of the earlier picture.
@@ -106,8 +106,8 @@ def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmar
 
 
 def motion(start: F32, end: F32, width: int, height: int) -> F32:
-    """The motion from places [K, 2] to others [K, 2] as a field [rows, CELLS, 2] px of square cells over a
-    picture: in each the mean of the nearest ones, by nearness."""
+    """Return the motion from places [K, 2] to others [K, 2] as a field [rows, CELLS, 2] (px) of square cells
+    over a picture: in each cell the mean of the nearest motions, weighted by nearness."""
     side = width / CELLS
     columns, rows = (
         np.arange(count) * side + (side - 1) / 2 for count in (CELLS, max(1, round(height / side)))
@@ -121,7 +121,7 @@ def motion(start: F32, end: F32, width: int, height: int) -> F32:
 
 
 def agreeing(start: F32, end: F32, apart: float) -> Bool:
-    """Which matches, from places [K, 2] to others [K, 2], move as those around them do, to `apart` px."""
+    """Tell which matches from places [K, 2] to others [K, 2] move like those around them, to `apart` px."""
     if len(start) <= AROUND:
         return np.zeros(len(start), np.bool_)
     moves = end - start

@@ -1,4 +1,4 @@
-"""Tissue that is far enough from instruments: what is measured beside one may be its own."""
+"""Tissue that is far enough from instruments: what is measured beside one may be of the instrument."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ EDGE_MARGIN = 20 / 640  # of the width: depths and flow smear that far across an
 
 
 def clear_of_instruments(tissue: Bool, halvings: int) -> Bool:
-    """Find where a mask [H, W] is tissue, and all around it, in a picture after so many halvings."""
+    """Find the pixels of a picture after so many halvings at and around which a mask [H, W] is all tissue."""
     height, width = (side >> halvings for side in tissue.shape)
     step = 1 << halvings
     small = np.ascontiguousarray(tissue[: height * step : step, : width * step : step])
@@ -19,7 +19,7 @@ def clear_of_instruments(tissue: Bool, halvings: int) -> Bool:
 
 
 class ClearOfInstruments:
-    """The same for masks that are asked for twice: with their own frame, and as that of the frame before."""
+    """Caches the same for masks that are used twice: with their own frame, and with the next one."""
 
     def __init__(self, halvings: int) -> None:
         self._halvings = halvings

@@ -1,4 +1,4 @@
-"""Stereo matching of rectified gray pictures, see `pyramid`, in one of their halves."""
+"""Stereo matching of rectified gray pictures, at one level of their pyramids (`pyramid`)."""
 
 from typing import NamedTuple
 
@@ -10,15 +10,15 @@ from sags_node.vision.coarse_stereo import coarse_disparity
 from sags_node.vision.inverse_search import CENTRE, search, start
 from sags_node.vision.pyramid import level
 
-PATCH_STRIDE = 4  # px, of patches of 8
-COARSE_STRIDE = 4  # px, in smaller pictures than the last
-SEARCH_STEPS = 3
-WINDOW = 5  # patches, over which row errors differ little, and disparities seldom alone
-SMALL_WIDTH = 320  # px: a smaller whole picture is searched at half of its size, for the noise in it
-GUESS_WIDTH = 120  # px: at most so wide is the picture in which a guess is made
+PATCH_STRIDE = 4  # px between patches of 8 px
+COARSE_STRIDE = 4  # px between them in pictures smaller than the last
+SEARCH_STEPS = 3  # of a patch's search, at most
+WINDOW = 5  # patches: the window over which row errors are averaged and median disparities taken
+SMALL_WIDTH = 320  # px: a smaller whole picture is searched at half of its size, because of its noise
+GUESS_WIDTH = 120  # px, largest width of the picture in which a guess is made
 LARGEST_ROW_ERROR = 2.0  # px
-LARGEST_ROW_STEP = 0.35  # px beside the mean row error around
-LARGEST_STEP = 1.5  # px beside the median disparity around: a wrong match stands alone
+LARGEST_ROW_STEP = 0.35  # px from the mean row error around
+LARGEST_STEP = 1.5  # px from the median disparity around: a wrong match stands alone
 MOST_ALONE = 0.35  # of the patches around: where more stand alone, none is right
 TETHER = 0.7  # of the texture along rows: how firmly a patch is held to that mean
 
@@ -36,15 +36,15 @@ class Patches(NamedTuple):
 def match_patches(
     left: GrayPyramid, right: GrayPyramid, disparities: tuple[float, float], halvings: int
 ) -> Patches:
-    """Inverse search from a guess in a small picture up to the one wanted.
+    """Match patches by inverse search, from a guess in a small picture up to the one wanted.
 
     On the smooth surface of organs it is more accurate than semi-global matching in less time, but it only
-    refines a guess that is right to a few pixels. That is made afresh for every frame: it costs little and
-    keeps no memory that could lock in an error.
+    refines a guess that is right to a few pixels. The guess is made afresh for every frame: it costs little,
+    and there is no memory that could lock in an error.
 
     Args:
         disparities: the smallest and the largest to search, px of the matching picture.
-        halvings: which picture that is.
+        halvings: of the matching picture.
     """
     finest = halvings
     if finest == 0 and left.full.shape[1] < SMALL_WIDTH and left.halves:
@@ -61,7 +61,7 @@ def match_patches(
 def _find(
     left: GrayPyramid, right: GrayPyramid, disparities: tuple[float, float], halvings: int, finest: int
 ) -> tuple[F32, Bool]:
-    """Patches of the picture after `finest` halvings."""
+    """The field and `good` of the patches of the picture after `finest` halvings."""
     top = finest
     while top < len(left.halves) and left.full.shape[1] >> top > GUESS_WIDTH:
         top += 1

@@ -1,6 +1,6 @@
-"""Metric depth from a monocular network: each picture's relative inverse depth is laid onto known depth.
+"""Metric depth from a monocular network: each picture's relative inverse depth is fitted to known depth.
 
-What such a network says is right but for scale and shift of the inverse depth.
+Such a network's inverse depth is right up to scale and shift.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,9 @@ from sags_node.errors import UsageError
 from sags_node.types import F32, F64, Bool
 from sags_node.vision.onnx_session import DepthNetworkError
 
-MEASURE_EVERY = 5  # frames: so rarely depth is matched for its scale alone
-LARGEST_ERROR = 0.15  # of the depth, median: here the confidence is 0
-DECLARED_ERROR = 0.5 * LARGEST_ERROR  # nothing tells how wrong it is
+MEASURE_EVERY = 5  # frames: how often the eyes are matched for the scale alone
+LARGEST_ERROR = 0.15  # of the depth, median: here the confidence has fallen to its least
+DECLARED_ERROR = 0.5 * LARGEST_ERROR  # taken for a declared scale, whose error is not known
 LEAST_CONFIDENCE = 0.05
 MOST_SAMPLES = 4000
 FEWEST_SAMPLES = 200
@@ -24,7 +24,7 @@ KEPT = 0.7  # of the samples, in a trimmed step
 STEPS = 10
 OUTLIER = 2.5  # robust standard deviations
 SPREAD_PER_MAD = 1.4826  # a normal distribution's
-LEAST_CORRELATION = 0.5  # of what is no outlier
+LEAST_CORRELATION = 0.5  # of the inliers
 
 Measure = Callable[[], F32 | None]  # depth [H, W] (m, 0 unknown) that stereo or the session gives
 
@@ -45,15 +45,15 @@ class MonoDepth:
     stream cannot wait for that: its Gaussians are placed at the depth of the newest frame. So both are solved
     for in closed form, and what comes out is used as any other depth is.
 
-    Between measurements a frame is laid onto the depth of the frame before, not onto the drawn model: that
-    stands 0.07 % nearer, which adds up.
+    Between measurements a frame is fitted to the depth of the frame before, not to the drawn model, which is
+    0.07 % nearer: that would add up.
 
     Args:
         declared_depth: m, median of the first picture, for one camera alone.
-        config: its depth range is the one that is believed.
+        config: depth outside its range is taken for unknown.
 
     Attributes:
-        is_declared: the scale goes back to that distance; nothing has been measured since.
+        is_declared: the scale comes from that distance; nothing has been measured since.
     """
 
     def __init__(self, declared_depth: float | None, config: StereoConfig) -> None:
@@ -66,15 +66,15 @@ class MonoDepth:
 
     @property
     def measures(self) -> bool:
-        """The next frame is laid onto what is measured."""
+        """True: the next frame is fitted to measured depth."""
         return self._frames_to_measure == 0
 
     def __call__(self, relative: F32, tissue: Bool, measure: Measure) -> tuple[F32, F32]:
-        """Depth [H, W] (m, 0 unknown) and confidence [H, W] (one number where known).
+        """Return depth [H, W] (m, 0 unknown) and confidence [H, W] (one number where known).
 
         Args:
             relative: [H, W] the network's inverse depth, any scale and shift.
-            measure: asked in every fifth frame; None where only one camera is.
+            measure: gives measured depth, every fifth frame; it returns None for one camera alone.
 
         Raises:
             DepthNetworkError: it does not fit what is measured, or nothing is known yet.
@@ -82,7 +82,7 @@ class MonoDepth:
         """
         line = self._align(relative, tissue, measure)
         inverse = line.scale * relative + np.float32(line.shift)
-        # All of it, not only what is believed: a limit would pull at the next frame's line.
+        # All depths, not only those within the range: a limit would bias the next frame's fit.
         self._before = np.divide(
             np.float32(1), inverse, out=np.zeros_like(inverse), where=tissue & (inverse > 0)
         )
@@ -106,7 +106,7 @@ class MonoDepth:
         if self._line is None or self._before is None:
             return self._declare(relative, tissue)
         found = fit_scale_shift(relative, self._before, tissue)
-        # After a cut nothing agrees with the frame before: then the network's own scale is all there is.
+        # After a cut nothing agrees with the frame before: then the last line is all there is.
         return self._line if found is None else replace(found, error=self._line.error)
 
     def _declare(self, relative: F32, tissue: Bool) -> ScaleShift:
@@ -125,12 +125,12 @@ class MonoDepth:
 
 
 def fit_scale_shift(relative: F32, depth: F32, usable: Bool) -> ScaleShift | None:
-    """Robust line from relative inverse depth to 1 / depth; None: too little to go by, or no rising line.
+    """Fit a robust line from relative inverse depth to 1 / depth; None: too few samples, or no rising line.
 
     It starts at the least median of squares among lines through two samples (Rousseeuw, 1984), goes on by
-    trimmed steps and ends with all that is no outlier to that. So nearly half of the picture may have moved,
-    or be wrong, without pulling at the line. A line by least squares would be a little too flat wherever
-    `relative` is noisy; laid frame onto frame, its depth would be flat after some seconds.
+    trimmed steps and ends with all inliers. So nearly half of the picture may have moved, or be wrong,
+    without pulling at the line. A line by least squares would be a little too flat wherever `relative` is
+    noisy; fitted frame to frame, its depth would be flat after some seconds.
 
     Args:
         relative: [H, W] any unit.

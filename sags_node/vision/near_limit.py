@@ -17,23 +17,23 @@ from sags_node.vision.matchers import GUESS_WIDTH
 from sags_node.vision.pyramid import BORDER, inner, level
 
 NEAREST = 0.01  # m: nearer, most endoscopes cannot focus, and the eyes hardly share a view
-PERIOD_NS = 500_000_000  # between two looks
+PERIOD_NS = 500_000_000  # ns between two looks
 AGREED = 2  # looks in a row that show something nearer
 RETREAT = 10  # looks in a row without anything near, after which the limit goes back
 ROOM = 0.7  # of the nearest depth that was found: tissue moves between two looks
 LEAST_SHARE = 0.02  # of the tissue that both eyes see: fewer pixels may be wrong matches, or an instrument's
-BEYOND, BEYOND_SHARE = 0.004, 0.1  # m: what is nearer than can be matched is looked for as far as this
+BEYOND, BEYOND_SHARE = 0.004, 0.1  # m: tissue too near to match is sought down to here; its share
 SEARCHED = 96  # disparities at most: more cost too much, and are found in a smaller picture as well
-WINDOW = 9  # px of the small picture
+WINDOW = 9  # px of the small picture, over which correlation is taken
 MATCHES = 0.8  # correlation of two windows; 99 % stay below in pictures that do not belong together
 PLAIN = 2.0  # grey levels, standard deviation in a window: less cannot be matched
 
 
 class NearLimit:
-    """Where matching may end.
+    """The nearest depth that is matched.
 
     Attributes:
-        limit: m, no tissue is nearer as far as is known.
+        limit: m; as far as is known, no tissue is nearer.
         findings: that tissue is nearer than a limit that was set, or else than `NEAREST`, and what helps. May
             be read from any thread.
     """
@@ -53,7 +53,7 @@ class NearLimit:
         self._found: deque[float] = deque(maxlen=RETREAT)
 
     def look(self, t_capture_ns: int, left: GrayPyramid, right: GrayPyramid, tissue: Bool) -> None:
-        """Take the pictures of one frame and its tissue [H, W]; most of them are let pass unseen."""
+        """Take the pictures of one frame and its tissue [H, W]; most frames are skipped."""
         first = self._looked_ns is None
         if self._is_set and self.limit <= NEAREST:
             return
@@ -92,7 +92,7 @@ def nearest_tissue(
     end: float = NEAREST,
     share: float = LEAST_SHARE,
 ) -> float:
-    """Depth of the nearest `share` of the tissue [H, W] that both eyes see, m; infinite: nothing tells.
+    """Return the depth (m) of the nearest `share` of the tissue [H, W] that both eyes see; infinite: unknown.
 
     Args:
         focal_baseline: px m, of the whole picture.

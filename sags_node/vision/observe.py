@@ -38,8 +38,8 @@ def observe(pair: RectifiedPair, tissue: Bool, measured: Measured) -> Observatio
 
 
 def resized(observation: Observation, scale: float) -> Observation:
-    """The observation with pictures of `scale` times the size. Masks and depths are not interpolated: a mean
-    across an edge is a surface that does not exist."""
+    """Return the observation with pictures of `scale` times the size. Masks and depths are not interpolated:
+    a mean across an edge is a surface that does not exist."""
     if scale == 1:
         return observation
     camera = observation.camera

@@ -1,4 +1,4 @@
-"""Depth by a user's network, stereo or monocular, for as long as it delivers."""
+"""Depth by a user's network, stereo or monocular, for as long as the network works."""
 
 import logging
 import time
@@ -28,15 +28,15 @@ log = logging.getLogger(__name__)
 
 MOST_FAILURES = 3  # in a row, after which the network is not tried any more
 MOST_CHANNELS = 4  # of an output that is maps; more are features
-FEWEST_FINITE = 0.5  # of the numbers
-ALIKE = 0.1  # of the depth: a wrong scale, sign or eye is off by more, what both measure by less
-FEWEST_ALIKE = 0.5  # of the places with a measured depth
-MEANINGS = {True: ("disparity", "depth"), False: ("inverse_depth", "depth")}  # of a stereo network's output?
+FEWEST_FINITE = 0.5  # of the output's numbers must be finite
+ALIKE = 0.1  # of the depth: depths that differ by less agree; a wrong scale, sign or eye makes more
+FEWEST_ALIKE = 0.5  # of the places with a measured depth must agree with it
+MEANINGS = {True: ("disparity", "depth"), False: ("inverse_depth", "depth")}  # by whether it is stereo
 HELP = "docs/networks.md says what the keys mean"
 
 
 class DepthNetwork:
-    """A network as its file and `vision.onnx` describe it. It is run once at the start.
+    """A network as its file and `vision.onnx` describe it. It is run twice at the start.
 
     Attributes:
         name: of the file.
@@ -61,7 +61,7 @@ class DepthNetwork:
         self._check_description()
         self._size, self._focal_baseline = size, focal_baseline
         self._output = self._said.output or session.outputs[0]
-        self._normalization = self._said.normalization or NORMALIZATIONS["unit"]  # not said of bytes
+        self._normalization = self._said.normalization or NORMALIZATIONS["unit"]  # bytes need none
         self._fits = [one.fit(size, self._said.multiple or 1) for one in self._inputs]
         try:
             log.info("%s", self._described(self._warm_up()))
@@ -69,7 +69,7 @@ class DepthNetwork:
             raise UsageError(f"{error} ({session.description}); {HELP}") from None
 
     def __call__(self, left: U8, right: U8 | None) -> F32:
-        """Disparity [H, W] (px; NaN or <= 0: unknown), or relative inverse depth of a monocular network.
+        """Return disparity [H, W] (px; NaN or <= 0: unknown), or relative inverse depth if monocular.
 
         Args:
             left, right: [H, W, 3] RGB; the right one is only looked at by a stereo network.
@@ -135,8 +135,8 @@ class DepthNetwork:
             )
 
     def _warm_up(self) -> float:
-        """Return what one call costs, ms: the first of all is slower. What it gives for noise tells
-        nothing."""
+        """Run the network twice on noise; return the time of the second call, ms, for the first is slower.
+        The output for noise is not judged."""
         noise = np.random.default_rng(0).integers(0, 256, (self._size[1], self._size[0], 3), np.uint8)
         right = noise if self.is_stereo else None
         self._run(noise, right)
@@ -186,16 +186,16 @@ class NetworkDepth:
 
     @property
     def measures(self) -> bool:
-        """The next frame is laid onto what `measure` gives, if that is anything."""
+        """True: the next frame is fitted to the depth from `measure`, if there is any."""
         return not self._network.is_stereo and self._mono.measures and self._failures < MOST_FAILURES
 
     @property
     def is_declared(self) -> bool:
-        """The scale of its depth is declared, not measured."""
+        """True: the scale of its depth is declared, not measured."""
         return self._mono.is_declared
 
     def __call__(self, pair: RectifiedPair, tissue: Bool, measure: Measure) -> tuple[F32, F32] | None:
-        """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1); None: `problem` says why.
+        """Return depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1); None: `problem` says why.
 
         Args:
             measure: for a monocular network, see `MonoDepth`; a stereo network is compared with it until it
@@ -228,10 +228,10 @@ class NetworkDepth:
         return found
 
     def _compare(self, depth: F32, measure: Measure) -> None:
-        """Tell a network that is described wrongly: elsewhere its disparities match by chance here and there.
+        """Refuse a network that is described wrongly, whose disparities match by chance here and there.
 
         Raises:
-            DepthNetworkError: its first depth [H, W] is not what is measured without it.
+            DepthNetworkError: its first depth [H, W] differs from the depth measured without it.
         """
         measured = None if self._has_agreed else measure()
         if measured is None or np.count_nonzero(measured) < FEWEST_SAMPLES:

@@ -1,7 +1,7 @@
-"""A user's ONNX file: opened with limits; what is said of it; how it is fed and how its maps are read.
+"""A user's ONNX file: it is opened with limits, described, and fed with pictures; its maps are read.
 
-What is said of a network stands in the file itself, in a YAML file beside it, and in the launch file. Later
-wins.
+A network's description stands in the file itself, in a YAML file beside it, and in the launch file. Of
+these the later one wins.
 """
 
 import os
@@ -117,7 +117,7 @@ class OnnxSession:
         self.processor = "cuda" if "CUDA" in self._session.get_providers()[0] else "cpu"
 
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """All outputs by name.
+        """Run the network, and return all outputs by name.
 
         Raises:
             DepthNetworkError: the runtime failed.
@@ -162,10 +162,10 @@ def _first_line(error: Exception) -> str:
 
 
 def read_format(config: OnnxConfig, metadata: Mapping[str, str]) -> NetworkFormat:
-    """All that is said of the network.
+    """Read the description of a network.
 
     Args:
-        metadata: of the ONNX file, each value as YAML; keys that `NetworkFormat` lacks are others'.
+        metadata: of the ONNX file, each value as YAML; keys that `NetworkFormat` lacks are ignored.
 
     Raises:
         UsageError: a value is wrong, or the sidecar cannot be read or holds an unknown key.
@@ -183,7 +183,7 @@ def read_format(config: OnnxConfig, metadata: Mapping[str, str]) -> NetworkForma
 
 
 def _validated(tree: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The values of a map that are said, typed; text is read as YAML, since metadata holds only text."""
+    """The values that a map gives, checked and typed. Text is read as YAML: metadata holds only text."""
     try:
         parsed = {
             key: parse_yaml(value, f"{where}: {key}") if isinstance(value, str) else value
@@ -221,7 +221,7 @@ class Input:
     height: int | None
 
     def fit(self, size: Size, multiple: int) -> Fit:
-        """A side that the network fixes is resized to it; one that it leaves open is padded."""
+        """Return how a picture fits: resized to a side that the network fixes, padded where it is open."""
         inner = self.width or size[0], self.height or size[1]
         outer = (
             self.width or -(-size[0] // multiple) * multiple,
@@ -232,7 +232,7 @@ class Input:
     def tensor(
         self, pictures: Mapping[Eye, U8], fit: Fit, normalization: Normalization, bgr: bool
     ) -> NDArray[Any]:
-        """The network's input [1, C, h, w] or [1, h, w, C] from pictures [H, W, 3] RGB."""
+        """Make the network's input [1, C, h, w] or [1, h, w, C] from pictures [H, W, 3] RGB."""
         values = np.concatenate(
             [self._channels(pictures[eye], fit, normalization, bgr) for eye in self.eyes], 2
         )
@@ -259,8 +259,8 @@ class Input:
 
 
 def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tuple[Input, ...]:
-    """How a network takes its pictures: one input is one picture or both in its channels, two are a pair,
-    four are a pair at a small and at the full size.
+    """Tell how a network takes its pictures: one input is one picture or both in its channels, two are a
+    pair, four are a pair at a small and at the full size.
 
     Args:
         name: of the file, for messages.
@@ -317,12 +317,12 @@ def _layout(tensor: Tensor, said: NetworkFormat, name: str) -> tuple[int, bool]:
 
 
 def has_clear_layout(tensor: Tensor) -> bool:
-    """Tell whether its shape says which side is the channels'."""
+    """Tell whether a tensor's shape shows which dimension holds the channels."""
     return tensor.shape[1] in CHANNELS or tensor.shape[3] in CHANNELS
 
 
 def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Sequence[Tensor]:
-    """As they are named, left and right eye in turn; else in the file's order."""
+    """The tensors in the order of `said.inputs` (left and right eye in turn), else in the file's order."""
     if said.inputs is None:
         return tensors
     by_name = {tensor.name: tensor for tensor in tensors}
@@ -332,7 +332,7 @@ def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Seque
 
 
 def maps_of(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
-    """The maps [C, h, w] of the padded picture, whole or coarser, that an output is; None: it is none.
+    """Return an output as maps [C, h, w] of the padded picture, full size or coarser; None: it is no map.
 
     Args:
         values: [1, C, h, w], [1, h, w, C], [C, h, w], [h, w, C] or [h, w].
@@ -349,13 +349,13 @@ def maps_of(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
 
 
 def sizes_of_maps(fit: Fit) -> str:
-    """Return what `maps_of` takes, for messages."""
+    """Return the sizes that `maps_of` accepts, for messages."""
     width, height = fit.outer
     return f"{width}x{height} px that it was given, or of a half, a quarter or an eighth of them"
 
 
 def unfit(plane: F32, fit: Fit) -> F32:
-    """A map of the padded picture as one of the picture [h, w] alone, at `fit.inner`."""
+    """Return a map of the padded picture without the padding, [h, w] at size `fit.inner`."""
     if plane.shape[::-1] != fit.outer:
         plane = cv2.resize(plane, fit.outer, interpolation=cv2.INTER_LINEAR)
     return plane[: fit.inner[1], : fit.inner[0]]

@@ -63,8 +63,8 @@ class _EyeMap:
 
 
 def _resize(picture: U8, size: tuple[int, int]) -> U8:
-    """Area averaging where it is needed: below that it costs five times as much for the same picture, and by
-    others than whole factors eight times as much."""
+    """Resizes, by area averaging only where it is needed: for ratios up to 1.5 it costs five times as much
+    for the same picture, and for ratios that are not whole numbers eight times as much."""
     height, width = picture.shape[:2]
     if (width, height) == size:
         return picture
@@ -134,7 +134,7 @@ class Rectifier:
 
         Raises:
             SagsError: the pictures do not have the calibration's size.
-            UsageError: the pose is none.
+            UsageError: the pose holds NaN or infinity.
         """
         made = made or self.pictures(frame)
         camera = self.camera
@@ -157,7 +157,7 @@ class Rectifier:
         )
 
     def later(self, frame: StereoFrame) -> Published:
-        """One frame to be rectified by who asks for a picture of it."""
+        """Return a frame whose pictures are rectified when they are asked for."""
 
         @cache
         def picture(side: str) -> U8:
@@ -168,7 +168,7 @@ class Rectifier:
         return Published(self.camera, picture)
 
     def mask(self, mask: Bool) -> Bool:
-        """A mask of the raw left picture, rectified at the working size; False outside the raw picture.
+        """Rectify a mask of the raw left picture at the working size; False outside the raw picture.
 
         Raises:
             SagsError: the mask does not have the pictures' size.
@@ -177,8 +177,8 @@ class Rectifier:
         return self._left.mask(mask)
 
     def depth(self, depth: F32) -> F32:
-        """Depth of the left rectified picture, at the working size. It is never interpolated: a mean across
-        an edge is a surface that does not exist.
+        """Resize the depth of the left rectified picture to the working size. It is not interpolated: a mean
+        across an edge is a surface that does not exist.
 
         Raises:
             SagsError: the depth picture does not have the pictures' size.

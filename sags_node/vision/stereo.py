@@ -19,13 +19,13 @@ from sags_node.vision.pyramid import inner, level, pyramids
 
 FULL_SIZE_BELOW = 480  # px width: matching at half of less costs half of the accuracy and saves little
 SMALLEST_SIDE = 32  # px of the matching picture: four patches of the inverse search
-WIDEST = 1 / 3  # of the largest depth, between the eyes: what they see of one thing differs too much beyond
+WIDEST = 1 / 3  # of the largest depth: a wider baseline makes the eyes' views differ too much
 SMOOTHING_RADIUS = 1 / 100  # of the matching picture's width
 
 
 class StereoDepth:
-    """Depth of the left rectified picture. Keeps nothing from frame to frame that changes it but how near
-    tissue can be, see `NearLimit`.
+    """Depth of the left rectified picture. All that is kept from frame to frame, and changes it, is how near
+    tissue can be (`NearLimit`).
 
     Matching runs at the working size divided by the scale. A match is trusted as far as its
     neighbourhood agrees with the place in the right picture that it was matched to: the confidence is 0 at a
@@ -64,7 +64,7 @@ class StereoDepth:
         self.rows = RowMonitor(camera.width)
 
     def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
-        """Depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1, 0 where the depth is unknown).
+        """Return depth [H, W] (m, 0 unknown) and confidence [H, W] (0..1, 0 where the depth is unknown).
 
         Depth is unknown outside `tissue` [H, W] and within a few px of its edge.
         """
@@ -90,8 +90,8 @@ class StereoDepth:
         return (*self.rows.findings, *self._near.findings)
 
     def judge(self, pair: RectifiedPair, disparity: F32, tissue: Bool) -> tuple[F32, F32]:
-        """Depth and confidence of a disparity [H, W] (px; NaN or <= 0: unknown) that something else found,
-        trusted only as far as the pictures agree, as its own is."""
+        """Return depth and confidence from a disparity [H, W] (px; NaN or <= 0: unknown) of a network. As
+        with matched depth, it is trusted as far as the pictures agree."""
         left, right = pyramids(pair)
         assert right is not None  # there is no disparity without
         self._near.look(pair.t_capture_ns, left, right, tissue)
@@ -124,6 +124,6 @@ class StereoDepth:
 
 
 def _leave_out_unseen(clear: Bool, disparities: F32) -> None:
-    """The strip that the right eye does not see: a match is found there, never a true one."""
+    """Clears the strip that the right eye does not see: a match found there is never true."""
     if disparities.size:
         clear[:, : max(0, int(np.ceil(np.median(disparities))))] = False

@@ -18,7 +18,7 @@ from sags_node.vision.tissue_topic import NearestMask, NoMaskError, TopicMasks
 log = logging.getLogger(__name__)
 
 LARGEST_INSTRUMENTS = 0.5  # of the usable picture
-FIRST_FRAMES = 5  # all of them with more: the mask is upside down
+FIRST_FRAMES = 5  # if all of them have more, the mask is inverted
 
 
 class TissueMask:
@@ -33,7 +33,7 @@ class TissueMask:
         masks: those of another process, for method topic.
 
     Raises:
-        UsageError: a box to exclude does not lie in the raw picture, the network cannot be used, or nothing
+        UsageError: an excluded box does not lie in the raw picture, the network cannot be used, or nothing
             receives masks.
     """
 
@@ -57,14 +57,14 @@ class TissueMask:
         self._found: Bool | None = None
 
     def __call__(self, frame: StereoFrame, pair: RectifiedPair, expected: RenderedView | None = None) -> Bool:
-        """Mask [H, W], True = tissue; highlights on tissue are tissue.
+        """Return the mask [H, W], True = tissue; highlights on tissue are tissue.
 
         Args:
             expected: the model as it was drawn last, where there is one: only looked at where nobody gives a
                 mask.
 
         Raises:
-            UsageError: the masks of a recording say of its first frames that most of them is instrument.
+            UsageError: the masks of a recording's first frames call most of the picture instrument.
         """
         if self._config.method == "none":
             return self.usable
@@ -78,7 +78,7 @@ class TissueMask:
 
     @property
     def instruments(self) -> Bool | None:
-        """Return what shows an instrument in the newest frame [H, W], before it grows; None: nobody looks."""
+        """Return where the newest frame shows instruments [H, W], without the margin; None: nobody looks."""
         return None if self._found is None else ~self._found & self.usable
 
     @property
@@ -105,8 +105,8 @@ class TissueMask:
         return None
 
     def _check_polarity(self, tissue: Bool, is_live: bool) -> None:
-        """A mask upside down would have the model learn the instruments alone. Live it may also be right: the
-        scope is still outside. Then none is taken until one calls less instrument."""
+        """Refuses inverted masks: with them the model would learn the instruments alone. A live mask may also
+        be right, as the scope is still outside: then masks are left out until one calls less instrument."""
         if self._frames_checked == FIRST_FRAMES:
             return
         share = float(np.mean(~tissue[self.usable]))
@@ -134,7 +134,7 @@ class TissueMask:
 
 
 def _outside(config: TissueConfig, raw_size: tuple[int, int]) -> Bool:
-    """Find where no box is, [H, W] of the raw picture."""
+    """True outside the excluded boxes, [H, W] of the raw picture."""
     width, height = raw_size
     outside = np.ones((height, width), np.bool_)
     for x, y, box_width, box_height in config.exclude:

@@ -14,7 +14,7 @@ CLIPPED = 240  # grey level of the brightest channel above which any surface loo
 CLIPPED_WINDOW = 20  # px around a highlight that say what it lies on
 WHITE = 230  # grey level of the darkest channel above which nothing of a surface shows
 WHITEOUT = 0.5  # of that window is white: no highlight, but a shaft in the light
-COARSE = 4  # px of a mean over so many
+COARSE = 4  # px of a coarse pixel, from which means over that window are taken
 
 # How much each sign counts: from 1 on their sum means instrument. Rounded from a logistic regression on D4D,
 # which did as well on the phantom as one made there. A coarse disparity brought nothing beside them.
@@ -24,16 +24,16 @@ GOLD = 6.0  # of (min(R, G) - B) / (R + G + B)
 LARGEST_GOLD = 0.2
 SHADE = 0.5  # where the brightest channel is below SHADE_LEVEL
 SHADE_LEVEL = 40  # grey level
-CHROMATICITY = 12.0  # of what R / (R + G + B) lacks to the model
+CHROMATICITY = 12.0  # of how far R / (R + G + B) is below the model's
 LARGEST_CHROMATICITY = 0.05
 MEMORY = 0.2  # for having been instrument in the frame before
-SURE = 1.15  # somewhere in a region
+SURE = 1.15  # evidence that a region must have somewhere
 
 OPENING = 3  # px: thinner is noise
 CLOSING = 7  # px: gaps within an instrument
 LONGEST_DOUBT = 1.0  # s
 FORGIVEN = 3.0  # s of doubt, per second without
-LONGEST_STEP = 0.2  # s between two frames that counts
+LONGEST_STEP = 0.2  # s: of a longer time between two frames only so much counts
 
 
 class InstrumentFinder:
@@ -52,12 +52,12 @@ class InstrumentFinder:
 
     def __init__(self) -> None:
         self._found: Bool | None = None  # [h, w] in the frame before; None: it was judged alone
-        self._held: F32 = np.zeros((1, 1), np.float32)  # [h, w] s, for which it is so on doubtful grounds
-        self._trusted: Bool = np.ones((1, 1), np.bool_)  # [h, w] where these count
+        self._held: F32 = np.zeros((1, 1), np.float32)  # [h, w] s of being instrument on doubtful grounds
+        self._trusted: Bool = np.ones((1, 1), np.bool_)  # [h, w] where such grounds count
         self._stamp_ns = 0
 
     def __call__(self, image: U8, expected: RenderedView | None = None, stamp_ns: int = 0) -> Bool:
-        """Instruments [H, W] of a picture [H, W, 3].
+        """Find the instruments [H, W] of a picture [H, W, 3].
 
         Args:
             expected: the model as it was drawn last; None: the picture is judged alone, and what was found
@@ -91,10 +91,10 @@ class InstrumentFinder:
 
 
 def _evidence(red: U8, green: U8, blue: U8) -> tuple[F32, F32]:
-    """Return what the channels [h, w] of a shrunk picture say alone [h, w]; and 0 on highlights, 1 elsewhere
-    [h, w].
+    """Return the evidence [h, w] of the channels [h, w] of a shrunk picture alone; and 0 on highlights, 1
+    elsewhere [h, w].
 
-    What is said of a highlight is what is said around it.
+    A highlight has the mean evidence around it.
     """
     r, g, b = (channel[::4, ::4].astype(np.float32) for channel in (red, green, blue))
     light = r + g + b
@@ -110,7 +110,7 @@ def _evidence(red: U8, green: U8, blue: U8) -> tuple[F32, F32]:
 
 
 def _around(evidence: F32, is_open: F32) -> F32:
-    """The mean evidence of the open pixels within CLIPPED_WINDOW, [h, w]."""
+    """The mean evidence within CLIPPED_WINDOW of the pixels that are no highlights, [h, w]."""
     return np.asarray(_widely(evidence * is_open) / (_widely(is_open) + np.float32(1e-3)))
 
 
@@ -124,7 +124,7 @@ def _widely(plane: F32) -> F32:
 
 @kernel
 def _colorless(red: U8, green: U8, blue: U8, typical_redness: float) -> tuple[F32, F32]:
-    """By channels, not pixels of three: five times faster, here and below."""
+    """Evidence by colour, and 0 on highlights. Planes are five times as fast as RGB pixels, also below."""
     height, width = red.shape
     evidence, is_open = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     for y in range(height):
@@ -147,7 +147,7 @@ def _doubtful(
     drawn_red: F32, drawn_green: F32, drawn_blue: F32, alpha: F32,
     is_open: F32, found: Bool, trusted: Bool,
 ) -> F32:  # fmt: skip
-    """Return what being less red than the model (0..1) and the frame before add, [h, w].
+    """Return the evidence [h, w] of being less red than the model (0..1), and of the frame before.
 
     What is redder than the model is tissue that an instrument has left.
     """
@@ -166,7 +166,7 @@ def _doubtful(
 
 @kernel
 def _count_doubt(found: Bool, evidence: F32, step: float, held: F32, trusted: Bool) -> None:
-    """Seconds on doubtful grounds, and whether they still count; in place."""
+    """Updates in place the seconds of being instrument on doubtful grounds, and whether these still count."""
     height, width = found.shape
     for y in range(height):
         for x in range(width):
@@ -178,7 +178,7 @@ def _count_doubt(found: Bool, evidence: F32, step: float, held: F32, trusted: Bo
 
 
 def _regions(evidence: F32) -> Bool:
-    """Regions of evidence of at least 1 that touch the picture's edge and are sure somewhere."""
+    """Regions of evidence of at least 1 that touch the picture's edge and reach `SURE` somewhere."""
     solid = (evidence >= 1).view(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, _disc(OPENING))
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _disc(CLOSING))

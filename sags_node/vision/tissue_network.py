@@ -26,11 +26,11 @@ MULTIPLE = 32  # px, of sides that the network leaves open
 
 
 class TissueNetwork:
-    """One picture in; out come scores of classes, one score, or class numbers, of the picture or coarser.
+    """Takes one picture, and gives scores of classes, one score, or class numbers, at its size or coarser.
 
     The highest of several scores is the class. Whole numbers are classes. One score is a probability while it
-    lies within 0 and 1, else a logit; where it is high is class 1. How pictures are fed is said as for depth
-    networks, in the file's metadata or a .yaml beside it; by default RGB as for ImageNet.
+    lies within 0 and 1, else a logit; where it is high is class 1. How pictures are fed is described as for
+    depth networks, in the file's metadata or a .yaml beside it; the default is RGB as for ImageNet.
 
     Args:
         size: width and height of the pictures it will get, px.
@@ -58,7 +58,7 @@ class TissueNetwork:
             raise UsageError(f"vision.tissue.path: {error}") from None
 
     def __call__(self, image: U8) -> Bool:
-        """Tissue [H, W] of a picture [H, W, 3] RGB.
+        """Return the tissue [H, W] of a picture [H, W, 3] RGB.
 
         Raises:
             DepthNetworkError: the network failed, or its answer is no mask.

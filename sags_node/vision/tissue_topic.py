@@ -26,8 +26,8 @@ class NoMaskError(SagsError):
 class TopicMasks:
     """The mask that was made of a frame, or of one within `tolerance` of it.
 
-    A mask is made of a picture that was published, so that of the newest frame comes too late for it: that of
-    the frame before is used. Nobody is waited for.
+    A mask is made of a published picture, so the newest frame's mask comes too late for it: the mask of the
+    frame before is used. The node does not wait.
 
     Attributes:
         is_new: whether the last mask was not used before.
@@ -50,7 +50,7 @@ class TopicMasks:
         self.is_new = False
 
     def __call__(self, pair: RectifiedPair) -> Bool:
-        """Tissue [H, W] of a rectified pair.
+        """Return the tissue [H, W] of a rectified pair.
 
         Raises:
             NoMaskError: none has come, none of this time, or it is no mask of this picture.

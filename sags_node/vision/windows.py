@@ -13,13 +13,13 @@ from sags_node.types import F32
 
 @inlined
 def chunks(width: int) -> Any:
-    """How many vectors cover a row."""
+    """Return how many vectors cover a row."""
     return (width + LANES - 1) // LANES
 
 
 @inlined
 def chunk(i: int, width: int) -> Any:
-    """The first pixel of one of them."""
+    """Return the first pixel of a row's `i`-th vector."""
     return min(i * LANES, width - LANES)
 
 
@@ -30,8 +30,8 @@ def inside(y: Any, height: int) -> Any:
 
 @kernel
 def repeat_ends(line: F32, at: int, width: int, radius: int) -> None:
-    """`width` sums stand in `line` from `at` + `radius` on: repeat the first and last in the `radius` places
-    before and after them."""
+    """Repeat the first and the last of `width` sums, which stand in `line` from `at` + `radius` on, in the
+    `radius` places before and after them."""
     for k in range(radius):
         line[at + k] = line[at + radius]
         line[at + radius + width + k] = line[at + radius + width - 1]
@@ -39,7 +39,7 @@ def repeat_ends(line: F32, at: int, width: int, radius: int) -> None:
 
 @inlined
 def window_row(line: F32, at: int, radius: int) -> Any:
-    """A vector of sums over 2 radius + 1 places, the first from `at` on."""
+    """Return a vector of sums over 2 radius + 1 places, the first from `at` on."""
     found = load_anywhere(line, at)
     for k in range(1, 2 * radius + 1):
         found = found + load_anywhere(line, at + k)

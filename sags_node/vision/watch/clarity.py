@@ -1,4 +1,4 @@
-"""How clear the eyes see: contrast and fine detail, beside what they usually have and beside each other."""
+"""How clearly the eyes see: contrast and fine detail, compared with the usual and with the other eye."""
 
 import math
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ LOCAL = 15  # px of it: shading wider than that is no structure
 
 # Octaves. Contrast and detail of a heart's two pictures differ by half an octave and one, on other tissue by
 # 0.1, and change by 0.2 while it moves. A fogged lens takes one and a half, and all of the detail.
-USUAL_DIFFERENCE = 0.6  # what eyes may differ by for good
-LOST_CONTRAST = 0.8  # beside what they usually differ by
-LOST_DETAIL = 1.5  # of one eye beside the other, and of both beside what they usually have
-VEILED = 0.5  # of the contrast of both eyes, beside what they usually have
-FINEST = 0.005  # of the detail: below is rounding
+USUAL_DIFFERENCE = 0.6  # by which eyes may differ permanently
+LOST_CONTRAST = 0.8  # of one eye against the other, beyond their usual difference
+LOST_DETAIL = 1.5  # of one eye against the other, and of both against their usual detail
+VEILED = 0.5  # of both eyes' contrast, against their usual one
+FINEST = 0.005  # least ratio of detail, not in octaves: below is rounding
 REMEMBERED_S = 3.0  # s over which what is usual follows
 LASTING_S = 10.0  # s: what has been unclear for so long is how the scene looks now
 
@@ -31,7 +31,7 @@ SMOKE = Finding(
 
 
 class Unclear(NamedTuple):
-    """What one frame lacks."""
+    """What is unclear in one frame."""
 
     eye: str = ""  # the one that is fogged: left or right
     all: str = ""  # what all eyes are: blurred or veiled
@@ -76,13 +76,13 @@ class Clarity:
 
 
 def structure(pyramid: GrayPyramid) -> F32:
-    """Return what is no shading, in a small picture [h, w]."""
+    """Return a small picture [h, w] without its shading."""
     small = _small_level(pyramid)
     return np.ascontiguousarray(inner(small - cv2.blur(small, (LOCAL, LOCAL))))
 
 
 def mean_difference(a: F32, b: F32) -> float:
-    """Mean of the absolute differences of two small pictures."""
+    """Return the mean absolute difference of two small pictures."""
     return cv2.norm(a, b, cv2.NORM_L1) / a.size
 
 
@@ -103,8 +103,8 @@ def _contrast(pyramid: GrayPyramid, structure: F32) -> float:
 
 
 def _detail(pyramid: GrayPyramid) -> float:
-    """Octaves of what is finer than a blur: steps between the pixels of the first half over those of a
-    picture of half its size, which are half of them when there is nothing finer."""
+    """Fine detail, in octaves: the steps between pixels of the first half over those of the next smaller one,
+    less 0.5, which is their ratio if there is no finer detail."""
     fine = inner(pyramid.halves[0])[::4]
     coarse = inner(pyramid.halves[min(1, len(pyramid.halves) - 1)])[::2]
     steps = [mean_difference(rows[:, 1:], rows[:, :-1]) for rows in (fine, coarse)]

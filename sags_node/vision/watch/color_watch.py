@@ -13,7 +13,7 @@ from sags_node.vision.watch.palette import Colors
 from sags_node.vision.watch.standing import Debounced
 
 ACROSS = 64  # pixels across the picture that are looked at
-DARK = 0.15  # of full light, mean of R, G and B: below, the black of the camera counts
+DARK = 0.15  # of full light, mean of R, G and B: below, the camera's black level distorts colours
 LEAST_SEEN = 0.1  # of them are neither dark nor clipped: fewer tell nothing
 BLUE = 0.08  # of R + G + B: blue over red of the median pixel
 
@@ -28,7 +28,7 @@ class ColorWatch(Debounced):
     """Looks at the left picture of every frame."""
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Return what was judged before: colours hold nothing back."""
+        """Note whether red and blue are exchanged. Returns `judged`: colours hold nothing back."""
         self.note(evidence.pair.t_capture_ns, [EXCHANGED] if is_blue(evidence.pair.left) else [])
         return judged
 

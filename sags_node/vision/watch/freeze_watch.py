@@ -2,8 +2,8 @@
 
 A camera never gives the same picture twice: its noise differs. A capture card or a scope's processor that
 lost its input repeats the last one, often under a caption that goes on: a clock, a dot. A codec on the way
-sends it anew with each key frame, equal up to quantisation. Where both eyes take that way, neither tells of
-the other (`vision.watch.pair_watch`). Recordings may repeat pictures: nobody takes them for the present.
+sends it anew with each key frame, equal up to quantisation. If both eyes freeze so, comparing them shows
+nothing (`vision.watch.pair_watch`). Recordings may repeat pictures: nobody takes them for the present.
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,16 @@ import numpy as np
 from sags_node.types import F32, U8, Bool, Finding
 from sags_node.vision.watch.judgement import Evidence, Judgement
 
-LONGEST_NS = 300_000_000  # what converts frame rates repeats a picture for 0.1 s at most (10 Hz given as 30)
-LONGEST_STILL_NS = 2_000_000_000  # tissue that lives moves within a heartbeat, or a breath
-GROUP_NS = (
-    190_000_000  # pictures from a key frame to the next: they repeat each other for longer than 5 Hz do
-)
-EVERY = 2  # px
+LONGEST_NS = 300_000_000  # a converter of frame rates repeats a picture for 0.1 s at most (10 Hz given as 30)
+LONGEST_STILL_NS = 2_000_000_000  # living tissue moves within a heartbeat, or a breath
+GROUP_NS = 190_000_000  # least time between key frames of a frozen picture; at 5 Hz pictures change sooner
+EVERY = 2  # px between the pixels that are compared
 CELLS = 40  # across the picture
 CAPTIONS = 0.04  # of the cells, all outside the middle half of the picture, may change
 RECODED = 4.0  # grey levels, rms in a cell: codecs at common rates differ by less from key frame to key frame
 RECODED_CELLS = 0.15  # of the cells may differ more
-STILL_CELLS = 0.05  # and while nothing moves; of D4D at rest a tenth does within a second
-QUIET_CELLS = 0.5  # of the cells are equal in every bit: this is no sensor's noise
+STILL_CELLS = 0.05  # of the cells may do so while nothing moves; in D4D at rest a tenth do within a second
+QUIET_CELLS = 0.5  # of the cells are equal in every bit: there is no sensor noise
 GLANCED, GLANCED_ROWS = 8.0, 8  # grey levels, mean over some rows: no codec makes that
 
 Box = tuple[int, int, int, int]
@@ -51,29 +49,29 @@ class _Change(Enum):
 
 
 class FreezeWatch:
-    """Compares every live frame with the first that showed the same, as they came.
+    """Compares every live frame, as it came, with the first that showed the same picture.
 
     Attributes:
         findings: what is wrong, and how to fix it. May be read from any thread.
 
     Args:
-        captions: x, y, width and height of boxes that count for nothing, px of the raw left picture.
+        captions: x, y, width and height of boxes that are ignored, px of the raw left picture.
     """
 
     def __init__(self, captions: Sequence[Box] = ()) -> None:
         self.findings: tuple[Finding, ...] = ()
         self._captions = captions
         self._last_ns = 0  # stamp of the frame before
-        self._shown: Eyes = ()  # what has been shown since
+        self._shown: Eyes = ()  # the frame that has been repeated since
         self._changed: list[Bool] = []  # cells of each eye that captions have changed since
-        self._group_ns = 0  # it has been for so long, by the stamps
-        self._unchanged_ns = 0  # and with the groups of pictures before
-        self._first: Eyes = ()  # hardly anything has changed since
-        self._is_quiet = False  # without noise
-        self._still_ns = 0  # and so it was for so long
+        self._group_ns = 0  # for how long that has been shown, by the stamps
+        self._unchanged_ns = 0  # the same, with the groups of pictures before that differ only in coding
+        self._first: Eyes = ()  # the frame since which hardly anything has changed
+        self._is_quiet = False  # the newest frame has no sensor noise
+        self._still_ns = 0  # for how long hardly anything has changed, without noise
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """A picture that came for too long is held."""
+        """Hold a picture that has come for too long."""
         frame = evidence.frame
         passed_ns = max(0, frame.t_capture_ns - self._last_ns)  # clocks may be set back
         self._last_ns = frame.t_capture_ns
@@ -99,7 +97,7 @@ class FreezeWatch:
         return judged
 
     def _change(self, eyes: Eyes) -> _Change:
-        """Since `_shown`."""
+        """How the picture differs from `_shown`."""
         if [eye.shape for eye in eyes] != [eye.shape for eye in self._shown]:
             return _Change.NEW
         if any(map(self._is_plainly_new, eyes, self._shown)):
@@ -113,8 +111,8 @@ class FreezeWatch:
         return _Change.RECODED if _are_recoded(squares, RECODED_CELLS) else _Change.NEW
 
     def _squares(self, eyes: Eyes, others: Eyes) -> list[F32]:
-        """The squares of the differences of each eye, the mean in each cell [rows, columns]; 0 under known
-        captions."""
+        """The mean squared difference of each eye in each cell [rows, columns], of the channel where it is
+        largest; 0 under known captions."""
         found = []
         for eye, other in zip(eyes, others, strict=True):
             height, width = eye.shape[:2]
@@ -126,11 +124,11 @@ class FreezeWatch:
         return found
 
     def _is_plainly_new(self, picture: U8, other: U8) -> bool:
-        """A few rows show that most are."""
+        """Whether a few rows show that a picture is new; most new ones are found so."""
         return max(cv2.mean(self._apart(picture, other, max(1, len(picture) // GLANCED_ROWS)))) > GLANCED
 
     def _apart(self, picture: U8, other: U8, rows: int) -> U8:
-        """The differences in every so many rows."""
+        """The absolute differences in every `rows`-th row; 0 under known captions."""
         apart = cv2.absdiff(*(np.ascontiguousarray(eye[::rows, ::EVERY]) for eye in (picture, other)))
         for x, y, width, height in self._captions:
             apart[-(-y // rows) : -(-(y + height) // rows), x // EVERY : -(-(x + width) // EVERY)] = 0

@@ -1,4 +1,4 @@
-"""What watchers say of a frame: the one question of all of them is what of it may be trusted."""
+"""What watchers say of a frame. All answer one question: what of it may be trusted?"""
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
@@ -21,12 +21,12 @@ class Judgement:
     """What of a frame may be used."""
 
     hold: str = ""  # why nothing of it is taken in; empty: it is
-    stage: str = "picture"  # what that is about
+    stage: str = "picture"  # the stage to which `hold` belongs
     repeats: bool = False  # it shows the same as the frame mapped last
     no_stereo: str = ""  # why its eyes are not matched; empty: they are
-    learn: bool = True  # else it is followed, and not learnt
+    learn: bool = True  # False: it is followed, but not learnt
     is_new_scene: bool = False  # it shows another scene for good: begin a new model
-    covered: Bool | None = None  # [h, w] a small picture of what is not tissue now
+    covered: Bool | None = None  # [h, w] in a small picture: what is not tissue now
     covered_left: Bool | None = None  # [rows, columns] cells that the left eye does not see
     covered_right: Bool | None = None  # and the right one
     gain: F32 | None = None  # [3] exposure to be taken out of the pictures
@@ -41,7 +41,7 @@ class Watcher(Protocol):
         """Return what is wrong, and how to fix it. May be read from any thread."""
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Return what may be used of a frame: `judged`, which those that were asked before say, or less."""
+        """Return what may be used of a frame: `judged`, which the watchers before it returned, or less."""
 
 
 class PoseWatch:
@@ -56,7 +56,7 @@ class PoseWatch:
         self._needed = needed
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Without its pose a frame is held: nobody knows where it shows the tissue."""
+        """Hold a frame without a pose: nobody knows where it shows the tissue."""
         problem = evidence.frame.pose_problem if self._needed else None
         self.findings = () if problem is None else (problem,)
         return judged if problem is None else replace(judged, hold=problem.text, stage="pose")

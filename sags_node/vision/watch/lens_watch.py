@@ -21,7 +21,7 @@ from sags_node.vision.watch.standing import Debounced, watched_ns
 
 CELLS = 40  # across the picture
 SMALLEST = 8  # px of the first half, the side of a cell: of fewer, the detail is chance
-EVERY = 2  # rows of a cell that are looked at
+EVERY = 2  # rows from one that is read to the next
 NOISE = 0.5  # grey levels: detail below it is a camera's noise
 # Octaves of one eye's detail beside the other's. Of 100 cells of tissue that is pulled, one loses 0.8; under
 # drops 90 lose more than 1, half of them 3.
@@ -44,7 +44,7 @@ class LensWatch(Debounced):
         self._hidden: I8 = np.zeros((1, 1), np.int8)  # -1: from the left eye, 1: from the right one
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """The depth of the frame mapped last says where tissue is in the right picture."""
+        """Find what the lenses hide. The frame mapped last tells where tissue is in the right picture."""
         pair, last = evidence.pair, evidence.last
         if last is None or evidence.is_repeat:
             return judged
@@ -86,8 +86,8 @@ class LensWatch(Debounced):
 
 @kernel
 def _measure(half: F32, side: int, detail: F32) -> None:
-    """Second differences along and across every other row, mean over each cell, grey levels: edges that are
-    only out of focus have next to none."""
+    """Mean absolute second differences, along and across every other row, in each cell, grey levels. Edges
+    out of focus have next to none."""
     rows, columns = detail.shape
     line = np.empty(columns * side, np.float32)  # sums over the pixels below each other in one row of cells
     share = np.float32(1 / (side * -(-side // EVERY)))
@@ -104,7 +104,7 @@ def _measure(half: F32, side: int, detail: F32) -> None:
 
 @kernel
 def _add_bends(above: F32, row: F32, below: F32, line: F32) -> None:
-    """`row` begins a pixel before the others."""
+    """Adds the second differences of a row to `line`; `row` begins a pixel before the others."""
     one, two = np.uint64(1), np.uint64(2)
     for i in range(line.size):
         x = np.uint64(i)
@@ -118,8 +118,8 @@ def _compare(detail: F32, depth: F32, side: int, focal_baseline: Any, apart: F32
 
     Args:
         depth: [H, W] m, of the left eye's pixels; 0: unknown, taken for the median.
-        side: px of it in a cell.
-        focal_baseline: a distance of 1 m is so many cells of disparity.
+        side: of a cell, px of `depth`.
+        focal_baseline: disparity at a distance of 1 m, in cells.
     """
     rows, columns = apart.shape
     inverse, known = np.zeros((rows, columns), np.float32), np.empty(rows * columns, np.float32)
@@ -146,8 +146,8 @@ def _compare(detail: F32, depth: F32, side: int, focal_baseline: Any, apart: F32
 
 @kernel
 def _judge(apart: F32, tissue: Bool, side: int, share: Any, usual: F32, hidden: I8, covered: Bool) -> Any:
-    """Carry on what is usual and what is hidden of each cell, in place. Writes what is `covered`
-    [left or right, rows, columns], a cell wider than what is hidden. Returns how many are hidden."""
+    """Updates each cell's `usual` and `hidden` in place. Writes `covered` [left or right, rows, columns], a
+    cell wider than what is hidden. Returns how many cells are hidden from either eye."""
     rows, columns = apart.shape
     lost, back, most = np.float32(LOST), np.float32(BACK), np.float32(USUAL_DIFFERENCE)
     found = np.zeros((rows, columns), np.int8)

@@ -1,8 +1,8 @@
-"""Whether the eyes are at one time and in one place: what the matched rows tell of it.
+"""Whether both eyes show one moment and still stand as calibrated: what the rows of matches tell of it.
 
 Where tissue moves up or down, an eye that is late shows it on another row than the other eye does. Row errors
-that grow with the vertical motion are lateness; those that jump all over the picture are a knock at the
-scope. Both mean that disparities are off by as much.
+that grow with the vertical motion mean that an eye is late; a jump all over the picture means that the scope
+was knocked. In both cases disparities are off by as much.
 """
 
 import math
@@ -18,15 +18,15 @@ from sags_node.vision.flow import OpticalFlow
 from sags_node.vision.pyramid import inner, narrowed
 from sags_node.vision.watch.standing import Debounced, watched_ns
 
-STRIDE = 4  # px
-WINDOW_NS = 200_000_000  # of the motion that is compared with row errors
-FEWEST_FIELDS, LONGEST_WINDOW_NS = 3, 1_000_000_000  # behind it where frames that are matched are far apart
+STRIDE = 4  # px between patches of the flow
+WINDOW_NS = 200_000_000  # ns of motion that are compared with row errors
+FEWEST_FIELDS, LONGEST_WINDOW_NS = 3, 1_000_000_000  # with fewer fields the window is longer (ns)
 FEWEST_LATE = 2  # fields that show it, each by itself: one alone was tissue that slips or a match gone wrong
-SHORTEST_STEP_NS = 50_000_000  # between two frames: in less time tissue moves less than flow errs
+SHORTEST_STEP_NS = 50_000_000  # between two frames: in less time tissue moves less than the flow's error
 LONGEST_STEP_NS = 200_000_000  # between two frames: longer motion is not followed in so small pictures
 LATE_ERROR = 0.2  # px of the working size, explained by motion: 1 % of the depth where disparities are 20 px
-LEAST_SLOPE = 0.1  # of the motion in a frame: less is chance
-KNOCKED = 1.0  # px of the working size beside the usual row error; clear pairs stay within 0.1
+LEAST_SLOPE = 0.1  # row error over motion: less is chance
+KNOCKED = 1.0  # px of the working size from the usual row error; clear pairs stay within 0.1
 LEAST_MATCHED = 0.6  # of the usual share of matches
 REMEMBERED_S = 5.0  # s over which what is usual follows: a lasting loss of matches is usual after twice that
 
@@ -47,9 +47,9 @@ class _Sums(NamedTuple):
 
     stamp_ns: int
     matches: int
-    motion: float  # of squares
-    product: float  # of motion and row error
-    error: float  # px
+    motion: float  # squared, px^2
+    product: float  # motion times row error, px^2
+    error: float  # row error, px
 
     @property
     def explained(self) -> float:
@@ -58,11 +58,11 @@ class _Sums(NamedTuple):
 
 
 class MatchWatch(Debounced):
-    """Looks at every field of matches. They may be farther apart than flow can follow: the motion is that
-    since a frame shortly before, which need not have been matched.
+    """Looks at every field of matches. These may be farther apart than flow can follow, so motion is measured
+    since a frame shortly before, matched or not.
 
     Attributes:
-        is_late: an eye was, in the last field.
+        is_late: an eye was late in the last field.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class MatchWatch(Debounced):
         self._seen.append((stamp_ns, narrowed(left)))
 
     def __call__(self, stamp_ns: int, rows: RowErrors) -> str:
-        """Take the row errors of the frame seen last; why its matches are no depth, or empty."""
+        """Take the row errors of the frame seen last. Return why it has no valid depth; empty: it has."""
         share = min(1.0, watched_ns(self._stamp_ns, stamp_ns) * 1e-9 / REMEMBERED_S)
         self._stamp_ns = stamp_ns
         median, matched = rows.median, np.count_nonzero(rows.matched) / rows.matched.size
@@ -108,8 +108,8 @@ class MatchWatch(Debounced):
         return "far fewer places match than usual" if matched < LEAST_MATCHED * usual else ""
 
     def _follows_motion(self, stamp_ns: int, rows: RowErrors, knocked: bool) -> bool:
-        """Tell whether row errors follow the vertical motion of the last frames; where the scope may have
-        been `knocked`, whether that explains more of them than that they differ."""
+        """Tell whether row errors follow the vertical motion of the last frames. If the scope may have been
+        `knocked`, motion must explain more of them than a constant offset does."""
         small, sums = self._seen[-1][1], self._sums
         before = [shown for then, shown in self._seen if stamp_ns - then >= SHORTEST_STEP_NS]
         while sums:

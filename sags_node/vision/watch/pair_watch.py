@@ -1,6 +1,6 @@
-"""Whether both eyes show what they should: what no stage notices by itself, because it fails quietly.
+"""Whether both eyes show what they should: faults that no stage notices, because it fails quietly.
 
-Looked for in small pictures of every frame, whatever else is left out of it. An eye is compared with the
+They are looked for in small pictures of every frame, whatever else is skipped. An eye is compared with the
 other one and with what it showed a moment ago: a scene that gets smooth or stands still does so in both.
 """
 
@@ -19,9 +19,9 @@ from sags_node.vision.watch.judgement import Evidence, Judgement
 from sags_node.vision.watch.picture_fit import GREEN
 from sags_node.vision.watch.standing import Debounced
 
-BLOCK = 8  # px: of JPEG and its kin
-EVERY = 16  # rows
-# So many times the picture's mean step are the steps across borders larger than those beside them. Recorded
+BLOCK = 8  # px, of JPEG and similar codecs
+EVERY = 16  # rows from one that is read to the next
+# By how much steps across block borders exceed those beside them, over the picture's mean step. Recorded
 # endoscopies have 0.1 to 0.3; JPEG of quality 50 to 30 has 0.3 to 1.3, of quality 10, which keeps 28 to
 # 30 dB, 1.3 to 2.4.
 BLOCKY = 1.0
@@ -31,13 +31,13 @@ BLACK = 20.0  # grey levels; video that keeps its black at 16 too
 WHITE = 235.0  # and its white at 235
 ONE_COLOR = 6.0  # grey levels between the darkest and the brightest of a picture of one colour
 OUTLIERS = 0.01  # of the pixels at either end: a caption, dead pixels
-EQUAL = 0.5  # of what a shift by one small pixel makes; true pairs 1 to 5
+EQUAL = 0.5  # of the difference that a shift by one small pixel makes; true pairs have 1 to 5
 LEAST_MATCH = 0.35  # correlation; nothing matches below
-CLEARLY_BETTER = 0.2  # of a match the wrong way round, against the best the right way round
+CLEARLY_BETTER = 0.2  # correlation by which exchanged eyes must match better than in their order
 
-HISTORY = 12  # frames among which an eye is looked at for standing still
+HISTORY = 12  # frames with which an eye is compared to see whether it stands still
 MOVED = 1.0  # grey levels, mean: the other eye has moved for sure
-UNMOVED = 1 / 8  # of what changes in the other eye; clear pairs change alike to 1/2, fog leaves 1/4
+UNMOVED = 1 / 8  # of the other eye's change; clear pairs have 1/2 or more, with fog 1/4
 
 _TEXTS = {
     "black": "the {eye} picture is black: check the light, the lens cap and the cable",
@@ -78,7 +78,7 @@ class PairWatch(Debounced):
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Without its left picture a frame is held; without its right one nothing is matched."""
+        """Hold a frame with a bad left picture or exchanged eyes; do not match eyes of which one is bad."""
         frame = evidence.frame
         found = self._look(frame, evidence.pair)
         learn = not any(code.startswith("picture") for code, _ in found)
@@ -143,7 +143,7 @@ def _small(image: U8) -> Small:
 
 
 def _emptiness(rgb: U8) -> str:
-    """Black, white or plain, of one colour, in the middle, where every scope shows something; else empty."""
+    """The fault of the middle, where scopes show something: black, white, plain (one colour), or none."""
     height, width = rgb.shape[:2]
     middle = rgb[height // 4 : height - height // 4, width // 4 : width - width // 4]
     dark, bright = _ends(middle, round(OUTLIERS * middle.shape[0] * middle.shape[1])).tolist()
@@ -156,7 +156,7 @@ def _emptiness(rgb: U8) -> str:
 
 @kernel
 def _ends(rgb: U8, outliers: int) -> I64:
-    """The darkest and the brightest of each channel, [2, 3], but for so many pixels at either end."""
+    """The darkest and the brightest value of each channel, [2, 3], without so many outliers at either end."""
     counts, ends = np.zeros((3, 256), np.int64), np.empty((2, 3), np.int64)
     for y in range(rgb.shape[0]):
         for x in range(rgb.shape[1]):
@@ -176,14 +176,14 @@ def _ends(rgb: U8, outliers: int) -> I64:
 
 
 def _are_equal(left: F32, right: F32) -> bool:
-    """Two captures of one picture differ by noise and brightness, far less than by a small shift."""
+    """Whether both are captures of one picture: these differ far less than after a small shift."""
     apart = mean_difference(left, right * np.float32(cv2.mean(left)[0] / cv2.mean(right)[0]))
     return apart < EQUAL * mean_difference(left[:, 1:], left[:, :-1])
 
 
 def _are_exchanged(left: F32, right: F32) -> bool:
-    """In a rectified pair everything lies farther left in the right picture. In an exchanged one it lies
-    farther right, unless the eyes converge so much that the calibration shifts it back."""
+    """Whether the eyes are exchanged: then everything lies farther right in the right picture, not farther
+    left (unless the eyes converge so much that the calibration shifts it back)."""
     match = row_correlation(left, right)
     reach = len(match) // 2
     wrong, true = match[:reach].max(), match[reach + 1 :].max()
@@ -191,7 +191,7 @@ def _are_exchanged(left: F32, right: F32) -> bool:
 
 
 def row_correlation(left: F32, right: F32) -> F32:
-    """Correlation of the rows for disparities from minus to plus half of the width, [2 * (w // 2) + 1]."""
+    """Correlate rows for disparities from minus to plus half of the width, [2 * (w // 2) + 1]."""
     width = left.shape[1]
     reach = width // 2
     # Row after row, with so many zeros between them that a shift brings no row beside another.

@@ -1,5 +1,5 @@
-"""The colours that the tissue usually has, whatever the exposure. Blood is a colour that there is suddenly
-far more of.
+"""The colours that the tissue usually has, whatever the exposure. Blood shows as a colour of which there is
+suddenly far more.
 """
 
 import cv2
@@ -11,13 +11,13 @@ from sags_node.vision.watch.picture_fit import BRIGHT, DARK, FINE
 from sags_node.vision.watch.standing import watched_ns
 
 BINS = 32  # of the share of red in a colour, and of green
-RARE = 0.002  # of the tissue has a colour like this, or less
-NOVEL = 4.0  # times as much of it as usual, or as is rare: the colour is new
+RARE = 0.002  # of the tissue: least share that counts as usual for any colour
+NOVEL = 4.0  # times the usual share: a colour with more than that is new
 REMEMBERED_S = 3.0  # s over which the usual colours follow
 
 
 class Colors:
-    """The channels of a picture [h, w, 3], and what of it tells a colour.
+    """The channels of a picture [h, w, 3], and which of its pixels tell a colour.
 
     Attributes:
         light: [h, w] their sum.
@@ -25,14 +25,14 @@ class Colors:
     """
 
     def __init__(self, picture: U8, dark: float) -> None:
-        """`dark`: of full light, mean of the channels."""
+        """`dark`: of full light; a pixel is too dark if the mean of its channels is below."""
         self.red, self.green, self.blue = (each.astype(np.uint16) for each in cv2.split(picture))
         self.light = self.red + self.green + self.blue
         brightest = np.maximum(np.maximum(self.red, self.green), self.blue)
         self.fair: Bool = (self.light > 3 * 255 * dark) & (brightest < 255 * BRIGHT)
 
     def bins(self) -> NDArray[np.uint16]:
-        """[h, w] of `BINS` times `BINS`: by share of red, then of green."""
+        """Return each pixel's bin [h, w], of `BINS` times `BINS`: by share of red, then of green."""
         one = self.light + 1
         return np.asarray(BINS * (BINS * self.red // one) + BINS * self.green // one)
 
@@ -67,13 +67,13 @@ class Palette:
         return self._is_new
 
     def take(self, except_new: bool) -> None:
-        """Learn the colours of that picture."""
+        """Learn the colours of the picture that `new` took last; `except_new`: but for its new colours."""
         found = self._shares(self._counted & ~self._is_new if except_new else self._counted)
         if found.any():
             before = found if self._usual is None else self._usual
             self._usual = before + np.float32(self._share) * (found - before)
 
     def _shares(self, counted: Bool) -> F32:
-        """How much [BINS, BINS] of what is counted [h, w] has each colour."""
+        """The share [BINS, BINS] of each colour in what is `counted` [h, w]."""
         counts = np.bincount(self._bins[counted], minlength=BINS**2).reshape(BINS, BINS)
         return counts.astype(np.float32) / np.float32(max(1, counts.sum()))

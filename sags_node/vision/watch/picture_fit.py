@@ -9,8 +9,8 @@ from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, Bool
 
 FEWEST = 50  # small px of the model in the picture, to judge it by
-DARK, BRIGHT = 0.03, 0.95  # beyond, a channel tells noise or saturation
-MISFIT = 0.1  # of the range of colours, mean over the channels
+DARK, BRIGHT = 0.03, 0.95  # beyond, a channel shows only noise or saturation
+MISFIT = 0.1  # of the range of colours, mean over the channels: above it a pixel does not agree
 COVERED = 0.15  # of the px misfit: something covers them, or it is another scene; a beating heart stays below
 LEAST_MATCH = 0.3  # correlation of the structure
 SOME = 3  # every so many px tell the exposure
@@ -25,8 +25,8 @@ class Fit:
         usable: share of the channels that can be compared.
         gain: [3] of the exposure.
         wrong: [h, w] where they do not agree.
-        misfit: share of what is known there.
-        contrast: of what is seen over that of the model, after the gain.
+        misfit: share of the known pixels that do not agree.
+        contrast: that of the seen picture over that of the model, after the gain.
         match: correlation of their structure.
     """
 
@@ -51,13 +51,13 @@ class Fit:
 
 
 def structure(gray: F32) -> F32:
-    """Return what of a small picture [h, w] is neither noise nor shading."""
+    """Return the structure of a small picture [h, w]: neither noise nor shading."""
     found: F32 = cv2.blur(gray, (FINE, FINE)) - cv2.blur(gray, (LOCAL, LOCAL))
     return found
 
 
 def _misfit(seen: F32, drawn: F32, known: Bool, fair: Bool, gain: F32) -> tuple[Bool, float]:
-    """Find where pictures do not agree [h, w], and the share of what is known there."""
+    """Find where pictures do not agree [h, w], and the share of the known pixels where they do not."""
     difference, wrong = np.empty(seen.shape, np.float32), np.empty(known.shape, np.bool_)
     _subtract(seen, drawn, fair, np.reciprocal(gain), difference)
     count, misfit = _judge(cv2.blur(difference, (FINE, FINE)), known, fair, wrong)
@@ -67,7 +67,7 @@ def _misfit(seen: F32, drawn: F32, known: Bool, fair: Bool, gain: F32) -> tuple[
 @kernel
 def _compare(seen: F32, drawn: F32, known: Bool, fair: Bool, ratios: F32, counts: I64) -> Any:
     """Find where both can be compared (`fair`), in how many pixels of each channel (`counts`), and every
-    `SOME` th of the ratios there. Returns how many channels of the model could be."""
+    `SOME`-th of the ratios there. Returns how many of the model's values could be compared."""
     dark, bright = np.float32(DARK), np.float32(BRIGHT)
     channels = 0
     for y in range(known.shape[0]):
@@ -86,7 +86,7 @@ def _compare(seen: F32, drawn: F32, known: Bool, fair: Bool, ratios: F32, counts
 
 
 def _gain(ratios: F32, counts: I64) -> F32:
-    """[3] of the exposure: the median of each channel's ratios; of too few, the mean of the others."""
+    """The exposure's gain [3]: the median of each channel's ratios; if they are too few, the others' mean."""
     some = [-(-count // SOME) for count in counts.tolist()]
     known = {k: middle_of(ratios[k, : some[k]]) for k in range(3) if some[k] >= FEWEST}
     mean = sum(known.values()) / len(known) if known else 1.0
@@ -94,7 +94,7 @@ def _gain(ratios: F32, counts: I64) -> F32:
 
 
 def middle_of(values: F32) -> float:
-    """The upper of the middle ones; 0 of none. `np.median` takes eight times as long."""
+    """Return the upper median of values; 0 if there are none. `np.median` takes eight times as long."""
     half = values.size // 2
     return float(np.partition(values, half)[half]) if values.size else 0.0
 
@@ -130,7 +130,7 @@ def _judge(difference: F32, known: Bool, fair: Bool, wrong: Bool) -> Any:
 
 @kernel
 def _take_green(seen: F32, drawn: F32, fair: Bool, gain: Any, picture: F32, model: F32) -> None:
-    """One channel of both, less the gain. Where they cannot be compared both are the model: no edges."""
+    """The green of both, without the gain. Where they cannot be compared both are the model: no edges."""
     for y in range(model.shape[0]):
         for x in range(model.shape[1]):
             model[y, x] = drawn[y, x, GREEN]

@@ -1,7 +1,7 @@
 """Whether a picture shows the model's scene: what is too dark, too bright, veiled, covered or another scene
 is not to be learnt, and is no reason for a new model.
 
-Looked at in small pictures, before anything else is done with a frame. The exposure is one gain for each
+Small pictures are compared, before anything else is done with a frame. The exposure is one gain for each
 channel. A veil, as smoke is, takes contrast away all over. Blood and other cover changes some of the picture.
 Another scene changes most of it, and no motion explains it.
 """
@@ -24,19 +24,19 @@ from sags_node.vision.watch.picture_fit import COVERED, FEWEST, GREEN, LEAST_MAT
 from sags_node.vision.watch.standing import Debounced, watched_ns
 
 WIDTH = 80  # px of the small pictures
-SEEN_ALPHA = 0.5
+SEEN_ALPHA = 0.5  # of the model: a pixel with more is known
 LEAST_USABLE = 0.5  # of the model's channels can be compared: with less the picture is overexposed or dark
-WHOLE = 0.98  # with so much, it may be learnt in another exposure than the model's
+WHOLE = 0.98  # of them: with more, a picture may be learnt in another exposure than the model's
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
 VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
 RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
-LEAST_KEPT = 0.3  # of what is known, in view after motion
-LARGEST_GAIN = 1.5  # from one frame to the next; beyond, a picture is brought to the model's exposure
-STEADY = 1.2  # of the gain before: the exposure has changed for good when it stays so
-FOLLOWED = 0.9  # of the gain's logarithm, per frame, is still taken out of a picture after that
+LEAST_KEPT = 0.3  # of what is known must be in view after motion
+LARGEST_GAIN = 1.5  # over the model's exposure; a picture with more is brought to that exposure
+STEADY = 1.2  # factor to the gain before: if it stays smaller, the exposure has changed for good
+FOLLOWED = 0.9  # of the gain's logarithm that the frame before took out is taken out after that
 STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.001, a bleeding 0.04 in its first frame
-LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}
-NEW_SCENE_NS = 3_000_000_000
+LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}  # what lasts is usual
+NEW_SCENE_NS = 3_000_000_000  # ns: an unknown scene that lasts begins a new model
 
 _FLOW = OpticalFlow(stride=4)
 
@@ -55,15 +55,15 @@ _UNKNOWN = Finding(
 
 
 class Look(NamedTuple):
-    """What one picture is, beside the model as it was drawn last."""
+    """How one picture compares with the model as it was drawn last."""
 
     wrong: Finding | None = None  # why it cannot be followed
     veiled: bool = False  # its colours and contrast are not the scene's
     covered: Bool | None = None  # [h, w] where something lies over the scene; None: nowhere
     gain: F32 = np.ones(3, np.float32)  # [3] its exposure over the model's
     whole: bool = True  # next to nothing of it is clipped
-    guess: F32 | None = None  # [rows, columns, 2] px: where the scene is found again, about
-    clear: bool = True  # it is good in itself
+    guess: F32 | None = None  # [rows, columns, 2] px: roughly the motion to where the scene is found again
+    clear: bool = True  # the picture itself is good
 
 
 class SceneWatch(Debounced):
@@ -72,11 +72,11 @@ class SceneWatch(Debounced):
     def __init__(self, moving: bool = False) -> None:
         """
         Args:
-            moving: the camera's pose is estimated: what shows another scene is left to that.
+            moving: the camera's pose is estimated, which also deals with pictures of another scene.
         """
         self._moving = moving
         super().__init__()
-        self._since: dict[str, int] = {}  # stamps: how long something has lasted, but for what nobody saw
+        self._since: dict[str, int] = {}  # the stamps since when something lasts, moved on by unwatched gaps
         self._looked_ns: int | None = None  # at the frame before
         self._gain: F32 = np.ones(3, np.float32)  # of the frame before
         self._taken_out: F32 = np.ones(3, np.float32)
@@ -85,14 +85,14 @@ class SceneWatch(Debounced):
         self._is_clear = True  # the last frame was
 
     def forget(self) -> None:
-        """There is a new model."""
+        """Begin anew with a new model."""
         self._since.clear()
         self._palette = Palette()
         self._tissue = None
         self._gain = self._taken_out = np.ones(3, np.float32)
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Find where it is known that a frame is not to be learnt, its colours tell nothing."""
+        """Compare a frame with the scene. Colours are not judged of one that is not to be learnt anyway."""
         pair, last = evidence.pair, evidence.last
         if last is None or judged.hold or evidence.is_repeat:
             return judged
@@ -129,8 +129,8 @@ class SceneWatch(Debounced):
         return replace(judged, learn=learn, covered=cover, gain=gain, guess=seen.guess)
 
     def _cover(self, seen: Look, picture: U8, now: int) -> Bool | None:
-        """[h, w] what lies over the tissue: what the model does not explain, and colours that are new. What
-        stays so long is taken for tissue."""
+        """What lies over the tissue, [h, w]: what the model does not explain, and new colours. What lasts
+        longer than `LONGEST_NS` is taken for tissue."""
         assert self._tissue is not None
         new = self._palette.new(picture, self._tissue, now)
         is_strange = bool(np.count_nonzero(new & self._tissue) > STRANGE * np.count_nonzero(self._tissue))
@@ -145,7 +145,7 @@ class SceneWatch(Debounced):
         return grown.view(np.bool_)
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
-        """Return what to take out of the pictures; None: the model follows their exposure by itself."""
+        """Return the gain [3] to take out of the pictures; None: the model follows their exposure itself."""
         steady = _strength(gain / self._gain) < STEADY
         self._gain = gain
         if _strength(gain) <= LARGEST_GAIN:
@@ -158,14 +158,14 @@ class SceneWatch(Debounced):
         return self._taken_out
 
     def _lasts(self, what: str, is_so: bool, now: int) -> int:
-        """Count for how long it has been so, ns."""
+        """Return for how long it has been so, ns."""
         if not is_so:
             self._since.pop(what, None)
             return 0
         return now - self._since.setdefault(what, now)
 
     def _leave_gaps_out(self, now: int) -> None:
-        """Nothing lasted while nobody looked, nor until the clock was set back."""
+        """Does not count long gaps between frames, nor time before the clock was set back, as lasting."""
         before, self._looked_ns = self._looked_ns, now
         unseen = 0 if before is None else now - before - watched_ns(before, now)
         self._since = {what: since + unseen for what, since in self._since.items()}
@@ -181,7 +181,7 @@ def _every(step: int, picture: Any, small: Any) -> None:
 
 
 def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
-    """The pair as it would be with 1 / `gain` [3] of its exposure."""
+    """Return the pair as it would be with 1 / `gain` [3] of its exposure."""
     factors = (1 / gain).astype(np.float64)
 
     def change(picture: U8) -> U8:
@@ -194,13 +194,13 @@ def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
 
 
 def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
-    """A mask of a small picture for one of `shape`."""
+    """Enlarge a small picture's mask to `shape`."""
     large: U8 = cv2.resize(small.view(np.uint8), shape[1::-1], interpolation=cv2.INTER_NEAREST)
     return large.view(np.bool_)
 
 
 def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> Look:
-    """Return what a picture is, beside the frame mapped last.
+    """Compare a picture with the frame mapped last.
 
     Args:
         picture: [h, w, 3] the left one, small.
@@ -248,10 +248,10 @@ def _after_motion(
     now: GrayPyramid, before: GrayPyramid, guess: F32 | None, step: int, seen: F32, drawn: F32, known: Bool,
     fit: Fit,
 ) -> Fit:  # fmt: skip
-    """The fit after the motion that the pictures show, searched from a guess [rows, columns, 2] px of the way
-    back; `fit` where that is worse."""
+    """The fit after the motion between the pictures is taken out; `fit` if that is no better. The motion is
+    searched from a guess [rows, columns, 2] px of the way back."""
     few = narrowed(now)
-    px = np.float32(now.full.shape[1] / (2 * inner(few.halves[0]).shape[1]))  # of the picture in one of these
+    px = np.float32(now.full.shape[1] / (2 * inner(few.halves[0]).shape[1]))  # picture px per flow px
     flow = _FLOW(few, narrowed(before), None if guess is None else guess / px)
     flow = cv2.resize(flow, known.shape[::-1], interpolation=cv2.INTER_AREA) * (px / np.float32(step))
     columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in known.shape[::-1]))
@@ -265,7 +265,7 @@ def _after_motion(
 
 
 def _around(landmarks: Landmarks, step: int, shape: tuple[int, ...]) -> Bool:
-    """Find where [h, w] of a small picture tissue was found again: nothing covers it."""
+    """True [h, w] where tissue was found again in a small picture: nothing covers it there."""
     found = np.zeros(shape, np.uint8)
     columns, rows = np.rint(landmarks.after / step).astype(np.intp).T
     found[rows.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)] = 1
@@ -274,5 +274,5 @@ def _around(landmarks: Landmarks, step: int, shape: tuple[int, ...]) -> Bool:
 
 
 def _strength(gain: F32) -> float:
-    """How far a gain is from one, as a factor."""
+    """How far a gain is from one: the largest factor of a channel, up or down."""
     return float(max(max(each, 1 / max(each, 1e-6)) for each in gain.tolist()))

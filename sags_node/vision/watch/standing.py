@@ -1,24 +1,24 @@
-"""Which findings stand: one bad frame is none, and a warning ends soon after its cause. For how long
-something was watched."""
+"""Which findings stand: one bad frame makes none, and a warning ends soon after its cause. Also, how much of
+the time was watched."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
 
 from sags_node.types import Finding
 
-WINDOW_NS = 250_000_000  # half of the time in which a person is to be warned
-BEGINS, ENDS = 0.6, 0.3  # of the frames in that time: a finding stands, and it stands no more
-FEWEST = 2  # frames
-LONGEST_STEP_NS = 1_000_000_000  # between two frames: nobody knows what was to be seen in a longer gap
+WINDOW_NS = 250_000_000  # ns: half of the time within which a person must be warned
+BEGINS, ENDS = 0.6, 0.3  # of the frames in that time: a finding begins at the first and ends below the second
+FEWEST = 2  # frames that must show a finding
+LONGEST_STEP_NS = 1_000_000_000  # ns: of a longer gap between two frames only so much counts as watched
 
 
 def watched_ns(before_ns: int | None, now_ns: int) -> int:
-    """How much of the time between two frames was watched: none where the clock was set back."""
+    """Return how much of the time between two frames was watched: none if the clock was set back."""
     return 0 if before_ns is None else min(max(0, now_ns - before_ns), LONGEST_STEP_NS)
 
 
 class Debounced:
-    """What watchers have in common: the findings of the last frames, and those of them that last.
+    """What watchers have in common: it keeps the findings of the last frames, and tells which of them last.
 
     Attributes:
         findings: those that stand. May be read from any thread.
