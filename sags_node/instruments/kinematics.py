@@ -54,6 +54,7 @@ class Arm:
         grown = np.diag(self._spread) + older * DRIFT
         self._spread[np.diag_indices(6)] = np.maximum(np.diag(self._spread), np.minimum(grown, self._most))
         self._told_ns = t_ns
+        self._learnt_ns = min(self._learnt_ns, t_ns)  # of a clock that was set back
 
     @property
     def tip(self) -> F64:

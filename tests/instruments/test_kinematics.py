@@ -122,6 +122,17 @@ def test_one_that_is_told_in_plain_sight_and_not_seen_there_is_not_sure() -> Non
     assert len(set(states.ids.tolist())) == 2
 
 
+@pytest.mark.fault("clock: set back while a robot's tool is corrected")
+def test_what_is_seen_is_learnt_where_the_clock_was_set_back() -> None:
+    arm, E, tip = Arm(1, ERROR), moved(0.003, 0, 0), np.array([0.02, 0.0, 0.06])
+    for begin in (1000 * S, 0):
+        E = E @ moved(0.003, 0, 0)
+        for number in range(50):
+            arm.move(E @ pose(tip, np.array([0.6, 0.0, 0.8])), begin + number * S // 10)
+            arm.learn(tip, 0.001)
+        assert np.linalg.norm(arm.tip - tip) < 0.001
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_false_tips_of_the_picture_are_passed_over(seed: int) -> None:
     """Kinematics 5 mm and 5 degrees off, of a tip that goes round for 20 s; it is seen to 1 mm, but one time
