@@ -17,7 +17,7 @@ SURE = 0.5  # of both confidences: docs/wire.md, Anchors
 
 
 def follow(u: float, v: float, frames: int | None) -> None:
-    """Print where the tissue at pixel u, v of the left picture is, a line for each frame."""
+    """Print where the tissue at pixel u, v of the left image is, a line for each frame."""
     with Subscriber([ANCHORS], patience=60) as node, ControlClient() as control:
         newest = node.wait(ANCHORS, timeout=60)  # with the first frame there is a model to pin to
         if newest is None:
@@ -57,7 +57,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("u", type=float, help="px, in the left picture")
+    parser.add_argument("u", type=float, help="px, in the left image")
     parser.add_argument("v", type=float)
     parser.add_argument("--frames", type=int, help="stop after so many; default: Ctrl-C")
     asked = parser.parse_args()

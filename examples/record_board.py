@@ -86,7 +86,7 @@ def main() -> None:
     except (SagsError, WriterError) as error:
         sys.exit(f"error: {error}")
     place = " ".join(f"{1e3 * part:.2f}" for part in T_HAND_CAMERA[:3, 3])
-    print(f"camera on the hand: {place} mm; robot - pictures: {1e3 * AHEAD_S:.0f} ms")
+    print(f"camera on the hand: {place} mm; robot - images: {1e3 * AHEAD_S:.0f} ms")
 
 
 if __name__ == "__main__":

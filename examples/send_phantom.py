@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--pose-endpoint", help="also hand the scope's pose in there")
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--name", default="/stereo")
-    parser.add_argument("--jpeg", type=int, help="quality; default: raw pictures")
+    parser.add_argument("--jpeg", type=int, help="quality; default: raw images")
     parser.add_argument("--size", type=int, nargs=2, default=(640, 512), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--seconds", type=float, help="default: until Ctrl-C")

@@ -21,7 +21,7 @@ PICTURE, MASK = TopicName("left/image_rect_color", ReceivedImage), "left/tissue_
 
 
 def segment(picture: U8) -> U8:
-    """255 where a picture [H, W, 3] RGB shows tissue, else 0."""
+    """255 where an image [H, W, 3] RGB shows tissue, else 0."""
     red, green, _ = np.moveaxis(picture.astype(np.int16), -1, 0)
     return np.where(red - green > 25, 255, 0).astype(np.uint8)
 
@@ -34,7 +34,7 @@ def main(endpoint: str) -> None:
             publisher.poll(0)  # lets the node subscribe
             newest = subscriber.wait(PICTURE, timeout=0.1, after=last)
             if newest is not None:
-                last, stamp_ns = newest, newest.stamp_ns  # the mask bears the stamp of its picture
+                last, stamp_ns = newest, newest.stamp_ns  # the mask bears the stamp of its image
                 mask = cdr.image(segment(newest.array), "mono8", stamp_ns)
                 publisher.publish_content(MASK, mask, newest.meta.frame_id, stamp_ns, newest.meta.epoch)
 

@@ -37,7 +37,7 @@ lerobot_option = click.option(
     "--lerobot",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Depth, tracks, both pictures and masks of every frame of a recording, in the form of LeRobot.",
+    help="Depth, tracks, both images and masks of every frame of a recording, in the form of LeRobot.",
 )
 
 

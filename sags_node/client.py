@@ -1,5 +1,5 @@
 """The API for programs that use a node: subscribers, received messages, control requests, and senders of
-pictures and poses.
+images and poses.
 
 Importing it loads NumPy, ZeroMQ and the message formats, but nothing of the mapper: no Numba, torch, OpenCV
 or Open3D.

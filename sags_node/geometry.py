@@ -94,7 +94,7 @@ def unproject(camera: Camera, pixels: Array, depths: Array) -> Array:
 
 
 def scale_intrinsics(K: F64, size: tuple[int, int], new_size: tuple[int, int]) -> F64:
-    """`K` [3, 3] for a picture resized from `size` to `new_size` (width, height). Pixel centres are integers,
+    """`K` [3, 3] for an image resized from `size` to `new_size` (width, height). Pixel centres are integers,
     so the point that stays in place is the corner (-0.5, -0.5), not (0, 0)."""
     sx, sy = new_size[0] / size[0], new_size[1] / size[1]
     scaled = K.copy()
@@ -106,19 +106,19 @@ def scale_intrinsics(K: F64, size: tuple[int, int], new_size: tuple[int, int]) -
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The camera whose picture is resized to `width` x `height` px."""
+    """The camera whose image is resized to `width` x `height` px."""
     K = scale_intrinsics(camera.K, (camera.width, camera.height), (width, height))
     return Camera(width, height, K, camera.T_world_cam)
 
 
 def scale_pixels(pixels: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
-    """Convert pixels [..., 2] of a picture of `size` (width, height) to that resized to `new_size`."""
+    """Convert pixels [..., 2] of an image of `size` (width, height) to that resized to `new_size`."""
     factors = np.array(new_size, np.float64) / size
     return (pixels + 0.5) * factors - 0.5
 
 
 def disparity_to_depth(disparity: F32, focal_px: float, baseline: float) -> F32:
-    """Depth (m) of a disparity picture (px); where disparity <= 0 the depth is 0, unknown."""
+    """Depth (m) of a disparity image (px); where disparity <= 0 the depth is 0, unknown."""
     return np.divide(
         np.float32(focal_px * baseline), disparity, out=np.zeros_like(disparity), where=disparity > 0
     )

@@ -36,7 +36,7 @@ I8 = NDArray[np.int8]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
-Samples = NDArray[np.uint8] | NDArray[np.uint16]  # of a picture as a camera gives it
+Samples = NDArray[np.uint8] | NDArray[np.uint16]  # of an image as a camera gives it
 Side = Literal["left", "right"]
 
 # A view drawn at a small size holds the mean colour of each pixel. It differs from the colour at the centre
@@ -80,9 +80,9 @@ class Camera:
 class Eye:
     """One camera of a stereo rig, as a ROS camera_info file describes it."""
 
-    width: int  # px, of the raw picture
+    width: int  # px, of the raw image
     height: int
-    K: F64  # [3, 3] px, raw picture
+    K: F64  # [3, 3] px, raw image
     distortion: F64  # [5] plumb_bob: k1 k2 p1 p2 k3; or [8] rational_polynomial: and k4 k5 k6
     R: F64  # [3, 3] rotation from the raw to the rectified camera
     P: F64  # [3, 4] projection of the rectified camera; P[0, 3] = -f B for the right eye, metres
@@ -90,7 +90,7 @@ class Eye:
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """Two calibrated eyes whose rectified pictures share rows."""
+    """Two calibrated eyes whose rectified images share rows."""
 
     name: str
     left: Eye
@@ -123,7 +123,7 @@ class Reference:
     """The ground truth that a recording has for one frame. Only for evaluation: the frame path never reads
     it."""
 
-    depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified picture at calibration size
+    depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified image at calibration size
     depth_kind: str = "exact"  # exact | structured_light | ct | stereo_network
     points: F64 | None = None  # [P, 3] m, world: the same surface points in every frame
     points_visible: Bool | None = None  # [P] seen by the left eye in this frame
@@ -141,7 +141,7 @@ class ToolPose:
 
 @dataclass(frozen=True, slots=True)
 class StereoFrame:
-    """A raw stereo picture pair as a source delivers it."""
+    """A raw stereo image pair as a source delivers it."""
 
     frame_id: int  # gaps are frames the source dropped
     t_capture_ns: int  # left eye
@@ -150,21 +150,21 @@ class StereoFrame:
     right: U8 | None  # [H, W, 3] RGB, raw; None only where `depth` is given
     epoch: int = 0  # grows when the clock jumps back or a recording loops
     T_world_cam: F64 | None = None  # [4, 4] pose of the left rectified camera, when the session knows it
-    tissue: Bool | None = None  # [H, W] raw left picture, when the session knows it
+    tissue: Bool | None = None  # [H, W] raw left image, when the session knows it
     reference: Reference | None = None
     depth: F32 | None = None  # [H, W] m, 0 unknown, left rectified, at calibration size; instead of stereo
     t_device_ns: int = 0  # left eye, as the device, sender or recording stamped it by its own clock; 0: none
-    t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live picture
+    t_arrival_ns: int = 0  # left eye, wall clock; 0: not a live image
     pose_problem: Finding | None = None  # why `T_world_cam` is an older pose; such a frame is not taken in
     tools: tuple[ToolPose, ...] = ()  # where a robot says that its tools are
     warm_up: bool = False  # the model learns from it, and nothing of it is shown or counted
     recorded_s: float | None = None  # s, its time in the recording, from 0 in each loop; None: live
-    recorded_number: int = -1  # index of its left picture in the recording, from 0; -1: live
+    recorded_number: int = -1  # index of its left image in the recording, from 0; -1: live
 
 
 @dataclass(frozen=True, slots=True)
 class GrayPyramid:
-    """A gray picture and its smaller copies; see `vision.pyramid`."""
+    """A gray image and its smaller copies; see `vision.pyramid`."""
 
     full: U8  # [H, W]
     halves: tuple[F32, ...]  # grey levels 0..255; [k] has (H >> k + 1) x (W >> k + 1) px and a border around
@@ -172,7 +172,7 @@ class GrayPyramid:
 
 @dataclass(frozen=True, slots=True)
 class RectifiedPictures:
-    """The rectified pictures of a frame, before its camera's pose is known: the part that takes time."""
+    """The rectified images of a frame, before its camera's pose is known: the part that takes time."""
 
     left: U8  # [H, W, 3] RGB
     right: U8 | None  # [H, W, 3] RGB
@@ -190,7 +190,7 @@ class Published:
 
 @dataclass(frozen=True, slots=True)
 class RectifiedPair:
-    """Row-aligned, undistorted pictures at the working size."""
+    """Row-aligned, undistorted images at the working size."""
 
     frame_id: int
     t_capture_ns: int
@@ -342,12 +342,12 @@ class Colours:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What consumers are shown of a view: the model with the detail of pictures, see
+    """What consumers are shown of a view: the model with the detail of images, see
     `sags_node.detail`."""
 
     rgb: U8  # [H, W, 3]
-    taken: U8  # [H, W] 0..255, the share that comes from a picture
-    oldest_ns: int  # when the oldest of these pictures was captured
+    taken: U8  # [H, W] 0..255, the share that comes from an image
+    oldest_ns: int  # when the oldest of these images was captured
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,7 +384,7 @@ class AnchorStates:
 
     ids: I64  # [A] an id is never used again
     points: F32  # [A, 3] m, world; NaN: lost
-    pixels: F32  # [A, 2] in the left picture, also beyond its edges; NaN: behind the camera or lost
+    pixels: F32  # [A, 2] in the left image, also beyond its edges; NaN: behind the camera or lost
     visibility: F32  # [A] 0..1, seen by the left eye: neither behind an instrument nor behind other tissue
     confidence: F32  # [A] 0..1; falls while the anchor is not seen, 0: lost
     ages: F32  # [A] s since it was pinned
@@ -409,14 +409,14 @@ class InstrumentStates:
     ids: I64  # [I] an id is never used again
     tips: F32  # [I, 3] m, world
     axes: F32  # [I, 3] unit, world, from the shaft to the tip
-    pixels: F32  # [I, 2] of the tip in the left picture
+    pixels: F32  # [I, 2] of the tip in the left image
     confidence: F32  # [I] 0..1, of the tip, see `sags_node.confidence`
     distance: F32  # [I] m, from the tip along the axis to the tissue; 0: it touches it, or is in it
     distance_confidence: F32  # [I] 0..1
     clearance: F32  # [I] m, from the tip to the nearest tissue
     clearance_confidence: F32  # [I] 0..1
     nearest: F32  # [I, 3] m, world, of the tissue
-    sources: I64  # [I] who tells it: 1 the picture, 2 the robot, 3 the robot corrected by the picture
+    sources: I64  # [I] who tells it: 1 the image, 2 the robot, 3 the robot corrected by the image
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -495,9 +495,9 @@ class ViewStatus:
 
 @dataclass(frozen=True, slots=True)
 class ClockStatus:
-    """The clock that stamps live pictures, against this machine's wall clock."""
+    """The clock that stamps live images, against this machine's wall clock."""
 
-    offset_ms: float  # wall clock - that clock, plus the shortest delay of a picture
+    offset_ms: float  # wall clock - that clock, plus the shortest delay of an image
     drift_ppm: float | None  # how fast the offset grows, us/s; None: it is not known yet
     seconds: float  # for which it was watched
 
@@ -521,5 +521,5 @@ class NodeHealth:
     views: Mapping[str, ViewStatus] = field(default_factory=dict)  # those that consumers asked for, by name
     rung: RungState | None = None  # None: fixed steps, or no frame yet
     motion: MotionState | None = None  # None: nobody asks for it, or too little is known yet
-    clock: ClockStatus | None = None  # None: a recording, or pictures without stamps
+    clock: ClockStatus | None = None  # None: a recording, or images without stamps
     recording: Mapping[str, object] | None = None  # state of the recording asked for; None: none was

@@ -60,7 +60,7 @@ def test_rows_of_warnings_and_of_faults_are_read() -> None:
 
 
 RESULTS = sorted((ROOT / "benchmarks/results").glob("*.json"))
-# They measure time, bytes or memory. `soak` judges single pictures of a phantom that never ends.
+# They measure time, bytes or memory. `soak` judges single images of a phantom that never ends.
 COMPARE_NOTHING = set("archive_costs archive_costs_fit bridges crowd inputs kernels soak thin".split())
 
 

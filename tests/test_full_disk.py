@@ -128,7 +128,7 @@ def a_data_set(disk: Path) -> None:
 
 WRITERS: dict[str, Callable[[Path], Any]] = {
     "the node's model": lambda disk: write_ply(disk / "x.ply", random_gaussians(0, 1000, camera())),
-    "the overlay's picture": a_still,
+    "the overlay's image": a_still,
     "the overlay's video": a_video,
     "a hand-eye calibration": lambda disk: save_hand_eye(HandEye(np.eye(4)), disk / "rig", {}),
     "a data set of many recordings": a_data_set,
@@ -150,7 +150,7 @@ def test_a_video_that_gets_no_more_is_told_of_at_once(disk: Path, caplog: pytest
     fill(disk, 0)
     with pytest.raises(SagsError, match=NO_SPACE):
         a_video(disk)
-    assert caplog.messages == [f"{disk / 'x.mp4'} gets no more pictures: {NO_SPACE}; the overlay goes on"]
+    assert caplog.messages == [f"{disk / 'x.mp4'} gets no more images: {NO_SPACE}; the overlay goes on"]
 
 
 @pytest.mark.fault("disk: full while recording")

@@ -65,7 +65,7 @@ BAD = {
 }
 
 
-@pytest.mark.fault("file: a picture is damaged or claims to be huge")
+@pytest.mark.fault("file: an image is damaged or claims to be huge")
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_picture_is_one_message_that_names_it(
     name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
@@ -74,9 +74,9 @@ def test_a_bad_picture_is_one_message_that_names_it(
     (tmp_path / name).write_bytes(content)
     with pytest.raises(SagsError) as caught:
         read_picture(tmp_path / name)
-    assert str(caught.value).startswith(f"picture {tmp_path / name} ") and said in str(caught.value)
+    assert str(caught.value).startswith(f"image {tmp_path / name} ") and said in str(caught.value)
     assert str(caught.value).endswith("replace or remove the pair")
-    with pytest.raises(SagsError, match="bag: a compressed picture"):
+    with pytest.raises(SagsError, match="bag: a compressed image"):
         decode_file(np.frombuffer(content, np.uint8), "bag")
     assert capfd.readouterr() == ("", "")
 
@@ -181,9 +181,9 @@ def test_what_is_no_file_is_not_waited_for(kind: str, tmp_path: Path) -> None:
     recordings(tmp_path)
     make = NO_FILES[kind]
     make(tmp_path / "r/000a.png")
-    with pytest.raises(UsageError, match=r"r/000a\.png has a picture's name but is no file; remove it"):
+    with pytest.raises(UsageError, match=r"r/000a\.png has an image's name but is no file; remove it"):
         open_source(cfg.FoldersSource(left=tmp_path / "l", right=tmp_path / "r"))
-    with pytest.raises(SagsError, match=r"cannot read picture .*000a\.png: it is a"):
+    with pytest.raises(SagsError, match=r"cannot read image .*000a\.png: it is a"):
         read_picture(tmp_path / "r/000a.png")
     make(tmp_path / "poses.npz")
     with pytest.raises(UsageError, match=r"poses\.npz is not a readable npz file: .*it is a"):
@@ -223,7 +223,7 @@ def test_a_video_that_cannot_be_written_is_one_message(
     ("steps", "shown"),
     [
         ([0.0333711] * 8, [0.0333711] * 8),
-        ([0.02, 0.05, 4.0, 0.033], [0.02, 0.05, 4.0, 0.033]),  # late pictures, a pause
+        ([0.02, 0.05, 4.0, 0.033], [0.02, 0.05, 4.0, 0.033]),  # late images, a pause
         ([0.04, -9.0, 0.04, 7200.0, 0.04], [0.04, 1 / 30, 0.04, 1 / 30, 0.04]),  # other recordings
         ([0.0, 1e-9, 0.04], [1 / 30, 1e-9, 0.04]),
     ],

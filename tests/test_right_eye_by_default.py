@@ -72,7 +72,7 @@ def running(phantom_session: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def test_nobody_asked_for_it_and_nothing_is_drawn(running: Watched) -> None:
-    """What is not the drawn picture costs nothing: the camera's picture and its calibration come all the
+    """What is not the drawn image costs nothing: the camera's image and its calibration come all the
     same."""
     with running.subscribed("sags/left/", "sags/status", f"sags/{PICTURE}", f"sags/{INFO}"):
         time.sleep(0.2)  # for the subscriptions to arrive

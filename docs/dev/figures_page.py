@@ -159,7 +159,7 @@ def _live() -> str:
         f"{clip} | " + filled(re.sub(r"\{(\w+)", rf"{{{name}[\1]", LIVE_ROW)) for clip, name in LIVE.items()
     ]
     titles = " three runs each | frames shown | latency p50; p99, ms | Gaussians | the frame as shown, dB"
-    return table(f"{titles} | the picture before, dB | depth, median, mm", rows)
+    return table(f"{titles} | the image before, dB | depth, median, mm", rows)
 
 
 def _ladder() -> str:

@@ -34,8 +34,8 @@ SECONDS, RATE, FIRST = 10.0, 30, 156  # of the session: two pulls of 5 s; the fi
 FRAMES = round(SECONDS * RATE)
 PINNED = 15  # frame whose tissue the vessel is made for, and in which it is pinned
 QUALITY = 60  # of WebP
-EVERY = 2  # frames; the film has 15 pictures a second
-CROP = 40, 80, 500, 448  # px of the left picture: columns and rows from, to
+EVERY = 2  # frames; the film has 15 images a second
+CROP = 40, 80, 500, 448  # px of the left image: columns and rows from, to
 SIZE = 460, 368  # px, of each half
 SAID = "Held by the tissue", "Rigid, scope tracked"
 STRIP = 30  # px, for what is written above
@@ -118,7 +118,7 @@ def smooth(points: F64) -> F64:
 
 
 def rigid(picture: U8, body: Body, camera: Camera, tissue: Bool) -> U8:
-    """A picture [H, W, 3] with the vessel where it was in space, but for instruments."""
+    """An image [H, W, 3] with the vessel where it was in space, but for instruments."""
     z, rgba = np.full(picture.shape[:2], np.inf, np.float32), np.zeros((*picture.shape[:2], 4), np.uint8)
     Placed(body, np.eye(4)).draw(camera, z, rgba)
     rgba[~tissue] = 0
@@ -139,7 +139,7 @@ def true_rim(camera: Camera, vertices: F64, triangles: I64) -> U8:
 
 
 def film(advance: Callable[[int], object]) -> Iterator[Image.Image]:
-    """Play the session frame by frame; the pictures of its second pull."""
+    """Play the session frame by frame; the images of its second pull."""
     session = open_session(None, [*SESSION, *PLAYED])
     config, phantom = session.config, Phantom(SCENE)
     warm_up(config)
@@ -187,7 +187,7 @@ def main(out: Path) -> None:
     first, *others = film(lambda number: print(f"\r{number + 1} of {FRAMES}", end="", flush=True))
     period = 1000 * EVERY // RATE
     first.save(out, save_all=True, append_images=others, duration=period, loop=0, quality=QUALITY, method=6)
-    print(f"\n{out}: {1 + len(others)} pictures, {out.stat().st_size / 1e6:.2f} MB")
+    print(f"\n{out}: {1 + len(others)} images, {out.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def _tables(section: type[Section], prefix: str, title: str) -> Iterator[str]:
 
 def _kinds(prefix: str, sections: tuple[type[Section], ...]) -> Iterator[str]:
     """What all recordings have in common, then what each kind of source has beyond it."""
-    yield f"## `{prefix.removesuffix('.')}`: where the pictures come from\n"
+    yield f"## `{prefix.removesuffix('.')}`: where the images come from\n"
     yield "`source.kind` says which kind of source it is, and so which other keys there are."
     yield "Without `source` it is the `phantom`.\n"
     yield from _tables(RecordedSource, prefix, "Every recording")

@@ -25,11 +25,11 @@ Debian's libraries come beside it.
 |---|---|---|---|
 """
 EXTRAS = ("node", "viewer", "report", "bridges")  # those of `all`
-TWIN = "wrong pictures or depth; each kernel is compared with a readable twin"
-GOLDEN = "wrong pictures or depth; golden replays repeat bit by bit"
+TWIN = "wrong images or depth; each kernel is compared with a readable twin"
+GOLDEN = "wrong images or depth; golden replays repeat bit by bit"
 LINE = "a wrong or no message"
 USES = {
-    "av": ("reads and writes videos (FFmpeg)", "wrong pictures or stamps; counts and stamps are checked"),
+    "av": ("reads and writes videos (FFmpeg)", "wrong images or stamps; counts and stamps are checked"),
     "click": ("the command line", "a command does not run"),
     "foxglove-sdk": ("sags bridge foxglove", "that bridge alone"),
     "lz4": ("compression in bags", "a bag is not read; checksums"),
@@ -40,8 +40,8 @@ USES = {
     "numpy": ("arrays", GOLDEN),
     "onnxruntime": ("runs networks of the user", "wrong depth or masks; of NaN the matcher takes over"),
     "open3d": ("surfaces that are exported, registered, rendered", "a wrong mesh; compared with exact truth"),
-    "opencv-contrib-python-headless": ("rectification, flow, pictures as files", GOLDEN),
-    "pillow": ("the first look at pictures as files", "a picture is refused"),
+    "opencv-contrib-python-headless": ("rectification, flow, images as files", GOLDEN),
+    "pillow": ("the first look at images as files", "an image is refused"),
     "pydantic": ("launch files", "a wrong key is taken; each limit has a test"),
     "pyigtl": ("sags bridge openigtlink", "that bridge alone"),
     "pyyaml": ("launch, scene and calibration files", "a wrong value; only safe_load, and fuzzed"),

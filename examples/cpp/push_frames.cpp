@@ -1,4 +1,4 @@
-// A sender in C++17, written from docs/inputs.md alone: hands stereo pictures in to a node with source.kind push.
+// A sender in C++17, written from docs/inputs.md alone: hands stereo images in to a node with source.kind push.
 //
 //     push_frames [ENDPOINT] [FRAMES] [WIDTH] [HEIGHT]      default: tcp://127.0.0.1:5558, until Ctrl-C, 640 x 512
 //
@@ -69,7 +69,7 @@ std::string meta(std::int64_t stamp_ns, std::int64_t seq, std::uint32_t width, s
     put("type_hash", TYPE_HASH);
     put("seq", seq);
     put("frame_id", seq);
-    put("stamp_ns", stamp_ns);  // when the picture was taken
+    put("stamp_ns", stamp_ns);  // when the image was taken
     put("publish_ns", now_ns());
     put("session", std::string("push_frames"));
     put("epoch", 0);

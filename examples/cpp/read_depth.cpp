@@ -1,4 +1,4 @@
-// A consumer in C++17, written from docs/wire.md alone: the drawn picture and its metric depth.
+// A consumer in C++17, written from docs/wire.md alone: the drawn image and its metric depth.
 //
 //     read_depth [ENDPOINT] [FRAMES]      default: tcp://127.0.0.1:5556, until Ctrl-C
 //
@@ -64,10 +64,10 @@ float float_at(const zmq::message_t& data, std::size_t index) {
     return value;
 }
 
-// Throws std::exception for what is no picture of the kind that is due on this topic.
+// Throws std::exception for what is no image of the kind that is due on this topic.
 Message decode(const std::string& topic, std::vector<zmq::message_t>& parts) {
     if (parts.size() < 4 || parts.size() > MAX_PARTS || parts[1].size() > MAX_META_BYTES)
-        throw std::runtime_error("not a picture");
+        throw std::runtime_error("not an image");
     // Without limits msgpack takes as much memory as a few bytes claim.
     const msgpack::unpack_limit limit(64, 64, MAX_META_BYTES, MAX_META_BYTES, MAX_META_BYTES, 8);
     const auto unpacked =

@@ -1,4 +1,4 @@
-// A node's pictures and anchors in Unity or plain .NET, through `sags bridge web`; docs/bridges.md says what comes.
+// A node's images and anchors in Unity or plain .NET, through `sags bridge web`; docs/bridges.md says what comes.
 //
 // Unity: put this file into Assets, and SagsView on a RawImage. Elsewhere: Program.cs.
 

@@ -100,7 +100,7 @@ def _grid(plots: Sequence[str]) -> str:
 
 
 def _worst(store: Store, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The `WORST` recordings, each with the sheet of pictures of its own report."""
+    """The `WORST` recordings, each with the sheet of images of its own report."""
     column = next((each for each in WORST_BY if any(_number(row, each) is not None for row in rows)), None)
     if column is None:
         return ['<p class="quiet">no figure to tell them by</p>']

@@ -17,7 +17,7 @@ from sags_node.sources.dvrk import read_sidecar
 from sags_node.sources.replay import Replay
 from sags_node.sources.source import open_source, recorded_rig
 
-WIDE = 2.2  # width / height of two pictures side by side, at least; of one it is at most 1.9 (16:9, 17:9)
+WIDE = 2.2  # width / height of two images side by side, at least; of one it is at most 1.9 (16:9, 17:9)
 PHANTOM_RATE = 30.0  # frames per second, where the launch file names none
 
 

@@ -138,7 +138,7 @@ def _work(recording: Recording, plan: Plan, key: str, program: Sequence[str], he
         cores = needs(plan, recording).cores
         figures_file, log = stage / FIGURES, stage / LOG  # not in `out`, which may become full
         ended = run_limited([*program, *said], cores, plan.limits, figures_file, log)
-        is_full = shutil.disk_usage(out).free < LEAST_FREE  # not all writers of pictures report it
+        is_full = shutil.disk_usage(out).free < LEAST_FREE  # not all writers of images report it
         if is_full or NO_SPACE in _tail(log):
             raise _FailedError("no space", NO_SPACE)
         if ended != Ended(0):

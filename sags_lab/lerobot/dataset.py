@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 
 UNEVEN = 0.02  # share that a rate may be off a whole one: stamps in whole ms make 30 Hz 1 % wrong
 ROWS = 64  # frames that are kept in memory until they are written
-PICTURES_LOOKED_AT = 10  # one frame in so many counts in the statistics of pictures
+PICTURES_LOOKED_AT = 10  # one frame in so many counts in the statistics of images
 STATISTICS = {  # feature -> shape of its statistics; (1,): one number for all pixels or values
     DEPTH: (1,), TISSUE: (1,), POSE: (4, 4), POINTS: (3,), VISIBILITY: (1,), "timestamp": (1,),
     LEFT: (3, 1, 1), RIGHT: (3, 1, 1),
@@ -55,7 +55,7 @@ STATISTICS = {  # feature -> shape of its statistics; (1,): one number for all p
 class LeRobot:
     """A data set of one episode.
 
-    Observations: pictures of both eyes (`observation.images.endoscope.left` and `right`), the model's depth
+    Observations: images of both eyes (`observation.images.endoscope.left` and `right`), the model's depth
     (m, 0 unknown) and the tissue mask at a fourth of the size, the camera's pose T_world_cam [4, 4] (m, NaN:
     not known), and 64 points that are followed ([64, 3] m, world; NaN: lost) with their visibility 0..1.
 
@@ -190,7 +190,7 @@ def _merge(folders: Sequence[Path], out: Path, version: Version) -> int:
         first = first or info
         if (info["features"], info["fps"]) != (first["features"], first["fps"]):
             raise UsageError(
-                f"{folder} has pictures of another size or rate than {folders[0]}: one data set "
+                f"{folder} has images of another size or rate than {folders[0]}: one data set "
                 "holds one kind; give them vision.width, vision.height and source.rate that are the same"
             )
         old = info["codebase_version"]

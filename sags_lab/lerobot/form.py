@@ -67,7 +67,7 @@ def _places(episode: int) -> dict[str, int]:
 
 
 def features_of(size: tuple[int, int], eyes: Sequence[str], fps: int) -> dict[str, Any]:
-    """Return the features as info.json has them, for pictures of this size; sides of videos are even."""
+    """Return the features as info.json has them, for images of this size; sides of videos are even."""
     width, height = (side - side % 2 for side in size)
     coarse = [height // COARSE, width // COARSE]
     video = {

@@ -10,9 +10,9 @@ from sags_node.types import F32, F64, Bool
 STIR_PX = (4, 8, 16, 32, 64)  # thresholds of the 2D ranking (stir-challenge.github.io, evaluation)
 STIR_MM = (2, 4, 8, 16, 32)  # thresholds of the 3D ranking
 STIR_2026 = (2, 4, 8, 16, 32)  # thresholds, px and mm (the same page since 2026)
-STEREOMIS_PX = (1, 2, 4, 8, 16)  # of a picture of 256x256 (github.com/mhayoz/online_endo_track)
-STEREOMIS_LOST = 16  # px of such a picture: a point farther off is lost
-LEAST_KNOWN = 0.1  # of a picture: SCARED leaves out frames with less true depth (arXiv 2101.01133, III-D)
+STEREOMIS_PX = (1, 2, 4, 8, 16)  # of an image of 256x256 (github.com/mhayoz/online_endo_track)
+STEREOMIS_LOST = 16  # px of such an image: a point farther off is lost
+LEAST_KNOWN = 0.1  # of an image: SCARED leaves out frames with less true depth (arXiv 2101.01133, III-D)
 
 
 def nearest_distances(points: F64, ends: F64) -> F64:
@@ -24,7 +24,7 @@ def nearest_distances(points: F64, ends: F64) -> F64:
 
 def stereo_points_mm(left: F64, right: F64, K_left: F64, K_right: F64, baseline_mm: float) -> F64:
     """Return points [P, 3] (mm, left camera) of raw pixels [P, 2] of both eyes, as STIR makes its 3D truth.
-    Raw pictures count as rectified, with the left eye's intrinsics [3, 3] and rows; only the distance between
+    Raw images count as rectified, with the left eye's intrinsics [3, 3] and rows; only the distance between
     the principal points is taken off. Points behind the camera are infinite."""
     f, cx, cy = K_left[0, 0], K_left[0, 2], K_left[1, 2]
     disparity = left[:, 0] + (K_right[0, 2] - cx) - right[:, 0]
@@ -113,13 +113,13 @@ def depth_figures(depth: F32, truth: F32, where: Bool) -> dict[str, float] | Non
 def stereomis_figures(found: F64, truth: F64, visible: Bool, size: tuple[int, int]) -> dict[str, float]:
     """Return StereoMIS-Tracking's figures of points [P, T, 2] px that are seen where `visible` [P, T].
 
-    `mte_px`: median error of each point where it is seen, mean over points. The others are in px of a picture
+    `mte_px`: median error of each point where it is seen, mean over points. The others are in px of an image
     of 256x256. `delta`: share of what is seen after the first frame that is within 1, 2, 4, 8 and 16 px, mean
     over the five. `survival`: share of the frames of all points before the point is first seen more than
     16 px off.
 
     Args:
-        size: width and height of the pictures, px.
+        size: width and height of the images, px.
     """
     errors = np.linalg.norm(found - truth, axis=2)
     medians = [np.median(error[seen]) for error, seen in zip(errors, visible, strict=True) if seen.any()]

@@ -87,11 +87,11 @@ class _Run:
         self._before: F32 | None = None
 
     def number_of(self, frame_id: int) -> int:
-        """The number of a frame among all pictures of the clip."""
+        """The number of a frame among all images of the clip."""
         return frame_id * self._stride
 
     def look(self, number: int, result: FrameResult, tools: Bool | None) -> None:
-        """Compare the drawn frame with its picture, and depth with the scan that belongs to the frame."""
+        """Compare the drawn frame with its image, and depth with the scan that belongs to the frame."""
         tissue, image = result.observation.tissue, metrics.as_float(result.observation.image)
         self._drawn.append(metrics.psnr(metrics.as_float(result.views["left"].rgb), image, tissue))
         if self._before is not None:
@@ -148,7 +148,7 @@ class _Run:
 
 
 def _average(values: Sequence[float]) -> float | None:
-    """Mean of the finite values: the PSNR of a picture without tissue is not finite."""
+    """Mean of the finite values: the PSNR of an image without tissue is not finite."""
     numbers = [value for value in values if math.isfinite(value)]
     return float(np.mean(numbers)) if numbers else None
 

@@ -1,4 +1,4 @@
-"""D4D's files (Docea et al., arXiv 2603.02985): which pictures, which calibration, which surface.
+"""D4D's files (Docea et al., arXiv 2603.02985): which images, which calibration, which surface.
 
 By the README and the loader of its authors (github.com/reubendocea/d4d): lengths are metres, and a curated
 pose maps points of the left rectified camera into the frame of the structured light. Which colour of a mask
@@ -24,7 +24,7 @@ from sags_node.types import F64, Bool, Eye, StereoRig
 LARGEST_JSON = 64 << 20  # bytes
 BASELINES = (1e-3, 50e-3)  # m: outside, the calibration is not in metres
 LOOKED_AT = 8  # masks, at most
-UNSURE = (0.4, 0.6)  # share of a picture that is white: it does not tell which colour is the instrument
+UNSURE = (0.4, 0.6)  # share of an image that is white: it does not tell which colour is the instrument
 MOVED = (5e-3, 3.0)  # m and degrees between the curated poses of a clip; beyond, the endoscope was moved
 DEFAULT_RATE = 15.0  # Hz, where names are no stamps
 
@@ -37,14 +37,14 @@ class Scan:
     cloud: Path  # .ply
     pose: Path
     T_cloud_cam: F64  # [4, 4] m, of the left rectified camera
-    tools: Path | None  # mask over the scanner's picture; None: there is none
+    tools: Path | None  # mask over the scanner's image; None: there is none
     scanner: Path  # its camera_info
 
 
 @dataclass(frozen=True, slots=True)
 class D4dClip:
     name: str  # specimen/session/clip
-    left: Path  # folders of rectified pictures
+    left: Path  # folders of rectified images
     right: Path
     rig: StereoRig
     rate: float  # Hz
@@ -142,7 +142,7 @@ def _read_pose(file: Path) -> F64:
 
 
 def _rate(pictures: list[Path]) -> float:
-    """Frames per second of pictures named `seconds_nanoseconds`."""
+    """Frames per second of images named `seconds_nanoseconds`."""
     stamps = [file.stem.split("_") for file in pictures]
     if len(stamps) < 2 or not all(len(each) == 2 and "".join(each).isdecimal() for each in stamps):
         return DEFAULT_RATE
@@ -151,7 +151,7 @@ def _rate(pictures: list[Path]) -> float:
 
 
 def _masks(folder: Path, pictures: list[Path]) -> dict[int, Path]:
-    """Masks by number of the frame: those named as pictures, else, if as many, in order."""
+    """Masks by number of the frame: those named as images, else, if as many, in order."""
     files = sorted(folder.glob("*.png"))
     stems = {file.stem: file for file in files}
     named = {number: stems[file.stem] for number, file in enumerate(pictures) if file.stem in stems}
@@ -162,7 +162,7 @@ def _masks(folder: Path, pictures: list[Path]) -> dict[int, Path]:
 
 
 def _rig(folder: Path, session: Path) -> StereoRig:
-    """The rig of rectified pictures, by the projection matrices of the clip, else of its session."""
+    """The rig of rectified images, by the projection matrices of the clip, else of its session."""
     places = ((folder, "{}_rect*.yaml"), (folder, "{}.yaml"), (session, "{}.yaml"))
     files = []
     for side in ("left", "right"):
@@ -223,7 +223,7 @@ def instruments_are_white(masks: list[Path]) -> bool | None:
     """Tell whether white is the instrument in masks: the colour that covers less is. None without masks.
 
     Raises:
-        SagsError: about half of the pictures is white, or a mask cannot be read.
+        SagsError: about half of the images is white, or a mask cannot be read.
     """
     if not masks:
         return None

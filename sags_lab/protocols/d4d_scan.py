@@ -1,4 +1,4 @@
-"""D4D's truth: the scans of structured light as depth in the left picture, and a check of their place."""
+"""D4D's truth: the scans of structured light as depth in the left image, and a check of their place."""
 
 from itertools import product
 from pathlib import Path
@@ -20,12 +20,12 @@ AROUND = 2  # px
 ALIKE = 0.1  # share of the depth that scan and stereo may differ by, if the scan is in the right place
 LEAST_ALIKE = 0.5  # share of the pixels known to both that must be alike
 LEAST_SHARED = 0.05  # share of the pixels known to stereo that the scan must know, too
-LEAST_INSIDE = 0.9  # share of a scan that must lie inside the mask over the scanner's picture
+LEAST_INSIDE = 0.9  # share of a scan that must lie inside the mask over the scanner's image
 
 
 def read_surface(scan: Scan) -> tuple[F64, Bool | None]:
     """Read the points [P, 3] m of a scan, and which of them are tissue [P] by the mask over the scanner's
-    picture; None: there is no such mask.
+    image; None: there is no such mask.
 
     Raises:
         SagsError: a file is missing or damaged, or the files do not fit each other.

@@ -1,4 +1,4 @@
-"""STIR's and StereoMIS's files: which pictures, which calibration, which truth."""
+"""STIR's and StereoMIS's files: which images, which calibration, which truth."""
 
 import configparser
 import json
@@ -35,9 +35,9 @@ class StirClip:
     left: Path  # videos
     right: Path
     rig: StereoRig
-    starts: F64  # [P, 2] px of the first left picture
+    starts: F64  # [P, 2] px of the first left image
     ends: F64  # [E, 2] px of the last one, in no order
-    starts_mm: F64  # [P3, 3] of those that are marked in the right picture too, in the left camera
+    starts_mm: F64  # [P3, 3] of those that are marked in the right image too, in the left camera
     ends_mm: F64  # [E3, 3]
 
 
@@ -96,7 +96,7 @@ def _middles(boxes: I64) -> I64:
 
 def marked_in_both(left: Path, right: Path, when: str, rig: StereoRig) -> F64:
     """Return points [P, 3] mm that are marked in both eyes; none where the right eye's marks or an infrared
-    picture are missing.
+    image are missing.
 
     Marks are paired as STIR's loader pairs them: of those whose row and disparity are possible, it takes the
     one whose infrared patch correlates *least* with the left one's. That may be a slip, but published truth
@@ -126,7 +126,7 @@ def marked_in_both(left: Path, right: Path, when: str, rig: StereoRig) -> F64:
 
 
 def as_stir_counts(rig: StereoRig, left: F64, right: F64) -> F64:
-    """Return points [P, 3] mm of pixels [P, 2] of both raw pictures, by the arithmetic of STIR's truth."""
+    """Return points [P, 3] mm of pixels [P, 2] of both raw images, by the arithmetic of STIR's truth."""
     baseline_mm = 1e3 * abs(float(rig.T_right_left[0, 3]))
     return stereo_points_mm(left, right, rig.left.K, rig.right.K, baseline_mm)
 
@@ -142,7 +142,7 @@ def stir_rig(file: Path, size: tuple[int, int]) -> StereoRig:
     sign of x tells.
 
     Args:
-        size: width and height of the pictures, px.
+        size: width and height of the images, px.
 
     Raises:
         UsageError: it is missing or no calibration.
@@ -166,7 +166,7 @@ def stir_rig(file: Path, size: tuple[int, int]) -> StereoRig:
 class StereoMisSequence:
     """One folder of StereoMIS, `P1` to `P3_...`."""
 
-    video: Path  # the left picture above the right one
+    video: Path  # the left image above the right one
     rig: StereoRig
     frames: tuple[int, ...]  # numbers of frames whose poses are known
     poses: F64  # [len(frames), 4, 4] T_world_cam of the left raw camera, m
@@ -174,10 +174,10 @@ class StereoMisSequence:
     masks: Path | None  # folder of `NNNNNNl.png`, not black where it is tissue; None: there are none
 
     def tissue_in(self, frame: int) -> Bool | None:
-        """Return where the raw left picture of a frame shows tissue, [H, W]; None: it has no mask.
+        """Return where the raw left image of a frame shows tissue, [H, W]; None: it has no mask.
 
         Raises:
-            SagsError: the mask is damaged, or of another size than the picture.
+            SagsError: the mask is damaged, or of another size than the image.
         """
         file = None if self.masks is None else self.masks / f"{frame:06d}l.png"
         if file is None or not file.is_file():
@@ -185,7 +185,7 @@ class StereoMisSequence:
         mask = read_picture(file, cv2.IMREAD_GRAYSCALE)
         if mask.shape != (self.rig.left.height, self.rig.left.width):
             raise SagsError(
-                f"mask {file} is {mask.shape[1]}x{mask.shape[0]} px, its picture "
+                f"mask {file} is {mask.shape[1]}x{mask.shape[0]} px, its image "
                 f"{self.rig.left.width}x{self.rig.left.height}; was one of them resized?"
             )
         return mask > 0
@@ -272,7 +272,7 @@ def _stereomis_rig(file: Path) -> StereoRig:
 
 
 def check_sizes(video: Video, rig: StereoRig) -> None:
-    """Raise SagsError where a picture, both eyes one above the other, is not of the calibration's size."""
+    """Raise SagsError where an image, both eyes one above the other, is not of the calibration's size."""
     wanted = rig.left.width, 2 * rig.left.height
     if video.size != wanted:
         raise SagsError(f"{video.path} is {video.size} px, its calibration is for {wanted}; is it resized?")

@@ -29,7 +29,7 @@ SAME = 0.01  # px: a point this near to one that was returned is the same one, e
 class Followed:
     """Points in one frame; one that is not found keeps its last known values."""
 
-    pixels: F64  # [P, 2] px, raw left picture
+    pixels: F64  # [P, 2] px, raw left image
     points: F64  # [P, 3] m, left rectified camera; NaN: never known
     found: Bool  # [P]
     visible: Bool  # [P] found, and surely seen by the left eye
@@ -58,7 +58,7 @@ class PointTracker:
         self._said: dict[int, tuple[F64, F64]] = {}  # by anchor: pixel [2] and point [3] as last returned
 
     def follow(self, pixels: F64, now: StereoFrame, following: StereoFrame) -> Followed:
-        """Return where points at `pixels` [P, 2] (px, raw left picture) of frame `now` are in `following`.
+        """Return where points at `pixels` [P, 2] (px, raw left image) of frame `now` are in `following`.
 
         Frames are known by their stamps: `now` is processed only if it is not the `following` of the call
         before. A point that cannot be pinned (instrument, no depth, outside) stays where it is.
@@ -73,7 +73,7 @@ class PointTracker:
         return self._found(anchors, pixels, self._newest, self._newest.anchors)
 
     def pin(self, pixels: F64, now: StereoFrame) -> Followed:
-        """Pin points at `pixels` [P, 2] (px, raw left picture) of frame `now`, and return them in that frame,
+        """Pin points at `pixels` [P, 2] (px, raw left image) of frame `now`, and return them in that frame,
         with what else is known there, such as their 3D points.
 
         Raises:
@@ -143,7 +143,7 @@ def to_raw(eye: Eye, camera: Camera, pixels: F64) -> F64:
 
 
 def raw_pair(rig: StereoRig, points: F64) -> tuple[F64, F64]:
-    """Project points [P, 3] (m, rectified left camera) into the raw pictures of both eyes, [P, 2] px each."""
+    """Project points [P, 3] (m, rectified left camera) into the raw images of both eyes, [P, 2] px each."""
     if not len(points):
         return np.empty((0, 2)), np.empty((0, 2))
     left = points @ rig.left.R  # in the raw left camera

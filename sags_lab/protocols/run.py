@@ -43,7 +43,7 @@ PICKED = ("paper_psnr", "paper_ssim", "lpips", "psnr", "ssim", "copy_psnr")
 def measure_endonerf(
     folder: Path, overrides: Sequence[str], lpips: Path | None, progress: Progress
 ) -> dict[str, Any]:
-    """Measure with frames 1, 9, 17, ... held out; masked pixels are black in both pictures and count. Masks
+    """Measure with frames 1, 9, 17, ... held out; masked pixels are black in both images and count. Masks
     are used as they are, without the margin that a node puts around instruments.
 
     Each held-out frame is drawn from the frames before it. Published fits see those after it, too.
@@ -185,7 +185,7 @@ def _way(
 
 @dataclass(frozen=True, slots=True)
 class _Tracks:
-    """Points of the first raw left picture, where they were known last."""
+    """Points of the first raw left image, where they were known last."""
 
     pixels: F64  # [P, 2] raw, left
     points_mm: F64  # [P, 3] in the raw left camera, as STIR counts; infinite: never pinned

@@ -1,7 +1,7 @@
 """STIR by the rules of 2026: points known in many frames, and whether each eye sees them.
 
 By the challenge's page (stir-challenge.github.io/evaluation) and its evaluator
-(github.com/mertkaraoglu/stir-challenge-2026-metrics): points are given in the left picture of the first
+(github.com/mertkaraoglu/stir-challenge-2026-metrics): points are given in the left image of the first
 frame. Their 3D positions there are asked for, so the right eye is matched, too. The evaluator counts all
 annotated frames but the first.
 """
@@ -44,7 +44,7 @@ class Annotated:
 class Stir2026Sequence:
     folder: Path
     rig: StereoRig
-    queries: F64  # [P, 2] px of the first left picture
+    queries: F64  # [P, 2] px of the first left image
     truth: dict[int, Annotated]  # by number of the frame
 
 
@@ -136,7 +136,7 @@ class _Judged:
 
 
 def measure_stir_2026(folder: Path, overrides: Sequence[str], progress: Progress) -> dict[str, Any]:
-    """Measure points followed from the first frame on: `mono`, px in the left picture; `stereo`, mm, where a
+    """Measure points followed from the first frame on: `mono`, px in the left image; `stereo`, mm, where a
     point is visible if both eyes see it; `stereo_first_frame`, the same in the first frame alone; `unmoved`,
     px, for points that stay and are said to be visible. All are pooled over points, frames and sequences, as
     in the evaluator. `latency_p95_ms` is of frames after number `WARM_UP`."""

@@ -1,7 +1,7 @@
 """StereoMIS-Tracking: points followed through StereoMIS, as its authors measure them.
 
 By the public description of Hayoz et al., "Online 3D reconstruction and dense tracking in endoscopic videos"
-(MICCAI 2024; github.com/mhayoz/online_endo_track, data: doi.org/10.5281/zenodo.10867949): rectified pictures,
+(MICCAI 2024; github.com/mhayoz/online_endo_track, data: doi.org/10.5281/zenodo.10867949): rectified images,
 camera poses, masks, and where points are in each frame.
 """
 
@@ -66,7 +66,7 @@ def tracked_sequence(folder: Path) -> TrackedSequence:
     left = sorted(folder.glob("video_frames*/*l.png"))
     right = [file.with_name(file.name.removesuffix("l.png") + "r.png") for file in left]
     if not left or not all(file.is_file() for file in right):
-        raise UsageError(f"{folder} lacks pictures: video_frames/000001l.png and 000001r.png of each frame")
+        raise UsageError(f"{folder} lacks images: video_frames/000001l.png and 000001r.png of each frame")
     _, poses = read_tum(folder / "groundtruth.txt")
     pixels, visible = _tracks(folder / TRACKS)
     counts = {"pictures": len(left), "poses": len(poses), "frames with points": pixels.shape[1]}
@@ -78,7 +78,7 @@ def tracked_sequence(folder: Path) -> TrackedSequence:
     size = np.array([rig.left.width, rig.left.height])
     if (pixels[visible] >= size).any():
         raise UsageError(
-            f"{folder / TRACKS} has points outside pictures of {size[0]}x{size[1]} px: other size?"
+            f"{folder / TRACKS} has points outside images of {size[0]}x{size[1]} px: other size?"
         )
     return TrackedSequence(
         tuple(left[frames]),
@@ -158,7 +158,7 @@ def measure_tracked(folder: Path, overrides: Sequence[str], progress: Progress) 
 
 
 def _followed(sequence: TrackedSequence, config: LaunchConfig, progress: Progress) -> F64:
-    """Pixels [P, T, 2], clipped to the picture as the authors do."""
+    """Pixels [P, T, 2], clipped to the image as the authors do."""
     tracker = PointTracker(config, sequence.rig)
     frames = config.source.frames if isinstance(config.source, RecordedSource) else None
     numbers = range(len(sequence.left))[:frames]

@@ -22,7 +22,7 @@ class Said(NamedTuple):
 
 
 def read_eye(data: bytes | memoryview, where: str) -> Eye | None:
-    """Read the calibration in a `CameraInfo`, for pictures as they are sent: with its region of interest and
+    """Read the calibration in a `CameraInfo`, for images as they are sent: with its region of interest and
     binning. None: the message says that the camera is not calibrated.
 
     Raises:
@@ -51,7 +51,7 @@ def read_eye(data: bytes | memoryview, where: str) -> Eye | None:
 
 
 def topic_of(pictures: str) -> str:
-    """Return the camera_info topic that belongs to a topic of pictures."""
+    """Return the camera_info topic that belongs to a topic of images."""
     return pictures.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
 
 
@@ -65,7 +65,7 @@ def changes(said: Sequence[Said]) -> list[Said]:
 
 
 def in_force(said: Sequence[Said], stamps: I64) -> I64:
-    """Return for each picture the index in `changes` of its calibration [N]; before the first, 0."""
+    """Return for each image the index in `changes` of its calibration [N]; before the first, 0."""
     since = np.array([each.since_ns for each in said], np.int64)
     return np.maximum(np.searchsorted(since, stamps, "right") - 1, 0)
 

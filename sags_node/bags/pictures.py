@@ -1,4 +1,4 @@
-"""Checks and decodes the pictures in ROS messages, raw and compressed; encodes compressed ones."""
+"""Checks and decodes the images in ROS messages, raw and compressed; encodes compressed ones."""
 
 import re
 import struct
@@ -28,7 +28,7 @@ _TO_FILE = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}
 
 
 class Encoding(NamedTuple):
-    """The conversion of one of ROS's picture encodings to RGB."""
+    """The conversion of one of ROS's image encodings to RGB."""
 
     bytes_per_pixel: int
     to_rgb: int | None  # OpenCV's code of the conversion; None: it is RGB
@@ -67,11 +67,11 @@ def header_stamp(data: bytes | memoryview) -> int:
 
 
 def decode_picture(data: bytes | memoryview, kind: str, where: str) -> U8:
-    """Decode the RGB picture [H, W, 3] in an `Image` or `CompressedImage`; a new array.
+    """Decode the RGB image [H, W, 3] in an `Image` or `CompressedImage`; a new array.
 
     Args:
         kind: ROS type of the message.
-        where: name of the picture in error messages.
+        where: name of the image in error messages.
 
     Raises:
         SagsError: the message is damaged, or its encoding is not supported.
@@ -99,8 +99,8 @@ def decompressed(message: Any, where: str) -> tuple[U8, str]:
         if (stream := _STREAM.search(message.format)) is None:
             raise
         raise SagsError(
-            f"{where}: {stream[0]!r} is a stream of pictures, and single ones are read (JPEG, PNG); make "
-            "a video of each eye's messages, or record single pictures"
+            f"{where}: {stream[0]!r} is a stream of images, and single ones are read (JPEG, PNG); make "
+            "a video of each eye's messages, or record single images"
         ) from None
     if decoded.ndim == 3:
         encoding = _OF_CHANNELS[decoded.shape[2]]
@@ -124,7 +124,7 @@ def _raw_to_rgb(message: Any, where: str) -> U8:
     encoding = ENCODINGS.get(message.encoding)
     if encoding is None:
         known = ", ".join(ENCODINGS)
-        raise SagsError(f"{where}: a picture encoded as {message.encoding!r} is not read; known: {known}")
+        raise SagsError(f"{where}: an image encoded as {message.encoding!r} is not read; known: {known}")
     height, width, step = message.height, message.width, message.step
     used = width * encoding.bytes_per_pixel
     sizes = 0 < height <= LARGEST_SIDE and 0 < width <= LARGEST_SIDE
@@ -143,19 +143,19 @@ def _raw_to_rgb(message: Any, where: str) -> U8:
 
 
 def decode_file(file: U8, where: str) -> U8:
-    """Decode the picture file in a message with OpenCV: [H, W] or BGR(A) [H, W, C].
+    """Decode the image file in a message with OpenCV: [H, W] or BGR(A) [H, W, C].
 
     Raises:
-        SagsError: it is no picture file, damaged, too large, or not 8 bit.
+        SagsError: it is no image file, damaged, too large, or not 8 bit.
     """
-    decoded = decode(file, cv2.IMREAD_UNCHANGED, f"{where}: a compressed picture", "record it again")
+    decoded = decode(file, cv2.IMREAD_UNCHANGED, f"{where}: a compressed image", "record it again")
     if decoded.dtype != np.uint8:
-        raise SagsError(f"{where}: a compressed picture is {decoded.dtype}; what is read is 8 bit")
+        raise SagsError(f"{where}: a compressed image is {decoded.dtype}; what is read is 8 bit")
     return decoded
 
 
 def encode_file(picture: NDArray[Any], encoding: str, form: str, options: Sequence[int]) -> bytes:
-    """Encode a picture [H, W] or [H, W, C], in one of ROS's encodings, as a JPEG or PNG file (`form`).
+    """Encode an image [H, W] or [H, W, C], in one of ROS's encodings, as a JPEG or PNG file (`form`).
 
     Args:
         options: of `cv2.imencode`.
@@ -170,7 +170,7 @@ def encode_file(picture: NDArray[Any], encoding: str, form: str, options: Sequen
     except cv2.error:
         done = False
     if not done:
-        raise SagsError(f"a picture of {picture.shape} cannot be compressed as {form}")
+        raise SagsError(f"an image of {picture.shape} cannot be compressed as {form}")
     return bytes(file.data)
 
 

@@ -59,7 +59,7 @@ def bag() -> None:
     "--compression",
     type=click.Choice(["none", "jpeg", "png"]),
     default="none",
-    help="Of 8-bit pictures. jpeg: alpha, masks and color_key become png: they stay exact.",
+    help="Of 8-bit images. jpeg: alpha, masks and color_key become png: they stay exact.",
 )
 @shown(
     *("--max-cache", "max_cache_mb"),
@@ -111,7 +111,7 @@ def record(
     If a recording is named, it is played through a node of its own, and what that publishes is recorded.
 
     Leaves a rosbag2 folder: MCAP files that Foxglove, PlotJuggler and `ros2 bag` open, and metadata.yaml.
-    Calibration and parameters are attached. Uncompressed pictures of both eyes take up to 27 bytes for each
+    Calibration and parameters are attached. Uncompressed images of both eyes take up to 27 bytes for each
     pixel of a frame: 265 MB/s for 640x512 px at 30 Hz. Messages that the disk was too slow for are counted as
     dropped, those that never arrived as lost. A killed recorder's file is fixed by `sags bag recover`.
 
@@ -249,9 +249,9 @@ def play(
 ) -> None:
     """Publish a recording again; Enter pauses and goes on.
 
-    Subscribers get it as from a node: stamps are moved to now, compressed pictures are sent raw. It takes no
+    Subscribers get it as from a node: stamps are moved to now, compressed images are sent raw. It takes no
     requests: no anchors (sags overlay, clicks in sags view), views nor sags health. Those need a node, which
-    plays the pictures of a recording: sags run PATH.
+    plays the images of a recording: sags run PATH.
 
     \b
     sags bag play out/case1 --rate 0.5 --loop

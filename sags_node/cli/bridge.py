@@ -62,7 +62,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
     @both_options
     @shown("--overlay-ns", default="overlay", help="Namespace of a sags overlay.")
     @run_dir_option
-    @max_age_option(help="Seconds since capture after which a picture is taken back.")
+    @max_age_option(help="Seconds since capture after which an image is taken back.")
     @as_json
     @wraps(command)
     def with_common(node: NodeAddress, overlay_ns: str, json_out: bool, **rest: Any) -> None:
@@ -139,7 +139,7 @@ def _check_installed(module: str, package: str, command: str) -> None:
     "--send",
     metavar="NAMES",
     default="",
-    help="Some of picture,render,overlay,surface,anchors,camera; default: all.",
+    help="Some of image,render,overlay,surface,anchors,camera; default: all.",
 )
 @shown("--rate", type=positive, default=10.0, help="Hz of all but the surface.")
 @shown("--surface-rate", type=positive, default=2.0, help="Hz of the surface.")
@@ -206,7 +206,7 @@ def web(ready: Ready, stop: threading.Event, **options: Any) -> None:
 
 
 @bridge.command()
-@click.option("--left", metavar="LAUNCH", help="What comes behind the left eye's pictures.")
+@click.option("--left", metavar="LAUNCH", help="What comes behind the left eye's images.")
 @click.option("--right", metavar="LAUNCH", help="What comes behind the right eye's.")
 @shown("--rate", type=positive, default=60.0, help="Hz of the display.")
 @shown("--overlay-ns", default="overlay", help="Namespace of the sags overlay.")
@@ -217,7 +217,7 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
 
     For displays that blend by that colour, such as dVRK's.
 
-    LAUNCH is the rest of a pipeline, as for gst-launch-1.0. It gets BGRx pictures at the display's rate.
+    LAUNCH is the rest of a pipeline, as for gst-launch-1.0. It gets BGRx images at the display's rate.
     Where nothing fresh is there, they are the key colour alone, which such a display shows as nothing.
 
     \b
@@ -246,7 +246,7 @@ def gst(overlay_ns: str, run_dir: Path | None, **options: Any) -> None:
 def foxglove(layout: Path | None, ready: Ready, stop: threading.Event, **options: Any) -> None:
     """Serve Foxglove: every topic live, on ws://127.0.0.1:8765.
 
-    Topics come as the node sends them, and pictures as H.264 too where PyAV is there (.../h264): for a thin
+    Topics come as the node sends them, and images as H.264 too where PyAV is there (.../h264): for a thin
     link, look at those. Only what a panel shows is asked of the node.
 
     \b

@@ -56,7 +56,7 @@ reading_options = group_of(  # for forms of calibration that leave something out
         "--size",
         callback=_sides,
         metavar="WxH",
-        help="Picture size, for forms that do not say it; default: the pictures'.",
+        help="Image size, for forms that do not say it; default: the images'.",
     ),
     click.option(
         *("--unit", "metres"),
@@ -96,7 +96,7 @@ def calib() -> None:
     type=(click.Path(path_type=Path), click.Path(path_type=Path)),
     multiple=True,
     metavar="LEFT RIGHT",
-    help="Pictures, or folders of them, to compare with; may be repeated.",
+    help="Images, or folders of them, to compare with; may be repeated.",
 )
 @reading_options
 @as_json
@@ -112,8 +112,8 @@ def check(
     """Look over a calibration for what usually goes wrong.
 
     PATH is a calibration of any known form, or a session, whose calibration is compared with its own
-    pictures. With pictures the rows of both eyes are measured, and the check tells which end is wrong, the
-    calibration or the pictures, and whether one eye's scale is off. Where the session knows depths, they
+    images. With images the rows of both eyes are measured, and the check tells which end is wrong, the
+    calibration or the images, and whether one eye's scale is off. Where the session knows depths, they
     show whether the principal points differ sideways. docs/calibration.md lists the forms.
 
     \b
@@ -128,7 +128,7 @@ def check(
         raise UsageError("--session and --images: one of them is enough")
     stray, overrides_only = split(overrides)
     if stray is not None:
-        raise UsageError(f"'{stray}': one calibration at a time; pictures come after --images or --session")
+        raise UsageError(f"'{stray}': one calibration at a time; images come after --images or --session")
     with progress("comparing") as advance:
         findings = check_calibration(path, session, images, overrides_only, size, metres, advance, launched)
     rows = [asdict(finding) for finding in findings]
@@ -139,7 +139,7 @@ def check(
 @path_argument
 @out_option
 @reading_options
-@click.option("--scale", type=positive, default=1.0, help="Of pictures that are resized after calibration.")
+@click.option("--scale", type=positive, default=1.0, help="Of images that are resized after calibration.")
 @force_option
 def convert(
     path: Path, out: Path, size: tuple[int, int] | None, metres: float | None, scale: float, force: bool
@@ -177,16 +177,16 @@ def convert(
     default=EYES,
     show_default=True,
     metavar="FILE.png",
-    help="The picture; an older eyes.png is replaced.",
+    help="The image; an older eyes.png is replaced.",
 )
 @force_option
 @as_json
 def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool, json_out: bool) -> None:
     """Show what the source gives for each eye.
 
-    Watches cameras, or any other source, and writes a picture of both eyes side by side: is each eye whole,
+    Watches cameras, or any other source, and writes an image of both eyes side by side: is each eye whole,
     upright, and on its own side? Lines across both help to compare heights. Also size, rate, skew and age of
-    the pictures. No calibration is needed; where the launch file names one, its size is compared.
+    the images. No calibration is needed; where the launch file names one, its size is compared.
 
     \b
     sags calib live launch/v4l2.yaml
@@ -209,7 +209,7 @@ def look_at_eyes(launch: tuple[str, ...], seconds: float, out: Path, force: bool
         eye = load_rig(config.rig).left
         if (eye.width, eye.height) != (found["width"], found["height"]):
             raise SagsError(
-                f"the calibration {config.rig} is for {eye.width}x{eye.height} px, the pictures are "
+                f"the calibration {config.rig} is for {eye.width}x{eye.height} px, the images are "
                 f"{found['width']}x{found['height']}; set source.geometry.crop, or calibrate at this size"
             )
 
@@ -238,9 +238,9 @@ def stereo(
     json_out: bool,
     **board_of: Any,
 ) -> None:
-    """Calibrate a stereo rig from pictures of a board.
+    """Calibrate a stereo rig from images of a board.
 
-    Pictures are paired by sorted name. Views that fit far worse than the rest are left out and named. With
+    Images are paired by sorted name. Views that fit far worse than the rest are left out and named. With
     --live they are taken from a source as the board is moved about, and kept in FOLDER/views.
 
     \b
@@ -280,7 +280,7 @@ def hand_eye(
     From a recording of a board and of the robot's poses.
 
     The board lies still. The robot moves and turns the scope about, at different speeds: from that the offset
-    between the robot's clock and the pictures' is found, too. docs/inputs.md says more.
+    between the robot's clock and the images' is found, too. docs/inputs.md says more.
 
     \b
     sags calib hand-eye case.mcap rig:=calib/my_rig robot.kind:=bag robot.topic:=/ECM/measured_cp \\

@@ -46,9 +46,9 @@ def anchor() -> None:
 @click.argument("pixel", nargs=2, type=float, metavar="U V")
 @asking
 def pin(pixel: tuple[float, float], json_out: bool, node: NodeAddress) -> None:
-    """Pin an anchor at pixel U V of the left picture.
+    """Pin an anchor at pixel U V of the left image.
 
-    Prints its number. The picture is left/image_rect_color. It has the calibration's size, or that of
+    Prints its number. The image is left/image_rect_color. It has the calibration's size, or that of
     vision.width and height in the launch file, on every machine. A pixel without depth is refused.
 
     \b

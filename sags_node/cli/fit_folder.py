@@ -217,7 +217,7 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
     lines = {}
     if tested["frames"]:  # else none was held out
         lines["picture"] = f"{_number(tested['psnr'], 'dB')} PSNR on {tested['frames']} frames kept back" + (
-            "" if mean is None else f" (the mean of the pictures around: {_number(mean['psnr'], 'dB')})"
+            "" if mean is None else f" (the mean of the images around: {_number(mean['psnr'], 'dB')})"
         )
         if found["published"]:
             others = ", ".join(f"{name} {psnr:.1f} dB" for name, psnr in found["published"].items())
@@ -236,12 +236,12 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def figures_table(found: dict[str, Any]) -> Table:
-    """Return a table of all figures of the pictures, and of those published for the same clip."""
+    """Return a table of all figures of the images, and of those published for the same clip."""
     table = text.table("", "frames", "PSNR over tissue", "PSNR, masked pixels equal", "SSIM", "LPIPS")
     between = found["between"] or {}
     rows = {
         "heldout": found["heldout"],
-        "  pictures around, carried": between.get("carried"),
+        "  images around, carried": between.get("carried"),
         "  their mean as they are": between.get("mean"),
         "train": found["train"],
     }

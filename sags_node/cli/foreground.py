@@ -47,9 +47,9 @@ def run_node(node: Node, seconds: float | None, console: Console, stop: threadin
 
 
 def inputs_text(config: LaunchConfig) -> list[str]:
-    """Return where the node takes pictures and poses of other programs, a line each."""
+    """Return where the node takes images and poses of other programs, a line each."""
     lines = []
-    for what, part in (("pictures", config.source), ("poses", config.robot)):
+    for what, part in (("images", config.source), ("poses", config.robot)):
         if isinstance(part, PushSource | PushRobot):
             lines.append(f"taking {what} at {part.endpoint}")
         elif isinstance(part, Ros2Source | Ros2Robot):

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option(
-    "--push", metavar="ENDPOINT", help="Push coded pictures of the phantom there: without a camera."
+    "--push", metavar="ENDPOINT", help="Push coded images of the phantom there: without a camera."
 )
-@shown("--rate", type=positive, default=30.0, help="Hz of pushed pictures.")
+@shown("--rate", type=positive, default=30.0, help="Hz of pushed images.")
 @shown("--port", type=click.IntRange(0, 65535), default=8768, help="Of the page; 0: any free one.")
-@click.option("--overlay", metavar="NS", help="Wait for each picture's overlay, in this namespace.")
+@click.option("--overlay", metavar="NS", help="Wait for each image's overlay, in this namespace.")
 @shown(
     "--seconds", type=positive, default=10.0, help="How long codes count, from two seconds after the first."
 )
@@ -39,8 +39,8 @@ def latency(
     """Measure the delay from what a camera sees to what a screen shows.
 
     Numbers as ArUco codes are shown, and read again in the pixels of a virtual screen. It shows the
-    running node's left picture, and an overlay if one is named. The way between is split by the stamps. Lost
-    codes and pictures that could not be read are counted.
+    running node's left image, and an overlay if one is named. The way between is split by the stamps. Lost
+    codes and images that could not be read are counted.
 
     With a camera: open the page that is printed in a browser on this machine, on the display that the camera
     films. Ten codes a second are shown. The delay of that display is in the figures, and so is the wait for
@@ -49,7 +49,7 @@ def latency(
     \b
     sags run launch/v4l2.yaml & sags latency --seconds 60
 
-    Without a camera: pictures are pushed into the node.
+    Without a camera: images are pushed into the node.
 
     \b
     python examples/send_phantom.py push --rig out/rig        # its calibration

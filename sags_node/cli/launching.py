@@ -166,7 +166,7 @@ def open_launched(path: str | None, overrides: Sequence[str], guess: Guess | Non
     (width, height), worked = session.published_size, session.working_size
     device = device_of(session.config)
     console.print(
-        f"refining on {device.name}{device.reason and f' ({device.reason})'}, pictures of {width}x{height} px"
+        f"refining on {device.name}{device.reason and f' ({device.reason})'}, images of {width}x{height} px"
         + ("" if worked == (width, height) else f", worked at {worked[0]}x{worked[1]} px"),
         soft_wrap=True,
     )
@@ -195,7 +195,7 @@ def _pictures_text(session: Session) -> str:
     length = "" if count is None else f", {count} frames, {count / source.rate:.1f} s"
     rig = f"calibration {config.rig}" if config.rig is not None else "calibration of the recording"
     if come_rectified(config):
-        rig += ", the pictures are rectified already"
+        rig += ", the images are rectified already"
     if not session.rig.metric:
         rig = f"no calibration: {GUESSED_FOV:g} degrees across are guessed, depth has no unit (sags calib)"
     assumed = source.assumed if isinstance(source, Replay) else ""

@@ -205,7 +205,7 @@ def main(verbose: bool, form: str) -> None:
 def run(launch: tuple[str, ...], seconds: float | None, json_out: bool) -> None:
     """Run the node: map the source and publish until it ends.
 
-    It plays a launch file, a recording, a folder of videos or pictures (see sags import --check), or a video
+    It plays a launch file, a recording, a folder of videos or images (see sags import --check), or a video
     that shows both eyes; without any the built-in phantom session in a loop. Without a calibration it plays
     all the same: depth then has no unit, and all that is published says so.
 
@@ -369,7 +369,7 @@ def health(json_out: bool, node: NodeAddress) -> None:
 def doctor(launch: tuple[str, ...], json_out: bool) -> None:
     """Check that everything the node needs is here.
 
-    With a launch file also what it names: pictures, calibration, devices, networks. No camera is opened.
+    With a launch file also what it names: images, calibration, devices, networks. No camera is opened.
     """
     from sags_node.config.launch_file import load_launch
     from sags_node.tools.doctor import as_rows, examine
@@ -389,7 +389,7 @@ def import_folder(folder: Path, overrides: tuple[str, ...], json_out: bool) -> N
 
     Each thing that is odd or missing comes with its fix. Looked at are layout, counts and gaps, sizes, black
     borders, interlacing, order of the eyes and rows, mask polarity, unit of depth, and the calibration
-    against the pictures; and it is opened as sags run opens it. Exit code 1: it cannot be played as it is.
+    against the images; and it is opened as sags run opens it. Exit code 1: it cannot be played as it is.
 
     \b
     sags import --check /data/endonerf/pulling_soft_tissues

@@ -48,7 +48,7 @@ def measure(
     for a way along the surface pin some more on it. Stretch is the ratio to the first value that was sure.
 
     Nine of ten errors are meant to be smaller than the one that is told. It follows from the confidence of
-    the anchors' depth, and from how exactly anchors are followed in the picture. A value is unsure, and says
+    the anchors' depth, and from how exactly anchors are followed in the image. A value is unsure, and says
     why, while one of its anchors is hidden, may be on other tissue, or has a guessed depth. With a lost
     anchor there is no value. Without a calibration lengths have no unit.
 

@@ -31,8 +31,8 @@ SAID_BY_PICTURES = ("source", "calibration")  # checks of sags doctor that are m
 def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: bool, json_out: bool) -> None:
     """Try a recording or cameras, and write a launch file for it.
 
-    Of two videos, folders or devices the left eye comes first. It is opened, and some of its pictures are
-    looked at: size and rate, how one picture shows both eyes, borders, interlacing, whether the eyes are
+    Of two videos, folders or devices the left eye comes first. It is opened, and some of its images are
+    looked at: size and rate, how one image shows both eyes, borders, interlacing, whether the eyes are
     exchanged, late, or their rows apart, and whether the calibration fits. What a key can fix is set.
     key:=value are written too. Without arguments it asks, where there is a terminal.
 
@@ -54,7 +54,7 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
         named, out = _asked(out)
     file = out or Path(f"{named[0].resolve().stem}.yaml")
     check_file(file, force)
-    with console.status("looking at the pictures"):
+    with console.status("looking at the images"):
         found = propose(named, [word for word in words if ":=" in word])
     rows: list[dict[str, Any]] = [asdict(finding) for finding in found.findings]
     wrong = is_wrong(found.findings)

@@ -91,7 +91,7 @@ def evaluate(
     """Measure a recorded session: run time against error.
 
     It is played, then read once more and compared with what was shown. In real time that is what a
-    subscriber gets: rate, latency, pictures and depth. Then up to 150 frames are played again, frame by
+    subscriber gets: rate, latency, images and depth. Then up to 150 frames are played again, frame by
     frame, for the right eye and hidden tissue; without truth also for depth beside its own stereo, and
     points that are followed forth and back. --pace step shows the model every frame on any machine.
 
@@ -161,7 +161,7 @@ def evaluate(
 @click.option(
     "--monocular",
     is_flag=True,
-    help="The depth is an estimate from one picture, true up to scale and shift; not for online.",
+    help="The depth is an estimate from one image, true up to scale and shift; not for online.",
 )
 @click.option(
     "--block",

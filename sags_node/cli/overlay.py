@@ -1,4 +1,4 @@
-"""`sags overlay`: meshes held by the tissue, over the live picture."""
+"""`sags overlay`: meshes held by the tissue, over the live image."""
 
 from typing import Any
 
@@ -43,7 +43,7 @@ class Ahead(click.ParamType["float | str"]):
 @click.option("--repin", is_flag=True, help="Pin again where it was after the model was started anew.")
 @shown("--max-age", type=positive, default=0.5, help="Seconds after which an overlay is blanked.")
 @click.option(
-    "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye's picture."
+    "--show-latency", is_flag=True, help="Write the time from capture to overlay into the left eye's image."
 )
 @click.option(
     "--ahead",

@@ -32,7 +32,7 @@ def view(port: int, host: str, insecure: bool, json_out: bool, node: NodeAddress
     """Show a running node in a web browser on this machine.
 
     A page with the live model in 3D (drag turns, wheel zooms, right drag moves), the left camera and its
-    picture; beside it pictures of your choice (input, model, depth, error, the right eye, stereo, the
+    image; beside it images of your choice (input, model, depth, error, the right eye, stereo, the
     overlay), rates and latencies; buttons to freeze a moment, to keep a screenshot or the model as a file,
     and to pause, reset and record. A click on the tissue pins an anchor, which follows it; a click on an
     anchor chooses it, and the distance to the one before is told.

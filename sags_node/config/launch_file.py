@@ -77,9 +77,9 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         )
     if config.one_camera and config.vision.onnx.path is None:
         raise UsageError(
-            f"{name}: source.right is missing: name the right eye's pictures. With one camera alone depth "
+            f"{name}: source.right is missing: name the right eye's images. With one camera alone depth "
             "comes from a monocular network: set vision.onnx.path, and vision.onnx.declared_depth to the "
-            "distance to the middle of the first picture, m; docs/networks.md has an example under 'One eye'"
+            "distance to the middle of the first image, m; docs/networks.md has an example under 'One eye'"
         )
     return config
 

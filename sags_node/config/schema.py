@@ -152,16 +152,16 @@ class RecordedSource(Section):
     )
     stride: FrameNumber = Field(1, ge=1, description="play only each stride-th frame")
     poses: Path | None = Field(
-        None, description="npz with T_world_cam [T, 4, 4] (m), one of each picture of the left eye"
+        None, description="npz with T_world_cam [T, 4, 4] (m), one of each image of the left eye"
     )
     reference: ReferenceConfig = ReferenceConfig()
 
 
 class FoldersSource(RecordedSource):
-    """Two folders of pictures, paired by sorted file name, or one of a single camera's."""
+    """Two folders of images, paired by sorted file name, or one of a single camera's."""
 
     kind: Literal["folders"] = "folders"
-    left: Path = Field(description="folder of the left eye's pictures")
+    left: Path = Field(description="folder of the left eye's images")
     right: Path | None = Field(
         None, description="folder of the right eye's; null: one camera, with a monocular vision.onnx"
     )
@@ -169,40 +169,40 @@ class FoldersSource(RecordedSource):
     instruments: Instruments = Field("white", description=_INSTRUMENTS)
     levels: Levels | None = Field(
         None,
-        description="what becomes black and white of 10 to 16 bit pictures, in units of the brightest value; "
+        description="what becomes black and white of 10 to 16 bit images, in units of the brightest value; "
         "default: white is the brightest value of the bits that they use",
     )
 
 
 class GeometryConfig(Section):
-    """How pictures become those of the two eyes: taken apart; each eye deinterlaced, cropped, turned."""
+    """How images become those of the two eyes: taken apart; each eye deinterlaced, cropped, turned."""
 
     layout: Literal[
         "separate", "side_by_side", "over_under", "panes", "row_interleaved", "frame_sequential"
     ] = Field(
         "separate",
-        description="separate: a picture shows one eye; side_by_side: both, in its left and right half; "
+        description="separate: an image shows one eye; side_by_side: both, in its left and right half; "
         "over_under: in the upper and lower half; panes: in the boxes crop and crop_right; row_interleaved: "
         "in every other row, as the two fields of field-sequential stereo are; frame_sequential: each eye in "
-        "every other picture",
+        "every other image",
     )
     first: Literal["left", "right"] = Field(
-        "left", description="whose is the left or upper half, the first row, the first picture"
+        "left", description="whose is the left or upper half, the first row, the first image"
     )
     deinterlace: Literal["none", "top", "bottom"] = Field(
         "none",
-        description="of interlaced pictures, keep the field of the first (top) or second (bottom) row and "
+        description="of interlaced images, keep the field of the first (top) or second (bottom) row and "
         "fill the rows between from their neighbours",
     )
-    crop: Box | None = Field(None, description="what is used of each eye's picture; default: all")
+    crop: Box | None = Field(None, description="what is used of each eye's image; default: all")
     crop_right: Box | None = Field(None, description="of the right eye's; default: as source.geometry.crop")
     flip: Literal["none", "horizontal", "vertical", "both"] = Field(
-        "none", description="of each eye's picture: mirrored, upside down, or turned by 180 degrees (both)"
+        "none", description="of each eye's image: mirrored, upside down, or turned by 180 degrees (both)"
     )
     levels: Levels = Field(
         (0.0, 1.0),
         description="what becomes black and white, in units of the brightest value; of 10, 12 and 16 bit "
-        "pictures the eight bits that are used then lie where the picture has its tones",
+        "images the eight bits that are used then lie where the image has its tones",
     )
 
     @model_validator(mode="after")
@@ -232,7 +232,7 @@ def _first_of_both(geometry: GeometryConfig) -> GeometryConfig:
     return geometry
 
 
-# For sources whose pictures are all of one kind: each shows both eyes, or each shows one.
+# For sources whose images are all of one kind: each shows both eyes, or each shows one.
 Geometry = Annotated[GeometryConfig, AfterValidator(_first_of_both)]
 
 
@@ -279,7 +279,7 @@ class EndoNerfSource(RecordedSource):
         "auto",
         description="of poses_bounds.npy. Camera to world with axes right, down, forward (opencv), down, "
         "right, back (llff, as imgs2poses writes) or right, up, back (opengl); world_to_camera: the inverse "
-        "of opencv. auto: what explains the pictures, else opencv",
+        "of opencv. auto: what explains the images, else opencv",
     )
 
 
@@ -297,21 +297,21 @@ class BagSource(RecordedSource):
     path: Path = Field(description="folder with metadata.yaml, or a .mcap, .db3 or .bag file")
     left: str | None = Field(
         None,
-        description="picture topic of the left eye, or of both where source.geometry.layout says so; "
+        description="image topic of the left eye, or of both where source.geometry.layout says so; "
         "default: guessed, e.g. /RIG/left/image_raw",
     )
-    right: str | None = Field(None, description="picture topic of the right eye; default: guessed")
+    right: str | None = Field(None, description="image topic of the right eye; default: guessed")
     left_info: str | None = Field(
-        None, description="camera_info topic of the left eye; default: beside its pictures"
+        None, description="camera_info topic of the left eye; default: beside its images"
     )
     right_info: str | None = Field(
-        None, description="camera_info topic of the right eye; default: beside its pictures"
+        None, description="camera_info topic of the right eye; default: beside its images"
     )
     tolerance: float = Field(0.02, gt=0, le=1, description="s; how far the stamps of a pair may lie apart")
     clocks: Literal["one", "two"] = Field(
         "one",
         description="one: both eyes are stamped by one clock; two: by clocks that differ, and the right "
-        "eye's is set by when its pictures were recorded",
+        "eye's is set by when its images were recorded",
     )
     geometry: Geometry = GeometryConfig()
 
@@ -345,8 +345,8 @@ class PhantomSource(RecordedSource):
 
     kind: Literal["phantom"] = "phantom"
     seconds: float = Field(4.0, gt=0, le=600, description="length of the session")
-    width: int = Field(640, ge=64, le=4096, description="of a picture, px")
-    height: int = Field(512, ge=64, le=4096, description="of a picture, px")
+    width: int = Field(640, ge=64, le=4096, description="of an image, px")
+    height: int = Field(512, ge=64, le=4096, description="of an image, px")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="another number gives another tissue")
     camera_motion: Annotated[
         CameraMotion, BeforeValidator(lambda said: _MOVES.get(said, said) if isinstance(said, bool) else said)
@@ -367,15 +367,15 @@ class LiveSource(Section):
 
 
 class V4l2Source(LiveSource):
-    """Live cameras: two devices, or one whose pictures show both eyes."""
+    """Live cameras: two devices, or one whose images show both eyes."""
 
     kind: Literal["v4l2"] = "v4l2"
     left: str = Field(
         "/dev/video0", description="device; the only one where source.geometry.layout says it shows both eyes"
     )
     right: str | None = Field("/dev/video2", description="device of the right eye")
-    width: Pixels = Field(640, ge=1, description="of one device's picture, px")
-    height: Pixels = Field(480, ge=1, description="of one device's picture, px")
+    width: Pixels = Field(640, ge=1, description="of one device's image, px")
+    height: Pixels = Field(480, ge=1, description="of one device's image, px")
     rate: Rate = Field(30.0, description="frames per second")
     fourcc: str | None = Field(
         None,
@@ -384,7 +384,7 @@ class V4l2Source(LiveSource):
         description="pixel format, e.g. YUYV, MJPG, or with more than 8 bit Y10, Y12, Y16; default: the "
         "device's",
     )
-    deadline: Seconds = Field(1.0, description="seconds without a picture before the device is reopened")
+    deadline: Seconds = Field(1.0, description="seconds without an image before the device is reopened")
     pair_tolerance_ms: Apart = Field(
         20.0, description="how far the stamps of a pair may lie apart, two devices"
     )
@@ -400,20 +400,20 @@ class V4l2Source(LiveSource):
 
 
 class GstSource(LiveSource):
-    """Live pictures from GStreamer, in a process of its own; docs/inputs.md has examples."""
+    """Live images from GStreamer, in a process of its own; docs/inputs.md has examples."""
 
     kind: Literal["gst"] = "gst"
     launch: str | None = Field(
         None,
-        description="launch string of both eyes. It ends open where a picture shows both "
+        description="launch string of both eyes. It ends open where an image shows both "
         "(source.geometry.layout), else in one branch to `left.` and one to `right.`",
     )
     left: str | None = Field(
         None, description="launch string of the left eye, ending open; instead of source.launch"
     )
     right: str | None = Field(None, description="launch string of the right eye, ending open")
-    start: Seconds = Field(15.0, description="seconds until the first picture of each eye, at most")
-    deadline: Seconds = Field(2.0, description="seconds without a picture before it is started again")
+    start: Seconds = Field(15.0, description="seconds until the first image of each eye, at most")
+    deadline: Seconds = Field(2.0, description="seconds without an image before it is started again")
     pair_tolerance_ms: Apart = Field(
         5.0,
         description="how far the stamps of a pair may lie apart; cameras that are not synchronised need half "
@@ -433,7 +433,7 @@ class GstSource(LiveSource):
         if self.launch is not None and len(led) != (2 if separate else 0):
             raise ValueError(
                 "launch needs one branch that ends in '! left.' and one in '! right.' (see tee), or "
-                "geometry.layout where its pictures show both eyes"
+                "geometry.layout where its images show both eyes"
                 if separate
                 else f"geometry.layout {self.geometry.layout}: launch ends open, without left. and right."
             )
@@ -441,14 +441,14 @@ class GstSource(LiveSource):
 
 
 class SentSource(LiveSource):
-    """What all live pictures have in common that another program stamps and sends."""
+    """What all live images have in common that another program stamps and sends."""
 
-    rate: Rate = Field(30.0, description="pictures per second that each eye should come with")
+    rate: Rate = Field(30.0, description="images per second that each eye should come with")
     pair_tolerance_ms: Apart = Field(5.0, description="how far the stamps of a pair may lie apart")
     stamps: Literal["wall", "own"] = Field(
         "wall",
         description="wall: of this machine's clock, or one that is set by it; own: of another clock, brought "
-        "to ours by the shortest way that pictures take",
+        "to ours by the shortest way that images take",
     )
 
     @model_validator(mode="after")
@@ -470,19 +470,19 @@ class RosGraph(Section):
 
 
 class Ros2Source(SentSource, RosGraph):
-    """Picture topics (Image or CompressedImage) of a ROS 2 graph; docs/inputs.md says more."""
+    """Image topics (Image or CompressedImage) of a ROS 2 graph; docs/inputs.md says more."""
 
     kind: Literal["ros2"] = "ros2"
     left: str = Field(
         "/stereo/left/image_raw",
-        description="picture topic of the left eye; or of both: source.geometry.layout",
+        description="image topic of the left eye; or of both: source.geometry.layout",
     )
-    right: str = Field("/stereo/right/image_raw", description="picture topic of the right eye")
+    right: str = Field("/stereo/right/image_raw", description="image topic of the right eye")
     left_info: str | None = Field(
-        None, description="camera_info topic of the left eye; default: beside its pictures; not used with rig"
+        None, description="camera_info topic of the left eye; default: beside its images; not used with rig"
     )
     right_info: str | None = Field(
-        None, description="camera_info topic of the right eye; default: beside its pictures"
+        None, description="camera_info topic of the right eye; default: beside its images"
     )
 
 
@@ -503,7 +503,7 @@ class Guarded(Section):
 
 
 class PushSource(SentSource, Guarded):
-    """Pictures that another program hands in over ZeroMQ; docs/inputs.md says how."""
+    """Images that another program hands in over ZeroMQ; docs/inputs.md says how."""
 
     kind: Literal["push"] = "push"
     geometry: GeometryConfig = GeometryConfig()
@@ -558,7 +558,7 @@ class RobotPoses(Section):
         None,
         ge=-1000,
         le=1000,
-        description="the robot's stamp minus the picture's (before latency_ms), of one moment; default: what "
+        description="the robot's stamp minus the image's (before latency_ms), of one moment; default: what "
         "the hand-eye calibration found",
     )
     tools: tuple[RobotTool, ...] = Field((), max_length=8, description="tools whose tips come from the robot")
@@ -591,7 +591,7 @@ class PushRobot(RobotPoses, Guarded):
 
 
 class BagRobot(RobotPoses):
-    """Poses of a ROS recording, beside its pictures."""
+    """Poses of a ROS recording, beside its images."""
 
     kind: Literal["bag"] = "bag"
     topic: str = Field("/tf", description="of TFMessage, PoseStamped or TransformStamped")
@@ -613,7 +613,7 @@ class StereoConfig(Section):
     )
     min_depth: Depth | None = Field(
         None,
-        description="m; nothing is looked for nearer; default: 0.03, and down to 0.01 where the pictures "
+        description="m; nothing is looked for nearer; default: 0.03, and down to 0.01 where the images "
         "show something so near",
     )
     max_depth: Depth = Field(0.30, description="m; nothing is looked for beyond")
@@ -626,7 +626,7 @@ class StereoConfig(Section):
 
     @property
     def nearest(self) -> float:
-        """The nearest depth that is searched, m, unless the pictures show something nearer."""
+        """The nearest depth that is searched, m, unless the images show something nearer."""
         return USUAL_NEAREST if self.min_depth is None else self.min_depth
 
 
@@ -654,7 +654,7 @@ def _by_name(said: object) -> object:
 
 
 class NetworkFormat(Section):
-    """How a depth network takes pictures and what it gives: what its file does not say must be set."""
+    """How a depth network takes images and what it gives: what its file does not say must be set."""
 
     inputs: tuple[Name, ...] | None = Field(
         None, description="names: left eye, right eye; default: the only one"
@@ -683,7 +683,7 @@ class NetworkFormat(Section):
     )
     scale: Annotated[Finite, AfterValidator(_not_zero)] | None = Field(
         None,
-        description="the output's numbers times this are px of the picture that the network gets, or m; -1: "
+        description="the output's numbers times this are px of the image that the network gets, or m; -1: "
         "disparities are negative; default: 1",
     )
 
@@ -704,7 +704,7 @@ class OnnxConfig(NetworkFormat):
         True, description="true: depth is matched where the network fails; false: the run ends"
     )
     declared_depth: Depth | None = Field(
-        None, description="m to the middle of the first picture: the scale of one camera alone"
+        None, description="m to the middle of the first image: the scale of one camera alone"
     )
 
 
@@ -725,10 +725,10 @@ class TissueConfig(Section):
     endpoint: str | None = Field(None, description="data socket that publishes left/tissue_mask, for topic")
     ns: str = Field("masks", pattern=NAMESPACE, description="namespace of that topic")
     tolerance: float = Field(
-        0.1, gt=0, le=10, description="s; how far the stamps of mask and picture may lie apart"
+        0.1, gt=0, le=10, description="s; how far the stamps of mask and image may lie apart"
     )
     dilate: int = Field(2, ge=0, le=64, description="px added around instruments, working size")
-    exclude: tuple[Box, ...] = Field((), description="boxes of the raw left picture never to use (captions)")
+    exclude: tuple[Box, ...] = Field((), description="boxes of the raw left image never to use (captions)")
 
     @model_validator(mode="after")
     def _source_is_described(self) -> TissueConfig:
@@ -748,7 +748,7 @@ PoseWay = Literal["session", "fixed", "estimate", "refine"]
 
 
 class VisionConfig(Section):
-    """The pictures that are published and worked on, and where the camera is."""
+    """The images that are published and worked on, and where the camera is."""
 
     width: int | None = Field(
         None,
@@ -775,12 +775,12 @@ class VisionConfig(Section):
     pose: PoseWay = Field(
         "session",
         description="of the camera. session: the session's or the robot's, fixed where there is none; fixed: "
-        "it never moves; estimate: from the pictures, by the motion that most of the tissue shares; refine: "
-        "as session, and the pictures take out what it is slowly off by",
+        "it never moves; estimate: from the images, by the motion that most of the tissue shares; refine: "
+        "as session, and the images take out what it is slowly off by",
     )
 
     def published_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return width and height of published pictures, for a camera of `width` x `height` px. Where one is
+        """Return width and height of published images, for a camera of `width` x `height` px. Where one is
         set, the other keeps the proportions."""
         if self.width is not None:
             return self.width, self.height or round(height * self.width / width)
@@ -789,7 +789,7 @@ class VisionConfig(Section):
         return width, height
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
-        """Return the size of the pictures that are worked on, as `published_size` does. A scale that is still
+        """Return the size of the images that are worked on, as `published_size` does. A scale that is still
         to be chosen counts as 1."""
         scale = 1.0 if self.scale == "auto" else self.scale
         width, height = self.published_size(width, height)
@@ -892,7 +892,7 @@ class PublishConfig(Guarded):
     )
     detail: bool = Field(
         True,
-        description="the left render and consumers' views show the pictures' own detail where the model says "
+        description="the left render and consumers' views show the images' own detail where the model says "
         "that they saw the same tissue; false: the model alone",
     )
 
@@ -915,7 +915,7 @@ class LaunchConfig(Section):
     )
     rectified: bool | None = Field(
         None,
-        description="the pictures are rectified already: only the projection_matrix of the calibration is "
+        description="the images are rectified already: only the projection_matrix of the calibration is "
         "used; default: what the names of their folders, files or topics say (rect, rectified, image_rect)",
     )
     source: Source = PhantomSource()
@@ -964,7 +964,7 @@ class LaunchConfig(Section):
 
     @property
     def one_camera(self) -> bool:
-        """Whether there is only one eye: no source for the right one, and no pictures that show both."""
+        """Whether there is only one eye: no source for the right one, and no images that show both."""
         if isinstance(self.source, VideosSource) and self.source.geometry.layout != "separate":
             return False
         return isinstance(self.source, FoldersSource | VideosSource) and self.source.right is None

@@ -1,9 +1,9 @@
-"""Look a picture up where the tissue of each pixel was, and blend what is there into a view.
+"""Look an image up where the tissue of each pixel was, and blend what is there into a view.
 
 A view's pixel at depth z is a point of tissue. Less its motion since the source's moment, in the source's
-camera, that point falls on a pixel of the source's picture. It counts where the source showed tissue, and
+camera, that point falls on a pixel of the source's image. It counts where the source showed tissue, and
 where the surface that it showed was as deep. That place changes slowly over a view: it is computed for every
-fourth pixel along both axes (`trace`) and interpolated linearly between. What the picture shows there is
+fourth pixel along both axes (`trace`) and interpolated linearly between. What the image shows there is
 looked up for each pixel that has no detail yet (`carry`): in a left view these are few.
 """
 
@@ -28,7 +28,7 @@ NEAREST = 1e-3  # m: no tissue is nearer
 AROUND = (9, 9)  # coarse pixels: the window from which a hole is filled
 LEAST_KNOWN = 0.5  # share of that window whose depth must be known to fill a hole
 COVERED = 0.3  # least coverage by Gaussians whose motion is known
-NOWHERE = -1e6  # px: the place of what is not in the source's picture
+NOWHERE = -1e6  # px: the place of what is not in the source's image
 FINDINGS = 3  # steps of the search for a ray's place in the source, each from the surface that the last met
 CLOSE = 1e-3  # of the depth: the search ends this close to that surface
 LITTLE = 3.0  # px of motion: below it a steady view's depths are not compared, which differ at edges anyway
@@ -49,11 +49,11 @@ def coarse_camera(camera: Camera) -> Camera:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Where a view's tissue was in a source's picture: for the pixels of `coarse_camera`, and one more
+    """Where a view's tissue was in a source's image: for the pixels of `coarse_camera`, and one more
     on each side."""
 
     places: F32  # [m + 2, n + 2, 2] u and v, px of `SeenFrame.lent`; `NOWHERE`: not in it
-    share: U8  # [m + 2, n + 2] 0..255 of the picture in the view
+    share: U8  # [m + 2, n + 2] 0..255 of the image in the view
 
 
 def every_fourth(depth: F32, small: Camera) -> F32:
@@ -75,17 +75,17 @@ def trace(
     depth: F32, small: Camera, source: SeenFrame, lent: U8, motion: F32 | None, tiles: F32 = WHOLLY,
     unsure: float = 0.0, steady: bool = False, wanted: U8 = EVERYWHERE,
 ) -> Trace:  # fmt: skip
-    """Find where the tissue of a view was in a source's picture.
+    """Find where the tissue of a view was in a source's image.
 
     Args:
         depth: [m, n] m, the view's depth from `every_fourth`; 0 unknown.
         small: the coarse camera of the view.
-        lent: the picture from `SeenFrame.lent`.
+        lent: the image from `SeenFrame.lent`.
         motion: [4, m, n] from `SmallDrawings.motion`; None: nothing has moved.
-        tiles: [rows, columns] 0..1 over the source's picture: how far each tile of it is trusted.
+        tiles: [rows, columns] 0..1 over the source's image: how far each tile of it is trusted.
         unsure: the doubt for each px that the tissue has moved: the share falls by 1 / (1 + doubt^2).
         steady: the source is a moment ago. If the camera is also the same, depths are not compared where the
-            tissue moved little, and where the model tells no depth or motion the picture is taken unmoved.
+            tissue moved little, and where the model tells no depth or motion the image is taken unmoved.
         wanted: [m, n] 0 where nothing is to be carried.
     """
     T = source.camera.viewmat @ small.T_world_cam
@@ -185,14 +185,14 @@ def _between(tiles: F32, across: Any, down: Any) -> Any:
 def carry(
     shown: U8, taken: U8, traced: Trace, lent: U8, gain: F32 = NO_GAIN, tint: F32 | None = None
 ) -> None:
-    """Blend a source's picture into a view, where most of what a pixel is interpolated from is tissue.
+    """Blend a source's image into a view, where most of what a pixel is interpolated from is tissue.
 
     Args:
         shown: [H, W, 3] RGB of the view; written.
         taken: [H, W] the share that each pixel got, 0..255; written. Pixels that have one already stay.
-        lent: the picture from `SeenFrame.lent`.
+        lent: the image from `SeenFrame.lent`.
         gain: [3] factor that brings the source's light to that of the view, at most 100.
-        tint: [m, n, 3] for the coarse camera: added to the picture's colours 0..1.
+        tint: [m, n, 3] for the coarse camera: added to the image's colours 0..1.
     """
     _, row, _, rows = cv2.boundingRect(traced.share)
     if not rows:
@@ -299,7 +299,7 @@ def _lit(lane: Any, gain: Any) -> Any:
 
 
 def paste(picture: U8, share: U8, shown: U8) -> None:
-    """Blend a picture [H, W, 3] into `shown` [H, W, 3], which is written, by `share` [H, W] 0..255."""
+    """Blend an image [H, W, 3] into `shown` [H, W, 3], which is written, by `share` [H, W] 0..255."""
     _paste(read_only(picture), read_only(share), shown)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of tissue that is hidden now: the newest ones in which it was seen."""
+"""Images of tissue that is hidden now: the newest ones in which it was seen."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""A frame that lends its picture to other moments and other cameras."""
+"""A frame that lends its image to other moments and other cameras."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class MatchedDepth:
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """A mapped frame, with what is needed to carry its picture to other views."""
+    """A mapped frame, with what is needed to carry its image to other views."""
 
     t_capture_ns: int
     camera: Camera  # left eye, working size
@@ -66,7 +66,7 @@ class SeenFrame:
     @cached_property
     def surface(self) -> F32:
         """[h, w] m, the model's depth corrected by what stereo measured; 0 unknown. A small model is flatter
-        than the tissue, and seen from the side a millimetre of depth shifts the picture by a pixel."""
+        than the tissue, and seen from the side a millimetre of depth shifts the image by a pixel."""
         if self.matched is None:
             return self.depth
         size = self.depth.shape[::-1]
@@ -75,12 +75,12 @@ class SeenFrame:
 
     @cached_property
     def pixels(self) -> F32:
-        """[N, 2] px where its Gaussians lie in the picture; NaN behind the camera."""
+        """[N, 2] px where its Gaussians lie in the image; NaN behind the camera."""
         return np.asarray(project(self.camera, self.gaussians.means)[0], np.float32)
 
     @cached_property
     def shows(self) -> Bool:
-        """[N] True: its picture shows that Gaussian."""
+        """[N] True: its image shows that Gaussian."""
         z = project(self.camera, self.gaussians.means)[1]
         height, width = self.depth.shape
         inside = np.all((self.pixels > -0.5) & (self.pixels < (width - 0.5, height - 0.5)), axis=1)
@@ -90,11 +90,11 @@ class SeenFrame:
         return found
 
     def lent(self, focal_px: float, sure: bool = False) -> U8:
-        """Return its picture with its tissue mask, [1 + H + 1, 1 + W + 1, 4]: RGB, and 255: tissue. In the
+        """Return its image with its tissue mask, [1 + H + 1, 1 + W + 1, 4]: RGB, and 255: tissue. In the
         border of one pixel the edge colours are repeated, and there is no tissue.
 
         Args:
-            focal_px: of the view: the picture is shrunk to about the view's resolution.
+            focal_px: of the view: the image is shrunk to about the view's resolution.
             sure: tissue beside an instrument does not count.
         """
         picture, tissue = self.picture(), self.sure_tissue if sure else self.tissue
@@ -118,7 +118,7 @@ class SeenFrame:
 
     @property
     def oldest_ns(self) -> int:
-        """The capture time of the oldest picture that it lends."""
+        """The capture time of the oldest image that it lends."""
         return self.t_capture_ns if self.whole is None else self.whole.oldest_ns
 
     def rows_of(self, ids: I64) -> tuple[I64, Bool]:

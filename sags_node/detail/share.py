@@ -1,6 +1,6 @@
 """How far to trust what is carried: learnt from how well it did in the frames before.
 
-For each tile of a source's picture, least squares give the share of the second guess in the mix of both that
+For each tile of a source's image, least squares give the share of the second guess in the mix of both that
 comes closest to the truth. Where highlights jump, or the motion is wrong, it is small.
 """
 
@@ -9,7 +9,7 @@ import numpy as np
 from sags_node.detail.seen import SeenFrame
 from sags_node.types import F32, F64, U8, Bool
 
-TILES = 16  # along the longer side of a picture
+TILES = 16  # along the longer side of an image
 REMEMBERED = 0.8  # part of the sums that is kept from one lesson to the next
 BELIEVED = 1e-3  # squared colours 0..1 that both sums begin with: the share begins at 1
 
@@ -21,11 +21,11 @@ class Share:
         self._sums: F64 | None = None  # [2, rows, columns]: lacking times difference, difference squared
 
     def learn(self, first: U8, second: U8, truth: U8, where: Bool) -> None:
-        """Learn from one picture how far to trust the second guess of it.
+        """Learn from one image how far to trust the second guess of it.
 
         Args:
             first, second: [h, w, 3] the two guesses.
-            truth: [h, w, 3] the picture that was then seen.
+            truth: [h, w, 3] the image that was then seen.
             where: [h, w] which pixels count.
         """
         height, width = where.shape
@@ -49,7 +49,7 @@ class Share:
         return np.asarray(np.clip(lacking / squared, 0, 1), np.float32)
 
     def of_gaussians(self, source: SeenFrame) -> F32:
-        """Return the share [N] of each Gaussian of a frame: that of the tile of the picture where it lies."""
+        """Return the share [N] of each Gaussian of a frame: that of the tile of the image where it lies."""
         tiles = self.tiles()
         factors = tiles.shape[1] / source.camera.width, tiles.shape[0] / source.camera.height
         places = np.clip(

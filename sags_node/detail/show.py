@@ -1,4 +1,4 @@
-"""What consumers are shown of a view: the drawn model, with the detail of pictures."""
+"""What consumers are shown of a view: the drawn model, with the detail of images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 LESSON_EVERY = 4  # frames between lessons: what they teach changes slowly, and each costs a small view
 ASIDE_EVERY = 12  # frames between lessons from the right eye
 LOOKED_AT = 4  # px, along both axes, between the pixels that a lesson compares
-COMPARED = 8  # px between the pixels at which a picture's sharpness is compared with the model's error
+COMPARED = 8  # px between the pixels at which an image's sharpness is compared with the model's error
 AROUND = np.ones((5, 5), np.uint8)  # px of the working size: around hidden tissue, also filled as if hidden
 UNSURE = 0.2  # share of hidden tissue's motion that is doubtful, for nobody saw it
 ANOTHER_EYE = 0.5  # exponent of the right eye's lesson one baseline aside: no other view has that eye's light
@@ -28,11 +28,11 @@ f4 = np.float32
 
 @dataclass(frozen=True, slots=True)
 class Lessons:
-    """The learnt trust in pictures. One thread teaches; any may ask."""
+    """The learnt trust in images. One thread teaches; any may ask."""
 
     moved: Share = field(default_factory=Share)  # of the expected motion, against no motion
-    ahead: Share = field(default_factory=Share)  # of the picture carried to the next frame, against the model
-    aside: Share = field(default_factory=Share)  # of the left picture carried to the right eye, likewise
+    ahead: Share = field(default_factory=Share)  # of the image carried to the next frame, against the model
+    aside: Share = field(default_factory=Share)  # of the left image carried to the right eye, likewise
 
 
 class Detail:
@@ -50,7 +50,7 @@ class Detail:
     def left(
         self, drawn: U8, depth: F32, camera: Camera, now: SeenFrame, older: Sequence[SeenFrame]
     ) -> Shown:
-        """Show a frame's left view: what it sees is its own picture, what is hidden comes from older ones.
+        """Show a frame's left view: what it sees is its own image, what is hidden comes from older ones.
 
         Args:
             drawn: [H, W, 3] RGB, the model for that eye.
@@ -125,7 +125,7 @@ class Detail:
             now: the frame.
             baseline: m between the eyes.
             frames_ahead: how long the view is after the frame, in frame intervals.
-            tint: from `tint`: the colours that this view has and the left picture has not.
+            tint: from `tint`: the colours that this view has and the left image has not.
         """
         rgb, taken = drawn.copy(), _nothing(camera)
         aside = float(np.linalg.norm(camera.T_world_cam[:3, 3] - now.camera.T_world_cam[:3, 3])) / baseline
@@ -170,11 +170,11 @@ class Detail:
         lessons.ahead.learn(drawn, carried(lessons.moved.of_gaussians(before)), truth, where)
 
     def learn_aside(self, now: SeenFrame, snapshot: Snapshot, right: U8, baseline: float) -> None:
-        """Learn from the right eye how well the left picture, carried there, shows what another eye sees.
+        """Learn from the right eye how well the left image, carried there, shows what another eye sees.
 
         Args:
             snapshot: of that frame.
-            right: [H, W, 3] the right picture, as it is published.
+            right: [H, W, 3] the right image, as it is published.
             baseline: m.
         """
         where = coarse_right_eye_mask(now.mask, now.depth, float(now.camera.K[0, 0]), baseline)
@@ -197,7 +197,7 @@ def _carried(
     drawn: U8, depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None, steady: bool = False,
     tint: F32 | None = None,
 ) -> U8:  # fmt: skip
-    """A drawn picture with all the detail that a source can lend it."""
+    """A drawn image with all the detail that a source can lend it."""
     rgb, lent, small = drawn.copy(), source.lent(np.inf), coarse_camera(camera)
     traced = trace(every_fourth(depth, small), small, source, lent, motion, steady=steady)
     carry(rgb, _nothing(camera), traced, lent, tint=tint)
@@ -205,7 +205,7 @@ def _carried(
 
 
 def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool]:
-    """Every `LOOKED_AT` th pixel of a picture [H, W, 3], what `where` [h, w] says there, and the camera that
+    """Every `LOOKED_AT` th pixel of an image [H, W, 3], what `where` [h, w] says there, and the camera that
     sees just these pixels."""
     height, width = picture.shape[:2]
     first = LOOKED_AT // 2
@@ -223,7 +223,7 @@ def _sampled(camera: Camera, picture: U8, where: Bool) -> tuple[Camera, U8, Bool
 
 
 def _loss_by_pixel(frame: SeenFrame, drawn: U8) -> float:
-    """The error of a picture one pixel out of place over the model's error: RMS difference of neighbouring
+    """The error of an image one pixel out of place over the model's error: RMS difference of neighbouring
     pixels over RMS error of `drawn`, on tissue. Its square is the ratio of what they add to the error."""
     height, width = drawn.shape[:2]
     size = -(-width // COMPARED), -(-height // COMPARED)
@@ -239,7 +239,7 @@ def _loss_by_pixel(frame: SeenFrame, drawn: U8) -> float:
 
 
 def _in_light_of(drawn: U8, picture: U8, where: Bool) -> U8:
-    """A picture with mean and contrast of the drawn one, channel by channel: eyes differ in both."""
+    """An image with mean and contrast of the drawn one, channel by channel: eyes differ in both."""
     mask = where.view(np.uint8)
     mean, shown_mean = np.array(cv2.mean(picture, mask)[:3]), np.array(cv2.mean(drawn, mask)[:3])
     spread = (picture - mean.astype(f4)) * where[..., None]

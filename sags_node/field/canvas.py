@@ -15,7 +15,7 @@ class Canvas:
     """A rasteriser like `interface.Rasterizer`, on tensors. Not thread-safe."""
 
     def __init__(self, width: int, height: int, device: torch.device, antialias: bool = True) -> None:
-        """Draw pictures of `width` x `height` px on a torch device: a GPU, or the CPU, which is slow."""
+        """Draw images of `width` x `height` px on a torch device: a GPU, or the CPU, which is slow."""
         from sags_node.engine.gpu import runtime
 
         on_device = runtime.device_named(str(device))

@@ -1,4 +1,4 @@
-"""From raw rows to a picture, as one differentiable step: activation, 3D filter, rasteriser.
+"""From raw rows to an image, as one differentiable step: activation, 3D filter, rasteriser.
 
 The 3D filter comes after the deformation, where a Gaussian's depth is known (`model.alias_free`); its
 variance has no gradient, as in Mip-Splatting. The 2D filter is part of the rasteriser.

@@ -1,4 +1,4 @@
-"""`losses.compare` and its gradient in two passes over the picture, where torch takes about a hundred."""
+"""`losses.compare` and its gradient in two passes over the image, where torch takes about a hundred."""
 
 from typing import Any
 

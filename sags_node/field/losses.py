@@ -3,7 +3,7 @@
     L = lambda_1 L_colour + lambda_2 L_depth + lambda_3 TV(colour) + lambda_4 TV(depth)
 
 With coverage A, colour c = C / A and depth d = D / A of a pixel, each term is a mean over the pixels it
-applies to (the two kinds of smoothness over the whole picture, so that a small region is not pulled harder
+applies to (the two kinds of smoothness over the whole image, so that a small region is not pulled harder
 than a large one):
 
     color             |c - image|, or softer                tissue                         lambda_1
@@ -165,7 +165,7 @@ def total_variation(picture: Tensor, region: Tensor, known: Tensor) -> Tensor:
 
 def dissimilarity(picture: Tensor, truth: Tensor, counted: Tensor) -> Tensor:
     """The sum of 1 - SSIM (Wang et al. 2004, equation 13) over the counted pixels [H, W] and the channels
-    of pictures [3, H, W]. Pixels that do not count are set to the truth in both pictures."""
+    of images [3, H, W]. Pixels that do not count are set to the truth in both images."""
     offsets = torch.arange(-5, 6, dtype=picture.dtype, device=picture.device)
     profile = torch.exp(-0.5 * (offsets / 1.5) ** 2)
     window = torch.outer(profile, profile) / profile.sum() ** 2

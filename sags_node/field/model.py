@@ -88,7 +88,7 @@ class DeformableModel:
         whole: Camera | None = None,
     ) -> Drawing:  # fmt: skip
         """Draw the model at one time for a camera it is fitted to. To learn from it: `Drawing.differentiate`,
-        then `descend`. `whole`: the camera of the whole picture, for the 3D filter; None: `camera`."""
+        then `descend`. `whole`: the camera of the whole image, for the 3D filter; None: `camera`."""
         return self._drawn(rasterizer, self.rows_at(t_ns, deformed), t_ns, camera, whole)
 
     def _drawn(

@@ -1,7 +1,7 @@
-"""How far away an instrument is: patches along its midline, found again in the right picture.
+"""How far away an instrument is: patches along its midline, found again in the right image.
 
 A shaft is smooth, and black or reflecting, so one patch alone is often wrong. But along a straight instrument
-the inverse depth, and so the disparity, is linear in the picture: of all such lines the one is taken with
+the inverse depth, and so the disparity, is linear in the image: of all such lines the one is taken with
 which most patches agree.
 """
 
@@ -41,17 +41,17 @@ class Disparities(NamedTuple):
 
 
 class Eyes(NamedTuple):
-    """The pictures in which disparities are measured."""
+    """The images in which disparities are measured."""
 
     left: U8  # [H, W] gray
     right: U8  # [H, W] gray
     tools: U8  # [H, W] 255: instrument
     counts: U8  # [H, W] 255: what shows an instrument or lies close beside it
-    row_error: float  # px by which the right picture is too low
+    row_error: float  # px by which the right image is too low
 
 
 def eyes(left: U8, right: U8, tools: Bool, row_error: float) -> Eyes:
-    """Prepare both gray pictures [H, W] and the instruments [H, W] in the left one for `disparities`."""
+    """Prepare both gray images [H, W] and the instruments [H, W] in the left one for `disparities`."""
     around = np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)
     shown = tools.view(np.uint8) * np.uint8(255)
     return Eyes(read_only(left), read_only(right), shown, cv2.dilate(shown, around), float(row_error))
@@ -107,7 +107,7 @@ def _scores(seen: Eyes, centre: F64, radius: int, tried: F64, every: int) -> F32
 
 @kernel
 def _taken(picture: U8, u: float, v: float, radius: int, every: int, patch: F64) -> None:
-    """Fill a patch [n, n] around a place, bilinear; beyond the picture its edge is repeated."""
+    """Fill a patch [n, n] around a place, bilinear; beyond the image its edge is repeated."""
     height, width = picture.shape
     column, row = int(np.floor(u)), int(np.floor(v))
     fx, fy = u - column, v - row
@@ -127,12 +127,12 @@ def agreements(
     left: U8, right: U8, counts: U8, u: float, v: float, row_error: float, radius: int, every: int, tried: F64
 ) -> F32:
     """Return the zero-mean normalised cross-correlation (ZNCC) [D] of a left patch with the right ones at the
-    disparities `tried` [D]; -1: beyond the right picture.
+    disparities `tried` [D]; -1: beyond the right image.
 
     Args:
-        left, right: gray pictures [H, W].
+        left, right: gray images [H, W].
         counts: [H, W] 255: what is compared of the left patch.
-        u, v: its middle, px; row_error: px by which the right picture is too low.
+        u, v: its middle, px; row_error: px by which the right image is too low.
         radius, every: half the side of the patch, and the step between the rows and columns compared, px.
     """
     side = 2 * radius // every + 1

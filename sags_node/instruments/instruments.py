@@ -24,7 +24,7 @@ AXIS_BIAS = np.radians(8.0)  # rad: nine of ten graspers of the phantom are off 
 AHEAD, STEP = 0.15, 5e-4  # m, along the axis: how far tissue is looked for, and how finely
 EVERY = 4  # px between the pixels of the tissue among which the nearest is sought
 KEPT = 0.5  # s for which the number of an instrument that is not found is kept
-SAME = 0.2  # of the picture's width: an instrument that is farther from where it was is another
+SAME = 0.2  # of the image's width: an instrument that is farther from where it was is another
 BY_PICTURE, BY_ROBOT, CORRECTED = 1, 2, 3  # what tells of an instrument
 
 
@@ -89,9 +89,9 @@ class Instruments:
 
         Args:
             tools: [H, W] True: the pixel shows an instrument; None: nobody looks for any.
-            left, right: gray pictures [H, W]; right is None where it must not be used.
+            left, right: gray images [H, W]; right is None where it must not be used.
             tissue: the model as the left eye sees it.
-            row_error: by how much the right picture is too low, px.
+            row_error: by how much the right image is too low, px.
             robot: where it says that its tools are.
         """
         if not self._is_due(tissue.t_capture_ns):

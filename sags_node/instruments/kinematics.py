@@ -1,10 +1,10 @@
-"""Where a robot says that a tool's tip is, and what the picture corrects of that.
+"""Where a robot says that a tool's tip is, and what the image corrects of that.
 
 A robot knows well how a tip moves, and badly where it is: joints, base frames and hand-eye are off by some
 millimetres and degrees. In the camera's frame all of that is one small rigid motion that changes slowly
 (the lumped error of Richter, Lu, Orosco and Yip, 2021, "Robotic tool tracking under partially visible
 kinematic chain"). A Kalman filter learns it from the tips that both eyes see. How a tool points is not taken
-from the picture: the turn is learnt from how the tips are off in several places.
+from the image: the turn is learnt from how the tips are off in several places.
 """
 
 import cv2
@@ -20,7 +20,7 @@ DRIFT = np.array([*3 * [np.radians(0.2)], *3 * [5e-4]]) ** 2  # rad^2/s, m^2/s: 
 ALIKE_NS = 1_000_000_000  # tips seen within this time share their error: together they count as one
 ACROSS = 0.5  # error of a seen tip across the ray, over that along the ray
 WRONG = 11.3  # chi-squared of three numbers that 1 of 100 exceeds: a seen tip that is farther off is ignored
-SEEN = np.arange(0, 0.06, 5e-4)  # m from the tip, of the part of a tool that is looked for in the picture
+SEEN = np.arange(0, 0.06, 5e-4)  # m from the tip, of the part of a tool that is looked for in the image
 BESIDE = 0.005  # m, plus the tip's error: how far an outline may lie beside a tool
 NEAREST = 0.01  # m: a tool that is nearer to the camera is not looked for
 
@@ -33,7 +33,7 @@ class Arm:
         error: m, nine of ten of its tips are nearer than this to where the robot says.
 
     Attributes:
-        is_corrected: the picture has corrected it.
+        is_corrected: the image has corrected it.
     """
 
     def __init__(self, number: int, error: float) -> None:
@@ -105,7 +105,7 @@ class Arm:
 
 
 def seen_as(arms: list[Arm], outlines: list[Outline], camera: Camera) -> dict[int, int]:
-    """Return the outline of each arm that has one: both lie along one line in the picture. Closest first."""
+    """Return the outline of each arm that has one: both lie along one line in the image. Closest first."""
     here = Camera(camera.width, camera.height, camera.K, np.eye(4))
     pairs = []
     for number, arm in enumerate(arms):

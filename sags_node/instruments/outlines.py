@@ -1,6 +1,6 @@
-"""The instruments of a mask, each with its midline in the picture.
+"""The instruments of a mask, each with its midline in the image.
 
-An instrument enters from the picture's edge. Its midline joins the middles of the pixels that are equally far
+An instrument enters from the image's edge. Its midline joins the middles of the pixels that are equally far
 from there inside the mask (level sets of the geodesic distance), so that jaws may be open. A region that
 touches the edge in several places is several instruments that overlap: each is followed straight on.
 """
@@ -15,8 +15,8 @@ from sags_node.types import F64, I32, U8, Bool
 
 WIDTH = 320  # px, of the mask in which midlines are sought
 MOST = 8  # instruments of a frame, and entries of a region, at most
-SMALLEST = 0.002  # of the picture: smaller regions are left out
-FRAME = 0.9  # of a row or column at the picture's edge: if so much is masked, it is no instrument
+SMALLEST = 0.002  # of the image: smaller regions are left out
+FRAME = 0.9  # of a row or column at the image's edge: if so much is masked, it is no instrument
 GAP = 7  # px: smaller gaps (a highlight, the window of a jaw) are closed
 APART = 21  # px: entries nearer than this are one
 BIN = 3  # px of the distance from the entry, for each point of a midline
@@ -32,19 +32,19 @@ FITS = 4  # iterations of a line's fit, each without the outliers of the one bef
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """An instrument in the picture; px of the mask."""
+    """An instrument in the image; px of the mask."""
 
     far: F64  # [2] u v, its end that is the farthest from the entry
     back: F64  # [2] u v, where the straight part that ends there begins
     middles: F64  # [K, 2] u v, points of the midline of that part that lie on its line, from the far end
     widths: F64  # [K] there
     spread: float  # how far its far end reaches to a side of the line: open jaws, a hook
-    is_outside: bool  # its end is at the picture's edge, so the tip is beyond; or it is too short to tell
+    is_outside: bool  # its end is at the image's edge, so the tip is beyond; or it is too short to tell
     is_alone: bool  # nothing else lies over it
 
 
 def outlines(tools: Bool, usable: Bool) -> list[Outline]:
-    """Find the instruments in a mask [H, W] that enter at the edge of the picture, or of its `usable` part
+    """Find the instruments in a mask [H, W] that enter at the edge of the image, or of its `usable` part
     [H, W]; those of the largest regions first. A region that does not touch this edge is no instrument."""
     scale = max(1.0, tools.shape[1] / WIDTH)
     size = round(tools.shape[1] / scale), round(tools.shape[0] / scale)
@@ -163,7 +163,7 @@ def geodesic(inside: U8, start: U8) -> tuple[I32, I32, I32]:
     """Return row, column and steps from the start, each [K], of all pixels reached; the nearest first.
 
     Every other step goes to four neighbours, the others to eight: so the fronts are octagons, nearly round
-    (Rosenfeld and Pfaltz, 1968, "Distance functions on digital pictures").
+    (Rosenfeld and Pfaltz, 1968, "Distance functions on digital images").
 
     Args:
         inside, start: [h, w] 1: where a way may lead, and where it begins (all of it inside), with step 1.

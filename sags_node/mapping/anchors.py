@@ -1,7 +1,7 @@
 """Points pinned to the tissue by a user and followed through its deformation.
 
 An anchor moves with the Gaussians around it, also while an instrument hides them: they follow the control
-nodes. The picture corrects it. Across the ray, the patch of the picture that surrounded the anchor at first
+nodes. The image corrects it. Across the ray, the patch of the image that surrounded the anchor at first
 is found again, so that it does not drift; along the ray, it keeps its distance to the drawn surface. An
 anchor that was out of sight for long is found by what surrounded it (`recall`).
 """
@@ -61,7 +61,7 @@ RECALL_EVERY = 0.5  # s, while an anchor is lost: it costs some milliseconds
 REMEMBER_EVERY = 2.0  # s, while no anchor is lost
 RECALL_RADIUS = 10  # px, searched around the place that the surrounding tissue predicts
 SURE = 0.3  # s: anchors that were found within this time are remembered
-LOST = 1.0  # s out of sight, after which an anchor is searched in the whole picture
+LOST = 1.0  # s out of sight, after which an anchor is searched in the whole image
 TOLD = 0.2  # s: an anchor is reported lost for at least this long, since clients miss frames
 
 _NOBODY = -1  # in the place of a Gaussian's id
@@ -94,7 +94,7 @@ class Anchors:
     """The anchors of one node. Ids are never reused.
 
     Args:
-        usable: `TissueMask.usable`, to say why a pixel cannot be pinned; None: the whole picture is usable.
+        usable: `TissueMask.usable`, to say why a pixel cannot be pinned; None: the whole image is usable.
     """
 
     def __init__(self, usable: Bool | None = None) -> None:
@@ -115,25 +115,25 @@ class Anchors:
         self, u: float, v: float, observation: Observation, snapshot: Snapshot, view: RenderedView,
         size: tuple[int, int] | None = None,
     ) -> int:  # fmt: skip
-        """Pin the tissue seen at a pixel (u, v) of the left picture; returns the anchor's id.
+        """Pin the tissue seen at a pixel (u, v) of the left image; returns the anchor's id.
 
         Args:
-            size: width and height of the picture that (u, v) is a pixel of; default: the observation's.
+            size: width and height of the image that (u, v) is a pixel of; default: the observation's.
 
         Raises:
-            SagsError: the pixel is outside the picture, excluded, on an instrument or without depth, or there
+            SagsError: the pixel is outside the image, excluded, on an instrument or without depth, or there
                 are too many anchors.
         """
         working = observation.tissue.shape[1], observation.tissue.shape[0]
         width, height = size or working
         if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
-            raise SagsError(f"pixel ({u:g}, {v:g}) is outside the left picture of {width}x{height} px")
+            raise SagsError(f"pixel ({u:g}, {v:g}) is outside the left image of {width}x{height} px")
         pixel = scale_pixels(np.array([u, v], np.float64), (width, height), working)
         column, row = np.clip(np.rint(pixel), 0, np.subtract(working, 1)).astype(int).tolist()
         if not observation.tissue[row, column]:
             why = "shows an instrument, or what lies on a lens"
             if self._usable is not None and not self._usable[row, column]:
-                why = "lies in a box of vision.tissue.exclude, or outside the camera's own picture"
+                why = "lies in a box of vision.tissue.exclude, or outside the camera's own image"
             raise SagsError(f"pixel ({u:g}, {v:g}) {why}, so no tissue is known there; choose another")
         depth = _depth_near(row, column, observation, view)
         if depth <= 0:
@@ -218,7 +218,7 @@ class Anchors:
         Args:
             snapshot: the model at that frame.
             view: that model, drawn for the left eye.
-            clear: the picture shows well how the tissue moves.
+            clear: the image shows well how the tissue moves.
         """
         self._frames += 1
         if len(self):
@@ -234,7 +234,7 @@ class Anchors:
 
         Args:
             held: the frame is not taken in.
-            equal: its picture equals that of the frame before, so that the same anchors would be found.
+            equal: its image equals that of the frame before, so that the same anchors would be found.
         """
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         passed = 0.0 if before is None else max(0.0, (stamp_ns - before) * 1e-9)
@@ -257,7 +257,7 @@ class Anchors:
         )
 
     def _find(self, observation: Observation) -> None:
-        """Search the picture for the patches of visible anchors, in turn, and move the anchors there."""
+        """Search the image for the patches of visible anchors, in turn, and move the anchors there."""
         table = self._table
         seen = np.flatnonzero((table.visibility == 1) & np.isfinite(table.depth_offsets))
         for i in seen[np.argsort(table.searched[seen], kind="stable")][:SEARCHED_PER_FRAME]:
@@ -464,7 +464,7 @@ def _seen(pixels: F64, depths: F64, tissue: Bool, drawn: F32) -> F64:
 
 
 def _patch(observation: Observation, pixel: F64, radius: int) -> U8 | None:
-    """The gray picture around a place, with subpixel precision; None where not all of it is tissue."""
+    """The gray image around a place, with subpixel precision; None where not all of it is tissue."""
     height, width = observation.tissue.shape
     column, row = (round(float(x)) for x in pixel)
     reach = radius + 1
@@ -477,7 +477,7 @@ def _patch(observation: Observation, pixel: F64, radius: int) -> U8 | None:
 
 
 def _window(observation: Observation, pixel: F64, radius: int) -> tuple[U8, Bool]:
-    """The gray picture around a place (subpixel), and where all pixels that it is sampled from are tissue."""
+    """The gray image around a place (subpixel), and where all pixels that it is sampled from are tissue."""
     size = 2 * radius + 1
     gray = cv2.getRectSubPix(observation.gray, (size, size), (float(pixel[0]), float(pixel[1])))
     height, width = observation.tissue.shape

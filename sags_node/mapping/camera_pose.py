@@ -1,4 +1,4 @@
-"""The camera's pose from points of the model that were found again in a picture: robust least squares."""
+"""The camera's pose from points of the model that were found again in an image: robust least squares."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -71,7 +71,7 @@ def fit_pose(points: F32, pixels: F32, disparities: F32, camera: Camera, baselin
 
 
 def at_pixels(picture: NDArray[Any], pixels: F32) -> NDArray[Any]:
-    """Values [N] of a picture [H, W] at pixels [N, 2] in it."""
+    """Values [N] of an image [H, W] at pixels [N, 2] in it."""
     columns, rows = (pixels + np.float32(0.5)).astype(np.intp).T
     return np.asarray(picture[rows, columns])
 

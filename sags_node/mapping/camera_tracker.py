@@ -20,27 +20,27 @@ from sags_node.vision.watch.standing import watched_ns
 
 HOLD = 0.2  # share of the way to the pose against the tissue at rest, per frame: keeps it from drifting
 LARGEST_JUMP = 8e-3  # m between frames, as `keyframes.distance` counts: a larger jump must be verified
-TRIAL = 6  # frames in which a pose that was found again must agree with picture and depth
+TRIAL = 6  # frames in which a pose that was found again must agree with image and depth
 TRIED = 3  # poses by the keyframes that are tried per frame
 LOOK_NS = 150_000_000  # ns between checks of a frame against the keyframes
 DISAGREEING = 5  # failed checks in a row, after which the pose that was found again counts as wrong
 PROBATION_NS = 3_000_000_000  # ns after a pose was found again: no new keyframes, learning can be undone
 GIVE_UP_NS = 3_000_000_000  # ns of lit frames that show one other scene: then a new model is begun
 SAME_SCENE = 0.7  # correlation of a lit frame with the one before, both shrunk
-LIT = 4.0  # grey levels, standard deviation over the tissue: a covered or dark picture has less
+LIT = 4.0  # grey levels, standard deviation over the tissue: a covered or dark image has less
 
 
 class CameraTracker:
     """Estimates the camera's pose from where the model's Gaussians are found in each frame.
 
-    Pictures cannot tell a camera that moves from tissue that moves as one. Here the motion that most of the
+    Images cannot tell a camera that moves from tissue that moves as one. Here the motion that most of the
     tissue shares is the camera's: every Gaussian has a place at rest, which follows it slowly, and the camera
     is where most of them are seen nearest to that. What moves otherwise, as pulled tissue does, counts
     little.
 
     A frame in which too few are found, or in which what is found looks otherwise, leaves the camera lost.
     Then the last pose stays; it and those by the keyframes are tried in every frame. The one at which the
-    model agrees best with picture and measured depth is on trial: it must go on to agree for `TRIAL` frames
+    model agrees best with image and measured depth is on trial: it must go on to agree for `TRIAL` frames
     before anything is learnt or shown again. Later the keyframes from before are its witnesses: if they
     disagree for long, the camera is lost again and what was learnt since is undone. When lit frames have
     shown one other scene for `GIVE_UP_NS`, a new model is begun at the last pose.

@@ -31,7 +31,7 @@ SAMPLE_GAUSSIANS = 8000
 SAMPLE_MS = 1.9  # for one drawing with its gradients, in a loop, on the machine of the ladder's prices
 TRIES = 21
 
-LEAST_PIXELS = 2  # pixels of the picture for each Gaussian, where the number of steps is fixed
+LEAST_PIXELS = 2  # pixels of the image for each Gaussian, where the number of steps is fixed
 FIELD_TIMES = 5.0  # factor on prices: first guess of what a frame of the paper's model takes
 GAUSSIANS_PER_MS = 1100  # of the frame's time, where the number of steps is fixed; see benchmarks/mapping.md
 
@@ -59,7 +59,7 @@ def backend_of(config: LaunchConfig) -> str:
 
 
 def affordable(config: LaunchConfig, width: int, height: int) -> int:
-    """The number of Gaussians that a model may have on the launch's device, for pictures of a size (px)."""
+    """The number of Gaussians that a model may have on the launch's device, for images of a size (px)."""
     if config.mapping.max_gaussians is not None:
         return config.mapping.max_gaussians
     on_gpu = device_of(config).kind == "cuda"
@@ -152,7 +152,7 @@ def measured_speed(rasterizer: Rasterizer) -> float:
     """Measure `Ladder.speed` of this machine: the median time of drawing made-up Gaussians with gradients.
 
     Args:
-        rasterizer: for pictures of `SAMPLE_SIZE`.
+        rasterizer: for images of `SAMPLE_SIZE`.
     """
     width, height = SAMPLE_SIZE
     rng = np.random.default_rng(0)

@@ -16,13 +16,13 @@ LARGEST = 1.5  # a larger change within one frame is another scene, not another 
 
 
 def exposure_gain(planes: F32, image: U8, tissue: Bool) -> F32:
-    """The factor [3] by which a picture is brighter than the model, for each channel.
+    """The factor [3] by which an image is brighter than the model, for each channel.
 
     An endoscope's exposure follows what comes near, and all colours change at once. With one gain for that,
     the model need not learn it Gaussian by Gaussian. The median ignores highlights and new tissue.
 
     Args:
-        planes: [5, H, W] of the rasteriser, drawn for that picture.
+        planes: [5, H, W] of the rasteriser, drawn for that image.
         image: [H, W, 3] RGB.
         tissue: [H, W] where to compare.
     """
@@ -37,7 +37,7 @@ def exposure_gain(planes: F32, image: U8, tissue: Bool) -> F32:
 
 @kernel
 def _ratios(planes: F32, image: U8, tissue: Bool, ratios: F32) -> Any:
-    """Write the ratios [3, M] of picture to model at fair pixels of a grid; returns how many there are."""
+    """Write the ratios [3, M] of image to model at fair pixels of a grid; returns how many there are."""
     height, width = tissue.shape
     dark, bright = np.float32(DARK), np.float32(BRIGHT)
     n = 0

@@ -1,6 +1,6 @@
-"""Pictures of the tissue as it was first seen: from them the camera's pose is found without drift.
+"""Images of the tissue as it was first seen: from them the camera's pose is found without drift.
 
-The model's places at rest follow optical flow, whose errors add up. So some pictures are kept, with the
+The model's places at rest follow optical flow, whose errors add up. So some images are kept, with the
 places at rest of their corners.
 """
 
@@ -15,9 +15,9 @@ from sags_node.mapping.keyframes import distance
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F32, F64, U8, Camera, Observation
 
-MOST = 16  # pictures
-FAR = 0.01  # m, as `keyframes.distance` counts: a picture this far from all others is kept
-REACH = 0.025  # m, the same: from farther away too little of a picture is found again
+MOST = 16  # images
+FAR = 0.01  # m, as `keyframes.distance` counts: an image this far from all others is kept
+REACH = 0.025  # m, the same: from farther away too little of an image is found again
 CORNERS = 300
 CORNER_QUALITY = 0.005
 CORNER_DISTANCE = 8 / 640  # of the width
@@ -37,7 +37,7 @@ class _View:
 
 
 class FirstViews:
-    """At most `MOST` pictures, the first one of each place."""
+    """At most `MOST` images, the first one of each place."""
 
     def __init__(self, tissue_map: TissueMap) -> None:
         self._map = tissue_map
@@ -60,7 +60,7 @@ class FirstViews:
         return next((pose for pose in poses if pose is not None), None)
 
     def offer(self, observation: Observation, at_rest: F64) -> None:
-        """Keep the picture of a frame that was taken in, if no kept one is near.
+        """Keep the image of a frame that was taken in, if no kept one is near.
 
         Args:
             observation: its camera says where the tissue is now.

@@ -1,4 +1,4 @@
-"""Where in the picture another refinement step pays most."""
+"""Where in the image another refinement step pays most."""
 
 from typing import Any
 
@@ -17,9 +17,9 @@ REACH = 32  # px: few Gaussians are larger, and those are faint out there
 
 
 def largest(residuals: F32, share: float) -> Bool:
-    """The tiles [rows, columns] of a picture with the largest squared colour residuals.
+    """The tiles [rows, columns] of an image with the largest squared colour residuals.
 
-    PSNR counts squared residuals, and most of their sum lies in few tiles: a step on a sixth of the picture
+    PSNR counts squared residuals, and most of their sum lies in few tiles: a step on a sixth of the image
     gains half of what a step on all of it does.
 
     Args:
@@ -33,13 +33,13 @@ def largest(residuals: F32, share: float) -> Bool:
 
 
 def tile_grid(mask: Bool) -> Bool:
-    """The rasteriser's tiles [rows, columns] of a picture as large as `mask` [H, W]; none is chosen."""
+    """The rasteriser's tiles [rows, columns] of an image as large as `mask` [H, W]; none is chosen."""
     height, width = mask.shape
     return np.zeros((-(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)), np.bool_)
 
 
 def tiles_of(pixels: I32, mask: Bool) -> Bool:
-    """The tiles [rows, columns] of a picture as large as `mask` in which the pixels [M, 2] (x, y) lie."""
+    """The tiles [rows, columns] of an image as large as `mask` in which the pixels [M, 2] (x, y) lie."""
     tiles = tile_grid(mask)
     tiles[pixels[:, 1] // TILE_HEIGHT, pixels[:, 0] // TILE_WIDTH] = True
     return tiles

@@ -13,9 +13,9 @@ class Localizer(Protocol):
 
     Attributes:
         lost: why the camera is lost; None: it is not.
-        unsure: why the last picture did not determine the pose; empty: it did, or it was not used.
+        unsure: why the last image did not determine the pose; empty: it did, or it was not used.
         pose: `T_world_cam` [4, 4] of the last frame.
-        by_picture: the pose is estimated from the pictures, so that it is no evidence beside them.
+        by_picture: the pose is estimated from the images, so that it is no evidence beside them.
     """
 
     lost: str | None
@@ -24,7 +24,7 @@ class Localizer(Protocol):
     by_picture: bool
 
     def guess(self, given: F64 | None) -> F64 | None:
-        """The expected pose of a frame, before its picture is used; None: the camera stands still.
+        """The expected pose of a frame, before its image is used; None: the camera stands still.
 
         Args:
             given: the pose that the session gives for the frame.

@@ -1,4 +1,4 @@
-"""New Gaussians from pixels and depth: already a good picture without any optimisation."""
+"""New Gaussians from pixels and depth: already a good image without any optimisation."""
 
 import math
 from typing import Any
@@ -31,7 +31,7 @@ def insert(
     spacing: float,
     smoothing: bool,
 ) -> slice:
-    """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the picture, at depth `z` [M] m.
+    """Add one Gaussian for each pixel [M, 2] (x, y), coloured by the image, at depth `z` [M] m.
 
     Args:
         errors: [M] m, predicted, of the depths; infinite: unknown, then the median of the model's is taken.

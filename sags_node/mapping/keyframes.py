@@ -72,7 +72,7 @@ class Keyframes:
         self._kept.append(_Keyframe(observation, view.depth))
 
     def find(self, observation: Observation) -> list[F64]:
-        """Find poses `T_world_cam` [4, 4] from which the picture may have been taken: one for each keyframe
+        """Find poses `T_world_cam` [4, 4] from which the image may have been taken: one for each keyframe
         that shows some of it, the one with most inliers first (ORB features, PnP in RANSAC)."""
         features = _features(observation.gray, observation.tissue)
         if len(features.codes) < LEAST_MATCHES:

@@ -1,6 +1,6 @@
 """The rungs of quality on which a frame can be mapped, what each costs, and which one a machine affords.
 
-A rung says how much of everything a frame gets. Gaussians do not depend on the size of the picture that they
+A rung says how much of everything a frame gets. Gaussians do not depend on the size of the image that they
 are drawn in, so a model is kept when the rung changes. Prices are times on one machine; only their ratios
 count, since every machine measures how long its own frames take. `benchmarks/ladder.md` has the price and
 the quality of each rung.
@@ -20,7 +20,7 @@ class Rung:
     gaussians: int  # at most
     scale: float = 1.0  # of the working size: at which the model is drawn and refined
     depth_every: int = 1  # frames: how often depth is matched
-    redraw: float = 1.0  # share of the picture, where it was worst, that is drawn anew after the steps
+    redraw: float = 1.0  # share of the image, where it was worst, that is drawn anew after the steps
 
 
 EVERYTHING = Rung(gaussians=2**31)
@@ -45,7 +45,7 @@ RUNGS = (
 )
 
 
-# On a GPU small pictures save little, and Gaussians are cheap.
+# On a GPU small images save little, and Gaussians are cheap.
 GPU_RUNGS = (
     Rung(15_000, scale=0.5, depth_every=3, redraw=0.4),
     Rung(20_000, scale=0.75, depth_every=2, redraw=0.4),
@@ -65,11 +65,11 @@ GPU_RUNGS = (
 class Prices:
     """What a frame costs on one machine, ms; only ratios count."""
 
-    every_frame: float  # whatever rung and size: the camera's pictures, watchers, tracks
+    every_frame: float  # whatever rung and size: the camera's images, watchers, tracks
     depth: float  # one match of depth
-    worked: float  # flow and masks of pictures of `FULL` px
-    drawn: float  # drawing a picture of `FULL` px
-    stepped: float  # a step on a picture of `FULL` px
+    worked: float  # flow and masks of images of `FULL` px
+    drawn: float  # drawing an image of `FULL` px
+    stepped: float  # a step on an image of `FULL` px
     per_thousand: float  # ms per 1,000 Gaussians
 
 
@@ -120,7 +120,7 @@ def best_scale(rungs: Sequence[Rung], pixels: int, seconds: float, speed: float)
     """The largest of `SCALES` that leaves room; `benchmarks/ladder.md` has what sizes give and cost.
 
     Args:
-        pixels: of the picture at scale 1.
+        pixels: of the image at scale 1.
         seconds, speed: see `Ladder`.
     """
     affords = FIRST_AIM * 1e3 * seconds / (WITH_OTHERS * speed)  # ms, in units of the prices

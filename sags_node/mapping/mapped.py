@@ -18,7 +18,7 @@ MIN_FIRST_DEPTHS = 200  # px with depth that a first model needs
 LOST_COVERAGE = 0.3  # of the tissue: a model that covers less is lost
 SETTLED = 10  # frames in which nothing moved, after which a model has little more to learn
 SETTLED_EVERY = 5  # frames: then it is refined in only one of so many
-SOME = slice(None, None, 8)  # rows and columns of a picture that are enough to judge by
+SOME = slice(None, None, 8)  # rows and columns of an image that are enough to judge by
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ def most_steps(still: int, frames: int) -> float:
 
 def is_lost(planes: F32, observation: Observation) -> bool:
     """Tell whether the model, moved to this frame, hardly covers it: after damage, or where the camera is
-    known to be in another place. What the picture shows is judged before, see `vision.watch.scene_watch`."""
+    known to be in another place. What the image shows is judged before, see `vision.watch.scene_watch`."""
     tissue = observation.tissue[SOME, SOME]
     covered = tissue & (planes[4, SOME, SOME] > HOLE_ALPHA)
     return bool(np.count_nonzero(covered) < LOST_COVERAGE * np.count_nonzero(tissue))
@@ -52,7 +52,7 @@ def is_lost(planes: F32, observation: Observation) -> bool:
 def is_worse_than_one_colour(planes: F32, observation: Observation) -> bool:
     """Tell whether one colour would show the tissue of this frame better than the model, whose colours are
     wrong on the whole. A model that has just learnt from the frame is then broken: compared with it, every
-    later picture would seem to show another scene."""
+    later image would seem to show another scene."""
     tissue = observation.tissue[SOME, SOME]
     if not tissue.any():
         return False

@@ -26,7 +26,7 @@ CONTROL_NODES = 512
 FIRST_STEPS = 30  # longer steps of a new model, in its first frame or, where time is short, the next ones
 TORN = 0.02  # of the Gaussians: where more are removed at once, they leave holes
 EXPOSURE_JUMP = 0.01  # smaller changes of the gain are left to the colour steps
-FOCUS = 0.2  # share of the picture: best quality for its time on pulled tissue and a beating heart
+FOCUS = 0.2  # share of the image: best quality for its time on pulled tissue and a beating heart
 FIRST_RATES = LearningRates().scaled(4.0)
 UNHURRIED_RATES = 0.6  # factor: with six steps a frame it gains 0.3 dB, with one it loses as much
 NODE_STEP_PX = 0.08  # px at the tissue's median depth: length of one step of the nodes
@@ -37,7 +37,7 @@ class Mapper:
 
     Each frame: predict where the tissue went (optical flow and depth, averaged on control nodes), remove what
     floats in free space, insert where the model has a hole or something new appears, refine while the budget
-    lasts: once the whole picture, then where it is worst. The order and the constants follow a measured
+    lasts: once the whole image, then where it is worst. The order and the constants follow a measured
     design; see `benchmarks/`.
 
     Attributes:
@@ -56,7 +56,7 @@ class Mapper:
         Args:
             refiner: draws and refines the model.
             smoothing: draw the Gaussians with the 3D filter (`model.alias_free`).
-            focus: share of the picture, where it is worst, for the steps after the first of a frame.
+            focus: share of the image, where it is worst, for the steps after the first of a frame.
         """
         self.map = tissue_map
         self.step = 0
@@ -65,7 +65,7 @@ class Mapper:
         self._focus = focus
         self.pace(False)
         self._view: RenderedView | None = None  # the model as it was drawn last
-        self._scale = 1.0  # of the pictures' size: at which the model was drawn last
+        self._scale = 1.0  # of the images' size: at which the model was drawn last
         self._first_steps = 0  # steps that a new model has had
         self._split = False  # whether Gaussians were split since the model was drawn
         self._frames = 0
@@ -86,7 +86,7 @@ class Mapper:
         Args:
             tracks: where the Gaussians are found in it; None: they have not moved.
             still: for how many frames, this one included, nothing has moved.
-            learn: False: the picture's colours are not the tissue's, and the model only follows the motion.
+            learn: False: the image's colours are not the tissue's, and the model only follows the motion.
             right: somebody looks at the right eye: the snapshot has what its colours differ by.
         """
         self._frames += 1
@@ -121,7 +121,7 @@ class Mapper:
         return self.map.model
 
     def _initialise(self, observation: Observation, budget: Budget) -> dict[str, int]:
-        if not can_start(observation):  # a black or covered picture: try again with the next frame
+        if not can_start(observation):  # a black or covered image: try again with the next frame
             planes = self._refiner.show(self.model.gaussians(), observation.camera)
             self._view = as_view(planes, self.model, observation)
             return {"inserted": 0}

@@ -38,7 +38,7 @@ class Drawn:
 class Tracks(NamedTuple):
     """Where Gaussians are found in a frame."""
 
-    pixels: F32  # [N, 2], also beyond the picture's edges; NaN: not seen, or covered by an instrument now
+    pixels: F32  # [N, 2], also beyond the image's edges; NaN: not seen, or covered by an instrument now
     seconds: float  # from the frame that the model shows to this one
 
 
@@ -59,7 +59,7 @@ class SurfaceTracker:
         Args:
             means: [N, 3] m, world, at the earlier frame.
             last: that frame, and the model drawn for it, to know what was hidden.
-            guess: [rows, columns, 2] px, flow of square cells over the picture to start the search from.
+            guess: [rows, columns, 2] px, flow of square cells over the image to start the search from.
         """
         before = last.observation
         flow = self._flow(pyramid_of(before), pyramid_of(observation), guess)
@@ -69,13 +69,13 @@ class SurfaceTracker:
 
 
 def found(means: F32, before: RenderedView, clear_before: Bool, flow: F32, clear_after: Bool) -> F32:
-    """Find where in the later picture each Gaussian of the earlier one is, as `Tracks.pixels`.
+    """Find where in the later image each Gaussian of the earlier one is, as `Tracks.pixels`.
 
     Args:
         means: [N, 3] m, world, at the earlier frame.
         before: the model drawn at the earlier frame, to know what was hidden.
         clear_before, clear_after: [h, w] tissue far enough from instruments, halved in size `HALVINGS` times.
-        flow: [h, w, 2] px of the whole pictures, from the earlier to the later one, at any size.
+        flow: [h, w, 2] px of the whole images, from the earlier to the later one, at any size.
     """
     pixels = np.full((len(means), 2), np.float32(np.nan))
     _find(means, pack(before.camera), before.depth, before.alpha, clear_before, flow, clear_after, pixels)
@@ -187,7 +187,7 @@ def _advect_rows(
 
 @inlined
 def _bilinear(flow: F32, u: Any, v: Any, channel: int) -> Any:
-    """Flow at a place in the picture; beyond the outermost pixel centres it is constant."""
+    """Flow at a place in the image; beyond the outermost pixel centres it is constant."""
     height, width, _ = flow.shape
     one = np.float32(1)
     u = min(max(u, np.float32(0)), np.float32(width - 1))

@@ -35,7 +35,7 @@ class LearningRates:
 
 
 COLOUR_RELAXATION = 0.9  # of the SIRT step on colours and slopes
-SLOPE_DECAY = 0.99  # per step: what the picture does not ask for fades
+SLOPE_DECAY = 0.99  # per step: what the image does not ask for fades
 STEEPEST = 0.25  # largest slope: change of a colour 0..1 for each standard deviation
 COLOUR_DAMPING = 0.3  # px of coverage: a barely seen Gaussian changes its colour slowly
 BETA1, BETA2 = 0.5, 0.99  # low momentum: a few steps per frame must not coast
@@ -61,14 +61,14 @@ class Optimiser:
     where all are seen whole, which makes m = 2. Where others hide their middle, their pixels lie in a ring or
     on one side; the bound is then (sum w) (2 |c|^2 + 6 m |a|^2). So with the relaxation r the step is
     r / (sum w) for colours and r / (3 max(1, m - 1) sum w) for slopes. The first bound asks for r < 2, the
-    second one for r < 1 - 1 / m; between the two, tests show that no step makes the picture worse.
+    second one for r < 1 - 1 / m; between the two, tests show that no step makes the image worse.
     """
 
     def __init__(self) -> None:
         self._steps = 0
 
     def step(self, model: GaussianModel, gradients: Gradients, camera: Camera, rates: LearningRates) -> None:
-        """Update every row of the model that contributed to the picture. A row whose gradient or optimiser
+        """Update every row of the model that contributed to the image. A row whose gradient or optimiser
         state is not finite sits the step out, with its state made anew."""
         self._steps += 1
         corrections = 1.0 / (1.0 - np.array([BETA1, BETA2]) ** self._steps)

@@ -1,4 +1,4 @@
-"""Whether a picture and its measured depth agree with what is expected from a camera pose."""
+"""Whether an image and its measured depth agree with what is expected from a camera pose."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from sags_node.types import F32, U8, Bool, Camera, Observation, RenderedView
 
-WIDTH = 160  # px, about: of the shrunk pictures that are compared
+WIDTH = 160  # px, about: of the shrunk images that are compared
 WINDOW = 9  # shrunk px: shading wider than that is the light's, which moves with the scope
 LEAST_VARIANCE = 1.0  # grey levels squared: less texture is noise
 LEAST_COVERED = 0.4  # share of the tissue in view that must be known
@@ -21,7 +21,7 @@ LEAST_DEPTHS = 200  # shrunk px with depth that a comparison needs
 
 @dataclass(frozen=True, slots=True)
 class Small:
-    """A picture and its depth, shrunk."""
+    """An image and its depth, shrunk."""
 
     gray: F32  # [h, w] grey levels
     depth: F32  # [h, w] m, 0 unknown
@@ -33,7 +33,7 @@ class Agreement:
     """How well a frame agrees with what is expected."""
 
     covered: float  # share of the frame's tissue about which anything is expected
-    correlation: float  # of the pictures, within small windows; -1..1
+    correlation: float  # of the images, within small windows; -1..1
     near: float | None  # share of the depths that agree; None: too few are measured
     offset: float  # px of disparity that all depths differ by
 
@@ -54,7 +54,7 @@ class Agreement:
         if self.covered < LEAST_COVERED:
             return "hardly any known tissue in view"
         if self.correlation < LEAST_CORRELATION:
-            return "the picture does not show what the model has there"
+            return "the image does not show what the model has there"
         if self.near is None:
             return ""
         if self.near < LEAST_NEAR or abs(self.offset) > LARGEST_OFFSET * STEREO_ERROR:
@@ -88,7 +88,7 @@ def agreement(expected: Small, frame: Small, camera: Camera, baseline: float) ->
     """The agreement of a frame with what is expected, pixel by pixel; exposure and wide shading do not count.
 
     Args:
-        camera: of the pictures before they were shrunk, to compute disparities in px.
+        camera: of the images before they were shrunk, to compute disparities in px.
         baseline: m.
     """
     where = expected.where & frame.where
@@ -105,7 +105,7 @@ def agreement(expected: Small, frame: Small, camera: Camera, baseline: float) ->
 
 
 def local_correlation(a: F32, b: F32, where: Bool) -> float:
-    """The zero-mean correlation of two pictures [h, w] in small windows, which weigh by their texture."""
+    """The zero-mean correlation of two images [h, w] in small windows, which weigh by their texture."""
     weight = where.astype(np.float32)
     count = _sum(weight)
     inside = where & (count > WINDOW)

@@ -1,4 +1,4 @@
-"""Given camera poses, put right by the picture where they are off."""
+"""Given camera poses, put right by the image where they are off."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from sags_node.mapping.tissue_map import TissueMap
 from sags_node.types import F64, Observation, RenderedView
 from sags_node.vision.watch.standing import watched_ns
 
-SECONDS = 10.0  # s over which the correction follows the picture: longer than a breath
+SECONDS = 10.0  # s over which the correction follows the image: longer than a breath
 
 
 class PoseRefiner:
@@ -18,8 +18,8 @@ class PoseRefiner:
 
     A robot knows well how the scope moves within a second, and less well where it is: joints and trocar give
     way, and the error grows slowly. Tissue breathes quickly and comes back. So the camera moves as it is
-    given, and a correction of its place follows the picture more slowly than tissue breathes: what is quick
-    is the tissue's motion. Where the picture cannot tell, the correction stays.
+    given, and a correction of its place follows the image more slowly than tissue breathes: what is quick
+    is the tissue's motion. Where the image cannot tell, the correction stays.
 
     Attributes: see `Localizer`. It is never `lost`.
     """

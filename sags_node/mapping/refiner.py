@@ -54,7 +54,7 @@ class Refiner(Protocol):
 
         Args:
             tiles: [rows, columns] that are drawn; the others keep what was drawn before. None: all are drawn.
-            share: of the picture, where it was worst before the steps, that is drawn too; 1: all of it.
+            share: of the image, where it was worst before the steps, that is drawn too; 1: all of it.
         """
         if tiles is not None and share > 0:
             tiles = None if share >= 1 else tiles | self._worst_tiles(share)
@@ -66,11 +66,11 @@ class Refiner(Protocol):
     def refine(self, rates: LearningRates) -> None:
         """Take one step on what was drawn last: loss and its gradient, back-propagation, nodes, Gaussians.
 
-        Stores each Gaussian's contribution in the model, too, so the whole picture must have been drawn.
+        Stores each Gaussian's contribution in the model, too, so the whole image must have been drawn.
         """
 
     def refine_worst(self, share: float, rates: LearningRates, nodes: bool = True) -> Bool:
-        """Draw that share of the picture anew, where it is worst, and take one step on it.
+        """Draw that share of the image anew, where it is worst, and take one step on it.
 
         Args:
             nodes: move them too.
@@ -104,7 +104,7 @@ class CpuRefiner(Refiner):
     """The refiner that works on the model's own arrays."""
 
     def __init__(self, make_rasterizer: MakeRasterizer) -> None:
-        """`make_rasterizer` makes a rasteriser for pictures of a width and height, px."""
+        """`make_rasterizer` makes a rasteriser for images of a width and height, px."""
         self._rasterizer_of, self._viewer_of = cache(make_rasterizer), cache(make_rasterizer)
         self._optimiser = Optimiser()
         # [5, H, W] and [H, W]; the planes are the rasteriser's memory: what it drew last

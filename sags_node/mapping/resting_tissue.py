@@ -22,7 +22,7 @@ REST_SECONDS = 60.0  # s over which a place at rest follows the tissue: ten brea
 CALM = 3.0  # times the median distance from the place at rest: tissue farther away moves by itself
 LOOK_NS = 200_000_000  # ns between comparisons with the first views
 LEAST_INLIERS = 0.35  # of the points
-LEAST_AGREEMENT = 0.5  # correlation of the picture with the colours of the Gaussians found in it
+LEAST_AGREEMENT = 0.5  # correlation of the image with the colours of the Gaussians found in it
 LARGEST_SCALE = 4 / 640  # of the width: scale of the residuals
 
 
@@ -66,7 +66,7 @@ class RestingTissue:
         rows, away = rows[calm], away[calm]
         seen = at_pixels(observation.gray, pixels[rows]).astype(np.float32)
         if correlation(model.colors[rows].mean(1), seen) < LEAST_AGREEMENT:
-            return "the picture does not show the model's tissue"
+            return "the image does not show the model's tissue"
 
         before = project(last.view.camera, model.means[rows])[0].astype(np.float32)
         chosen = _most_textured(last.observation.gray, before)
@@ -123,7 +123,7 @@ class RestingTissue:
 
 
 def _is_inside(pixels: F32, picture: U8) -> Bool:
-    """Which of the pixels [N, 2] lie in the picture; NaN does not."""
+    """Which of the pixels [N, 2] lie in the image; NaN does not."""
     height, width = picture.shape
     u, v = pixels.T
     inside: Bool = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)

@@ -10,15 +10,15 @@ NEAR_MARGIN = 0.5  # of the disparity, above the nearest: instruments come in be
 
 
 def right_eye_mask(tissue: Bool, depths: F32, focal_px: float, baseline: float) -> Bool:
-    """The right eye's pixels that show tissue for certain, without having looked at the right picture.
+    """The right eye's pixels that show tissue for certain, without having looked at the right image.
 
     A pixel is kept when every disparity that tissue and instruments can have (1st to 99th percentile of the
-    drawn depth, widened by `FAR_MARGIN` and `NEAR_MARGIN`) takes it to a tissue pixel of the left picture. A
+    drawn depth, widened by `FAR_MARGIN` and `NEAR_MARGIN`) takes it to a tissue pixel of the left image. A
     mask made by warping with the depth itself would be wrong where the depth is wrong, on the shafts above
     all, and let the instrument in.
 
     Args:
-        tissue: [H, W] of the left picture.
+        tissue: [H, W] of the left image.
         depths: [M] m, of tissue as it is drawn for the left eye.
         focal_px: of the rectified pair.
         baseline: m.

@@ -1,10 +1,10 @@
-"""The picture for the right eye of a stereo display: the model, in the colours that this eye sees.
+"""The image for the right eye of a stereo display: the model, in the colours that this eye sees.
 
 Tissue does not look the same to both eyes: what shines lies elsewhere, and the cameras differ in colour and
 vignette. So each Gaussian remembers how much brighter than its colour the right eye saw it, from the
-right pictures of frames before. The detail of the left picture is added as to any view (`sags_node.detail`).
+right images of frames before. The detail of the left image is added as to any view (`sags_node.detail`).
 
-The right picture of a frame is never used to draw that frame. Instruments come neither from the left picture
+The right image of a frame is never used to draw that frame. Instruments come neither from the left image
 nor from the right one.
 """
 
@@ -70,8 +70,8 @@ class RightView:
             view: as it was drawn for that frame.
             shown: [H, W, 3] RGB, what was shown of it.
             model: which may have changed since.
-            picture: [H, W, 3] RGB of the right eye.
-            tissue: [H, W] of the left picture, without what the right eye does not see.
+            image: [H, W, 3] RGB of the right eye.
+            tissue: [H, W] of the left image, without what the right eye does not see.
             baseline: m.
         """
         snapshot = mapped.snapshot

@@ -54,9 +54,9 @@ SLOT_NS = 100_000_000  # ns from one slot of the field to the next
 # 0.6 dB worse and the window no better.
 KEPT_NS = 700_000_000
 MOST_KEPT = 24  # of these frames, at any frame rate
-# Pictures depend only on differences of the field between two times of its window. What changes all times
+# Images depend only on differences of the field between two times of its window. What changes all times
 # alike walks at random: without forgetting, features of about 1 are up to 130 after 1200 frames, a step
-# changes scales by powers of e, and at last a scale is 0 or covers the picture.
+# changes scales by powers of e, and at last a scale is 0 or covers the image.
 FORGOTTEN_NS = 2 * WINDOW_NS  # ns in which its cells go all but 1/e of the way back to their first values
 NODES = 128  # at which the field is evaluated; 512 double the time of a step, and gain nothing with few steps
 CELLS, CHANNELS = 32, 16  # of the HexPlane; twice as many of both gain nothing either
@@ -80,7 +80,7 @@ class Kept:
 
     t_ns: int  # on the field's clock
     drawn: Observation  # at the size in which the model was drawn
-    camera: Camera  # of the whole picture, for the 3D filter
+    camera: Camera  # of the whole image, for the 3D filter
 
 
 class FrameDeltas(Deltas):
@@ -180,7 +180,7 @@ class SagsMapper:
 
     def _initialise(self, observation: Observation, frame: Kept, budget: Budget) -> dict[str, int]:
         drawn, model = frame.drawn, self.model
-        if not can_start(observation):  # a black or covered picture: try again with the next frame
+        if not can_start(observation):  # a black or covered image: try again with the next frame
             self._show(observation, frame)
             return {"inserted": 0}
         depths = self.map.begin(drawn, self._limit(budget), NODES)

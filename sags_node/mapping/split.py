@@ -1,7 +1,7 @@
 """Splitting: where several Gaussians could show the tissue better than one, it is split in three. The outer
 parts take the rows of Gaussians that hardly show, so that the number of Gaussians and their cost stay.
 
-A split changes the picture less than a new Gaussian does, which covers what was there. The middle part stays
+A split changes the image less than a new Gaussian does, which covers what was there. The middle part stays
 where the whole was, under its id, so that nothing jumps for who follows the tissue by ids.
 """
 
@@ -28,7 +28,7 @@ PART_SIZE = 0.4  # of the whole, along its longest axis
 
 
 def split_worst(model: GaussianModel, observation: Observation, view: RenderedView, room: int) -> int:
-    """Split what shows most where the picture is worst.
+    """Split what shows most where the image is worst.
 
     What is hidden, by an instrument or other tissue, or out of view is not given up for it.
 

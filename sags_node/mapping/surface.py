@@ -13,7 +13,7 @@ from sags_node.vision.depth_grid import grid_of
 
 def surface_at(means: F32, observation: Observation) -> F32:
     """Return [N, 3] m for Gaussians at `means` [N, 3]: their depth (0: behind the camera or not in the
-    picture), the depth of tissue that is measured in their pixel (0: none), and its error."""
+    image), the depth of tissue that is measured in their pixel (0: none), and its error."""
     surface = np.empty((len(means), 3), np.float32)
     grid = grid_of(observation)
     _find_surface(

@@ -1,4 +1,4 @@
-"""Reads and writes picture and video files, with the limits that foreign files need.
+"""Reads and writes image and video files, with the limits that foreign files need.
 
 Imports no other folder.
 """

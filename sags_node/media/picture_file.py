@@ -1,6 +1,6 @@
-"""Decodes foreign picture files after a check of their headers, and holds the options for writing PNG.
+"""Decodes foreign image files after a check of their headers, and holds the options for writing PNG.
 
-Decoders take the memory that a header asks for. They fill the missing part of a cut-off picture with grey,
+Decoders take the memory that a header asks for. They fill the missing part of a cut-off image with grey,
 and do not tell. They print their own messages about a file, without its name.
 """
 
@@ -37,7 +37,7 @@ _READERS: dict[bytes, Callable[[BytesIO], ImageFile]] = {  # by how a file begin
     b"P6": PpmImagePlugin.PpmImageFile,
     b"RIFF": WebPImagePlugin.WebPImageFile,
 }
-_ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND\xaeB`\x82"}  # marks of a picture's end
+_ENDS = {_JPEG: b"\xff\xd9", _PNG: b"IEND\xaeB`\x82"}  # marks of an image's end
 _JPEG_MARK = re.compile(rb"\xff+([^\0\xff\xd0-\xd7])")  # but those inside pixel data
 warnings.filterwarnings("ignore", module=r"PIL\.TiffImagePlugin")  # of damaged files; they are refused
 _LONGEST_PADDING = 512  # bytes at the end of a file in which the end mark is looked for first
@@ -46,7 +46,7 @@ MAX_PIXELS = 64 << 20
 _MOST_KINDS = 32
 _FILTER, _PAETH = 19, 128  # cv2.IMWRITE_PNG_FILTER: older versions lack and ignore it
 _RLE = cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE
-# Options of `cv2.imencode` for camera pictures, masks and depth: one filter for all rows, and run-length
+# Options of `cv2.imencode` for camera images, masks and depth: one filter for all rows, and run-length
 # encoding. With a level but no filter, OpenCV tries all filters in each row: 1/3 to 2/3 more time.
 PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, *_RLE, _FILTER, _PAETH)
 STDERR = 2
@@ -61,13 +61,13 @@ _lock = threading.RLock()  # the descriptor is the whole process's
 
 
 def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) -> NDArray[Any]:
-    """Decode a picture with OpenCV.
+    """Decode an image with OpenCV.
 
-    The decoder's warnings about a picture that it could read go to the log, with `where`.
+    The decoder's warnings about an image that it could read go to the log, with `where`.
 
     Args:
         flags: of `cv2.imdecode`.
-        where: name of the picture in messages.
+        where: name of the image in messages.
         fix: what the user can do if it is damaged.
 
     Raises:
@@ -95,7 +95,7 @@ def decode(data: bytes | NDArray[np.uint8], flags: int, where: str, fix: str) ->
 
 
 class Complaints:
-    """Logs decoders' messages, each kind once: all pictures of a recording often have the same flaw."""
+    """Logs decoders' messages, each kind once: all images of a recording often have the same flaw."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -109,7 +109,7 @@ class Complaints:
                 if is_new:
                     self._kinds.add(kind)
             if is_new:
-                log.warning("%s: %s (said once, of the first such picture)", where, line)
+                log.warning("%s: %s (said once, of the first such image)", where, line)
 
 
 complaints = Complaints()
@@ -131,7 +131,7 @@ def claimed_size(data: memoryview) -> tuple[int, int] | None:
 
 
 def pages(data: memoryview) -> int:
-    """Count the pictures of the first one's size in a file, such as a stack of ImageJ. Smaller ones are
+    """Count the images of the first one's size in a file, such as a stack of ImageJ. Smaller ones are
     thumbnails. 1 where the file does not tell."""
     try:
         if not _is_tiff(data):
@@ -149,7 +149,7 @@ def pages(data: memoryview) -> int:
 
 
 def is_whole(data: memoryview) -> bool:
-    """Tell whether a picture is complete: it has its end mark or, in formats without one, all pixels."""
+    """Tell whether an image is complete: it has its end mark or, in formats without one, all pixels."""
     begin = next((begin for begin in _ENDS if bytes(data[: len(begin)]) == begin), None)
     if begin is not None:
         near = _ENDS[begin] in bytes(data[-_LONGEST_PADDING:])
@@ -180,7 +180,7 @@ def _is_tiff(data: memoryview) -> bool:
 
 
 def _tiff_tags(data: memoryview, at: int | None = None) -> Tiff.ImageFileDirectory_v2:
-    """The TIFF tags of the first picture, or of the one at byte `at`. Pillow itself cannot open some
+    """The TIFF tags of the first image, or of the one at byte `at`. Pillow itself cannot open some
     that OpenCV reads, such as three floats per pixel."""
     tags = Tiff.ImageFileDirectory_v2(bytes(data[:8]))
     file = BytesIO(data)
@@ -190,7 +190,7 @@ def _tiff_tags(data: memoryview, at: int | None = None) -> Tiff.ImageFileDirecto
 
 
 def _opened(data: memoryview) -> ImageFile:
-    """A picture whose header is read. `Image.open` would try other kinds, and warn of large pictures."""
+    """An image whose header is read. `Image.open` would try other kinds, and warn of large images."""
     start = bytes(data[:8])
     return next(reader for begin, reader in _READERS.items() if start.startswith(begin))(BytesIO(data))
 

@@ -1,7 +1,7 @@
-"""A video file: its pictures by number, and the stamps that the file gives them. Read by FFmpeg (PyAV).
+"""A video file: its images by number, and the stamps that the file gives them. Read by FFmpeg (PyAV).
 
-Headers are not believed. The number of pictures, their stamps and the key frames are read from the packets,
-once for each file. Pictures that an edit list hides do not count.
+Headers are not believed. The number of images, their stamps and the key frames are read from the packets,
+once for each file. Images that an edit list hides do not count.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ log = logging.getLogger(__name__)
 MAX_PIXELS = 64 << 20
 ONE_THREAD = 2_500_000  # px: up to here one thread decodes, at less CPU; full HD takes 1/4 of its time
 THREADS = min(4, os.cpu_count() or 1)
-REORDERED = 32  # pictures by which order of decoding and of display may differ
-LONGEST_PAUSE = 600.0  # s between two pictures; beyond, the stamps are of different clocks
-LARGE = 1 << 22  # bytes of a picture: from here on, a copy into new NumPy memory costs more than it saves
+REORDERED = 32  # images by which order of decoding and of display may differ
+LONGEST_PAUSE = 600.0  # s between two images; beyond, the stamps are of different clocks
+LARGE = 1 << 22  # bytes of an image: from here on, a copy into new NumPy memory costs more than it saves
 SAME = 1_000_000  # ns of rounding: stamps of most containers are whole milliseconds
-FAR = 8  # pictures ahead; nearer ones are reached by decoding, not by a seek
+FAR = 8  # images ahead; nearer ones are reached by decoding, not by a seek
 SHORT = 1.0  # s that a file may be shorter than its header says
 # Sizes of HD television, px. Untagged videos of these sizes are BT.709, all others BT.601: that is the matrix
-# of old television, and the one by which FFmpeg and OpenCV encode RGB pictures of any size.
+# of old television, and the one by which FFmpeg and OpenCV encode RGB images of any size.
 HD = {(1280, 720), (1440, 1080), (1920, 1080), (2048, 1080), (3840, 2160), (4096, 2160)}
 BROKEN = (av.FFmpegError, IndexError)  # a file breaks off; PyAV, where another stream begins in it
 _UNTAGGED = {2, 3}  # unspecified and reserved matrices of ISO/IEC 23091-2
@@ -56,7 +56,7 @@ HDR = {16: "PQ", 18: "HLG"}  # transfer characteristics of ISO/IEC 23091-2
 
 
 class LostPictureError(SagsError):
-    """One picture cannot be decoded; those behind it may be."""
+    """One image cannot be decoded; those behind it may be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,18 +71,18 @@ class _Index:
 
 
 class Video:
-    """One video file. Pictures are numbered as they are shown.
+    """One video file. Images are numbered as they are shown.
 
     Attributes:
-        size: width and height of a picture, px.
-        count: number of pictures.
+        size: width and height of an image, px.
+        count: number of images.
         stamps: [count] when each is shown, ns, rising; None where the file does not say it.
-        rate: Hz, where no picture is missing; None: not known.
+        rate: Hz, where no image is missing; None: not known.
         is_even: the stamps are those that the rate gives, or there are none.
         pixel_aspect: width of a pixel over its height.
         cut_off: what is missing of the file, with a remedy after a semicolon; "": nothing.
         tracks: number of video tracks; the first is read.
-        is_interlaced: the file says that its first picture is interlaced.
+        is_interlaced: the file says that its first image is interlaced.
         oddities: warnings about the file, each with a remedy after a semicolon.
 
     Raises:
@@ -92,7 +92,7 @@ class Video:
     def __init__(self, path: Path) -> None:
         self.path = path
         if path.is_dir():
-            raise UsageError(f"video {path} is a folder; of pictures: source.kind:=folders")
+            raise UsageError(f"video {path} is a folder; of images: source.kind:=folders")
         if not path.is_file():
             raise UsageError(f"video {path} does not exist; check the path, or SAGS_DATA if it is used")
         seen = path.stat()
@@ -103,10 +103,10 @@ class Video:
         self._reformatter = VideoReformatter()
         self._frame: av.VideoFrame | None = None  # the newest that is decoded
         first = self._restart()
-        if first is None and self._pts is not None:  # pictures have other stamps than their packets
+        if first is None and self._pts is not None:  # images have other stamps than their packets
             self._pts, first = None, self._restart()
         if first is None:
-            raise UsageError(f"video {path} holds no picture that can be decoded")
+            raise UsageError(f"video {path} holds no image that can be decoded")
         self._coded = first.width, first.height
         self.is_interlaced = first.interlaced_frame
         self._matrix: NDArray[np.int32] | None = None
@@ -120,7 +120,7 @@ class Video:
         self._untagged = Colorspace.ITU709 if _is_hd(*self.size) else Colorspace.ITU601
         self.stamps: I64 | None = None
         if self._pts is not None and first.pts is not None:
-            # Pictures before the first one that can be decoded depend on some that the file lacks.
+            # Images before the first one that can be decoded depend on some that the file lacks.
             self._pts = self._pts[self._pts >= first.pts]
             base = self._stream.time_base or Fraction(1, 1)
             self.stamps = np.array([round(int(ticks) * base * 10**9) for ticks in self._pts], np.int64)
@@ -146,13 +146,13 @@ class Video:
         if gaps := self.gaps:
             many, (before, lost) = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the first", gaps[0]
             self.oddities.append(
-                f"{path}: its stamps have {many} behind picture {before}, as long as {lost} pictures; it is "
-                "played by its stamps: were pictures lost, or was the recording paused?"
+                f"{path}: its stamps have {many} behind image {before}, as long as {lost} images; it is "
+                "played by its stamps: were images lost, or was the recording paused?"
             )
         if (bits := _bits_used(first)) is not None:
             self.oddities.append(
-                f"{path} has samples of {DEEP} bits, of which its first picture uses {bits}: it may be "
-                "played too dark; play its pictures as a folder, which finds the bits "
+                f"{path} has samples of {DEEP} bits, of which its first image uses {bits}: it may be "
+                "played too dark; play its images as a folder, which finds the bits "
                 f"(ffmpeg -i {self._name} %d.png)"
             )
 
@@ -168,14 +168,14 @@ class Video:
 
     @property
     def gaps(self) -> list[tuple[int, int]]:
-        """The number of the picture before each gap in the stamps, and how many pictures the gap lacks."""
+        """The number of the image before each gap in the stamps, and how many images the gap lacks."""
         if self.stamps is None or self.rate is None or self.is_even:
             return []
         steps = np.rint(np.diff(self.stamps) * self.rate * 1e-9).astype(int)
         return [(int(number), int(steps[number]) - 1) for number in np.flatnonzero(steps > 1)]
 
     def read(self, number: int) -> U8 | None:
-        """Read a picture, RGB [H, W, 3]; None past the end. Reading in order is fastest.
+        """Read an image, RGB [H, W, 3]; None past the end. Reading in order is fastest.
 
         Raises:
             LostPictureError: this one cannot be decoded.
@@ -191,11 +191,11 @@ class Video:
         while self._at < number:
             if self._decode() is None:
                 log.warning(
-                    "%s ends at picture %d, not at %d; copy it again", self.path, self._at + 1, self.count
+                    "%s ends at image %d, not at %d; copy it again", self.path, self._at + 1, self.count
                 )
                 return None
         if self._at > number:
-            raise LostPictureError(f"{self.path}: picture {number} cannot be decoded; copy the file again")
+            raise LostPictureError(f"{self.path}: image {number} cannot be decoded; copy the file again")
         assert self._frame is not None
         return self._converted(self._frame)
 
@@ -219,7 +219,7 @@ class Video:
         return next((rate for rate in reversed(told) if abs(rate - usual) < 0.01 * usual), usual), False
 
     def _restart(self) -> av.VideoFrame | None:
-        """Open the file anew and decode its first picture."""
+        """Open the file anew and decode its first image."""
         self._container, self._stream = _opened(self.path)
         self._stream.thread_type = "AUTO"
         small = self._stream.width * self._stream.height <= ONE_THREAD
@@ -227,13 +227,13 @@ class Video:
         return self._begin(is_sought=False)
 
     def _begin(self, is_sought: bool) -> av.VideoFrame | None:
-        """Decode the first picture from the position of the container on."""
+        """Decode the first image from the position of the container on."""
         self._frames = self._pictures(is_sought)
         self._at = -1
         return self._decode()
 
     def _jump(self, number: int) -> None:
-        """Seek so that this picture, or one before it, has just been decoded."""
+        """Seek so that this image, or one before it, has just been decoded."""
         if self._pts is not None and len(self._keys):
             at = int(np.searchsorted(self._keys[:, 0], self._pts[number], "right")) - 1
             with suppress(av.FFmpegError):  # from containers that cannot seek
@@ -243,14 +243,14 @@ class Video:
         self._restart()
 
     def _key_of(self, number: int) -> int:
-        """The number of the last key frame up to this picture."""
+        """The number of the last key frame up to this image."""
         if self._pts is None or not len(self._keys):
             return 0
         at = int(np.searchsorted(self._keys[:, 0], self._pts[number], "right")) - 1
         return int(np.searchsorted(self._pts, self._keys[max(at, 0), 0]))
 
     def _decode(self) -> av.VideoFrame | None:
-        """Decode the next picture; None at the end."""
+        """Decode the next image; None at the end."""
         self._frame = None  # its memory is used again
         for frame in self._frames:
             number = self._number_of(frame)
@@ -260,7 +260,7 @@ class Video:
         return None
 
     def _number_of(self, frame: av.VideoFrame) -> int:
-        """The number of a picture by its stamp; -1: it is not shown."""
+        """The number of an image by its stamp; -1: it is not shown."""
         if self._pts is None:
             return self._at + 1
         if frame.pts is None:
@@ -277,7 +277,7 @@ class Video:
             with suppress(*BROKEN):
                 packet = next(packets, None)
             if packet is not None and packet.size == 0:
-                continue  # a picture that a capture card dropped; or the end
+                continue  # an image that a capture card dropped; or the end
             begun = begun or packet is None or (packet.pts, packet.size) in self._begins
             if not begun:
                 continue
@@ -289,7 +289,7 @@ class Video:
     def _converted(self, frame: av.VideoFrame) -> U8:
         if (frame.width, frame.height) != self._coded:
             raise SagsError(
-                f"{self.path}: picture {self._at} is {frame.width}x{frame.height} px, the first one "
+                f"{self.path}: image {self._at} is {frame.width}x{frame.height} px, the first one "
                 f"{self._coded[0]}x{self._coded[1]}; cut the file there, e.g. with ffmpeg -ss and -t"
             )
         if frame.colorspace in _UNTAGGED:
@@ -319,7 +319,7 @@ def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
     streams = _tracks(container)
     if not streams:
         container.close()
-        raise UsageError(f"{path} cannot be read as a video: it holds no pictures; is it the right file?")
+        raise UsageError(f"{path} cannot be read as a video: it holds no images; is it the right file?")
     if streams[0].codec_context is None:
         container.close()
         raise UsageError(f"{path} cannot be read as a video: its codec is not known; convert it to H.264")
@@ -331,7 +331,7 @@ def _opened(path: Path) -> tuple[InputContainer, av.VideoStream]:
 
 
 def _tracks(container: InputContainer) -> list[av.VideoStream]:
-    """The video tracks that are not cover pictures."""
+    """The video tracks that are not cover images."""
     return [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
 
 
@@ -359,7 +359,7 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
         is_broken = is_broken or ends_in_a_packet(path, size, container.format.name)
         is_short = lacks_its_end(path, size, container.format.name)
         if (is_broken or is_short) and shown:
-            shown.pop()  # a part of a picture
+            shown.pop()  # a part of an image
         known = np.array([pts for pts in shown if pts is not None], np.int64)
         # AVI holds the decoding order only. FFmpeg guesses the stamps, which fails with codecs that reorder.
         is_guessed = container.format.name == "avi" and stream.codec_context.has_b_frames
@@ -375,33 +375,33 @@ def _read_index(path: Path, size: int, mtime_ns: int) -> _Index:
             missing = container.duration * 1e-6 - ends - SHORT
         cut_off = ""
         if named > total:
-            cut_off = f"of {named} pictures it holds {total}"
+            cut_off = f"of {named} images it holds {total}"
         elif missing > float(0.5 * base) or is_short:
             cut_off = "its end is missing"
         elif is_broken:
-            cut_off = "of its last picture a part is there"
+            cut_off = "of its last image a part is there"
         cut_off = cut_off and f"{path} is cut off: {cut_off}; copy it again"
         return _Index(len(shown), pts, np.array(sorted(keys), np.int64).reshape(-1, 3), unused, cut_off)
 
 
 def _why_unused(path: Path, pts: I64, base: Fraction) -> str:
-    """Return what is wrong with the stamps of pictures, given in decoding order; "": nothing."""
+    """Return what is wrong with the stamps of images, given in decoding order; "": nothing."""
     order = np.argsort(pts, kind="stable")
     moved = np.abs(order - np.arange(len(pts)))
     steps = np.diff(pts[order]) * float(base)
     again = f"ffmpeg -fflags +genpts -i {shlex.quote(str(path))} NEW"
     remedy = f"it is played by number, at its rate; {again} writes new stamps"
     if len(pts) and moved.max() > REORDERED:
-        return f"its stamps begin anew near picture {int(np.argmax(moved > REORDERED))}; {remedy}"
+        return f"its stamps begin anew near image {int(np.argmax(moved > REORDERED))}; {remedy}"
     if np.count_nonzero(steps == 0) > 0.1 * len(pts):
-        return f"several pictures have one stamp; {remedy}"
+        return f"several images have one stamp; {remedy}"
     if steps.max(initial=0) > LONGEST_PAUSE:
-        return f"its stamps jump by {steps.max():.0f} s after picture {int(np.argmax(steps))}; {remedy}"
+        return f"its stamps jump by {steps.max():.0f} s after image {int(np.argmax(steps))}; {remedy}"
     return ""
 
 
 def _upright(picture: U8, matrix: NDArray[np.int32]) -> U8:
-    """The picture, mirrored and turned by quarters as a display matrix [3, 3] (ISO/IEC 14496-12) says."""
+    """The image, mirrored and turned by quarters as a display matrix [3, 3] (ISO/IEC 14496-12) says."""
     across, down = matrix[0, 0], matrix[1, 1]
     if across == 0:
         picture = cv2.transpose(picture)
@@ -418,5 +418,5 @@ def _bits_used(frame: av.VideoFrame) -> int | None:
 
 
 def _is_hd(width: int, height: int) -> bool:
-    """Tell whether this is the size of one or two pictures of HD television."""
+    """Tell whether this is the size of one or two images of HD television."""
     return not HD.isdisjoint({(width, height), (width // 2, height), (width, height // 2)})

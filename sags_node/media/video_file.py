@@ -1,4 +1,4 @@
-"""Writes a video picture by picture: H.264 in MP4, which every browser plays."""
+"""Writes a video image by image: H.264 in MP4, which every browser plays."""
 
 import errno
 import logging
@@ -14,7 +14,7 @@ from sags_node.types import U8
 log = logging.getLogger(__name__)
 
 TICKS = 90_000  # per second: the period of usual rates is a whole number of ticks
-LONGEST_STEP = 60 * TICKS  # between two pictures; a longer pause is left out
+LONGEST_STEP = 60 * TICKS  # between two images; a longer pause is left out
 RATES = (1.0, 240.0)  # Hz: the range that players can play
 
 
@@ -22,8 +22,8 @@ class VideoFile:
     """A video file being written. Use it within `files.whole`: the file is complete only after `finish`.
 
     Args:
-        rate: Hz, for pictures without a stamp.
-        size: width and height of the pictures, px; odd ones lose a column or row.
+        rate: Hz, for images without a stamp.
+        size: width and height of the images, px; odd ones lose a column or row.
 
     Raises:
         OSError: it cannot be written.
@@ -44,13 +44,13 @@ class VideoFile:
         self._period = TICKS / rate
         self._first_ns: int | None = None
         self._shift = 0.0  # ticks that are added to stamps, as they began anew or a pause was left out
-        self._at = -self._period  # ticks, of the newest picture
+        self._at = -self._period  # ticks, of the newest image
 
     def add(self, picture: U8, stamp_ns: int | None = None) -> None:
-        """Add a picture, RGB [H, W, 3]; one of another size is scaled.
+        """Add an image, RGB [H, W, 3]; one of another size is scaled.
 
         Args:
-            stamp_ns: capture time: sets the interval to the picture before. If stamps begin anew, the picture
+            stamp_ns: capture time: sets the interval to the image before. If stamps begin anew, the image
                 follows at the rate; so it does after a minute's pause, which is logged. None: at the rate.
 
         Raises:
@@ -82,7 +82,7 @@ class VideoFile:
         self._write(frame)
 
     def finish(self) -> None:
-        """Encode the last pictures and close the file.
+        """Encode the last images and close the file.
 
         Raises:
             OSError: it cannot be written.

@@ -112,7 +112,7 @@ class NodeAddress:
         if connection.recording is not None:
             raise SagsError(
                 f"a recording is played as '{self.ns}': it takes no requests, so it holds no anchors and no "
-                f"views; a node does, with the recording's pictures: sags run "
+                f"views; a node does, with the recording's images: sags run "
                 f"{shlex.quote(str(connection.recording))}"
             )
         if connection.control is None:

@@ -56,11 +56,11 @@ class Content:
     encoding: str = ""
     shape: tuple[int, ...] = ()
     dtype: DType = ""
-    scale: float = 0.0  # size of one step of a thin picture of integers; 0: none
-    window: tuple[int, ...] = ()  # of a thin picture: x, y, and px of the whole picture per px of its own
+    scale: float = 0.0  # size of one step of a thin image of integers; 0: none
+    window: tuple[int, ...] = ()  # of a thin image: x, y, and px of the whole image per px of its own
     relative: bool = False  # its lengths have no unit
     detail_age_ns: int | None = (
-        None  # ns from the oldest picture in a view to its frame; None: the model alone
+        None  # ns from the oldest image in a view to its frame; None: the model alone
     )
 
     def cdr(self) -> bytes:
@@ -129,14 +129,14 @@ def from_ros1(raw: bytes, type_name: str) -> bytes:
 
 
 def compressed_image(file: bytes, form: str, header: Any) -> bytes:
-    """`sensor_msgs/CompressedImage` of a picture file, with the header of the picture's message."""
+    """`sensor_msgs/CompressedImage` of an image file, with the header of the image's message."""
     return _serialize(_ros[COMPRESSED](header, form, np.frombuffer(file, np.uint8)))
 
 
 def file_form(encoding: str, kind: str) -> str:
     """Return the `format` of a JPEG or PNG file (`kind`), as ROS's compressed_image_transport writes it.
 
-    `encoding` is that of the picture.
+    `encoding` is that of the image.
     """
     stored = encoding.replace("rgb", "bgr")  # the channel order of OpenCV, which writes and reads these files
     return f"{encoding}; {kind} compressed {stored}"
@@ -168,7 +168,7 @@ def picture_file(data: bytes, stamp_ns: int, frame: str = LEFT_FRAME) -> Content
 
 
 def image(array: NDArray[Any], encoding: str, stamp_ns: int, frame: str = LEFT_FRAME) -> Content:
-    """`sensor_msgs/Image` of a picture [H, W] or [H, W, C] in one of `IMAGE_ENCODINGS`."""
+    """`sensor_msgs/Image` of an image [H, W] or [H, W, C] in one of `IMAGE_ENCODINGS`."""
     dtype, channels = IMAGE_ENCODINGS[encoding]
     height, width = array.shape[:2]
     assert array.dtype == dtype and array.size == height * width * channels, (array.shape, array.dtype)
@@ -196,7 +196,7 @@ def uncalibrated(camera_info: bytes) -> bytes:
 
 
 def eye_info(eye: Eye, stamp_ns: int) -> Content:
-    """`sensor_msgs/CameraInfo` of a calibrated camera that gives raw pictures."""
+    """`sensor_msgs/CameraInfo` of a calibrated camera that gives raw images."""
     return _camera_info(eye.width, eye.height, eye.distortion, eye.K, eye.R, eye.P, stamp_ns, LEFT_FRAME)
 
 

@@ -163,7 +163,7 @@ def view(name: str, drawn: DrawnView) -> dict[str, Content]:
 
 
 def _visible(result: FrameResult) -> Bool:
-    """Which Gaussians [N] lie in the left picture and not under the surface drawn there."""
+    """Which Gaussians [N] lie in the left image and not under the surface drawn there."""
     view, gaussians = result.views["left"], result.snapshot.gaussians
     height, width = view.depth.shape
     pixels, depths = project(view.camera, gaussians.means)
@@ -218,7 +218,7 @@ def _mask(result: FrameResult) -> Content:
 
 
 def picture(pair: RectifiedPair, side: Side) -> Content:
-    """The rectified picture of an eye."""
+    """The rectified image of an eye."""
     return cdr.image(published.picture(pair, side), "rgb8", pair.t_capture_ns, cdr.FRAMES[side])
 
 

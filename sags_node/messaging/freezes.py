@@ -1,4 +1,4 @@
-"""Freezes of a picture that is being shown, as WebRTC counts them: an interval of at least three times the
+"""Freezes of an image that is being shown, as WebRTC counts them: an interval of at least three times the
 mean of those before, and at least 150 ms more than it (W3C, "Identifiers for WebRTC's Statistics API",
 `freezeCount`)."""
 
@@ -25,7 +25,7 @@ class Freezes:
         self._intervals: deque[float] = deque(maxlen=WINDOW)
 
     def add(self, now: float) -> None:
-        """Note that a picture was shown at `now`, s of any monotonic clock."""
+        """Note that an image was shown at `now`, s of any monotonic clock."""
         before, self._last = self._last, now
         if before is None:
             return
@@ -43,7 +43,7 @@ class Freezes:
 
 
 def freezes_of(moments: Iterable[float]) -> Freezes:
-    """The freezes of a stream whose pictures were shown at these moments, s."""
+    """The freezes of a stream whose images were shown at these moments, s."""
     counted = Freezes()
     for moment in moments:
         counted.add(moment)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MAX_PART_BYTES = 64 << 20  # a picture of 4096 x 4096 px, 4 bytes each
+MAX_PART_BYTES = 64 << 20  # an image of 4096 x 4096 px, 4 bytes each
 MAX_UNTAKEN_BYTES = 4 * MAX_PART_BYTES  # of a peer that may wait unread
 RECEIVE_HIGH_WATER = 8  # messages of a sender that wait in the socket
 SEND_HIGH_WATER = 4
@@ -109,7 +109,7 @@ class Inbox:
             gate = self._resources.enter_context(authenticated(context, config, section))
             self._socket = context.socket(zmq.ROUTER)
             limit(self._socket, SEND_HIGH_WATER, RECEIVE_HIGH_WATER, MAX_PART_BYTES)
-            self._socket.setsockopt(zmq.RCVBUF, -1)  # the system's: pictures are large
+            self._socket.setsockopt(zmq.RCVBUF, -1)  # the system's: images are large
             self._peers = Peers(self._socket, section, MAX_UNTAKEN_BYTES, gate.revocations)
             self._resources.callback(self._peers.close)
             self.endpoint = bind(self._socket, endpoint, f"{section}.endpoint", gate.keys)
@@ -152,7 +152,7 @@ class Inbox:
         self._tell()
 
     def _refuse_second(self, sender: _Sender, session: str, things: tuple[str, ...]) -> None:
-        """Refuse all messages of the second of two programs that send the same: pictures of both must not
+        """Refuse all messages of the second of two programs that send the same: images of both must not
         become a stereo pair.
 
         Raises:

@@ -32,7 +32,7 @@ class MaskSubscriber:
         self._subscriber = Subscriber([MASK], endpoint, ns)
 
     def nearest(self, stamp_ns: int) -> tuple[int, NDArray[Any]] | None:
-        """The stamp (ns) and picture of the recent mask nearest to `stamp_ns`; None before the first."""
+        """The stamp (ns) and image of the recent mask nearest to `stamp_ns`; None before the first."""
         mask = self._subscriber.nearest(MASK, stamp_ns)
         return None if mask is None else (mask.stamp_ns, mask.array)
 

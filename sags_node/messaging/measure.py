@@ -29,8 +29,8 @@ POSE = TopicName("tf", ReceivedRos)
 INFO = TopicName("left/camera_info", ReceivedCameraInfo)
 MEASURING = (ANCHORS, POSE, INFO)
 
-# Share of the picture's width. Nine of ten visible anchors are nearer than this to their point in the
-# picture: 0.7 to 1.4 px of 640 (`off_by_px` in benchmarks/results/tracking_*.json).
+# Share of the image's width. Nine of ten visible anchors are nearer than this to their point in the
+# image: 0.7 to 1.4 px of 640 (`off_by_px` in benchmarks/results/tracking_*.json).
 SIDEWAYS = 1.5 / 640
 NORMAL = 1.645  # standard deviations of a normal distribution, within which nine of ten lie
 

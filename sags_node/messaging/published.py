@@ -30,7 +30,7 @@ def camera_of(pair: RectifiedPair) -> Camera:
 
 
 def picture(pair: RectifiedPair, side: Side) -> U8:
-    """The rectified picture [H, W, 3] of an eye that exists, made from the raw one instead of enlarged."""
+    """The rectified image [H, W, 3] of an eye that exists, made from the raw one instead of enlarged."""
     if pair.published is not None:
         return pair.published.picture(side)
     shown = pair.left if side == "left" else pair.right
@@ -48,7 +48,7 @@ def nearest(pair: RectifiedPair, plane: Plane) -> Plane:
 
 
 def colours(view: RenderedView, size: tuple[int, int]) -> U8:
-    """Return the colours [H, W, 3] RGB of a view at `size` (width, height; px), with the detail of pictures
+    """Return the colours [H, W, 3] RGB of a view at `size` (width, height; px), with the detail of images
     if it was made at that size."""
     if view.shown is not None and view.shown.rgb.shape[1::-1] == size:
         return view.shown.rgb
@@ -56,7 +56,7 @@ def colours(view: RenderedView, size: tuple[int, int]) -> U8:
 
 
 def alpha(view: RenderedView, size: tuple[int, int]) -> F32:
-    """The coverage [H, W] 0..1 of a view at `size` (width, height; px), by the model or a picture."""
+    """The coverage [H, W] 0..1 of a view at `size` (width, height; px), by the model or an image."""
     drawn = view.alpha
     if drawn.shape[::-1] != size:
         drawn = np.asarray(cv2.resize(drawn, size, interpolation=cv2.INTER_LINEAR))
@@ -66,7 +66,7 @@ def alpha(view: RenderedView, size: tuple[int, int]) -> F32:
 
 
 def detail_age_ns(view: RenderedView) -> int | None:
-    """How long before the view's frame the oldest picture in it was captured; None: the model alone."""
+    """How long before the view's frame the oldest image in it was captured; None: the model alone."""
     return None if view.shown is None else max(0, view.t_capture_ns - view.shown.oldest_ns)
 
 

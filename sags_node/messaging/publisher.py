@@ -34,7 +34,7 @@ MAX_SUBSCRIPTION_BYTES = 512  # also the longest step of a CURVE handshake
 MAX_SUBSCRIPTIONS_BYTES = 16384  # of one peer, all together: ZeroMQ remembers them until the peer goes
 MAX_PREFIXES = 1024  # at most noted: a view may be subscribed to before it is opened, so any name may come
 SUBSCRIPTIONS_HIGH_WATER = 64  # messages of one peer that may wait
-MAX_THIN = 8  # thin pictures made at once, as many as views
+MAX_THIN = 8  # thin images made at once, as many as views
 MAX_THIN_NAME = 120  # characters; a longer name gets no answer
 PENDING_POLL_MS = 10  # between looks for the result of a handler's future
 EARLY_PICTURE = "left/image_rect_color"
@@ -63,12 +63,12 @@ class Publisher(Closes):
     Args:
         handlers: control op -> function of its args, see `control.ControlServer`; `ping` is always there.
         offered: what may be subscribed to, beside views.
-        thins: whether somebody makes the thin pictures of `thin`.
+        thins: whether somebody makes the thin images of `thin`.
         recording: what `sags bag play` plays here; None: this is a node.
         metric: False: lengths have no unit, as nobody has calibrated the eyes; every message says so.
 
     Attributes:
-        thin: thin pictures that somebody subscribes to, by topic.
+        thin: thin images that somebody subscribes to, by topic.
 
     Raises:
         UsageError: an endpoint open to other machines without keys, a key file that cannot be used, or a run
@@ -104,7 +104,7 @@ class Publisher(Closes):
         self._thin_seq = self._view_seq = 0  # where the `seq` of the next one begins
         self._last: FrameResult | None = None
         self._dropped = 0
-        self._pictured = -1  # the newest frame whose picture went before its result
+        self._pictured = -1  # the newest frame whose image went before its result
         self._kept: dict[str, _Value] = {}  # last values that no `FrameResult` holds
         self._peers: dict[str, Peers] = {}
         self._resources = ExitStack()
@@ -176,7 +176,7 @@ class Publisher(Closes):
     # ---- out -------------------------------------------------------------------------------------------
 
     def publish_picture(self, pair: RectifiedPair, epoch: int) -> None:
-        """Send a frame's left picture before its result, which then comes without it."""
+        """Send a frame's left image before its result, which then comes without it."""
         self._pictured = pair.frame_id
         self._seq[EARLY_PICTURE] += 1
         if self.wanted(EARLY_PICTURE):
@@ -231,7 +231,7 @@ class Publisher(Closes):
                 self._send(topic, value)
 
     def publish_thin(self, result: FrameResult, pictures: Mapping[str, Content]) -> None:
-        """Send thin pictures of a frame, by topic, to those who still ask for them."""
+        """Send thin images of a frame, by topic, to those who still ask for them."""
         for name in pictures.keys() & self.thin.keys():
             pair = result.pair
             self.publish_content(name, pictures[name], pair.frame_id, pair.t_capture_ns, result.epoch)
@@ -364,7 +364,7 @@ class Publisher(Closes):
             self._subscribed.discard(prefix)
 
     def _thin_subscription(self, name: str, begins: bool) -> None:
-        """Begin or end a thin picture. If it cannot be made, the reason is sent on its topic."""
+        """Begin or end a thin image. If it cannot be made, the reason is sent on its topic."""
         if not begins:
             if name in self.thin:  # names come and go without limit, and no `seq` may be used again
                 self.thin = {asked: thin for asked, thin in self.thin.items() if asked != name}
@@ -373,11 +373,11 @@ class Publisher(Closes):
         try:
             asked = topics.thin_picture(name)
             if not self._thins:
-                raise UsageError("thin pictures are made by a running node only")
+                raise UsageError("thin images are made by a running node only")
             if asked.topic not in self._seq:
                 raise UsageError(f"'{name}': {asked.topic} is not published; {topics.NO_RIGHT_EYE}")
             if name not in self.thin and len(self.thin) >= MAX_THIN:
-                raise UsageError(f"'{name}': {MAX_THIN} thin pictures are made already, the most at once")
+                raise UsageError(f"'{name}': {MAX_THIN} thin images are made already, the most at once")
         except UsageError as error:
             if len(name) <= MAX_THIN_NAME:
                 self._send(name, _Value(cdr.string(str(error)), time.time_ns()))

@@ -56,7 +56,7 @@ class ReceivedImage(Received):
 
 @dataclass(frozen=True)
 class ReceivedCompressed(Received):
-    """A thin picture; it is decoded when its `array` is asked for."""
+    """A thin image; it is decoded when its `array` is asked for."""
 
     @cached_property
     def array(self) -> NDArray[Any]:
@@ -71,7 +71,7 @@ class ReceivedCompressed(Received):
 
     @property
     def window(self) -> tuple[int, int, int]:
-        """The x and y of its first pixel in the whole picture, and px of that per px of this one."""
+        """The x and y of its first pixel in the whole image, and px of that per px of this one."""
         x, y, every = self.meta.window or (0, 0, 1)
         return x, y, every
 

@@ -30,7 +30,7 @@ AheadMs = Annotated[float, msgspec.Meta(ge=0, le=MAX_AHEAD_MS)] | Literal["auto"
 
 
 class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`add_anchor`: a pixel of the left picture, or a point in the world."""
+    """`add_anchor`: a pixel of the left image, or a point in the world."""
 
     u: float | None = None  # px
     v: float | None = None
@@ -42,7 +42,7 @@ class AnchorRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         given = {name for name in "uvxyz" if getattr(self, name) is not None}
         if given not in ({"u", "v"}, {"x", "y", "z"}):
-            raise ValueError("give either a pixel {u, v} of the left picture or a point {x, y, z} in metres")
+            raise ValueError("give either a pixel {u, v} of the left image or a point {x, y, z} in metres")
         if not all(abs(getattr(self, name)) <= LARGEST for name in given):  # refuses NaN, too
             raise ValueError(f"{', '.join(sorted(given))} must be finite, and no more than {LARGEST:g}")
 

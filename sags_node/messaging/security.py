@@ -306,7 +306,7 @@ def _usable(files: Iterable[Path]) -> Iterator[tuple[bytes, Client]]:
 
 
 def _files(places: Sequence[Path], section: str) -> list[Path]:
-    """The key files. Only `publish` has folders of roles; senders of pictures or poses have no role."""
+    """The key files. Only `publish` has folders of roles; senders of images or poses have no role."""
     within = ("", *ROLES) if section == "publish" else ("",)
     files: list[Path] = []
     for place in places:

@@ -1,4 +1,4 @@
-"""Send pictures and poses to a node, from a simulator or any program that has them.
+"""Send images and poses to a node, from a simulator or any program that has them.
 
 with FrameSender() as sender:
     sender.send(left, right)  # [H, W, 3] uint8 RGB
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 Picture = NDArray[Any] | bytes  # [H, W] or [H, W, C] uint8; or the bytes of a JPEG or PNG file
 MAX_RECEIPT_BYTES = 1 << 16
-CONNECT_MS = 500  # longest wait for the node when a sender is made, so that the first picture is not left out
+CONNECT_MS = 500  # longest wait for the node when a sender is made, so that the first image is not left out
 SILENT = 3.0  # s without a receipt, after which no node is there; one comes each second
 
 
@@ -97,7 +97,7 @@ class Sender(Closes):
         if self._unanswered is None:
             self._unanswered = time.monotonic()
         try:
-            # Copied: whoever sends may draw the next picture into the same memory.
+            # Copied: whoever sends may draw the next image into the same memory.
             self._socket.send_multipart(encode(Message(f"{self._ns}/{name}", meta, body.parts)), zmq.NOBLOCK)
         except zmq.Again:
             self.left_out += 1
@@ -124,9 +124,9 @@ class Sender(Closes):
 
 
 class FrameSender(Sender):
-    """Hands pictures in to a node with `source.kind: push`, at its `source.endpoint`; see `Sender`."""
+    """Hands images in to a node with `source.kind: push`, at its `source.endpoint`; see `Sender`."""
 
-    _queued = 4  # two pairs: a slow node gets new pictures, not old ones
+    _queued = 4  # two pairs: a slow node gets new images, not old ones
     _key = "source.kind"
 
     def __init__(
@@ -137,7 +137,7 @@ class FrameSender(Sender):
     def send(
         self, left: Picture, right: Picture, stamp_ns: int | None = None, encoding: str | None = None
     ) -> bool:
-        """Send both eyes' pictures of one moment; return False when one of them was left out.
+        """Send both eyes' images of one moment; return False when one of them was left out.
 
         Args:
             stamp_ns: when they were taken, wall clock (`time.time_ns`); default: now.
@@ -154,13 +154,13 @@ class FrameSender(Sender):
     def send_eye(
         self, eye: Literal["left", "right"], picture: Picture, stamp_ns: int, encoding: str | None = None
     ) -> bool:
-        """Send one eye's picture, where each eye has its own program. Their stamps say which form a pair."""
+        """Send one eye's image, where each eye has its own program. Their stamps say which form a pair."""
         return self._send_picture(eye, picture, stamp_ns, encoding)
 
     def send_side_by_side(
         self, picture: Picture, stamp_ns: int | None = None, encoding: str | None = None
     ) -> bool:
-        """Send one picture of both eyes, the left one in its left half; see `send`."""
+        """Send one image of both eyes, the left one in its left half; see `send`."""
         return self._send_picture("stereo", picture, stamp_ns, encoding)
 
     def _send_picture(self, whose: str, picture: Picture, stamp_ns: int | None, encoding: str | None) -> bool:
@@ -174,7 +174,7 @@ class FrameSender(Sender):
         fits = cdr.IMAGE_ENCODINGS.get(encoding)
         shape = picture.shape[2:] or (1,)
         if fits is None or picture.dtype != fits[0] or shape != (fits[1],):
-            raise ValueError(f"a picture {picture.shape} of {picture.dtype} is not {encoding}")
+            raise ValueError(f"an image {picture.shape} of {picture.dtype} is not {encoding}")
         return self._send(f"{whose}/image_raw", cdr.image(picture, encoding, stamp_ns, frame), stamp_ns)
 
 

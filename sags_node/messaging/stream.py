@@ -12,7 +12,7 @@ from sags_node.messaging import cdr, topics, wire
 from sags_node.messaging.address import Address, HandshakeWatch, NodeAddress, connect
 from sags_node.messaging.sockets import receive_frames
 
-MAX_MESSAGE_BYTES = 128 << 20  # of one part: a 4096 x 4096 picture of 8 bytes a pixel
+MAX_MESSAGE_BYTES = 128 << 20  # of one part: a 4096 x 4096 image of 8 bytes a pixel
 RECEIVE_HIGH_WATER = 32
 POLL_MS = 100  # after which a reader notices that it should end
 
@@ -80,13 +80,13 @@ def listen_to(
     when the caller is slow.
 
     Yields None at least every `POLL_MS` while none of them arrives, so that a caller can keep time.
-    Malformed messages are left out. If a thin picture cannot be made, its topic brings the reason: `refused`
+    Malformed messages are left out. If a thin image cannot be made, its topic brings the reason: `refused`
     gets the topic and the reason instead.
 
     Raises:
         UsageError: an unknown topic.
         SagsError: no endpoint is known, the node refuses this client, or it says why it cannot make a thin
-            picture.
+            image.
     """
     ns = node.ns
     known = [check_topic(topics.plain_name(ns, name)) for name in names]

@@ -30,7 +30,7 @@ from sags_node.messaging.wire import WireError
 from sags_node.workers import go_on
 
 KEPT = 4  # newest messages of a topic, so that topics of one frame can be joined by stamp
-# States of the node with valid content. While it is held, pictures are valid, and no model is sent.
+# States of the node with valid content. While it is held, images are valid, and no model is sent.
 VALID_STATES = ("running", "held", "degraded")
 _ALWAYS = frozenset({"status"})
 

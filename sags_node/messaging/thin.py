@@ -1,4 +1,4 @@
-"""Thin pictures: smaller forms of what a node draws and measures, for links that are too slow for the whole.
+"""Thin images: smaller forms of what a node draws and measures, for links that are too slow for the whole.
 
 Colour becomes JPEG, blended over black where it has an alpha, which has a topic of its own. Depth becomes
 16-bit PNG. Depths are never averaged: at half size every second one is sent unchanged.
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 def thin_pictures(
     result: FrameResult, asked: Mapping[str, ThinPicture], logged: set[str] | None = None
 ) -> dict[str, Content]:
-    """Return the thin pictures of a frame, by topic; a text instead of one that cannot be made.
+    """Return the thin images of a frame, by topic; a text instead of one that cannot be made.
 
     Args:
         logged: topics whose failure was logged; those that fail now are added.
@@ -45,7 +45,7 @@ def thin_pictures(
     for name, thin in asked.items():
         x, y, wide, high = thin.region or (0, 0, width, height)
         if x + wide > width or y + high > height:
-            made[name] = cdr.string(f"'{name}': the region leaves the picture, which has {width}x{height} px")
+            made[name] = cdr.string(f"'{name}': the region leaves the image, which has {width}x{height} px")
         elif tells_of(result, thin.topic):
             part = np.s_[y : y + high - high % thin.every, x : x + wide - wide % thin.every]
             try:
@@ -121,7 +121,7 @@ def _numbers(
 
 
 def _averaged(picture: U8, every: int) -> U8:
-    """The picture with each pixel the mean of `every` x `every` pixels."""
+    """The image with each pixel the mean of `every` x `every` pixels."""
     height, width = picture.shape[:2]
     if every == 1:
         return picture
@@ -130,7 +130,7 @@ def _averaged(picture: U8, every: int) -> U8:
 
 
 def decode(topic: str, scale: float, file: Buffer) -> NDArray[Any]:
-    """The picture in a thin message, see `received.ReceivedCompressed.array`; `scale` 0: its header has none.
+    """The image in a thin message, see `received.ReceivedCompressed.array`; `scale` 0: its header has none.
 
     Raises:
         WireError: the file is damaged.

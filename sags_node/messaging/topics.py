@@ -86,9 +86,9 @@ _VIEW_KINDS = {
     "camera_info": (CAMERA_INFO, "the camera of that viewpoint"),
 }
 
-THIN = "thin/"  # how the names of thin pictures begin
+THIN = "thin/"  # how the names of thin images begin
 _EVERY = {"full": 1, "half": 2, "quarter": 4}
-THIN_FORMS = {  # for each picture, the forms that may be sent instead
+THIN_FORMS = {  # for each image, the forms that may be sent instead
     "left/image_rect_color": ("jpeg",),
     "right/image_rect_color": ("jpeg",),
     "left/render/image": ("jpeg", "alpha"),
@@ -103,16 +103,16 @@ _THIN_NAME = re.compile(r"thin/([a-z]+)/(?:(\d{1,5}),(\d{1,5}),(\d{1,5}),(\d{1,5
 
 @dataclass(frozen=True, slots=True)
 class ThinPicture:
-    """A smaller form of one of the node's pictures, as the name of its topic asks for it."""
+    """A smaller form of one of the node's images, as the name of its topic asks for it."""
 
-    topic: str  # of the whole picture
+    topic: str  # of the whole image
     form: str  # jpeg, png or alpha
-    every: int  # px of the whole picture per px of this one
-    region: tuple[int, int, int, int] | None  # x, y, width, height in the whole picture; None: all of it
+    every: int  # px of the whole image per px of this one
+    region: tuple[int, int, int, int] | None  # x, y, width, height in the whole image; None: all of it
 
 
 def thin_picture(name: str) -> ThinPicture:
-    """Parse the name of a thin picture: `thin/SIZE/[X,Y,WIDTH,HEIGHT/]TOPIC/FORM`, without the namespace.
+    """Parse the name of a thin image: `thin/SIZE/[X,Y,WIDTH,HEIGHT/]TOPIC/FORM`, without the namespace.
 
     No such name is a prefix of another, so a subscription to one brings no other.
 
@@ -148,7 +148,7 @@ def is_scaled(thin: ThinPicture) -> bool:
 
 def find(name: str) -> Topic | None:
     """The entry of a topic named without the namespace; None: there is no such topic. Knows also those of
-    players, overlays, thin pictures, and views that a consumer may have opened."""
+    players, overlays, thin images, and views that a consumer may have opened."""
     known = BY_NAME.get(name) or _OF_OTHERS.get(name)
     if known is not None:
         return known

@@ -56,15 +56,15 @@ class Meta(msgspec.Struct, frozen=True, kw_only=True):
     ahead_ns: Count | msgspec.UnsetType = msgspec.UNSET  # what is shown is expected so long after `stamp_ns`
     detail_age_ns: Count | msgspec.UnsetType = (
         msgspec.UNSET
-    )  # how long before `stamp_ns` the oldest picture in a view was captured
-    scale: Scale | msgspec.UnsetType = msgspec.UNSET  # size of one step of a thin picture of integers
-    window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin picture: x, y, px of the whole per px
+    )  # how long before `stamp_ns` the oldest image in a view was captured
+    scale: Scale | msgspec.UnsetType = msgspec.UNSET  # size of one step of a thin image of integers
+    window: Window | msgspec.UnsetType = msgspec.UNSET  # of a thin image: x, y, px of the whole per px
     recorded_s: Seconds | msgspec.UnsetType = msgspec.UNSET  # time of the frame in the recording played
     units: Text | msgspec.UnsetType = msgspec.UNSET  # of lengths: "relative", of a guessed rig; unset: metres
 
 
 class Receipt(msgspec.Struct, frozen=True, kw_only=True):
-    """The node's answer, once a second, to a program that sends it pictures or poses."""
+    """The node's answer, once a second, to a program that sends it images or poses."""
 
     v: str = PROTOCOL
     taken: int  # messages since it connected

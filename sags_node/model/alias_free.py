@@ -18,7 +18,7 @@ from sags_node.kernels.jit import kernel, parallel_kernel
 from sags_node.types import F32, Camera
 
 FILTER_VARIANCE = 0.2  # of the squared sampling interval
-VIEW_MARGIN = 0.15  # of the picture's size: what is that far outside still counts as seen
+VIEW_MARGIN = 0.15  # of the image's size: what is that far outside still counts as seen
 UNSEEN = np.float32(np.inf)
 
 
@@ -28,9 +28,9 @@ def smoothing_variances(means: F32, cameras: Sequence[Camera]) -> F32:
     Args:
         means: [N, 3] m, world, after deformation.
         cameras: those the Gaussians were fitted to. A camera that only looks at the result does not belong
-            here: from nearer by it would ask for detail that nothing was ever measured of, and the picture
+            here: from nearer by it would ask for detail that nothing was ever measured of, and the image
             loses 2 dB at four times the size (`benchmarks alias`). The mapper gives the camera of the whole
-            picture, also while it fits to one of half the size (benchmarks/mapping.md).
+            image, also while it fits to one of half the size (benchmarks/mapping.md).
 
     Gaussians that no camera sees take the largest variance of the seen ones.
     """

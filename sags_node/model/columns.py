@@ -16,7 +16,7 @@ COLOR = slice(10, 13)  # RGB 0..1
 LOGIT = 13  # of the opacity
 COUNT = 14
 
-# Bounds for optimisers. What no picture determines, such as how thin a Gaussian is along the ray, walks at
+# Bounds for optimisers. What no image determines, such as how thin a Gaussian is along the ray, walks at
 # random: without bounds a scale reaches 0, or the size of the scene.
 LOG_SCALE_RANGE = (math.log(1e-6), math.log(5e-3))  # m
 COLOR_RANGE = (-0.5, 1.5)  # wider than what can be shown

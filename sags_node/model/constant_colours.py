@@ -13,7 +13,7 @@ LEAST = np.float32(0.01)  # a gentler slope is dropped: 2.5 grey levels for each
 
 
 def with_constant_colours(gaussians: Gaussians) -> Gaussians:
-    """Make Gaussians without slopes that give nearly the same picture. One with a slope is split in two along
+    """Make Gaussians without slopes that give nearly the same image. One with a slope is split in two along
     its steepest axis. Together the halves are as wide as the whole, less opaque in its middle and more
     beside it. Both have its id. The 3D filter is folded in.
 

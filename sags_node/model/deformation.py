@@ -105,7 +105,7 @@ class NodeDeformation:
         Args:
             model: its `means` are moved.
             gradients: [N, 3] of the loss by the means.
-            contribution: [N] weight of each Gaussian in the picture, 0 = not seen.
+            contribution: [N] weight of each Gaussian in the image, 0 = not seen.
             step: length of one step, m.
         """
         gradient, _ = _average(

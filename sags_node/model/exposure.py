@@ -1,4 +1,4 @@
-"""The camera's exposure over time: one gain per channel that all colours of a picture share.
+"""The camera's exposure over time: one gain per channel that all colours of an image share.
 
 An endoscope's automatic exposure follows the tissue that comes nearer; without it, every colour of the model
 would have to change with every frame. Not part of SAGS; the drift is 20 % within six seconds of a real
@@ -9,7 +9,7 @@ import numpy as np
 
 from sags_node.types import F32, I64
 
-NEUTRAL = 1e-6  # below this brightness a picture says nothing of its exposure
+NEUTRAL = 1e-6  # below this brightness an image says nothing of its exposure
 
 
 class Exposure:

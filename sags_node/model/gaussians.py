@@ -52,7 +52,7 @@ class GaussianModel:
     velocities = _Column(np.float32, 3)  # m/s, world
     depth_errors = _Column(np.float32)  # m, predicted, see `mapping.depth_memory`
     ids = _Column(np.int64)
-    contribution = _Column(np.float32)  # px, in the last step on a whole picture
+    contribution = _Column(np.float32)  # px, in the last step on a whole image
     origin = _Column(np.int32)  # row + 1 of its optimiser's state on a GPU, see `mapping.gpu`; 0: it has none
     in_front = _Column(np.int32)  # frames in a row in front of the measured surface
     node_index = _Column(np.int32, NEIGHBOURS)
@@ -161,7 +161,7 @@ class GaussianModel:
 
     def snapshot(self) -> Gaussians:
         """Copy the live rows, for publishing, with the 3D filter folded in: any renderer draws the same
-        picture."""
+        image."""
         drawn = bake_filter(self.gaussians())
         return Gaussians(
             self.means.copy(),

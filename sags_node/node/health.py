@@ -255,7 +255,7 @@ def _remedies(source: Source | None) -> tuple[str, str]:
             return what, "is one camera away, or source.pair_tolerance_ms too small?"
     return (
         what,
-        "do the pictures of both eyes come, with stamps no further apart than source.pair_tolerance_ms?",
+        "do the images of both eyes come, with stamps no further apart than source.pair_tolerance_ms?",
     )
 
 

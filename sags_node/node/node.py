@@ -5,7 +5,7 @@ r"""The running node: five threads and the slots between them.
 
 Slots hold the newest value only (live), or hand every value over (recordings not played in real time).
 The sockets live on the publishing thread; clients' requests about the model run on the mapping thread,
-between two frames. Consumers' own views are drawn, and thin pictures made, on threads of their own, which
+between two frames. Consumers' own views are drawn, and thin images made, on threads of their own, which
 take no more of a core than `allowance` says.
 """
 
@@ -107,7 +107,7 @@ class Node:
         )
         self._operations = Operations(self._state, self._hand_over_view)
         self._pictures: Latest[tuple[RectifiedPair, int]] = Latest(on_put=self._wake_publishing)  # and epoch
-        self._clock = CaptureClock()  # of live pictures
+        self._clock = CaptureClock()  # of live images
         self._manager = manager or ServiceManager({})
         self._wake = os.eventfd(0, os.EFD_NONBLOCK)
         self._frames: Latest[tuple[StereoFrame, float, RectifiedPictures]] = Latest()  # and when it came
@@ -328,7 +328,7 @@ class Node:
         self._wake_publishing()
 
     def _offer_picture(self, pair: RectifiedPair, epoch: int) -> None:
-        """Publish the picture at once, so that a mask made of it is in time for the next frame."""
+        """Publish the image at once, so that a mask made of it is in time for the next frame."""
         self._pictures.put((pair, epoch))
 
     def _wake_publishing(self) -> None:

@@ -121,7 +121,7 @@ class Operations:
             raise SagsError("there is no model yet; wait for the first frame")
         frame = newest.observation, newest.snapshot, newest.views["left"]
         if request.u is not None and request.v is not None:
-            if held := self._state.pipeline.held:  # the consumer clicked on a newer picture
+            if held := self._state.pipeline.held:  # the consumer clicked on a newer image
                 raise SagsError(f"frames are held: {held}; pin when they are taken in again")
             size = published.size_of(newest.pair)
             anchor = self._state.pipeline.anchors.add_pixel(request.u, request.v, *frame, size)
@@ -165,7 +165,7 @@ class Operations:
             self._state.pipeline.predict_motion()
         drawn = self._state.views.open(request, self._scene(), self._state.pipeline.seen)
         status = self._state.views.status[request.name]
-        if drawn is not None or status.draw_ms == 0:  # None: forget kept pictures of the old viewpoint
+        if drawn is not None or status.draw_ms == 0:  # None: forget kept images of the old viewpoint
             self._show_view(request.name, drawn)
         return {"topics": content.view_topics(request.name, request.stereo, request.depth), **asdict(status)}
 

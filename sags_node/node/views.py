@@ -74,7 +74,7 @@ class Views:
             allowance: what drawing may take of one core.
             latency: returns the recent time from capture to publication, s.
             backend: as for `make_rasterizer`.
-            detail: whether views get the detail of pictures.
+            detail: whether views get the detail of images.
         """
         self.status: Mapping[str, ViewStatus] = {}
         self.pairs: Collection[str] = ()
@@ -91,7 +91,7 @@ class Views:
     def open(
         self, request: ViewRequest, scene: FrameResult | None, seen: Sequence[SeenFrame] = ()
     ) -> DrawnView | None:
-        """Open a view, or change the one of that name. Returns its first picture if there is a scene;
+        """Open a view, or change the one of that name. Returns its first image if there is a scene;
         otherwise it is drawn with the next scene.
 
         Raises:
@@ -138,7 +138,7 @@ class Views:
 
         Args:
             watched: views that somebody subscribes to.
-            seen: frames that lend their pictures: that of the scene, and older ones (`Pipeline.seen`).
+            seen: frames that lend their images: that of the scene, and older ones (`Pipeline.seen`).
         """
         self._watched = watched
         if self._teacher is not None and seen:

@@ -79,7 +79,7 @@ class FrameRequest:
     """What consumers want of one frame."""
 
     waited: float = 0.0  # s since the frame came
-    left: bool = False  # somebody looks at the left view: it gets the picture's detail
+    left: bool = False  # somebody looks at the left view: it gets the image's detail
     right: bool = False  # somebody looks at the right eye: it is drawn, where there is one
     latency: float = 0.0  # s, recent time from capture to publication
     instruments: bool = False  # somebody wants to know where the instruments are
@@ -100,7 +100,7 @@ class Pipeline:
         rate: frames that come per second; None: they come when taken. Call `reconfigure` after a change.
         newest: the frame mapped last; None before the first, and after a reset.
         held: why the last frame was not taken in; empty: it was.
-        seen: the frames that lend views their pictures, the newest first: the one mapped last and older ones.
+        seen: the frames that lend views their images, the newest first: the one mapped last and older ones.
         metric: whether lengths are metres: the calibration is no guess.
     """
 
@@ -228,7 +228,7 @@ class Pipeline:
             back = "bring the scope back to tissue that it saw before"
             found.append(Finding("camera_lost", f"the camera is lost: {lost}; {back}"))
         if unknown := "; ".join(tool.problem for tool in self._tools if tool.problem):
-            said = f"{unknown}; instruments come from the picture alone: check the robot's program"
+            said = f"{unknown}; instruments come from the image alone: check the robot's program"
             found.append(Finding("tool_pose_missing", said))
         if not self.metric:
             found = [*(each for each in found if each.code != "rows_differ"), FINDING]  # a guess fits no rows
@@ -434,7 +434,7 @@ class Pipeline:
         return mapped
 
     def _lend(self, mapped: Mapped, pair: RectifiedPair, observation: Observation, judged: Judgement) -> None:
-        """Note the pictures from which views may take detail. None is taken from one in another light, or if
+        """Note the images from which views may take detail. None is taken from one in another light, or if
         the model is empty."""
         self.seen = ()
         known = len(mapped.snapshot.gaussians) > 0
@@ -449,7 +449,7 @@ class Pipeline:
         self._memory.add(now)
 
     def _left_eye(self, view: RenderedView, pair: RectifiedPair, wanted: bool) -> RenderedView:
-        """The model drawn for the left eye; with the picture's detail, if somebody looks."""
+        """The model drawn for the left eye; with the image's detail, if somebody looks."""
         if self._detail is None or not wanted or not self.seen:
             return view
         now, *older = self.seen

@@ -26,7 +26,7 @@ from sags_node.sources.robot import Posed
 from sags_node.sources.source import Source, open_source, recorded_rig
 from sags_node.types import StereoRig
 
-Guess = Callable[[schema.Source], StereoRig]  # makes a rig from the pictures of a source
+Guess = Callable[[schema.Source], StereoRig]  # makes a rig from the images of a source
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +40,12 @@ class Session:
 
     @property
     def working_size(self) -> tuple[int, int]:
-        """Width and height of the pictures that the mapper works on, px."""
+        """Width and height of the images that the mapper works on, px."""
         return self.config.vision.working_size(self.rig.left.width, self.rig.left.height)
 
     @property
     def published_size(self) -> tuple[int, int]:
-        """Width and height of the pictures that consumers get, px."""
+        """Width and height of the images that consumers get, px."""
         return self.config.vision.published_size(self.rig.left.width, self.rig.left.height)
 
 
@@ -124,8 +124,8 @@ def rig_to_play(
 
 
 def rig_of(config: LaunchConfig) -> StereoRig:
-    """Return the calibration that comes with the pictures, or that the launch file names, adapted to whether
-    the pictures come rectified."""
+    """Return the calibration that comes with the images, or that the launch file names, adapted to whether
+    the images come rectified."""
     return as_pictures_come(_named_rig(config), config)
 
 

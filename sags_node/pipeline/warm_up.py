@@ -25,7 +25,7 @@ from sags_node.vision.stereo import StereoDepth
 from sags_node.vision.tissue_classical import InstrumentFinder
 
 COMPILING = 600.0  # s, longest compilation of the vision's kernels on a slow machine
-# Pictures large enough for kernels of several threads: smaller ones use other kernels.
+# Images large enough for kernels of several threads: smaller ones use other kernels.
 _WIDTH, _HEIGHT, _FOCAL, _BASELINE, _DISPARITY = 240, 192, 225.0, 0.0043, 12
 
 
@@ -50,7 +50,7 @@ def warm_up(config: LaunchConfig) -> None:
     pipeline = Pipeline(small, _rig())
     right = config.publish.right is not False
     request = FrameRequest(left=True, right=right, instruments=True)  # somebody may look
-    budget = StepBudget(2)  # the first step covers the whole picture, the second where it is worst
+    budget = StepBudget(2)  # the first step covers the whole image, the second where it is worst
     frames = _frames()
     with _vision_beside():
         for frame in frames[:3]:  # these bring their depth: the other process compiles stereo
@@ -97,7 +97,7 @@ def _vision_beside() -> Iterator[None]:
 
 
 def _frames() -> list[StereoFrame]:
-    """Six frames of a picture that moves by a pixel per frame. The first three bring their depth. In the
+    """Six frames of an image that moves by a pixel per frame. The first three bring their depth. In the
     last three the scope moves instead of the tissue, and an instrument hides tissue."""
     coarse: U8 = np.random.default_rng(0).integers(40, 220, (_HEIGHT // 4, _WIDTH // 4 + 16, 3), np.uint8)
     texture = cv2.resize(coarse, (_WIDTH + 64, _HEIGHT))

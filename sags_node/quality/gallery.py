@@ -11,7 +11,7 @@ from sags_node.types import F32, U8, Bool
 
 EVENLY_SPACED = 3  # frames of a run
 TILE_WIDTH = 360  # px
-ERROR_AT_TOP = 0.15  # of full scale: the brightest colour of an error picture
+ERROR_AT_TOP = 0.15  # of full scale: the brightest colour of an error image
 _UNKNOWN = (60, 60, 60)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -92,7 +92,7 @@ def _coloured(share: F32, colormap: int, known: Bool) -> U8:
 
 
 def shrunk(picture: U8) -> U8:
-    """Shrink a picture to a width of `TILE_WIDTH`."""
+    """Shrink an image to a width of `TILE_WIDTH`."""
     height = max(1, round(picture.shape[0] * TILE_WIDTH / picture.shape[1]))
     resized: U8 = cv2.resize(picture, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
     return resized

@@ -1,6 +1,6 @@
-"""Figures of merit for pictures, depth and timings.
+"""Figures of merit for images, depth and timings.
 
-Pictures are float32 RGB 0..1 `[H, W, 3]`; `tissue` is True where a pixel counts. A figure over an empty
+Images are float32 RGB 0..1 `[H, W, 3]`; `tissue` is True where a pixel counts. A figure over an empty
 mask is NaN: nothing is invented where nothing was measured.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from sags_node.types import F32, F64, I64, U8, Bool
 
 Plane = TypeVar("Plane", F32, Bool)
-BEST_PSNR = 100.0  # dB, of identical pictures, so that the mean over frames stays finite
+BEST_PSNR = 100.0  # dB, of identical images, so that the mean over frames stays finite
 
 
 def as_float(picture: U8) -> F32:
@@ -28,13 +28,13 @@ def psnr(picture: F32, truth: F32, tissue: Bool) -> float:
 
 
 def paper_psnr(picture: F32, truth: F32, tissue: Bool) -> float:
-    """The PSNR (dB) as in the literature: both pictures are multiplied by the mask, without a margin,
+    """The PSNR (dB) as in the literature: both images are multiplied by the mask, without a margin,
     and all pixels are averaged: masked ones count as perfect (EndoGaussian, SAGS: `metrics.py`)."""
     return _decibel(_squared_error(picture, truth, tissue) * float(tissue.mean()))
 
 
 def paper_ssim(picture: F32, truth: F32, tissue: Bool) -> float:
-    """The `ssim` as in the literature: both pictures are black where masked, and all pixels count."""
+    """The `ssim` as in the literature: both images are black where masked, and all pixels count."""
     black = tissue[..., None].astype(np.float32)
     return ssim(picture * black, truth * black, np.ones_like(tissue))
 
@@ -57,7 +57,7 @@ def ssim(picture: F32, truth: F32, tissue: Bool) -> float:
     map over tissue and channels.
 
     A window at the border of the mask also sees pixels beyond it. Those are set to the truth in both
-    pictures, so that an instrument, which the model does not draw, does not lower the tissue beside it.
+    images, so that an instrument, which the model does not draw, does not lower the tissue beside it.
     """
     if not tissue.any():
         return float("nan")
@@ -87,13 +87,13 @@ def fit_gain_offset(picture: F32, truth: F32, mask: Bool) -> F32:
 
 
 def fitted_psnr(picture: F32, truth: F32, mask: Bool) -> float:
-    """The `psnr` (dB) over `mask` of a picture of another exposure, after `fit_gain_offset`."""
+    """The `psnr` (dB) over `mask` of an image of another exposure, after `fit_gain_offset`."""
     return psnr(fit_gain_offset(picture, truth, mask), truth, mask)
 
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """How far a depth picture is from its reference, over tissue; NaN where nothing could be compared."""
+    """How far a depth image is from its reference, over tissue; NaN where nothing could be compared."""
 
     median_mm: float
     p90_mm: float

@@ -1,4 +1,4 @@
-"""What is right, odd or wrong with the numbers of a calibration. `tools.calibration.rows` checks pictures."""
+"""What is right, odd or wrong with the numbers of a calibration. `tools.calibration.rows` checks images."""
 
 import logging
 import shlex
@@ -106,27 +106,27 @@ def _check_eyes(rig: StereoRig) -> list[Finding]:
 
 
 def check_intrinsics(where: str, K: F64, width: int, height: int) -> list[Finding]:
-    """Return what is odd or wrong with the `K` [3, 3] (px) of a picture; `where` names it in the findings."""
+    """Return what is odd or wrong with the `K` [3, 3] (px) of an image; `where` names it in the findings."""
     if np.any(K[2, :2] != 0):
         what = f"{where} is transposed: its last row is {K[2, 0]:g} {K[2, 1]:g} {K[2, 2]:g}, not 0 0 1"
         return [Finding("error", what, "write its columns as rows (MATLAB's cameraParameters are so)")]
     found = []
     for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
         if not 0.2 * width < focal < 20 * width:
-            what = f"{where}: {axis} = {focal:g} px is not plausible for a picture {width} px wide"
-            found.append(Finding("error", what, "give it in pixels of the full picture"))
+            what = f"{where}: {axis} = {focal:g} px is not plausible for an image {width} px wide"
+            found.append(Finding("error", what, "give it in pixels of the full image"))
     for axis, centre, side in (("cx", K[0, 2], width), ("cy", K[1, 2], height)):
         if not -side < centre < 2 * side:
-            what = f"{where}: {axis} = {centre:g} px is far outside a picture of {side} px"
+            what = f"{where}: {axis} = {centre:g} px is far outside an image of {side} px"
             found.append(Finding("error", what, "check image_width, image_height and the calibration"))
         elif not 0.2 * side < centre < 0.8 * side:
             what = f"{where}: {axis} = {centre:g} px is far from the middle of {side} px"
-            found.append(Finding("warning", what, "check that the calibration is of this picture size"))
+            found.append(Finding("warning", what, "check that the calibration is of this image size"))
     return found
 
 
 def _check_distortion(file: str, eye: Eye) -> list[Finding]:
-    """Warn if the radial distortion turns back before it reaches the picture's corners."""
+    """Warn if the radial distortion turns back before it reaches the image's corners."""
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(eye.distortion, (0, 8 - len(eye.distortion)))
     farthest = np.maximum(eye.K[:2, 2], [eye.width, eye.height] - eye.K[:2, 2]) / eye.K[[0, 1], [0, 1]]
     radius = np.linspace(0, LARGEST_RADIUS, RADII)
@@ -137,7 +137,7 @@ def _check_distortion(file: str, eye: Eye) -> list[Finding]:
     if not len(turns) or distorted[turns[0]] >= np.hypot(*farthest):
         return []
     reach = distorted[turns[0]] * eye.K[0, 0]
-    what = f"{file}: the distortion turns back {reach:.0f} px from the principal point, inside the picture"
+    what = f"{file}: the distortion turns back {reach:.0f} px from the principal point, inside the image"
     return [Finding("warning", what, "what lies farther out is wrong: calibrate with the board there too")]
 
 
@@ -154,7 +154,7 @@ def _check_model(file: str, eye: Eye) -> list[Finding]:
 
 
 def size_made_for(rig: StereoRig) -> float | None:
-    """Return the picture size that `K` was probably made for, over the size that the rig states: 0.5 for half
+    """Return the image size that `K` was probably made for, over the size that the rig states: 0.5 for half
     the size. None: the principal points lie near the middle, or do not agree on another size."""
     ratios = [
         ratio
@@ -173,23 +173,23 @@ def _check_size(rig: StereoRig) -> list[Finding]:
         return []
     made_for = f"{eye.width * size:.0f}x{eye.height * size:.0f}"
     what = (
-        f"both principal points lie at {size:.3g} of the middle: camera_matrix is of {made_for} pictures, "
+        f"both principal points lie at {size:.3g} of the middle: camera_matrix is of {made_for} images, "
         f"the files say {eye.width}x{eye.height}"
     )
-    fix = f"if the pictures are {eye.width}x{eye.height}, multiply camera_matrix and projection_matrix by "
+    fix = f"if the images are {eye.width}x{eye.height}, multiply camera_matrix and projection_matrix by "
     return [Finding("warning", what, f"{fix}{1 / size:.3g}, or calibrate at that size")]
 
 
 def wrong_size(path: Path | str, calibrated: tuple[int, int], size: tuple[int, int]) -> Finding | None:
-    """Return what is wrong if pictures of this `size` (width, height, px) are used with the calibration at
+    """Return what is wrong if images of this `size` (width, height, px) are used with the calibration at
     `path`, which is of the `calibrated` size; None: nothing."""
     ratio, down = size[0] / calibrated[0], size[1] / calibrated[1]
-    what = "the calibration is for {}x{} px, the pictures are {}x{}".format(*calibrated, *size)
+    what = "the calibration is for {}x{} px, the images are {}x{}".format(*calibrated, *size)
     if ratio != down:
-        fix = "the pictures have another shape (cropped?): calibrate with pictures as they come now"
+        fix = "the images have another shape (cropped?): calibrate with images as they come now"
         return Finding("error", what, fix)
     fix = (
-        f"calibrate at {size[0]}x{size[1]}, or if the pictures are only resized, not cropped: "
+        f"calibrate at {size[0]}x{size[1]}, or if the images are only resized, not cropped: "
         f"sags calib convert {shlex.quote(str(path))} -o FOLDER --scale {ratio:g}"
     )
     return (
@@ -201,7 +201,7 @@ def _check_rows(rig: StereoRig) -> list[Finding]:
     left, right = rig.left, rig.right
     if (left.width, left.height) != (right.width, right.height):
         what = f"left.yaml is {left.width}x{left.height}, right.yaml {right.width}x{right.height}"
-        return [Finding("error", what, "both eyes need the same picture size")]
+        return [Finding("error", what, "both eyes need the same image size")]
     found: list[Finding] = []
     for name, row, column, tolerance in (
         ("fx", 0, 0, 1e-3 * left.P[0, 0]),
@@ -213,8 +213,8 @@ def _check_rows(rig: StereoRig) -> list[Finding]:
             what = f"rectified {name} differs: {a:g} px in left.yaml, {b:g} px in right.yaml"
             fix = "the files are not from one stereo calibration; " + RECALIBRATE
             if name == "cy" and not found:  # only the rows disagree
-                what += f": do the eyes' pictures begin {abs(a - b):g} rows apart (roi, y_offset, a crop)?"
-                fix = "read out the same rows of both eyes, or calibrate with these pictures and set rig"
+                what += f": do the eyes' images begin {abs(a - b):g} rows apart (roi, y_offset, a crop)?"
+                fix = "read out the same rows of both eyes, or calibrate with these images and set rig"
             found.append(Finding("error", what, fix))
     return found or [Finding("ok", "rectified rows of both eyes agree")]
 

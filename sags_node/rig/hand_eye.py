@@ -24,7 +24,7 @@ class HandEye:
     """A hand-eye calibration."""
 
     T_hand_cam: F64  # [4, 4] m, pose of the left raw camera in the frame whose pose the robot tells
-    offset_ns: int = 0  # robot's stamp - picture's stamp, at the same moment
+    offset_ns: int = 0  # robot's stamp - image's stamp, at the same moment
 
 
 def read_hand_eye(file: Path) -> HandEye:

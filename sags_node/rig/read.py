@@ -26,7 +26,7 @@ from sags_node.rig.rig import fit_distortion, rectified_rig, rectify_eyes
 from sags_node.types import F64, StereoRig
 
 NOMINAL_BASELINE = 0.005  # m, of one camera alone, and of eyes that nobody has calibrated
-GUESSED_FOV = 60.0  # degrees across a picture: D4D has 58, the Hamlyn heart 44, da Vinci's scopes 60 to 70
+GUESSED_FOV = 60.0  # degrees across an image: D4D has 58, the Hamlyn heart 44, da Vinci's scopes 60 to 70
 ARCHIVE = "calibrationdata.tar.gz"
 ARCHIVE_SUFFIXES = (".tar.gz", ".tgz")
 LARGEST_MATRIX = 64  # numbers
@@ -89,7 +89,7 @@ def load_camera(file: Path) -> StereoRig:
 
 
 def guessed_rig(width: int, height: int, pixel_aspect: float = 1.0) -> StereoRig:
-    """Guess a rig of usual optics for uncalibrated pictures of this size (px); it is not `metric`.
+    """Guess a rig of usual optics for uncalibrated images of this size (px); it is not `metric`.
 
     Args:
         pixel_aspect: width of a pixel over its height.
@@ -105,7 +105,7 @@ def read_rig(path: Path, size: tuple[int, int] | None = None, metres: float | No
     The rig is named after the folder or file. What is not rectified is rectified by `cv2.stereoRectify`.
 
     Args:
-        size: width and height of the pictures, px, for the forms that do not say it.
+        size: width and height of the images, px, for the forms that do not say it.
         metres: per unit of length, if not the usual one: 1 for ROS and OpenCV, 0.001 for scikit-surgery.
 
     Raises:
@@ -175,7 +175,7 @@ def _rig(
     left, right = (fit_distortion(matrix(key), f"{where}: {key}") for key in ("D1", "D2"))
     if size is None:
         raise UsageError(
-            f"{where} does not say the size of the pictures: give --size WxH; for a launch file "
+            f"{where} does not say the size of the images: give --size WxH; for a launch file "
             "convert it first (sags calib convert)"
         )
     return replace(rectify_eyes(name, size, K, (left, right), R, T), says_P=False)
@@ -192,7 +192,7 @@ def read_text_folder(folder: Path, size: tuple[int, int] | None, metres: float |
     """Read the rig in a folder of text matrices; it is named after the folder.
 
     Args:
-        size: width and height of the pictures, px: the files do not say it.
+        size: width and height of the images, px: the files do not say it.
         metres: per unit of the translation; default: millimetres.
 
     Raises:
@@ -248,10 +248,10 @@ def read_files(
 ) -> StereoRig:
     """Read the rig in files that together hold M1 D1 M2 D2 R T, or these under other usual names.
 
-    R1 R2 P1 P2, if they are there, are kept, so that pictures are rectified as other programs do with them.
+    R1 R2 P1 P2, if they are there, are kept, so that images are rectified as other programs do with them.
 
     Args:
-        size: width and height of the pictures, px, where the files do not say it.
+        size: width and height of the images, px, where the files do not say it.
         metres: per unit of T; default 1.
 
     Raises:

@@ -12,11 +12,11 @@ from sags_node.types import F64, Camera, Eye, StereoRig
 LARGEST_SIDE = 16384  # px
 PLUMB_BOB = 5  # k1 k2 p1 p2 k3
 RATIONAL = 8  # and k4 k5 k6
-STILL = 1 / 180  # of the width: if the median pixel moves by no more, the pictures were rectified already
+STILL = 1 / 180  # of the width: if the median pixel moves by no more, the images were rectified already
 
 
 def rectified_rig(name: str, width: int, height: int, K: F64, baseline: float) -> StereoRig:
-    """Make a rig whose pictures are rectified already: both eyes have `K` [3, 3] (px) and no distortion.
+    """Make a rig whose images are rectified already: both eyes have `K` [3, 3] (px) and no distortion.
 
     Args:
         baseline: m.
@@ -28,7 +28,7 @@ def rectified_rig(name: str, width: int, height: int, K: F64, baseline: float) -
 
 
 def already_rectified(rig: StereoRig) -> StereoRig:
-    """Return the rig for pictures that `rig` rectified: only P holds for them, as for ROS's `image_rect`."""
+    """Return the rig for images that `rig` rectified: only P holds for them, as for ROS's `image_rect`."""
     left, right = (
         replace(eye, K=eye.P[:, :3].copy(), distortion=np.zeros(PLUMB_BOB), R=np.eye(3))
         for eye in (rig.left, rig.right)
@@ -37,7 +37,7 @@ def already_rectified(rig: StereoRig) -> StereoRig:
 
 
 def rectifies(rig: StereoRig) -> bool:
-    """Tell whether the rig straightens or turns pictures, rather than only zooming them."""
+    """Tell whether the rig straightens or turns images, rather than only zooming them."""
     across = np.linspace(0, 1, 9)
     for eye in (rig.left, rig.right):
         pixels = np.stack(np.meshgrid(across * eye.width, across * eye.height), -1).reshape(-1, 1, 2)
@@ -48,7 +48,7 @@ def rectifies(rig: StereoRig) -> bool:
 
 
 def part_of_sensor(eye: Eye, roi: tuple[int, int, int, int], binning: tuple[int, int], where: str) -> Eye:
-    """Return the eye for pictures of a binned part of the sensor: offset, then division (ROS, REP 104).
+    """Return the eye for images of a binned part of the sensor: offset, then division (ROS, REP 104).
 
     Args:
         roi: x, y, width and height of the part, px of the sensor; no width or height: all of it.
@@ -64,7 +64,7 @@ def part_of_sensor(eye: Eye, roi: tuple[int, int, int, int], binning: tuple[int,
     if min(x, y) < 0 or x + width > eye.width or y + height > eye.height or 0 in binned:
         raise UsageError(
             f"{where}: roi {x},{y} {width}x{height} with binning {across}x{down} is no part of "
-            f"{eye.width}x{eye.height} px; set rig to a calibration of these pictures"
+            f"{eye.width}x{eye.height} px; set rig to a calibration of these images"
         )
     if (x, y, *binned) == (0, 0, eye.width, eye.height):
         return eye
@@ -81,10 +81,10 @@ def rectify_eyes(
     name: str, size: tuple[int, int], K: tuple[F64, F64], distortion: tuple[F64, F64], R: F64, T: F64
 ) -> StereoRig:
     """Make a rig of two cameras, rectified by `cv2.stereoRectify`: rows and zero disparity agree, and no
-    rectified pixel lies outside the raw pictures.
+    rectified pixel lies outside the raw images.
 
     Args:
-        size: width and height of both pictures, px.
+        size: width and height of both images, px.
         K: left, right, each [3, 3] px.
         distortion: left, right, as `fit_distortion` gives them.
         R, T: rotation [3, 3] and translation [3] (m) from left to right camera coordinates.
@@ -94,7 +94,7 @@ def rectify_eyes(
     """
     if not all(1 <= side <= LARGEST_SIDE for side in size):
         raise UsageError(
-            f"{name}: a picture size of {size[0]}x{size[1]} px is not possible; give the right one"
+            f"{name}: an image size of {size[0]}x{size[1]} px is not possible; give the right one"
         )
     numbers = np.concatenate([part.ravel() for part in (*K, *distortion, R, T)])
     if not np.isfinite(numbers).all():
@@ -132,7 +132,7 @@ def fit_distortion(coefficients: F64, where: str) -> F64:
 
 
 def resized_rig(rig: StereoRig, factor: float) -> StereoRig:
-    """Return the rig for pictures that were resized by `factor`."""
+    """Return the rig for images that were resized by `factor`."""
     return replace(rig, left=_resized(rig.left, factor), right=_resized(rig.right, factor))
 
 

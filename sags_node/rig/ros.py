@@ -118,7 +118,7 @@ class _Limited(gzip.GzipFile):
 
     def seek(self, offset: int, whence: int = 0) -> int:
         if offset > LARGEST_ARCHIVE:
-            raise tarfile.ReadError("far larger than the pictures of a calibration")
+            raise tarfile.ReadError("far larger than the images of a calibration")
         return super().seek(offset, whence)
 
 

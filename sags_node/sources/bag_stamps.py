@@ -13,13 +13,13 @@ from sags_node.types import I64
 Key = tuple[int, int]  # log time and header stamp of a message, ns: identify it within its topic
 
 REPEATED = 0.3  # share of distinct stamps; less is not trusted (messages recorded three times leave 1/3)
-FEW_PAIRS = 0.9  # share of the left pictures; fewer pairs are worth a warning
+FEW_PAIRS = 0.9  # share of the left images; fewer pairs are worth a warning
 SYNCHRONISED_MS = 5.0  # ms between the eyes of a pair: the tolerance of live pairs, too
 LATE_STEPS = 1.5  # periods: the delays of both eyes to the recorder do not differ by more
-LONG = 3.0  # times the usual step between pictures: longer ones are gaps
+LONG = 3.0  # times the usual step between images: longer ones are gaps
 OFTEN = 0.1  # share of all steps: more gaps than that are no pauses
 DIFFER_FIX = (
-    "set source.clocks:=two, which sets one by the other by when pictures were recorded; better, set both "
+    "set source.clocks:=two, which sets one by the other by when images were recorded; better, set both "
     "machines' clocks (chrony, PTP) before recording"
 )
 
@@ -38,7 +38,7 @@ def pair_messages(
         others = others + ahead
     pairs = pair(stamps, others, config.tolerance)
     if not len(pairs):
-        count = f"{config.path}: left {len(left)} pictures, right {len(right)} pictures, pairs 0"
+        count = f"{config.path}: left {len(left)} images, right {len(right)} images, pairs 0"
         if config.clocks == "one" and len(pair(stamps, others + ahead, config.tolerance)):
             raise UsageError(f"{count}: the eyes' clocks differ by {abs(ahead) * 1e-9:.3g} s; {DIFFER_FIX}")
         skew = float(np.median(np.abs(stamps - others[nearest(stamps, others)]))) * 1e-6
@@ -51,8 +51,8 @@ def pair_messages(
 
 
 def taken(keys: Sequence[Key]) -> I64:
-    """Return when pictures were taken, ns: their header stamps, or their log times if most header stamps
-    repeat: then the driver did not stamp each picture."""
+    """Return when images were taken, ns: their header stamps, or their log times if most header stamps
+    repeat: then the driver did not stamp each image."""
     both: I64 = np.array(keys, np.int64)
     came, stamps = both[:, 0], both[:, 1]
     distinct = len(np.unique(stamps))
@@ -70,7 +70,7 @@ def judge_stamps(
     rate: float | None,
     eyes: tuple[Sequence[Key], Sequence[Key]],
 ) -> tuple[Finding, ...]:
-    """Return warnings about the pairs of both `eyes`' pictures: too few, or not of one clock or one moment;
+    """Return warnings about the pairs of both `eyes`' images: too few, or not of one clock or one moment;
     repeated or uneven stamps."""
     found = []
     for eye, pictures in zip(("left", "right"), eyes, strict=True):
@@ -78,15 +78,15 @@ def judge_stamps(
         if not np.array_equal(taken(pictures), stamped):
             count = len(set(stamped))
             what = (
-                f"{len(pictures)} {eye} pictures have {count} stamps: when they were recorded counts instead"
+                f"{len(pictures)} {eye} images have {count} stamps: when they were recorded counts instead"
             )
-            found.append(Finding("warning", what, "let the driver stamp each picture when it is taken"))
+            found.append(Finding("warning", what, "let the driver stamp each image when it is taken"))
     came = np.array([[each[0] for each in pair] for pair in keys], np.int64)
     later = float(np.median((came - stamps) @ [-1, 1])) * 1e-6
     if rate is not None and abs(later) > LATE_STEPS * 1e3 / rate:
         eye, other = ("right", "left") if later > 0 else ("left", "right")
         what = (
-            f"{eye} pictures were recorded {abs(later):.0f} ms later than the {other} ones of the same "
+            f"{eye} images were recorded {abs(later):.0f} ms later than the {other} ones of the same "
             "stamps: if they did not come so late, the eyes' clocks differ, and pairs are of other moments"
         )
         found.append(Finding("warning", what, DIFFER_FIX, {"clocks_differ_ms": round(later, 1)}))
@@ -96,14 +96,14 @@ def judge_stamps(
     usual = float(np.median(steps)) if len(steps) else 0.0
     if np.count_nonzero(steps > LONG * usual) > OFTEN * len(steps):
         what = (
-            f"stamps come in bursts, or pictures are missing: mostly {usual:.3g} ms from one to the next, "
+            f"stamps come in bursts, or images are missing: mostly {usual:.3g} ms from one to the next, "
             f"{float(steps.mean()):.3g} ms on the average"
         )
-        fix = "let the driver stamp each picture when it is taken, and record without losses"
+        fix = "let the driver stamp each image when it is taken, and record without losses"
         found.append(Finding("warning", what, fix))
     counts = [len(set(pictures)) for pictures in eyes]
     if len(keys) < FEW_PAIRS * counts[0]:
-        what = f"{len(keys)} pairs of {counts[0]} left and {counts[1]} right pictures"
+        what = f"{len(keys)} pairs of {counts[0]} left and {counts[1]} right images"
         found.append(Finding("warning", what, "what has no partner in time is left out"))
     return tuple(found)
 
@@ -114,7 +114,7 @@ def judge_skew(stamps: I64) -> tuple[Finding, ...]:
     if abs(skew) <= SYNCHRONISED_MS:
         return ()
     what = (
-        f"right pictures were taken {abs(skew):.1f} ms {'after' if skew > 0 else 'before'} the left ones "
+        f"right images were taken {abs(skew):.1f} ms {'after' if skew > 0 else 'before'} the left ones "
         "(median): the cameras are not synchronised"
     )
     fix = "depth is wrong where tissue moves: trigger both cameras together, or use genlock"

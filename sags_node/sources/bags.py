@@ -25,10 +25,10 @@ from sags_node.sources.layout import Layout, refuse_turned
 from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64, U8, Eye, StereoRig
 
-# Names that drivers and this node give to picture topics, the usual first; "/compressed" may follow.
+# Names that drivers and this node give to image topics, the usual first; "/compressed" may follow.
 PICTURE_NAMES = ("image_raw", "image_rect_color", "image_color", "image_rect", "image", "image_mono")
 COMPRESSED = "/compressed"
-MAX_WAITING = 64  # pictures that may wait for their partner
+MAX_WAITING = 64  # images that may wait for their partner
 STAMP_END = 12  # bytes of a message up to the end of its stamp: CDR encapsulation and stamp
 MOST_INFOS = 10_000  # camera_info of one topic that are kept; a moving zoom makes each differ
 
@@ -88,7 +88,7 @@ def _stamp(path: Path, message: BagMessage) -> int:
 
 
 class BagPairs(Pairs):
-    """The stereo pairs of a bag: pictures whose stamps are each other's nearest, and near enough. To go back,
+    """The stereo pairs of a bag: images whose stamps are each other's nearest, and near enough. To go back,
     it reads the bag anew.
 
     Raises:
@@ -138,7 +138,7 @@ class BagPairs(Pairs):
         self._messages = None
 
     def _picture_size(self) -> tuple[int, int]:
-        """The width and height of a picture as it was sent, px."""
+        """The width and height of an image as it was sent, px."""
         self.at(0)
         assert self._size is not None  # it was just read
         return self._size
@@ -153,8 +153,8 @@ class BagPairs(Pairs):
             self._size = size
         if size != self._size:
             raise SagsError(
-                f"{where}: {size_text(*size)} px, but the pictures before are {size_text(*self._size)}; "
-                f"all pictures must have one size: play what is before with source.frames:={self._index}"
+                f"{where}: {size_text(*size)} px, but the images before are {size_text(*self._size)}; "
+                f"all images must have one size: play what is before with source.frames:={self._index}"
             )
         return picture
 
@@ -176,7 +176,7 @@ class BagPairs(Pairs):
                 self._waiting[side, found] = message
             if len(self._waiting) > MAX_WAITING:
                 raise SagsError(
-                    f"{self._path}: left and right pictures of one stamp lie too far apart in the file; "
+                    f"{self._path}: left and right images of one stamp lie too far apart in the file; "
                     + (DIFFER_FIX if self._is_sorted() else "sort it by time (ros2 bag convert)")
                 )
         raise SagsError(f"{self._path} changed while it was read")
@@ -186,10 +186,10 @@ class BagPairs(Pairs):
 
 
 def find_eyes(config: BagSource, contents: Contents) -> Eyes:
-    """Return the picture topics that are named, or else the only ones that look like a stereo pair.
+    """Return the image topics that are named, or else the only ones that look like a stereo pair.
 
     Raises:
-        UsageError: a named topic is missing or holds no pictures, or there is no such pair or several.
+        UsageError: a named topic is missing or holds no images, or there is no such pair or several.
     """
     if config.geometry.layout != "separate":
         named = [config.left] if config.left is not None else sorted(contents.pictures)
@@ -213,7 +213,7 @@ def find_eyes(config: BagSource, contents: Contents) -> Eyes:
     there = ", ".join(sorted(contents.pictures)) or "none"
     raise UsageError(
         f"{config.path}: stereo pairs of topics that look usable: {listed}; set source.left and "
-        f"source.right, or where one topic shows both eyes source.left and source.geometry.layout. Picture "
+        f"source.right, or where one topic shows both eyes source.left and source.geometry.layout. Image "
         f"topics: {there}. (sags bag record takes both eyes, unless topics are named)"
     )
 
@@ -232,7 +232,7 @@ def _counterpart(left: str) -> str | None:
 
 
 def _rank(left: str) -> int | None:
-    """The rank of a name, 0: most usual; None for pictures not of a camera (render, depth, masks)."""
+    """The rank of a name, 0: most usual; None for images not of a camera (render, depth, masks)."""
     compressed = left.endswith(COMPRESSED)
     parts = left.removesuffix(COMPRESSED).split("/")
     if parts[-1] not in PICTURE_NAMES or "render" in parts:
@@ -241,17 +241,17 @@ def _rank(left: str) -> int | None:
 
 
 def _named(config: BagSource, contents: Contents, key: str, name: str) -> str:
-    """The bag's name of a picture topic, which may have a leading slash or /compressed added."""
+    """The bag's name of an image topic, which may have a leading slash or /compressed added."""
     for candidate in (name, f"/{name}", name.lstrip("/")):
         for full in (candidate, candidate + COMPRESSED):
             if full in contents.pictures:
                 return full
             if full in contents.types:
                 raise UsageError(
-                    f"source.{key}: {full} in {config.path} is {contents.types[full]}, not a picture topic"
+                    f"source.{key}: {full} in {config.path} is {contents.types[full]}, not an image topic"
                 )
     near = difflib.get_close_matches(name, contents.pictures, n=1, cutoff=0.3)
-    hint = f"did you mean '{near[0]}'?" if near else "it has no picture topics"
+    hint = f"did you mean '{near[0]}'?" if near else "it has no image topics"
     raise UsageError(f"source.{key}: {config.path} has no topic {name}; {hint}")
 
 
@@ -262,7 +262,7 @@ def read_rig(config: BagSource, judged: bool = True) -> StereoRig | None:
     """Read the calibration from the bag's camera_info topics; None if both are missing or uncalibrated.
 
     Raises:
-        UsageError: a named topic is missing, only one eye is calibrated, the pictures are turned, or the
+        UsageError: a named topic is missing, only one eye is calibrated, the images are turned, or the
             calibration is implausible.
         SagsError: the bag is damaged.
     """
@@ -296,7 +296,7 @@ def _played(config: BagSource, contents: Contents, eyes: Eyes) -> I64:
 
 
 def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> Eye | None:
-    """The calibration in a camera_info topic for pictures with these stamps; None: not calibrated.
+    """The calibration in a camera_info topic for images with these stamps; None: not calibrated.
 
     Raises:
         UsageError: it changes while they are played.
@@ -309,11 +309,11 @@ def _eye_of(config: BagSource, contents: Contents, topic: str, played: I64) -> E
     turns = np.flatnonzero(np.diff(counts))
     if len(turns):
         before, after = (said[counts[turns[0] + k]].eye.K[0, 0] for k in (0, 1))
-        # rounded down: playing begins with the first picture at or after `start`
+        # rounded down: playing begins with the first image at or after `start`
         start = int(round(config.start * 1e4) + (played[turns[0] + 1] - played[0]) // 100_000) / 1e4
         raise UsageError(
             f"{config.path}: {topic} changes while it is played ({len(turns)} times), first {start:g} s from "
-            f"the start (fx {before:g} to {after:g} px): zoom, focus or picture size was changed; play what "
+            f"the start (fx {before:g} to {after:g} px): zoom, focus or image size was changed; play what "
             f"is before with source.frames:={turns[0] + 1}, what is after with source.start:={start:g}, or "
             "set rig"
         )

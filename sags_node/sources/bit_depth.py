@@ -1,4 +1,4 @@
-"""Converts pictures of more than 8 bits, or of floating-point numbers, to 8 bits."""
+"""Converts images of more than 8 bits, or of floating-point numbers, to 8 bits."""
 
 import logging
 from collections.abc import Iterable
@@ -18,10 +18,10 @@ WHITES = (255, 1023, 4095, 16383, 65535)  # the brightest values of 8, 10, 12, 1
 
 
 class EightBits:
-    """Converts pictures [H, W, 3] of one type to 8 bits.
+    """Converts images [H, W, 3] of one type to 8 bits.
 
     Files do not tell which value is white. It is taken for the largest value of 8, 10, 12, 14 or 16 bits: the
-    fewest that hold `some` pictures. For floating-point numbers it is 1, if that holds them. With `levels`,
+    fewest that hold `some` images. For floating-point numbers it is 1, if that holds them. With `levels`,
     white is the largest value of an integer type.
     """
 
@@ -39,12 +39,12 @@ class EightBits:
         self._levels = levels or (0.0, 1.0 if is_float else self.white / self._full)
 
     def __call__(self, picture: NDArray[Any], file: Path) -> U8:
-        """Return the picture in 8 bits, a new array.
+        """Return the image in 8 bits, a new array.
 
         Raises:
             SagsError: it is brighter than the value taken for white.
         """
-        from sags_node.sources.pixels import spread  # a kernel; other pictures do not need it loaded
+        from sags_node.sources.pixels import spread  # a kernel; other images do not need it loaded
 
         if picture.max() > self.white:
             raise SagsError(

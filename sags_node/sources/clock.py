@@ -1,6 +1,6 @@
 """Estimates from stamps how far a live source's clock is from this machine's, and at which rate frames come.
 
-The transit time of a single picture is unknown. But no picture arrives before it was taken: so the smallest
+The transit time of a single image is unknown. But no image arrives before it was taken: so the smallest
 difference between arrival and stamp is the offset of the clocks plus the shortest transit time. The growth of
 that smallest difference is the drift.
 """
@@ -16,7 +16,7 @@ from sags_node.types import ClockStatus, StereoFrame
 BIN_NS = 1_000_000_000  # ns; of each such bin the smallest difference is kept
 KEPT = 120  # bins
 SURE = 20  # s: in less time, jitter outweighs the drift (1 ms in 20 s is 50 ppm)
-SET_NS = 100_000_000  # ns: a difference larger by this is a delayed picture,
+SET_NS = 100_000_000  # ns: a difference larger by this is a delayed image,
 SET_S = 10  # unless it lasts for so many seconds: then the clock was set
 MEASURED = 30  # periods from which the rate is measured
 OTHER = 0.1  # relative change of the rate from which on it counts
@@ -36,7 +36,7 @@ class CaptureClock:
         self._lowest = 0.0  # that line at the first bin, ns
 
     def add(self, stamp_ns: int, arrival_ns: int) -> None:
-        """Take in a picture with the sender's stamp `stamp_ns` that arrived at `arrival_ns`, wall clock."""
+        """Take in an image with the sender's stamp `stamp_ns` that arrived at `arrival_ns`, wall clock."""
         difference = arrival_ns - stamp_ns
         with self._lock:
             set_on = bool(self._bins) and difference < self._offset_at(stamp_ns) - SET_NS
@@ -44,7 +44,7 @@ class CaptureClock:
                 self._bins.clear()  # the clock was set, or the sender restarted: begin anew
                 self._slow.clear()
             elif self._bins and stamp_ns < self._last:
-                return  # a picture in the wrong order adds nothing
+                return  # an image in the wrong order adds nothing
             self._last = stamp_ns
             if not self._bins or stamp_ns - self._begun >= BIN_NS:
                 self._sort_out(stamp_ns)
@@ -59,12 +59,12 @@ class CaptureClock:
 
     def to_wall(self, stamp_ns: int) -> int | None:
         """Convert a time of the sender's clock to the wall clock, ns; late by the shortest transit time. None
-        before the first picture."""
+        before the first image."""
         with self._lock:
             return stamp_ns + self._offset_at(stamp_ns) if self._bins else None
 
     def status(self) -> ClockStatus | None:
-        """Return the offset and drift of the clock; None before the first picture."""
+        """Return the offset and drift of the clock; None before the first image."""
         with self._lock:
             if not self._bins:
                 return None
@@ -73,7 +73,7 @@ class CaptureClock:
             return ClockStatus(self._offset_at(self._last) * 1e-6, drift, seconds)
 
     def _sort_out(self, stamp_ns: int) -> None:
-        """Leave the finished bin out if it is late: otherwise late pictures would seem new."""
+        """Leave the finished bin out if it is late: otherwise late images would seem new."""
         if len(self._bins) < 2 or self._bins[-1][1] - self._offset_at(stamp_ns) <= SET_NS:
             self._slow.clear()
             return
@@ -90,7 +90,7 @@ class CaptureClock:
         at -= at[0]
         self._drift = 0.0
         if at[-1] >= SURE * BIN_NS:
-            i, j = np.triu_indices(len(at), max(1, len(at) // 4))  # there may be few bins: pictures paused
+            i, j = np.triu_indices(len(at), max(1, len(at) // 4))  # there may be few bins: images paused
             self._drift = float(np.median((differences[j] - differences[i]) / (at[j] - at[i])))
         self._lowest = float(np.min(differences - self._drift * at))
 

@@ -47,7 +47,7 @@ class _Frame(msgspec.Struct):
     gst: _Gst = msgspec.field(default_factory=_Gst)
 
     def stamps(self) -> tuple[int, int]:
-        """Return the capture times of the left and the right picture, ns, from the best clock listed."""
+        """Return the capture times of the left and the right image, ns, from the best clock listed."""
         seen = self.cpu.realtime
         fallback = seen.stereo_output_ns or seen.recorder_reception_ns
         left, right = seen.left_source_ns, seen.right_source_ns
@@ -81,7 +81,7 @@ class DvrkPairs(OneVideoPairs):
         video = Video(file.parent / Path(sidecar.video_file).name)  # a name cannot lead out of the folder
         first = GeometryConfig(layout="side_by_side", first="left" if order == "LR" else "right")
         super().__init__(video, Layout(first))
-        self.pixel_aspect = 1.0  # the sidecar says how both eyes share the picture: no need to guess
+        self.pixel_aspect = 1.0  # the sidecar says how both eyes share the image: no need to guess
         try:
             self.stamps, self.oddities = _stamps(file, sidecar, video)
         except UsageError:
@@ -145,7 +145,7 @@ def _stamps(file: Path, sidecar: Sidecar, video: Video) -> tuple[I64, list[str]]
             oddities = [
                 f"{lost} is {abs(longer) * 1e-6:.0f} ms shorter than {other}, and both are taken to begin "
                 f"together: stamps are {'early' if longer > 0 else 'late'} by as much if it lacks the first "
-                "frames, not the last ones; see whether pictures and the robot's poses move together"
+                "frames, not the last ones; see whether images and the robot's poses move together"
             ]
     if (np.diff(stamps[:, 0]) < 0).any():
         turn = int(np.argmax(np.diff(stamps[:, 0]) < 0)) + 1

@@ -1,6 +1,6 @@
 """Reads clips in the layout of EndoNeRF (Wang et al., MICCAI 2022).
 
-`images/` holds left pictures, `masks/` instruments, `depth/` a stereo network's depth, and `poses_bounds.npy`
+`images/` holds left images, `masks/` instruments, `depth/` a stereo network's depth, and `poses_bounds.npy`
 the camera in LLFF form. What the files do not tell (rate, units, polarity of the masks) is a source option;
 docs/recordings.md explains the defaults.
 """
@@ -28,7 +28,7 @@ FARTHEST_DEPTH = 1.0  # m: a larger median depth is refused
 DEPTH_UNITS = (1e-3, 1e-4, 1e-5, 1e-6, 1.0, 1e-3 / 256)  # m per count, the usual ones first; SERV-CT's last
 PUBLISHED = (640, 512, 569.4682)  # px: width, height and focal length of the clips of EndoNeRF
 PUBLISHED_BASELINE = 4.324e-3  # m, as their author states
-NOMINAL_BASELINE = 0.005  # m, if there is no right picture: then nothing depends on it
+NOMINAL_BASELINE = 0.005  # m, if there is no right image: then nothing depends on it
 
 
 class Llff(NamedTuple):
@@ -41,7 +41,7 @@ class Llff(NamedTuple):
 
     @property
     def K(self) -> F64:
-        """The matrix [3, 3] px. Principal point: the picture's middle; the first pixel's centre is (0, 0)."""
+        """The matrix [3, 3] px. Principal point: the image's middle; the first pixel's centre is (0, 0)."""
         x, y = (self.width - 1) / 2, (self.height - 1) / 2
         return np.array([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]])
 
@@ -75,7 +75,7 @@ class EndoNerfPairs(FolderPairs):
         self._read_axes(config.pose_axes)
 
     def _read_axes(self, said: str) -> None:
-        """Interpret the poses as the launch file says, or by the reading that explains the pictures."""
+        """Interpret the poses as the launch file says, or by the reading that explains the images."""
         poses, axes = self._llff.T_world_cam, said
         if said == "auto":
             has_depth = self._depth_files is not None
@@ -104,12 +104,12 @@ class EndoNerfPairs(FolderPairs):
         counts = read_picture(file, cv2.IMREAD_UNCHANGED)
         if counts.ndim != 2:
             raise SagsError(
-                f"{file} has {counts.shape[2]} channels; a depth picture is a grey PNG of 8 or 16 bit"
+                f"{file} has {counts.shape[2]} channels; a depth image is a grey PNG of 8 or 16 bit"
             )
         if counts.shape[1::-1] != self.size:
             raise SagsError(
-                f"{file} is {size_text(*counts.shape[1::-1])} px but the pictures are "
-                f"{size_text(*self.size)}; all pictures of a clip must have one size"
+                f"{file} is {size_text(*counts.shape[1::-1])} px but the images are "
+                f"{size_text(*self.size)}; all images of a clip must have one size"
             )
         known = (counts > 0) & (counts != UNKNOWN)
         if not known.any():
@@ -124,12 +124,12 @@ class EndoNerfPairs(FolderPairs):
         file, llff = folder / "poses_bounds.npy", self._llff
         if len(llff.T_world_cam) != self.count:
             raise UsageError(
-                f"{file} holds {len(llff.T_world_cam)} poses but {folder / 'images'} {self.count} pictures; "
-                "there must be one pose for each picture"
+                f"{file} holds {len(llff.T_world_cam)} poses but {folder / 'images'} {self.count} images; "
+                "there must be one pose for each image"
             )
         if self.size != (llff.width, llff.height):
             raise UsageError(
-                f"{file} is for {size_text(llff.width, llff.height)} px but the pictures are "
+                f"{file} is for {size_text(llff.width, llff.height)} px but the images are "
                 f"{size_text(*self.size)}; scale columns 4, 9, 14 (height, width, focal length)"
             )
 
@@ -211,7 +211,7 @@ def read_rig(config: EndoNerfSource) -> StereoRig:
 
 
 def baseline_of(config: EndoNerfSource) -> float | None:
-    """Return the baseline, m; None: it is unknown, and right pictures are not used.
+    """Return the baseline, m; None: it is unknown, and right images are not used.
 
     Raises:
         UsageError: as `read_llff`.

@@ -1,7 +1,7 @@
 """Live stereo from GStreamer: runs the user's launch string in a process of its own.
 
-A pipeline has one clock and one base time for all its pictures. The source stamps each picture on that clock.
-The stamp, converted to the wall clock, is the capture time. Live pipelines drop late pictures at each step;
+A pipeline has one clock and one base time for all its images. The source stamps each image on that clock.
+The stamp, converted to the wall clock, is the capture time. Live pipelines drop late images at each step;
 files are played at their own rate, to their end.
 """
 
@@ -25,7 +25,7 @@ from sags_node.types import Samples, Side
 log = logging.getLogger(__name__)
 
 DEFAULT_RATE = 30.0  # Hz, of pipelines that do not tell theirs
-OLD_NS = 1_000_000_000  # ns: consumers refuse older pictures, so they are worth a warning
+OLD_NS = 1_000_000_000  # ns: consumers refuse older images, so they are worth a warning
 POLL_S = 0.1
 # `queue` gives each eye a thread of its own. `videoconvert` converts from all formats and colour spaces, and
 # does nothing if the launch string ends in this format already.
@@ -42,11 +42,11 @@ def open_pipeline(config: GstSource, size: tuple[int, int] | None = None) -> Liv
     """Start the pipeline of a launch file.
 
     Args:
-        size: width and height that an eye's pictures must have, px.
+        size: width and height that an eye's images must have, px.
 
     Raises:
-        UsageError: its pictures do not fit the geometry or `size`.
-        SagsError: GStreamer is not installed, the pipeline is wrong, or no picture comes in time.
+        UsageError: its images do not fit the geometry or `size`.
+        SagsError: GStreamer is not installed, the pipeline is wrong, or no image comes in time.
     """
     only = Input("GStreamer", None, lambda: Pipeline(config), config.deadline)
     return LiveStereo([only], config, size)
@@ -65,10 +65,10 @@ def whole_launch(config: GstSource) -> tuple[str, list[str]]:
 
 
 class Pipeline:
-    """A running pipeline as a capture device: delivers single pictures of either eye, or of both in one.
+    """A running pipeline as a capture device: delivers single images of either eye, or of both in one.
 
     Raises:
-        SagsError: GStreamer is not installed, the pipeline is wrong, or no picture comes in time.
+        SagsError: GStreamer is not installed, the pipeline is wrong, or no image comes in time.
     """
 
     def __init__(self, config: GstSource) -> None:
@@ -93,7 +93,7 @@ class Pipeline:
             self._take_in(POLL_S)
             if time.monotonic() > until:
                 raise SagsError(
-                    f"GStreamer: no picture of {' and '.join(missing)} within {seconds:g} s; is the camera "
+                    f"GStreamer: no image of {' and '.join(missing)} within {seconds:g} s; is the camera "
                     "on? A source that takes longer needs a longer source.start"
                 )
 
@@ -101,20 +101,20 @@ class Pipeline:
         one, other = self._sinks[0], self._sinks[-1]
         if one.size != other.size:
             raise SagsError(
-                f"GStreamer: the left eye's pictures are {one.size[0]}x{one.size[1]} px but the right eye's "
+                f"GStreamer: the left eye's images are {one.size[0]}x{one.size[1]} px but the right eye's "
                 f"{other.size[0]}x{other.size[1]}; both eyes need one size"
             )
         if one.interlaced and not Layout(config.geometry).takes_fields:
             log.warning(
-                "GStreamer: the pictures are interlaced, so what moves is torn; add ! deinterlace fields=top "
+                "GStreamer: the images are interlaced, so what moves is torn; add ! deinterlace fields=top "
                 "to the launch string, or set source.geometry.deinterlace"
             )
 
     def read(self, timeout: float) -> Shot | None:
-        """Return the next picture; None when none comes within `timeout` seconds.
+        """Return the next image; None when none comes within `timeout` seconds.
 
         Raises:
-            SagsError: the pipeline failed, or one eye's pictures have ceased.
+            SagsError: the pipeline failed, or one eye's images have ceased.
             EndedError: a file was played to its end.
         """
         if not self._plays:
@@ -126,7 +126,7 @@ class Pipeline:
             self._take_in(timeout)
         silent = min(self._sinks, key=lambda sink: sink.seen)
         if time.monotonic() - silent.seen > self._deadline:
-            raise SagsError(f"GStreamer: no new picture of {silent.name} for {self._deadline:g} s")
+            raise SagsError(f"GStreamer: no new image of {silent.name} for {self._deadline:g} s")
         return self._arrived.popleft() if self._arrived else None
 
     def _take_in(self, timeout: float) -> None:
@@ -153,17 +153,17 @@ class Pipeline:
 
 
 class Sink:
-    """The pictures of one sink, in memory shared with the process."""
+    """The images of one sink, in memory shared with the process."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.seen = time.monotonic()  # when the last picture came
+        self.seen = time.monotonic()  # when the last image came
         self.running_ns = -1  # its stamp on the pipeline's clock
         self.has_begun = False
         self._warned_old = self._warned_still = False
 
     def begin(self, said: dict[str, Any], descriptor: int) -> None:
-        """Take in the format of the pictures, and map their shared memory."""
+        """Take in the format of the images, and map their shared memory."""
         self.has_begun = True
         self.size = said["width"], said["height"]
         self.rate, self.interlaced, self.live = said["rate"], said["interlaced"], said["live"]
@@ -174,11 +174,11 @@ class Sink:
         os.close(descriptor)
 
     def take(self, said: dict[str, Any]) -> Shot | None:
-        """Copy a picture out of its slot, which is written again; None if its stamp is not newer."""
+        """Copy an image out of its slot, which is written again; None if its stamp is not newer."""
         if said["running_ns"] <= self.running_ns:
             if not self._warned_still:
                 log.warning(
-                    "GStreamer: the stamps of %s do not rise (%.3f s after %.3f s); such pictures are left "
+                    "GStreamer: the stamps of %s do not rise (%.3f s after %.3f s); such images are left "
                     "out; does the source stamp them (do-timestamp=true)?",
                     *(self.name, said["running_ns"] * 1e-9, self.running_ns * 1e-9),
                 )
@@ -188,7 +188,7 @@ class Sink:
         self.seen = time.monotonic()
         if said["age_ns"] > OLD_NS and not self._warned_old:
             log.warning(
-                "GStreamer: the pictures of %s are %.1f s old when they come; make the launch string hold "
+                "GStreamer: the images of %s are %.1f s old when they come; make the launch string hold "
                 "fewer back (queue leaky=downstream max-size-buffers=1, rtspsrc latency=0)",
                 *(self.name, said["age_ns"] * 1e-9),
             )

@@ -1,11 +1,11 @@
-"""A child process that runs a GStreamer pipeline and puts its newest pictures into shared memory.
+"""A child process that runs a GStreamer pipeline and puts its newest images into shared memory.
 
     python -m sags_node.sources.gst_child '{"launch": ..., "sinks": ["left", "right"]}' FD
     python -m sags_node.sources.gst_child '{"elements": ["rtspsrc", ...]}' FD
     python -m sags_node.sources.gst_child '{"parse": ...}' FD
 
 FD is a SOCK_SEQPACKET socket. Each message to the parent is JSON: `{"sink", "width", ...}` with the memory's
-descriptor before the first picture of a sink, `{"sink", "slot", "t_ns", ...}` for a picture, `{"ended"}`,
+descriptor before the first image of a sink, `{"sink", "slot", "t_ns", ...}` for an image, `{"ended"}`,
 `{"error", "debug"}`; `{"parsed"}` for a valid launch string. The parent gives slots back by two bytes: the
 sink's index and the slot. START plays a file, which is paused at first. The process ends when the parent
 does. It is a separate process because plugins and drivers may crash or hang.
@@ -27,14 +27,14 @@ from typing import Any, NamedTuple
 from sags_node.wall_clock import DRIFT_NS, WallClock
 
 START = b"\xff\xff"
-SLOTS = 4  # pictures of a sink in shared memory
+SLOTS = 4  # images of a sink in shared memory
 POLL_NS = 100_000_000
-LAST_S = 2.0  # s for the parent to take the last pictures of a file
+LAST_S = 2.0  # s for the parent to take the last images of a file
 BYTES = {"RGB": 3, "ARGB64_LE": 8}  # per pixel
 
 NONE = 2**64 - 1  # GST_CLOCK_TIME_NONE: unknown
 PAUSED, PLAYING = 3, 4
-FAILED, DONE, ASYNC, LIVE = 0, 1, 2, 3  # results of a state change; LIVE: no picture while paused
+FAILED, DONE, ASYNC, LIVE = 0, 1, 2, 3  # results of a state change; LIVE: no image while paused
 ENDED, ERROR = 1 << 0, 1 << 1  # types of messages
 TIME = 3  # the format of segments that count time
 # Offsets of public fields, bytes. Behind GstMiniObject (64 on 64 bit) a GstMessage has its type, and a
@@ -66,7 +66,7 @@ class Picture(NamedTuple):
 
 
 class Caps(NamedTuple):
-    """The format of the pictures."""
+    """The format of the images."""
 
     format: str
     width: int
@@ -204,7 +204,7 @@ def _text(error: Any) -> str:
 
 
 class Sink:
-    """Hands the newest pictures of one appsink to the parent; `run` has a thread of its own."""
+    """Hands the newest images of one appsink to the parent; `run` has a thread of its own."""
 
     def __init__(
         self, gst: Gst, pipeline: int, wall: WallClock, name: str, index: int, there: socket.socket
@@ -227,7 +227,7 @@ class Sink:
     def run(self, live: bool) -> None:
         try:
             while True:
-                slot = self.free.get()  # first a free slot, then the picture that is newest by then
+                slot = self.free.get()  # first a free slot, then the image that is newest by then
                 while not (sample := self._gst.app_sink_try_pull_sample(self.element, POLL_NS)):
                     if self._gst.app_sink_is_eos(self.element):
                         return
@@ -251,7 +251,7 @@ class Sink:
         self._look(sample, picture, live)
         now -= gst.element_get_base_time(self._pipeline)
         t_ns = self._wall.at_zero((before_ns + after_ns) // 2 - now, after_ns - before_ns) + picture.running
-        if t_ns > after_ns + DRIFT_NS:  # a picture cannot be taken after it arrived
+        if t_ns > after_ns + DRIFT_NS:  # an image cannot be taken after it arrived
             t_ns = after_ns
         address = self._address + slot * self._slot_bytes
         gst.buffer_extract(gst.sample_get_buffer(sample), 0, address, self._slot_bytes)
@@ -260,7 +260,7 @@ class Sink:
         tell(self._there, said)
 
     def show_first(self) -> None:
-        """Tell the parent the format of a paused file's pictures, without consuming one.
+        """Tell the parent the format of a paused file's images, without consuming one.
 
         Raises:
             GstError: their format cannot be handed over.
@@ -271,10 +271,10 @@ class Sink:
             self._gst.mini_object_unref(sample)
 
     def _look(self, sample: int, picture: Picture, live: bool) -> None:
-        """Check that a picture can be handed over; for the first one, tell the parent its format."""
+        """Check that an image can be handed over; for the first one, tell the parent its format."""
         if picture.running == NONE:
             raise GstError(
-                f"the pictures of {self.name} carry no time stamp",
+                f"the images of {self.name} carry no time stamp",
                 "add do-timestamp=true to the source, or a parser (h264parse) before the decoder",
             )
         caps = self._gst.caps(sample)
@@ -282,11 +282,11 @@ class Sink:
             self._begin(caps, picture.bytes, live)
         elif caps[:3] != self._caps[:3]:
             was, now_is = (f"{c.width}x{c.height} {c.format}" for c in (self._caps, caps))
-            raise GstError(f"the pictures of {self.name} changed from {was} to {now_is}")
+            raise GstError(f"the images of {self.name} changed from {was} to {now_is}")
 
     def _begin(self, caps: Caps, size: int, live: bool) -> None:
         if caps.format not in BYTES or size % max(caps.height, 1) or not size:
-            raise GstError(f"{self.name} gives {caps.format} pictures of {size} bytes, not RGB")
+            raise GstError(f"{self.name} gives {caps.format} images of {size} bytes, not RGB")
         self._caps, self._slot_bytes = caps, size
         memory = os.memfd_create("pictures", os.MFD_CLOEXEC)
         os.ftruncate(memory, SLOTS * size)
@@ -345,7 +345,7 @@ def play(request: dict[str, Any], there: socket.socket) -> None:
     if state == FAILED:
         gst.has_ended(bus, POLL_NS)
         raise GstError("the pipeline does not start")
-    if state == LIVE:  # only the newest picture counts; late ones are dropped
+    if state == LIVE:  # only the newest image counts; late ones are dropped
         for sink in sinks:
             gst.set(sink.queue, leaky="downstream")
             gst.set(sink.element, drop="true", sync="false", max_buffers="2")
@@ -360,7 +360,7 @@ def play(request: dict[str, Any], there: socket.socket) -> None:
         thread.start()
     while not gst.has_ended(bus, POLL_NS):
         pass
-    for thread in threads:  # let them hand over the last pictures
+    for thread in threads:  # let them hand over the last images
         thread.join(LAST_S)
     tell(there, {"ended": True})
 

@@ -105,11 +105,11 @@ class GstProcess:
         return message, descriptors
 
     def start(self) -> None:
-        """Start to play a file, which waits at its first picture. Live pipelines play anyway."""
+        """Start to play a file, which waits at its first image. Live pipelines play anyway."""
         self._tell(START)
 
     def release(self, sink: int, slot: int) -> None:
-        """Give a slot back after its picture was copied."""
+        """Give a slot back after its image was copied."""
         self._tell(bytes((sink, slot)))
 
     def _tell(self, message: bytes) -> None:

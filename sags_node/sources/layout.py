@@ -1,4 +1,4 @@
-"""Turns the pictures of a device or file into those of the two eyes, as `source.geometry` says."""
+"""Turns the images of a device or file into those of the two eyes, as `source.geometry` says."""
 
 from pathlib import Path
 
@@ -11,13 +11,13 @@ from sags_node.types import U8, Bool, Samples, Side
 
 _FLIPS = {"horizontal": 1, "vertical": 0, "both": -1}  # OpenCV's codes
 FIELD_ROWS = {"top": 0, "bottom": 1}
-# How many eyes a picture shows (side by side, one above the other); (1, 1) in other layouts.
+# How many eyes an image shows (side by side, one above the other); (1, 1) in other layouts.
 EYES = {"side_by_side": (2, 1), "over_under": (1, 2), "row_interleaved": (1, 2)}
-WIDEST = 2.2  # width over height of one eye's picture; the widest usual one is 1.9 (17:9)
+WIDEST = 2.2  # width over height of one eye's image; the widest usual one is 1.9 (17:9)
 
 
 class Layout:
-    """Splits a picture into both eyes, then keeps one field, crops and flips each eye, and makes it 8 bit.
+    """Splits an image into both eyes, then keeps one field, crops and flips each eye, and makes it 8 bit.
 
     Args:
         config: `source.geometry`.
@@ -34,7 +34,7 @@ class Layout:
         self.order: tuple[Side, Side] = ("right", "left") if config.first == "right" else ("left", "right")
 
     def size(self, width: int, height: int, name: str) -> tuple[int, int]:
-        """Return width and height of an eye's picture (px), given those of the pictures that `name` delivers.
+        """Return width and height of an eye's image (px), given those of the images that `name` delivers.
 
         Raises:
             UsageError: it cannot be split or cropped as asked.
@@ -66,7 +66,7 @@ class Layout:
         other. Then an eye is narrower than high, or more than 2.2 times as wide.
 
         Args:
-            width, height: of the delivered pictures, px.
+            width, height: of the delivered images, px.
             told: the pixel aspect that the file gives.
         """
         match self._config.layout:
@@ -80,7 +80,7 @@ class Layout:
                 return told
 
     def eye(self, picture: Samples, side: Side) -> U8:
-        """Return one eye's picture [H, W, 3]; the argument itself if there is nothing to do."""
+        """Return one eye's image [H, W, 3]; the argument itself if there is nothing to do."""
         return self._finish(picture, 0, self._crops[side])
 
     def tissue(self, picture: Samples, left: U8) -> Bool | None:
@@ -92,18 +92,18 @@ class Layout:
         return unpainted(self._finish(picture, 0, self._tools), left)
 
     def eyes(self, picture: Samples) -> tuple[U8, U8]:
-        """Return the left and the right eye of a picture [H, W, 3] that shows both; views if possible."""
+        """Return the left and the right eye of an image [H, W, 3] that shows both; views if possible."""
         of = dict(zip(self.order, self._apart(picture), strict=True))
         left, right = (self._finish(*of[side], self._crops[side]) for side in ("left", "right"))
         return left, right
 
     def in_turn(self, first: Samples, second: Samples) -> tuple[U8, U8]:
-        """Return the left and the right eye of two successive pictures [H, W, 3] that show one eye each."""
+        """Return the left and the right eye of two successive images [H, W, 3] that show one eye each."""
         of = dict(zip(self.order, (first, second), strict=True))
         return self.eye(of["left"], "left"), self.eye(of["right"], "right")
 
     def _apart(self, picture: Samples) -> tuple[tuple[Samples, int], tuple[Samples, int]]:
-        """The first and the second eye as views, each with the row of the picture in which it begins."""
+        """The first and the second eye as views, each with the row of the image in which it begins."""
         height, width = picture.shape[:2]
         match self._config.layout:
             case "side_by_side":
@@ -129,21 +129,21 @@ class Layout:
     def _eight_bits(self, picture: Samples) -> U8:
         if picture.dtype == np.uint8 and self._config.levels == (0.0, 1.0):
             return np.ascontiguousarray(picture, np.uint8)
-        from sags_node.sources.pixels import spread  # a kernel; other pictures do not need it loaded
+        from sags_node.sources.pixels import spread  # a kernel; other images do not need it loaded
 
         return spread(picture, self._config.levels)
 
 
 def refuse_turned(geometry: GeometryConfig, where: Path | str) -> None:
-    """Refuse a calibration that comes with the pictures if they are flipped: it holds before the flip only.
+    """Refuse a calibration that comes with the images if they are flipped: it holds before the flip only.
 
     Raises:
         UsageError: they are flipped; the error begins with `where`.
     """
     if geometry.flip != "none":
         raise UsageError(
-            f"{where}: camera_info is of pictures as they come, and source.geometry.flip: {geometry.flip} "
-            "turns them: leave flip out, or calibrate with the turned pictures and set rig"
+            f"{where}: camera_info is of images as they come, and source.geometry.flip: {geometry.flip} "
+            "turns them: leave flip out, or calibrate with the turned images and set rig"
         )
 
 
@@ -153,7 +153,7 @@ def _cropped(width: int, height: int, crop: Box | None, name: str) -> tuple[int,
     x, y, w, h = crop
     if x + w > width or y + h > height:
         raise UsageError(
-            f"source.geometry: the box {list(crop)} (x, y, width, height) leaves the picture: an eye "
+            f"source.geometry: the box {list(crop)} (x, y, width, height) leaves the image: an eye "
             f"of {name} is {width}x{height} px"
         )
     return w, h

@@ -1,4 +1,4 @@
-"""Live stereo: keeps capture devices open, splits their pictures into eyes, and pairs these by stamps.
+"""Live stereo: keeps capture devices open, splits their images into eyes, and pairs these by stamps.
 
 A device that fails or falls silent is closed and opened again, until `stop`.
 """
@@ -25,22 +25,22 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 5.0  # s between attempts to open a device
 
 
 class EndedError(Exception):
-    """A file was played to its end: no more pictures will come."""
+    """A file was played to its end: no more images will come."""
 
 
 class CaptureDevice(Protocol):
-    """A device that delivers pictures.
+    """A device that delivers images.
 
     Attributes:
         rate: Hz.
-        size: of a picture, width and height, px.
+        size: of an image, width and height, px.
     """
 
     rate: float
     size: tuple[int, int]
 
     def read(self, timeout: float) -> Shot | None:
-        """Return the next picture; None when none comes within `timeout` seconds.
+        """Return the next image; None when none comes within `timeout` seconds.
 
         Raises:
             SagsError: the device is lost, and should be opened again.
@@ -54,9 +54,9 @@ class Input(NamedTuple):
     """One device of a live source."""
 
     name: str
-    side: Side | None  # the eye whose pictures it delivers; None: both
+    side: Side | None  # the eye whose images it delivers; None: both
     open: Callable[[], CaptureDevice]
-    deadline: float  # s without a picture before it is opened again
+    deadline: float  # s without an image before it is opened again
 
 
 class LiveStereo(LivePairs):
@@ -67,11 +67,11 @@ class LiveStereo(LivePairs):
 
     Args:
         inputs: one device for both eyes, or one for each.
-        config: geometry of the pictures, and tolerance of pairs.
-        size: width and height that an eye's pictures must have, px; None: any.
+        config: geometry of the images, and tolerance of pairs.
+        size: width and height that an eye's images must have, px; None: any.
 
     Raises:
-        UsageError: the pictures do not fit the geometry or `size`.
+        UsageError: the images do not fit the geometry or `size`.
         SagsError: a device is missing or cannot be opened.
     """
 
@@ -97,13 +97,13 @@ class LiveStereo(LivePairs):
             self._alternation = Alternation(1e9 / self.rate)
             self.rate /= 2
             log.warning(
-                "source.geometry.layout frame_sequential: nothing tells which eye the first picture shows; "
+                "source.geometry.layout frame_sequential: nothing tells which eye the first image shows; "
                 "look at them with sags calib live, and exchange them with source.geometry.first"
             )
 
     @property
     def dropped(self) -> int:
-        """The number of pictures without a partner, and of pairs that are no newer than the one before."""
+        """The number of images without a partner, and of pairs that are no newer than the one before."""
         return super().dropped + (self._alternation.alone if self._alternation else 0)
 
     def start(self) -> None:
@@ -115,14 +115,14 @@ class LiveStereo(LivePairs):
             reader.close()
 
     def _checked(self, one: Input) -> CaptureDevice:
-        """Open a device, and check that its pictures have the size of the rig or of the first pictures."""
+        """Open a device, and check that its images have the size of the rig or of the first images."""
         device = one.open()
         try:
             size = self._layout.size(*device.size, one.name)
             self.pixel_aspect = self._layout.pixel_aspect(*device.size, 1.0)
             if self._size is not None and self._size != size:
                 raise UsageError(
-                    f"{one.name}: the pictures of an eye are {size[0]}x{size[1]} px but should be "
+                    f"{one.name}: the images of an eye are {size[0]}x{size[1]} px but should be "
                     f"{self._size[0]}x{self._size[1]}, as the calibration and the other eye are; set the "
                     "size at the source, or source.geometry.crop"
                 )
@@ -133,7 +133,7 @@ class LiveStereo(LivePairs):
         return device
 
     def _put(self, picture: Shot | None, side: Side | None) -> None:
-        """Take a picture in; None: there are no more."""
+        """Take an image in; None: there are no more."""
         if picture is None:
             self.end()
             return
@@ -150,7 +150,7 @@ class LiveStereo(LivePairs):
 
 
 def _of(shot: Shot, image: U8) -> Picture:
-    """One eye's picture, with the stamps of the delivered one."""
+    """One eye's image, with the stamps of the delivered one."""
     return Picture(shot.t_ns, image, shot.device_ns or 0, shot.arrival_ns)
 
 
@@ -195,7 +195,7 @@ class DeviceReader:
             device.close()
 
     def _read(self) -> bool:
-        """Open the device if needed, and read it until it is lost; False: no more pictures will come."""
+        """Open the device if needed, and read it until it is lost; False: no more images will come."""
         try:
             if self._device is None:
                 self._device = self._open_device(self._input)
@@ -215,7 +215,7 @@ class DeviceReader:
         return True
 
     def _read_until_lost(self, device: CaptureDevice) -> int:
-        """Pass pictures on until the device fails, falls silent, or `stopped` is set; return their number."""
+        """Pass images on until the device fails, falls silent, or `stopped` is set; return their number."""
         count, name, deadline = 0, self._input.name, self._input.deadline
         last = time.monotonic()
         while not self._stopped.is_set():
@@ -229,6 +229,6 @@ class DeviceReader:
                 count += 1
                 last = time.monotonic()
             elif time.monotonic() - last > deadline:
-                log.warning("%s: no new picture for %g s; it will be opened again", name, deadline)
+                log.warning("%s: no new image for %g s; it will be opened again", name, deadline)
                 break
         return count

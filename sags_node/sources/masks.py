@@ -13,7 +13,7 @@ from sags_node.errors import UsageError
 from sags_node.types import U8, Bool
 
 HALF = 128  # grey level from which on a value is white
-MOST = 0.5  # share of a picture that instruments cover at most
+MOST = 0.5  # share of an image that instruments cover at most
 AREAS = 0.25  # share of in-between pixels with equal neighbours: in soft edges it is smaller
 LOSSY = (".jpg", ".jpeg", ".webp")
 NEAR = 8  # grey levels by which lossy files change a value
@@ -41,7 +41,7 @@ class Masks:
         some: masks spread over the recording.
 
     Raises:
-        UsageError: the values are ambiguous, or instruments would cover most of the picture.
+        UsageError: the values are ambiguous, or instruments would cover most of the image.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Masks:
         if share > MOST and isinstance(instruments, str):
             other = "black" if instruments == "white" else "white"
             raise UsageError(
-                f"{folder} would take {share:.0%} of the picture for instruments (polarity the other "
+                f"{folder} would take {share:.0%} of the image for instruments (polarity the other "
                 f"way?); if {instruments} means tissue there, set source.instruments:={other}"
             )
 

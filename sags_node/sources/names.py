@@ -1,4 +1,4 @@
-"""Reads from pictures' names their order, their times, and which ones of several folders belong together."""
+"""Reads from images' names their order, their times, and which ones of several folders belong together."""
 
 import logging
 import re
@@ -90,7 +90,7 @@ def gaps_in(files: Sequence[Path], are_times: bool) -> list[str]:
     where = f"{files[odd[0]].name} and {files[odd[0] + 1].name}"
     fix = "frames are played evenly: fill the gap or split the recording there"
     if are_times:
-        fix = "they are played by these times: were pictures lost, or was the recording paused?"
+        fix = "they are played by these times: were images lost, or was the recording paused?"
     return [f"{files[0].parent}: {len(odd)} gaps in the numbers, first between {where}; {fix}"]
 
 

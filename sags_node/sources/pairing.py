@@ -1,4 +1,4 @@
-"""Pairs the pictures of both eyes that are of one moment, by their stamps: live and in recordings."""
+"""Pairs the images of both eyes that are of one moment, by their stamps: live and in recordings."""
 
 import logging
 import threading
@@ -13,15 +13,15 @@ from sags_node.types import I64, U8, Samples, Side, StereoFrame
 
 log = logging.getLogger(__name__)
 
-QUEUE_LENGTH = 4  # pictures of one eye that wait for their partner
-REPORT_EVERY = 100  # unpaired pictures between two warnings
+QUEUE_LENGTH = 4  # images of one eye that wait for their partner
+REPORT_EVERY = 100  # unpaired images between two warnings
 POLL_S = 0.1  # s between looks while waiting for a pair
 NEAR = 0.6  # periods between partners, at most: free-running eyes are up to half a period apart
 SETTLING_NS = 300_000_000  # ns: stamps that go back by less are a better clock estimate (`sources.clock`)
 
 
 class Picture(NamedTuple):
-    """The picture of one eye."""
+    """The image of one eye."""
 
     t_ns: int  # wall clock
     image: U8  # [H, W, 3] RGB
@@ -30,19 +30,19 @@ class Picture(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """One picture as a device delivers it: of one eye, or of both."""
+    """One image as a device delivers it: of one eye, or of both."""
 
     t_ns: int  # wall clock
     image: Samples  # [H, W, 3] RGB
-    side: Side | None = None  # the eye, if one device delivers single pictures of both
+    side: Side | None = None  # the eye, if one device delivers single images of both
     device_ns: int | None = None  # stamp on the device's clock, which may begin at 0; None: none
     arrival_ns: int = 0  # wall clock; 0: not known
 
 
 class LivePairs:
-    """A `Source` of live stereo frames: any thread puts pictures in; pairs come out, until `stop` or `end`.
+    """A `Source` of live stereo frames: any thread puts images in; pairs come out, until `stop` or `end`.
 
-    Pictures are paired by their stamps. `frame_id` counts left pictures, so a left picture without a partner
+    Images are paired by their stamps. `frame_id` counts left images, so a left image without a partner
     leaves a gap. `epoch` grows when the clock is set back. If stamps go back by less than `SETTLING_NS`,
     pairs are left out until the stamps have caught up. A pair with the same stamp as the one before was sent
     twice, and is left out, too.
@@ -58,7 +58,7 @@ class LivePairs:
     def __init__(self, tolerance_ms: float, latency_ms: float = 0.0) -> None:
         self._tolerance_ns = round(tolerance_ms * 1e6)
         self._latency_ns = round(latency_ms * 1e6)
-        # Each picture with the number of pictures of its eye before it.
+        # Each image with the number of images of its eye before it.
         self._waiting: dict[Side, deque[tuple[int, Picture]]] = {"left": deque(), "right": deque()}
         self._pairs: deque[tuple[int, Picture, Picture]] = deque()
         self._counts: dict[Side, int] = {"left": 0, "right": 0}
@@ -69,11 +69,11 @@ class LivePairs:
 
     @property
     def dropped(self) -> int:
-        """The number of pictures without a partner, and of pairs that are no newer than the one before."""
+        """The number of images without a partner, and of pairs that are no newer than the one before."""
         return self._unpaired + self._outdated
 
     def start(self) -> None:
-        """Begin to receive pictures."""
+        """Begin to receive images."""
 
     def close(self) -> None:
         """Release the devices or sockets."""
@@ -87,7 +87,7 @@ class LivePairs:
         self.close()
 
     def add(self, side: Side, picture: Picture) -> None:
-        """Put in one eye's picture."""
+        """Put in one eye's image."""
         with self._arrived:
             waiting = self._waiting[side]
             if len(waiting) == QUEUE_LENGTH:
@@ -97,7 +97,7 @@ class LivePairs:
             self._arrived.notify_all()
 
     def add_both(self, left: Picture, right: Picture) -> None:
-        """Put in two pictures that are a pair, whatever their stamps."""
+        """Put in two images that are a pair, whatever their stamps."""
         with self._arrived:
             if len(self._pairs) == QUEUE_LENGTH:
                 self._pairs.popleft()
@@ -107,7 +107,7 @@ class LivePairs:
             self._arrived.notify_all()
 
     def end(self) -> None:
-        """Say that no more pictures will be put in."""
+        """Say that no more images will be put in."""
         with self._arrived:
             self._ended = True
             self._arrived.notify_all()
@@ -119,7 +119,7 @@ class LivePairs:
             self._arrived.notify_all()
 
     def __iter__(self) -> Iterator[StereoFrame]:
-        """Yield pairs as they arrive; wait while no pictures come."""
+        """Yield pairs as they arrive; wait while no images come."""
         epoch, last_ns = 0, -1
         while True:
             with self._arrived:
@@ -145,9 +145,9 @@ class LivePairs:
             )
 
     def _take(self) -> tuple[int, Picture, Picture] | None:
-        """Take the oldest pair: number of left pictures before it, left, right. None if there is none yet.
+        """Take the oldest pair: number of left images before it, left, right. None if there is none yet.
 
-        Of two pictures that are too far apart the older one is dropped; also if its successor is nearer.
+        Of two images that are too far apart the older one is dropped; also if its successor is nearer.
         """
         if self._pairs:
             return self._pairs.popleft()
@@ -170,20 +170,20 @@ class LivePairs:
         self._unpaired += 1
         if self._unpaired % REPORT_EVERY == 0:
             log.warning(
-                "%d pictures without a partner (left %d, right %d so far), last skew %.1f ms; "
+                "%d images without a partner (left %d, right %d so far), last skew %.1f ms; "
                 "is one camera away, or source.pair_tolerance_ms too small?",
                 *(self._unpaired, *self._counts.values(), self._skew_ns / 1e6),
             )
 
 
 class Alternation:
-    """Joins the pictures of one camera that shows the eyes in turn. Not thread-safe.
+    """Joins the images of one camera that shows the eyes in turn. Not thread-safe.
 
-    The time since the picture before tells which eye a picture shows, so that a lost picture does not swap
+    The time since the image before tells which eye an image shows, so that a lost image does not swap
     the eyes. It is measured on the device's clock, or else on a monotonic one.
 
     Args:
-        period_ns: from picture to picture.
+        period_ns: from image to image.
         clock_ns: monotonic.
     """
 
@@ -191,12 +191,12 @@ class Alternation:
         self._clock_ns = clock_ns
         self._period_ns = period_ns
         self._before: Shot | None = None
-        self._arrived_ns = 0  # arrival of the picture before
-        self._turn = -1  # number of the picture before, lost ones counted; even: the first eye
+        self._arrived_ns = 0  # arrival of the image before
+        self._turn = -1  # number of the image before, lost ones counted; even: the first eye
         self.alone = 0
 
     def add(self, picture: Shot) -> tuple[Shot, Shot] | None:
-        """Take a picture in; return the pictures of the first and the second eye if it completes a pair."""
+        """Take an image in; return the images of the first and the second eye if it completes a pair."""
         before, turn = self._before, self._turn
         self._turn, self._before = turn + self._steps(before, picture), picture
         is_second = self._turn % 2 == 1

@@ -1,4 +1,4 @@
-"""Stereo pairs from two folders of pictures."""
+"""Stereo pairs from two folders of images."""
 
 import logging
 from collections.abc import Sequence
@@ -24,10 +24,10 @@ from sags_node.types import F32, F64, I64, U8, Bool, Reference
 
 log = logging.getLogger(__name__)
 
-LARGEST_FILE = 256 << 20  # bytes: more than the largest allowed picture can need
+LARGEST_FILE = 256 << 20  # bytes: more than the largest allowed image can need
 MEND = "replace or remove the pair"
 NOT_SQUARE = 0.01  # difference of the pixel aspect from 1
-LOOKED_AT = 9  # pictures or masks, spread over a recording, to find out which value is white
+LOOKED_AT = 9  # images or masks, spread over a recording, to find out which value is white
 STORED = cv2.IMREAD_UNCHANGED
 
 F = TypeVar("F")
@@ -44,7 +44,7 @@ class RawPair(NamedTuple):
 
     left: U8  # [H, W, 3] RGB
     right: U8 | None  # [H, W, 3] RGB
-    tissue: Bool | None  # [H, W] of the left picture
+    tissue: Bool | None  # [H, W] of the left image
     depth: F32 | None = None  # [H, W] m
     T_world_cam: F64 | None = None  # [4, 4] m
     reference: Reference | None = None
@@ -56,15 +56,15 @@ class Pairs:
     Attributes:
         count: number of pairs as announced; a video may end earlier.
         rate: the recording's own, Hz; None: not known.
-        stamps: [count, 2] ns, of the left and the right picture; None: evenly spaced.
-        later: delay of the right picture in an evenly spaced recording, periods.
+        stamps: [count, 2] ns, of the left and the right image; None: evenly spaced.
+        later: delay of the right image in an evenly spaced recording, periods.
         pixel_aspect: width of a pixel over its height, as far as the recording tells.
         oddities: warnings about its files, each with a remedy after a semicolon.
         cut_off: why pairs are missing at its end, with a remedy after a semicolon; "": none are.
         reach: number of complete pairs, if it is cut off.
         judged: findings about its stamps or poses.
-        left_count: number of left pictures, also those without a partner; None: all have one.
-        left_numbers: [count] index of each pair's left picture among these; poses and references use it.
+        left_count: number of left images, also those without a partner; None: all have one.
+        left_numbers: [count] index of each pair's left image among these; poses and references use it.
     """
 
     count: int
@@ -108,18 +108,18 @@ def judge_pixels(aspect: float) -> tuple[Finding, ...]:
     """Return a warning if pixels are not square; `aspect` is their width over their height."""
     if abs(aspect - 1) < NOT_SQUARE:
         return ()
-    what = f"pixels are {aspect:.3g} times as wide as high: the eyes' pictures are squeezed"
-    fix = "calibrate pictures as they are played; a camera that is guessed has such pixels"
+    what = f"pixels are {aspect:.3g} times as wide as high: the eyes' images are squeezed"
+    fix = "calibrate images as they are played; a camera that is guessed has such pixels"
     return (Finding("warning", what, fix, {"pixel_aspect": aspect}),)
 
 
 class FolderPairs(Pairs):
-    """Pictures of two folders, paired by `pair_files`, or of the left one alone. Names that are times since
+    """Images of two folders, paired by `pair_files`, or of the left one alone. Names that are times since
     1970 give the stamps.
 
     Attributes:
-        files: the left pictures in order.
-        size: width and height of all pictures, px.
+        files: the left images in order.
+        size: width and height of all images, px.
         oddities: see `Pairs`.
 
     Raises:
@@ -184,44 +184,44 @@ class FolderPairs(Pairs):
         return samples if self._eight_bits is None else self._eight_bits(samples, file)
 
     def _samples(self, file: Path) -> NDArray[Any]:
-        """The picture, if its type is that of the first one."""
+        """The image, if its type is that of the first one."""
         samples = self._checked(read_samples(file), file)
         if samples.dtype != self._type:
-            raise SagsError(f"{file} holds {samples.dtype}, others {self._type}; save all pictures alike")
+            raise SagsError(f"{file} holds {samples.dtype}, others {self._type}; save all images alike")
         return samples
 
     def _checked(self, picture: NDArray[Any], file: Path) -> NDArray[Any]:
-        """The picture, if its size is that of the first one."""
+        """The image, if its size is that of the first one."""
         if _size(picture) != self.size:
             raise SagsError(
                 f"{file} is {size_text(*_size(picture))} px but {self.files[0]} is {size_text(*self.size)}; "
-                "all pictures must have one size"
+                "all images must have one size"
             )
         return picture
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """List the picture files of a folder, sorted by name, with numbers compared as numbers.
+    """List the image files of a folder, sorted by name, with numbers compared as numbers.
 
     Raises:
-        UsageError: the folder is missing or holds no picture, or something else has a picture's name.
+        UsageError: the folder is missing or holds no image, or something else has an image's name.
     """
     if not folder.is_dir():
         reason = "is not a folder" if folder.exists() else "does not exist"
-        raise UsageError(f"picture folder {folder} {reason}; check the path, or SAGS_DATA if it is used")
+        raise UsageError(f"image folder {folder} {reason}; check the path, or SAGS_DATA if it is used")
     pictures = [file for file in folder.glob(SHOWN) if file.suffix.lower() in SUFFIXES]
     for file in pictures:
         if file.exists() and not file.is_file():
-            raise UsageError(f"{file} has a picture's name but is no file; remove it from the folder")
+            raise UsageError(f"{file} has an image's name but is no file; remove it from the folder")
     if not pictures:
-        raise UsageError(f"picture folder {folder} holds no picture ({KINDS})")
+        raise UsageError(f"image folder {folder} holds no image ({KINDS})")
     return in_order(pictures)
 
 
 def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
-    """Decode one picture: RGB of 8 bit for `IMREAD_COLOR`, else as OpenCV's flags say.
+    """Decode one image: RGB of 8 bit for `IMREAD_COLOR`, else as OpenCV's flags say.
 
-    OpenCV silently fills the missing part of a cut-off picture with grey, so its end is checked first.
+    OpenCV silently fills the missing part of a cut-off image with grey, so its end is checked first.
 
     Raises:
         SagsError: the file is missing, no plain file, cut off, damaged, too large, or holds several.
@@ -232,19 +232,19 @@ def read_picture(file: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any]:
     try:
         data = read_file(file, LARGEST_FILE)
     except OSError as error:
-        raise SagsError(f"cannot read picture {file}: {error.strerror}") from None
+        raise SagsError(f"cannot read image {file}: {error.strerror}") from None
     if not is_whole(memoryview(data)):
-        raise SagsError(f"picture {file} is damaged or cut off ({len(data)} bytes); {MEND}")
+        raise SagsError(f"image {file} is damaged or cut off ({len(data)} bytes); {MEND}")
     if (count := pages(memoryview(data))) > 1:
         raise SagsError(
-            f"{file} holds {count} pictures, of which one would be shown; save each as a file of its own (in "
+            f"{file} holds {count} images, of which one would be shown; save each as a file of its own (in "
             "ImageJ: Save As, Image Sequence)"
         )
-    return decode(data, flags, f"picture {file}", MEND)
+    return decode(data, flags, f"image {file}", MEND)
 
 
 def read_samples(file: Path) -> NDArray[Any]:
-    """Decode one picture as RGB [H, W, 3] of its own depth: uint8, uint16 or float32.
+    """Decode one image as RGB [H, W, 3] of its own depth: uint8, uint16 or float32.
 
     Raises:
         SagsError: as `read_picture`, or its samples have another type.
@@ -254,22 +254,22 @@ def read_samples(file: Path) -> NDArray[Any]:
         picture = np.nan_to_num(picture, posinf=0.0, neginf=0.0).astype(np.float32)
     elif picture.dtype not in (np.uint8, np.uint16):
         raise SagsError(
-            f"picture {file} holds {picture.dtype}, which is not read; save it as PNG of 8 or 16 bit"
+            f"image {file} holds {picture.dtype}, which is not read; save it as PNG of 8 or 16 bit"
         )
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
 def size_text(width: int, height: int) -> str:
-    """Format a picture size: 640x480."""
+    """Format an image size: 640x480."""
     return f"{width}x{height}"
 
 
 def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Path, ...]]:
-    """Match the pictures of several folders: by name, if most are in all folders; by the times in names; or
-    else by order. Pictures that are left out, and odd pairs, are logged.
+    """Match the images of several folders: by name, if most are in all folders; by the times in names; or
+    else by order. Images that are left out, and odd pairs, are logged.
 
     Args:
-        numbered: other data (poses, depth) goes by number, so that no picture may be left out.
+        numbered: other data (poses, depth) goes by number, so that no image may be left out.
 
     Raises:
         UsageError: a folder cannot be read, or they cannot be paired.
@@ -285,15 +285,15 @@ def pair_files(folders: Sequence[Path], numbered: bool = False) -> list[tuple[Pa
         kept = {file for each in found for file in each}
         alone = [file for each in files for file in each if file not in kept]
         where = " and ".join(map(str, folders))
-        said = f"{len(alone)} pictures of {where} have no partner {how}, e.g. {alone[0]}"
+        said = f"{len(alone)} images of {where} have no partner {how}, e.g. {alone[0]}"
         if numbered:
-            raise UsageError(f"{said}; poses and depth go by number, so every picture needs its partners")
+            raise UsageError(f"{said}; poses and depth go by number, so every image needs its partners")
         log.warning("%s; they are left out", said)
         return found
     for folder, each in zip(folders, files, strict=True):
         if len(each) != len(files[0]):
             raise UsageError(
-                f"{folders[0]} holds {len(files[0])} pictures but {folder} holds {len(each)}; pairing goes "
+                f"{folders[0]} holds {len(files[0])} images but {folder} holds {len(each)}; pairing goes "
                 "by sorted name, so both need the same number, or names that tell which belong together"
             )
     for each in files[1:]:
@@ -333,7 +333,7 @@ def _size(picture: NDArray[Any]) -> tuple[int, int]:
 
 
 def _warn_of_gaps(left: Sequence[Path], right: Sequence[Path]) -> None:
-    """Warn if numbers in names show a missing picture: equal counts may hide one on each side."""
+    """Warn if numbers in names show a missing image: equal counts may hide one on each side."""
     one, other = (np.array(numbers(each), np.float64) for each in (left, right))
     if len(one) != len(other) or len(one) < 2:
         return
@@ -341,5 +341,5 @@ def _warn_of_gaps(left: Sequence[Path], right: Sequence[Path]) -> None:
     if odd.any():
         at = int(np.argmax(odd)) + 1
         log.warning(
-            "%s is paired with %s, unlike the pairs before: is a picture missing?", left[at], right[at]
+            "%s is paired with %s, unlike the pairs before: is an image missing?", left[at], right[at]
         )

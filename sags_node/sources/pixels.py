@@ -1,4 +1,4 @@
-"""Kernels for input pictures: conversion of 16 to 8 bits by levels, and detection of green-painted tools."""
+"""Kernels for input images: conversion of 16 to 8 bits by levels, and detection of green-painted tools."""
 
 from functools import lru_cache
 
@@ -16,10 +16,10 @@ CLOSE = np.ones((5, 5), np.uint8)  # fills dots inside instruments
 
 
 def spread(picture: Samples, levels: tuple[float, float]) -> U8:
-    """Map black and white to 0 and 255, rounded: a new picture [H, W, 3] of one [H, W, 3] of any strides.
+    """Map black and white to 0 and 255, rounded: a new image [H, W, 3] of one [H, W, 3] of any strides.
 
     Args:
-        levels: black and white, in units of the brightest value of the picture's type.
+        levels: black and white, in units of the brightest value of the image's type.
     """
     found = np.empty(picture.shape, np.uint8)
     _look_up(picture, _table(levels, picture.dtype), found)
@@ -47,8 +47,8 @@ def unpainted(pane: U8, left: U8) -> Bool:
     """Return the tissue mask [H, W]: True where `pane` shows `left` without green paint.
 
     Args:
-        pane: [H, W, 3] RGB, the left picture with semi-transparent green instruments.
-        left: [H, W, 3] RGB, the same picture without paint.
+        pane: [H, W, 3] RGB, the left image with semi-transparent green instruments.
+        left: [H, W, 3] RGB, the same image without paint.
     """
     painted = np.empty(pane.shape[:2], np.uint8)
     _find_paint(pane, left, painted)
@@ -60,7 +60,7 @@ def unpainted(pane: U8, left: U8) -> Bool:
 
 @kernel
 def _find_paint(pane: U8, left: U8, painted: U8) -> None:
-    """Write 1 where green was gained, else 0. One pass: intermediate pictures cost four times the time."""
+    """Write 1 where green was gained, else 0. One pass: intermediate images cost four times the time."""
     for y in range(painted.shape[0]):
         for x in range(painted.shape[1]):
             red, green, blue = (

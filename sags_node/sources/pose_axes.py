@@ -15,7 +15,7 @@ MOVES = (2.0, 0.15)  # px, and share of the width: smallest and largest useful m
 CLEARLY = 0.8  # largest ratio of the best difference to those of a still camera and of other readings
 LEAST_SEEN = 0.3  # share of the pixels with depth that both frames must show
 STEP = 4  # px between compared pixels
-SOFT = 2.0  # px, sigma of the blur before pictures are compared, so that small errors matter little
+SOFT = 2.0  # px, sigma of the blur before images are compared, so that small errors matter little
 
 
 class Seen(NamedTuple):

@@ -90,11 +90,11 @@ class _Edge:
             age = (t_ns - self._stamps[-1]) * 1e-9
             raise NoPoseError(
                 "pose_stopped",
-                f"the robot's pose has stopped: the newest is {age:.2f} s older than the picture; check "
+                f"the robot's pose has stopped: the newest is {age:.2f} s older than the image; check "
                 "the robot's program, its clock and robot.offset_ms",
             )
         if after == 0 and self._stamps[0] > t_ns:
-            raise NoPoseError("pose_missing", "the picture is older than all poses of the robot")
+            raise NoPoseError("pose_missing", "the image is older than all poses of the robot")
         before = after if self._stamps[after] == t_ns else after - 1
         gap = self._stamps[after] - self._stamps[before]
         if gap > LARGEST_GAP_NS:

@@ -14,14 +14,14 @@ from sags_node.messaging.wire import Message, WireError
 from sags_node.sources.sent import SentPictures
 from sags_node.types import U8, Finding
 
-NEWEST = 2  # pictures of each eye that may wait; older ones will not be shown
+NEWEST = 2  # images of each eye that may wait; older ones will not be shown
 
 
 class PushedPictures(SentPictures):
     """A `Source` of live stereo frames that other programs push.
 
     Args:
-        size: width and height that pictures must have, px; None: those of the first.
+        size: width and height that images must have, px; None: those of the first.
 
     Raises:
         UsageError, SagsError: see `Inbox`.
@@ -49,8 +49,8 @@ class PushedPictures(SentPictures):
             self.put_both(stamp_ns, arrival_ns, partial(_picture, message))
         else:
             raise SagsError(
-                f"topic {message.topic}: pictures come on NAME/left/image_raw, NAME/right/image_raw or "
-                "NAME/stereo/image_raw, files of pictures with /compressed behind"
+                f"topic {message.topic}: images come on NAME/left/image_raw, NAME/right/image_raw or "
+                "NAME/stereo/image_raw, files of images with /compressed behind"
             )
 
 
@@ -60,13 +60,13 @@ def _eye_and_kind(message: Message) -> tuple[str, str]:
 
 
 def _eyes_of(message: Message) -> list[str]:
-    """The names of the eyes whose pictures a message holds."""
+    """The names of the eyes whose images a message holds."""
     eye = _eye_and_kind(message)[0]
-    return [f"the {one} eye's pictures" for one in ("left", "right") if eye in (one, "stereo")]
+    return [f"the {one} eye's images" for one in ("left", "right") if eye in (one, "stereo")]
 
 
 def _picture(message: Message) -> U8:
-    """The picture, RGB [H, W, 3]; a view of the received memory if that holds RGB.
+    """The image, RGB [H, W, 3]; a view of the received memory if that holds RGB.
 
     Raises:
         SagsError: the message is damaged, or its encoding is not supported.

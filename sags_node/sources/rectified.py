@@ -1,4 +1,4 @@
-"""Finds out whether pictures come rectified: they must not be rectified a second time."""
+"""Finds out whether images come rectified: they must not be rectified a second time."""
 
 import re
 from pathlib import Path
@@ -15,9 +15,9 @@ OF_PICTURES = {"image", "images", "img", "frames", "left", "right", "l", "r"}
 
 
 def as_pictures_come(rig: StereoRig, config: cfg.LaunchConfig) -> StereoRig:
-    """Return the rig for a session's pictures. If these come rectified, only P of the calibration holds.
+    """Return the rig for a session's images. If these come rectified, only P of the calibration holds.
 
-    A calibration from files that hardly moves a pixel was made with rectified pictures: it stays as it is.
+    A calibration from files that hardly moves a pixel was made with rectified images: it stays as it is.
     """
     if not come_rectified(config):
         return rig
@@ -30,10 +30,10 @@ def as_named(rig: StereoRig, *names: Path) -> StereoRig:
 
 
 def _rectified_with(rig: StereoRig) -> StereoRig:
-    """The rig for pictures that were rectified with it; warns if its files do not hold P."""
+    """The rig for images that were rectified with it; warns if its files do not hold P."""
     if not rig.says_P:
         say(
-            f"{rig.path} does not say how pictures were rectified: P of cv2.stereoRectify with alpha=0 is "
+            f"{rig.path} does not say how images were rectified: P of cv2.stereoRectify with alpha=0 is "
             "taken, and if theirs has another focal length, depth is wrong by as much; write R1 R2 P1 P2 of "
             "their rectification into one OpenCV file with the rest"
         )
@@ -41,7 +41,7 @@ def _rectified_with(rig: StereoRig) -> StereoRig:
 
 
 def come_rectified(config: cfg.LaunchConfig) -> bool:
-    """Tell whether a session's pictures are rectified: by the launch file, or else by names of the source."""
+    """Tell whether a session's images are rectified: by the launch file, or else by names of the source."""
     source = config.source
     if config.rectified is not None:
         return config.rectified
@@ -56,13 +56,13 @@ def come_rectified(config: cfg.LaunchConfig) -> bool:
 
 
 def named_rectified(*names: Path | str) -> bool:
-    """Tell whether all these names of topics, folders or files say that pictures are rectified."""
+    """Tell whether all these names of topics, folders or files say that images are rectified."""
     return bool(names) and all(_says_rectified(name) for name in names)
 
 
 def _says_rectified(name: Path | str) -> bool:
     """Tell by the last part of a name that says raw or rectified. In a topic any part counts. In a path only
-    the last one does, and its folder if that is named after pictures, not after a case."""
+    the last one does, and its folder if that is named after images, not after a case."""
     parts = [
         _words(part) for part in (name.absolute().parts[-2:] if isinstance(name, Path) else name.split("/"))
     ]

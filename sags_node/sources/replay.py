@@ -32,15 +32,15 @@ Recording = (
 )
 DEFAULT_RATE = 30.0  # Hz, of recordings that do not tell theirs
 ASSUMED = " (assumed: the files do not say it; set source.rate)"
-# Check for the same picture in both eyes, in pictures so small that noise and compression are averaged away.
-WIDTH = 80  # px of these pictures
+# Check for the same image in both eyes, in images so small that noise and compression are averaged away.
+WIDTH = 80  # px of these images
 SURELY = 0.25  # times the change by a shift of one pixel; a scope's eyes differ by 1 to 5 times that
-LEAST = 1.0  # grey levels of that change: if it is less, the picture has no texture, and is not judged
+LEAST = 1.0  # grey levels of that change: if it is less, the image has no texture, and is not judged
 # Largest difference of both greens, smallest of red and blue, as shares of the sum of four pixels.
 GREENS, RED_BLUE = 0.005, 0.03
 MOSAIC = (
-    "the pictures are grey, and a Bayer mosaic: each pixel holds one colour; take it apart (OpenCV's "
-    "cvtColor with COLOR_BayerRG2BGR or another pattern), and save pictures in colour"
+    "the images are grey, and a Bayer mosaic: each pixel holds one colour; take it apart (OpenCV's "
+    "cvtColor with COLOR_BayerRG2BGR or another pattern), and save images in colour"
 )
 
 
@@ -54,7 +54,7 @@ class Replay:
     stamp is the wall clock's. In `step` pace the stamp is `frame_id / rate`. `epoch` grows with each loop,
     and when a stamp goes back.
 
-    A recording that holds a stamp for each picture is played by these, unless `config.rate` is set.
+    A recording that holds a stamp for each image is played by these, unless `config.rate` is set.
 
     Attributes:
         first: number of the first frame.
@@ -103,8 +103,8 @@ class Replay:
         for finding in [] if quiet else self.pairs.findings:
             say(f"{finding.what}; {finding.fix}")
         stamps = None if self.pairs.stamps is None else self.pairs.stamps[:: config.stride]
-        self._stamps = stamps if config.rate is None else None  # [turns, 2] ns, of both eyes' pictures
-        # Stamps of the left pictures, ns: to look up poses in the same bag.
+        self._stamps = stamps if config.rate is None else None  # [turns, 2] ns, of both eyes' images
+        # Stamps of the left images, ns: to look up poses in the same bag.
         self._recorded = stamps[:, 0] if stamps is not None and isinstance(self.pairs, BagPairs) else None
         self.dropped = 0
         self._began: float | None = None  # monotonic seconds of the first turn
@@ -128,7 +128,7 @@ class Replay:
             return
         self.pairs.close()
         raise UsageError(
-            f"{self._config.poses} holds {there} poses, the recording {lefts} pictures of the left eye; "
+            f"{self._config.poses} holds {there} poses, the recording {lefts} images of the left eye; "
             "T_world_cam must hold one for each of them, in their order, also for those that are not played"
         )
 
@@ -176,8 +176,8 @@ class Replay:
         """Play from the start.
 
         Raises:
-            UsageError: both eyes begin with the same picture.
-            SagsError: a picture is damaged, or the right eye ends before the left one.
+            UsageError: both eyes begin with the same image.
+            SagsError: an image is damaged, or the right eye ends before the left one.
         """
         stride = self._config.stride
         self._began = None
@@ -255,7 +255,7 @@ class Replay:
         return passes * one_pass + int(times[turn] - times[0])
 
     def _skew(self, index: int) -> int:
-        """The delay of the right picture after the left one, ns."""
+        """The delay of the right image after the left one, ns."""
         if self._stamps is None:
             return round(self.pairs.later * 1e9 / (self.rate * self._config.stride))
         return int(self._stamps[index, 1] - self._stamps[index, 0])
@@ -311,7 +311,7 @@ def open_pairs(config: Recording, references: bool) -> Pairs:  # noqa: PLR0911, 
 
 
 def is_mosaic(picture: U8) -> bool:
-    """Tell whether a grey picture [H, W, 3] is a Bayer mosaic of tissue. In each 2x2 block the greens on one
+    """Tell whether a grey image [H, W, 3] is a Bayer mosaic of tissue. In each 2x2 block the greens on one
     diagonal are about equal; red and blue on the other one differ."""
     grey = picture[..., 1]
     if not all(np.array_equal(grey, picture[..., channel]) for channel in (0, 2)):
@@ -324,11 +324,11 @@ def is_mosaic(picture: U8) -> bool:
 def refuse_one_eye_twice(left: U8, right: U8 | None) -> None:
     """Check that the first pair [H, W, 3] of a recording is not one eye twice, which gives no depth.
 
-    Live cameras are not refused: both may send a test picture until the scope is plugged in. They get the
+    Live cameras are not refused: both may send a test image until the scope is plugged in. They get the
     warning `eyes_equal` instead.
 
     Raises:
-        UsageError: both pictures are clearly of the same eye.
+        UsageError: both images are clearly of the same eye.
     """
     if right is None or left.shape != right.shape:
         return
@@ -337,6 +337,6 @@ def refuse_one_eye_twice(left: U8, right: U8 | None) -> None:
     shifted = float(np.abs(a[:, 1:] - a[:, :-1]).mean())
     if shifted > LEAST and float(np.abs(a - b).mean()) < SURELY * shifted:
         raise UsageError(
-            "both eyes get the same picture, so there is no depth; name the other eye's camera or file in "
+            "both eyes get the same image, so there is no depth; name the other eye's camera or file in "
             "source.right, or check the cables"
         )

@@ -28,14 +28,14 @@ from sags_node.workers import go_on
 
 log = logging.getLogger(__name__)
 
-WAIT_S = 0.1  # s to wait for a pose; robots send theirs sooner than cameras their pictures
+WAIT_S = 0.1  # s to wait for a pose; robots send theirs sooner than cameras their images
 POLL_S = 0.1
 CLOSE_S = 5.0
 STATIC = "/tf_static"
 WHOLE = 10_000_000  # samples kept of a bag: all
 TOOL_PROBLEMS = {  # why a tool's pose is not known
-    "pose_missing": "no pose of the picture's time has come",
-    "pose_stopped": "its newest pose is older than the picture",
+    "pose_missing": "no pose of the image's time has come",
+    "pose_stopped": "its newest pose is older than the image",
     "pose_jumped": "its pose jumped within the last second",
     "pose_too_far": "it is over 10 m from its base: its lengths must be in metres",
 }
@@ -73,7 +73,7 @@ class _BagPoses(Robot):
 
     def __init__(self, config: BagRobot, source: object) -> None:
         if not isinstance(source, BagSource):
-            raise UsageError("robot.kind bag takes poses from the bag of the pictures: set source.kind:=bag")
+            raise UsageError("robot.kind bag takes poses from the bag of the images: set source.kind:=bag")
         super().__init__(config, WHOLE)
         wanted = {absolute(config.topic), *self.tools}
         seen: dict[str, str] = {}
@@ -219,7 +219,7 @@ class Posed:
     (`StereoFrame.pose_problem`). Poses of tools are added where they are known (`StereoFrame.tools`).
 
     Args:
-        source: of the pictures.
+        source: of the images.
         config: its `robot` says where the poses come from.
 
     Raises:
@@ -253,12 +253,12 @@ class Posed:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Return what is wrong with the senders of pictures or poses, and how to fix it."""
+        """Return what is wrong with the senders of images or poses, and how to fix it."""
         return findings_of(self._source) + findings_of(self.robot)
 
     @property
     def dropped(self) -> int:
-        """The frames that the pictures' source dropped, and those before the first pose."""
+        """The frames that the images' source dropped, and those before the first pose."""
         return self._source.dropped + self._without
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Live stereo from a ROS 2 graph: two picture topics, paired by their stamps, or one that shows both eyes."""
+"""Live stereo from a ROS 2 graph: two image topics, paired by their stamps, or one that shows both eyes."""
 
 import logging
 import threading
@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.1  # s until the reading thread notices `stop` or a new topic
 CLOSE_S = 5.0  # s to wait for the reading thread
-QUIET_S = 3.0  # s without a picture, after which a warning says which topics there are
-MUCH_LOST = 0.1  # share of lost pictures; a strict `read` of our client allows as much
+QUIET_S = 3.0  # s without an image, after which a warning says which topics there are
+MUCH_LOST = 0.1  # share of lost images; a strict `read` of our client allows as much
 INFO_S = 10.0  # s to wait for the calibration: cameras may just be starting
 ZEROS_S = 2.0  # s to wait once an empty one came: drivers may start before they have loaded it
 
@@ -33,11 +33,11 @@ ZEROS_S = 2.0  # s to wait once an empty one came: drivers may start before they
 class RosCameras(SentPictures):
     """A `Source` of live stereo frames from a ROS 2 graph.
 
-    Pictures come raw or compressed, as their sender publishes them. The sender may restart. While the cameras
-    publish another calibration than `rig`, no pictures are given: depth would be wrong.
+    Images come raw or compressed, as their sender publishes them. The sender may restart. While the cameras
+    publish another calibration than `rig`, no images are given: depth would be wrong.
 
     Args:
-        size: width and height that pictures must have, px; None: those of the first.
+        size: width and height that images must have, px; None: those of the first.
         rig: the calibration that the cameras published at the start (`read_rig`); None: it is not theirs.
 
     Raises:
@@ -67,7 +67,7 @@ class RosCameras(SentPictures):
         changed = ", ".join(self._changed.copy().values())
         if not changed:
             return ()
-        said = f"{changed}: zoom, focus or picture size was changed, and nothing is shown"
+        said = f"{changed}: zoom, focus or image size was changed, and nothing is shown"
         return (Finding("calibration_changed", f"{said}; set it back, or restart the node to take it over"),)
 
     def start(self) -> None:
@@ -141,21 +141,21 @@ class RosCameras(SentPictures):
         name, there = self._names[eye], self._graph.publications()
         where = self._graph.where()
         if name in there and not there[name] & set(IMAGE_TYPES):
-            return f"{name} is {', '.join(sorted(there[name]))}, not a picture topic; set source.{eye}"
+            return f"{name} is {', '.join(sorted(there[name]))}, not an image topic; set source.{eye}"
         if name in there:
             return (
-                f"no picture comes on {name} ({where}), though somebody publishes it; does it run, and does "
+                f"no image comes on {name} ({where}), though somebody publishes it; does it run, and does "
                 "no firewall stop its packets?"
             )
         topics = ", ".join(sorted(topic for topic, kinds in there.items() if kinds & set(IMAGE_TYPES)))
         return (
-            f"nobody publishes {name} in {where}; picture topics there: {topics or 'none'}. Set "
+            f"nobody publishes {name} in {where}; image topics there: {topics or 'none'}. Set "
             f"source.{eye}, source.domain (ROS_DOMAIN_ID of the camera) or source.interface"
         )
 
 
 def picture_topics(config: Ros2Source) -> dict[Side, str]:
-    """Return the picture topic of each eye; only that of the left one if its pictures show both."""
+    """Return the image topic of each eye; only that of the left one if its images show both."""
     if config.geometry.layout != "separate":
         return {"left": absolute(config.left)}
     return {"left": absolute(config.left), "right": absolute(config.right)}
@@ -168,9 +168,9 @@ def absolute(name: str) -> str:
 
 def _explained(name: str, share: float) -> str:
     return (
-        f"{name}: {share:.0%} of the pictures are lost on the way. The kernel grants a receive buffer of "
+        f"{name}: {share:.0%} of the images are lost on the way. The kernel grants a receive buffer of "
         f"{receive_buffer() / 1e6:.1f} MB; more: sudo sysctl -w net.core.rmem_max=16777216, then start anew. "
-        "Or send CompressedImage, or fewer or smaller pictures"
+        "Or send CompressedImage, or fewer or smaller images"
     )
 
 
@@ -178,7 +178,7 @@ def read_rig(config: Ros2Source, seconds: float = INFO_S) -> StereoRig | None:
     """Read the calibration that the cameras publish; None if it is empty.
 
     Raises:
-        UsageError: no camera_info comes within `seconds`, one eye's is empty, the pictures are flipped, or
+        UsageError: no camera_info comes within `seconds`, one eye's is empty, the images are flipped, or
             the calibration is implausible.
         SagsError: a message is damaged.
     """

@@ -1,7 +1,7 @@
 """Reads keyframe folders of SCARED (Allan et al., arXiv 2101.01133).
 
 A keyframe is one view of a still organ, measured with structured light, and a video in which the scope moves
-away: `endoscope_calibration.yaml`, `data/rgb.mp4` (left picture above the right one), `data/frame_data`
+away: `endoscope_calibration.yaml`, `data/rgb.mp4` (left image above the right one), `data/frame_data`
 (poses) and `data/scene_points` (the measured surface as seen from each frame). Lengths are in mm.
 """
 
@@ -92,7 +92,7 @@ class ScaredPairs(Pairs):
         return Reference(self._rectified_depth(points[:height, :, ::-1]), "structured_light")
 
     def _rectified_depth(self, points: F32) -> F32:
-        """Depth [H, W] m in the left rectified picture, from points [H, W, 3] mm at the raw picture's pixels.
+        """Depth [H, W] m in the left rectified image, from points [H, W, 3] mm at the raw image's pixels.
         Each rectified pixel takes the point of the nearest raw one: points are never averaged.
         """
         depth = points @ (self._left.R[2] * METRES).astype(np.float32)
@@ -102,11 +102,11 @@ class ScaredPairs(Pairs):
 
 
 def read_rig(folder: Path, judged: bool = True) -> StereoRig:
-    """Read the keyframe's calibration for the pictures that are played, raw or rectified. Unless `judged`,
-    its plausibility is not checked: pictures may have been resized since.
+    """Read the keyframe's calibration for the images that are played, raw or rectified. Unless `judged`,
+    its plausibility is not checked: images may have been resized since.
 
     Raises:
-        UsageError: pictures or calibration are missing, damaged or implausible.
+        UsageError: images or calibration are missing, damaged or implausible.
     """
     pictures, rectified = _open_pictures(folder)
     pictures.close()
@@ -120,7 +120,7 @@ def read_calibration(folder: Path, size: tuple[int, int]) -> StereoRig:
     """Read `endoscope_calibration.yaml`, and rectify with OpenCV's defaults, as the public SCARED tools do.
 
     Args:
-        size: width and height of one eye's picture, px.
+        size: width and height of one eye's image, px.
 
     Raises:
         UsageError: the file is missing, damaged or implausible.
@@ -158,7 +158,7 @@ def _matrix(storage: cv2.FileStorage, file: Path, key: str, lengths: tuple[int, 
 
 
 def _open_pictures(folder: Path) -> tuple[OneVideoPairs | FolderPairs, bool]:
-    """Open the pictures of the folder; also tells whether they are rectified."""
+    """Open the images of the folder; also tells whether they are rectified."""
     if (folder / "data/rgb.mp4").is_file():
         video = Video(folder / "data/rgb.mp4")
         return OneVideoPairs(video, Layout(GeometryConfig(layout="over_under"))), False
@@ -169,7 +169,7 @@ def _open_pictures(folder: Path) -> tuple[OneVideoPairs | FolderPairs, bool]:
             numbers = [int(name[-6:]) if name[-6:].isdecimal() else -1 for name in names]
             if numbers != [0, pictures.count - 1]:
                 raise UsageError(
-                    f"{folder / left}: the pictures must be numbered like the poses, from 000000 without "
+                    f"{folder / left}: the images must be numbered like the poses, from 000000 without "
                     f"gaps, not {names[0]} to {names[1]}"
                 )
             return pictures, True
@@ -197,7 +197,7 @@ def _read_poses(folder: Path, count: int, left: Eye) -> F64 | None:
             T_world_key = T_rectified_raw @ T_raw_key
         poses.append(T_world_key @ geometry.invert(T_rectified_raw @ T_raw_key))
     if len(poses) == count and files.read(count) is not None:
-        log.warning("%s has poses of more than its %d pictures; were all of them copied?", folder, count)
+        log.warning("%s has poses of more than its %d images; were all of them copied?", folder, count)
     files.close()
     if not poses:
         raise UsageError(f"{folder / 'data/frame_data'} holds no frame_data000000.json; unpack it again")

@@ -1,4 +1,4 @@
-"""Checks pictures that other programs send, converts their stamps to this machine's clock, and pairs them."""
+"""Checks images that other programs send, converts their stamps to this machine's clock, and pairs them."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -13,23 +13,23 @@ from sags_node.sources.pairing import LivePairs, Picture
 from sags_node.sources.pictures import size_text
 from sags_node.types import U8, Side
 
-OLDEST_NS = 1_000_000_000  # ns: an older picture is of no use, or its clock is another one
+OLDEST_NS = 1_000_000_000  # ns: an older image is of no use, or its clock is another one
 AWAY_NS = 1_000_000_000  # ns: a gap of at least this, and of
 AWAY_STEPS = 10  # usual steps, means that the sender paused: nothing was lost
 ONE_CLOCK_NS = 100_000_000  # ns: if both eyes' clocks differ by less, they are one clock
 AHEAD_NS = 100_000_000  # ns ahead: synchronised clocks do not differ by more
-LATE_NS = 200_000_000  # ns of transit: a hand that is guided by later pictures misses
-SMOOTHED = 0.1  # weight of the newest picture in the mean age
+LATE_NS = 200_000_000  # ns of transit: a hand that is guided by later images misses
+SMOOTHED = 0.1  # weight of the newest image in the mean age
 ENOUGH = 0.9  # share of the nominal rate; if less comes, the sender is told
 OTHER: Mapping[Side, Side] = {"left": "right", "right": "left"}
-WINDOW = 90  # pictures over which losses are counted: 3 s at 30 Hz
+WINDOW = 90  # images over which losses are counted: 3 s at 30 Hz
 
 
 class Arrivals:
-    """Counts one eye's pictures and, by the gaps between stamps, those that were lost in transit.
+    """Counts one eye's images and, by the gaps between stamps, those that were lost in transit.
 
     Attributes:
-        lost: number since the start, up to the last full stretch of `WINDOW` pictures.
+        lost: number since the start, up to the last full stretch of `WINDOW` images.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class Arrivals:
 
     @property
     def share_lost(self) -> float:
-        """The share of pictures lost in the last `WINDOW`; 0 until so many have come."""
+        """The share of images lost in the last `WINDOW`; 0 until so many have come."""
         if len(self._stamps) < WINDOW:
             return 0.0
         return self._lost_now() / (self._lost_now() + len(self._stamps))
@@ -66,19 +66,19 @@ class Arrivals:
         return gap_ns > AWAY_STEPS * float(np.median(np.diff(np.array(self._stamps))))
 
     def _lost_now(self) -> float:
-        """The number of pictures missing in the last `WINDOW`, by the median step between stamps."""
+        """The number of images missing in the last `WINDOW`, by the median step between stamps."""
         steps = np.diff(np.array(self._stamps))
         return max(0.0, float(steps.sum() / np.median(steps)) - len(steps))
 
 
 class SentPictures(LivePairs):
-    """A `Source` of both eyes' pictures from another program. One receiving thread puts them in.
+    """A `Source` of both eyes' images from another program. One receiving thread puts them in.
 
     Attributes:
-        arrivals: counts of each eye's pictures.
+        arrivals: counts of each eye's images.
 
     Args:
-        size: width and height that pictures must have, px; None: those of the first.
+        size: width and height that images must have, px; None: those of the first.
     """
 
     def __init__(self, config: SentSource, size: tuple[int, int] | None) -> None:
@@ -92,30 +92,30 @@ class SentPictures(LivePairs):
         self._both = Layout(config.geometry.model_copy(update={"layout": both}))
         self._own = config.stamps == "own"
         self._clocks: Mapping[Side, CaptureClock] = {"left": CaptureClock(), "right": CaptureClock()}
-        self._age_ns = 0.0  # smoothed age of pictures on arrival
+        self._age_ns = 0.0  # smoothed age of images on arrival
 
     @property
     def dropped(self) -> int:
-        """The number of missing pairs: lost in transit, or without the other eye's picture."""
+        """The number of missing pairs: lost in transit, or without the other eye's image."""
         return max(super().dropped, *(eye.lost for eye in self.arrivals.values()))
 
     def slowness(self) -> str | None:
-        """Return a warning for the sender if pictures come too seldom or too late; else None."""
+        """Return a warning for the sender if images come too seldom or too late; else None."""
         rate = min(arrivals.rate for arrivals in self.arrivals.values())
         if rate < ENOUGH * self.rate:
             return (
-                f"{rate:.1f} of {self.rate:g} pictures a second come: send faster, or set "
+                f"{rate:.1f} of {self.rate:g} images a second come: send faster, or set "
                 f"source.rate:={round(rate, 1):g}"
             )
         if not self._own and self._age_ns > LATE_NS:
             return (
-                f"pictures are {self._age_ns * 1e-6:.0f} ms old when they come: send smaller ones, or JPEG; "
+                f"images are {self._age_ns * 1e-6:.0f} ms old when they come: send smaller ones, or JPEG; "
                 "stamp them when they are taken"
             )
         return None
 
     def put(self, eye: Side, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
-        """Put in one eye's picture.
+        """Put in one eye's image.
 
         Raises:
             SagsError: it is refused; the error says why, and how to fix it.
@@ -126,7 +126,7 @@ class SentPictures(LivePairs):
         self.add(eye, Picture(t_ns, self._one.eye(picture, eye), stamp_ns, arrival_ns))
 
     def put_both(self, stamp_ns: int, arrival_ns: int, decode: Callable[[], U8]) -> None:
-        """Put in a picture of both eyes: side by side, unless the geometry says otherwise; see `put`."""
+        """Put in an image of both eyes: side by side, unless the geometry says otherwise; see `put`."""
         t_ns = self._on_wall("left", stamp_ns, arrival_ns)
         for arrivals in self.arrivals.values():
             arrivals.add(stamp_ns)
@@ -143,24 +143,24 @@ class SentPictures(LivePairs):
             return stamp_ns
         way = "old" if age > 0 else "ahead of this machine's clock"
         raise SagsError(
-            f"a picture's stamp is {abs(age) * 1e-9:.1f} s {way}: stamp it by the wall clock when it is "
+            f"an image's stamp is {abs(age) * 1e-9:.1f} s {way}: stamp it by the wall clock when it is "
             "taken and set both clocks by each other, or set source.stamps:=own"
         )
 
     def _own_on_wall(self, eye: Side, stamp_ns: int, arrival_ns: int) -> int:
-        """Convert a stamp by the eye's own clock: pictures come in any order, and there may be two clocks."""
+        """Convert a stamp by the eye's own clock: images come in any order, and there may be two clocks."""
         self._clocks[eye].add(stamp_ns, arrival_ns)
         own, other = self._clocks[eye].to_wall(stamp_ns), self._clocks[OTHER[eye]].to_wall(stamp_ns)
         assert own is not None  # it was just added
         return own if other is None or abs(other - own) > ONE_CLOCK_NS else min(own, other)
 
     def _checked(self, picture: U8, layout: Layout) -> U8:
-        """The picture, if its eyes have the right size."""
-        size = layout.size(picture.shape[1], picture.shape[0], "a picture")
+        """The image, if its eyes have the right size."""
+        size = layout.size(picture.shape[1], picture.shape[0], "an image")
         self._size = self._size or size
         if size != self._size:
             raise SagsError(
-                f"an eye's picture is {size_text(*size)} px, it must be {size_text(*self._size)} as in the "
+                f"an eye's image is {size_text(*size)} px, it must be {size_text(*self._size)} as in the "
                 "calibration; send that size, or name the right calibration in rig"
             )
         return picture

@@ -31,7 +31,7 @@ class Source(Protocol):
         """Yield frames in capture order.
 
         Raises:
-            SagsError: a picture cannot be read, or the eyes do not match.
+            SagsError: an image cannot be read, or the eyes do not match.
         """
 
     def stop(self) -> None:
@@ -59,7 +59,7 @@ def open_source(
         config: the `source` section.
         references: read the recording's ground truth with each frame. Only evaluation needs it.
         progress: called with (done, total) while a phantom session is rendered.
-        size: width and height that an eye's live pictures must have, px; None: those of the first.
+        size: width and height that an eye's live images must have, px; None: those of the first.
         rig: the calibration that live cameras published, if any: it must stay the same.
         quiet: do not log warnings about a recording: whoever plays it later does.
 
@@ -92,7 +92,7 @@ def open_source(
 
 
 def recorded_rig(config: cfg.Source, judged: bool = True) -> StereoRig | None:
-    """Read the calibration that comes with the pictures; None if the launch file must name one. Unless
+    """Read the calibration that comes with the images; None if the launch file must name one. Unless
     `judged`, a bag's may be implausible, and SCARED's for another size.
 
     Raises:

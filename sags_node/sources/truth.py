@@ -1,4 +1,4 @@
-"""Reads what a recording holds besides pictures: poses, and references (ground truth) for evaluation."""
+"""Reads what a recording holds besides images: poses, and references (ground truth) for evaluation."""
 
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -78,17 +78,17 @@ class References:
         return ""
 
     def misnamed(self, pictures: Sequence[Path]) -> str:
-        """Return a warning if a depth file has the name of another frame's picture; else "".
+        """Return a warning if a depth file has the name of another frame's image; else "".
 
         Args:
-            pictures: of all frames, in order.
+            images: of all frames, in order.
         """
         places = {file.stem: place for place, file in enumerate(pictures)}
         for number, file in self._depth_files.items():
             if places.get(file.stem, number) != number:
                 return (
                     f"{file} is taken for the depth of {pictures[number].name}: frame numbers begin at 0; "
-                    "if it is that of the picture of its name, number the reference from 0"
+                    "if it is that of the image of its name, number the reference from 0"
                 )
         return ""
 
@@ -96,10 +96,10 @@ class References:
         """Return the reference of one frame of the recording, None if it has none.
 
         Args:
-            size: width and height of its picture, px.
+            size: width and height of its image, px.
 
         Raises:
-            SagsError: the depth picture is damaged, not 16 bit, or has another aspect ratio than the frame.
+            SagsError: the depth image is damaged, not 16 bit, or has another aspect ratio than the frame.
         """
         depth_file = self._depth_files.get(index)
         points, visible = self._tracks.get(index, (None, None))
@@ -115,7 +115,7 @@ class References:
         (height, width), (wide, high) = counts.shape, size
         if abs(width * high - height * wide) >= max(size):  # by a whole pixel
             raise SagsError(
-                f"{file} is {size_text(width, height)} px, of another shape than the pictures "
+                f"{file} is {size_text(width, height)} px, of another shape than the images "
                 f"({size_text(wide, high)}); reference depth must show what they show, cropped as they are"
             )
         return np.where(counts == UNKNOWN, np.float32(0), counts * np.float32(self._config.depth_unit))

@@ -1,4 +1,4 @@
-"""Live stereo from V4L2: two cameras paired by their stamps, or one whose pictures show both eyes."""
+"""Live stereo from V4L2: two cameras paired by their stamps, or one whose images show both eyes."""
 
 import logging
 import math
@@ -19,17 +19,17 @@ from sags_node.types import Samples, Side
 
 log = logging.getLogger(__name__)
 
-FIRST_PICTURE_S = 3  # s that cameras may need to start: OpenCV blocks until the first picture
+FIRST_PICTURE_S = 3  # s that cameras may need to start: OpenCV blocks until the first image
 DEEP = {"Y10 ": 6, "Y12 ": 4, "Y16 ": 0}  # pixel formats of 16 bit words, and their unused bits
 NEAR_NS = 1_000_000_000  # ns: a stamp this near to its arrival is of the kernel's monotonic clock
-STRANGE = 30  # pictures: if none of so many has such a stamp, the driver uses another clock
+STRANGE = 30  # images: if none of so many has such a stamp, the driver uses another clock
 
 
 class Device:
     """An open camera.
 
     Most drivers stamp by the kernel's monotonic clock. Once a driver was seen to do so, its stamps are
-    believed, however old: its buffers may hold pictures that nobody took for a while.
+    believed, however old: its buffers may hold images that nobody took for a while.
 
     Args:
         path: device file; a udev link such as /dev/video-left follows its camera from port to port.
@@ -40,7 +40,7 @@ class Device:
     """
 
     _is_near = False  # a stamp near to its arrival was seen
-    _far = 0  # pictures up to the first such stamp
+    _far = 0  # images up to the first such stamp
 
     def __init__(self, path: str, config: V4l2Source) -> None:
         self._path = path
@@ -93,7 +93,7 @@ class Device:
         return rate
 
     def read(self, timeout: float) -> Shot | None:
-        """Return the next picture; None if none comes within `timeout` seconds, or its stamp is the last one.
+        """Return the next image; None if none comes within `timeout` seconds, or its stamp is the last one.
 
         Raises:
             SagsError: the device is gone.
@@ -106,7 +106,7 @@ class Device:
         except cv2.error:
             found = False
         if not found:
-            raise SagsError(f"{self._path} stopped delivering pictures")
+            raise SagsError(f"{self._path} stopped delivering images")
         stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
         if stamp_ms and stamp_ms == self._last_stamp_ms:
             return None
@@ -120,10 +120,10 @@ class Device:
         return Shot(arrival_ns - age_ns, image, device_ns=device_ns, arrival_ns=arrival_ns)
 
     def _age(self, driver_ns: int, before_ns: int) -> int:
-        """The age of a picture on arrival, ns, given the driver's stamp and how long before arrival it lies.
+        """The age of an image on arrival, ns, given the driver's stamp and how long before arrival it lies.
         0 if the driver gives no stamp (0), or one of another clock.
 
-        No picture is taken after it arrived: if a driver stamps ahead (vivid does), the age is 0.
+        No image is taken after it arrived: if a driver stamps ahead (vivid does), the age is 0.
         """
         if not self._is_near:
             self._is_near = abs(before_ns) <= NEAR_NS
@@ -156,7 +156,7 @@ def open_cameras(
 
     Args:
         config: devices, size, rate, and the tolerance of pairs.
-        size: width and height that an eye's pictures must have, px.
+        size: width and height that an eye's images must have, px.
         open_device: opens one camera.
 
     Raises:

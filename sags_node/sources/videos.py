@@ -12,9 +12,9 @@ from sags_node.sources.pairing import NEAR, pair
 from sags_node.sources.pictures import Pairs, RawPair, size_text
 from sags_node.types import I64
 
-PARTNERED = 0.5  # share of pictures that must find a partner by stamps; else they pair by number
+PARTNERED = 0.5  # share of images that must find a partner by stamps; else they pair by number
 TORN = (
-    "the file says that its pictures are interlaced: what moves is torn, unless both fields are of one moment"
+    "the file says that its images are interlaced: what moves is torn, unless both fields are of one moment"
 )
 UNEVEN_RATES = 0.1  # relative difference allowed between the rates of two files with gaps or jitter
 
@@ -22,15 +22,15 @@ UNEVEN_RATES = 0.1  # relative difference allowed between the rates of two files
 class VideoPairs(Pairs):
     """Two videos, or the left one alone. The number of pairs follows the left one.
 
-    Pictures with the same number are a pair. If stamps show that some are missing, the nearest in time are.
+    Images with the same number are a pair. If stamps show that some are missing, the nearest in time are.
 
     Attributes:
         left, right: the videos; right None: there is one eye.
-        by_number: pictures are paired by number, not by stamps.
-        oddities: see `Video`; also the number of pictures without a partner.
+        by_number: images are paired by number, not by stamps.
+        oddities: see `Video`; also the number of images without a partner.
 
     Args:
-        layout: geometry of each eye's picture.
+        layout: geometry of each eye's image.
 
     Raises:
         UsageError: a file is missing or not a video, or the two differ in size or rate.
@@ -88,7 +88,7 @@ class VideoPairs(Pairs):
         return [self.left] if self.right is None else [self.left, self.right]
 
     def _joined(self, left: Video, right: Video) -> I64 | None:
-        """The numbers of the pictures of each pair [N, 2]; None: pictures with the same number are pairs."""
+        """The numbers of the images of each pair [N, 2]; None: images with the same number are pairs."""
         if left.size != right.size:
             sizes = (
                 f"{left.path} has {size_text(*left.size)} px but {right.path} has {size_text(*right.size)}"
@@ -105,8 +105,8 @@ class VideoPairs(Pairs):
             if apart > (0.01 if is_even else UNEVEN_RATES):
                 said = "they are not one stereo pair: record both at one rate, or bring one to it"
                 way = f"-i {shlex.quote(str(right.path))} -r {left.rate:g}"
-                if left.count == right.count:  # so no picture may be added
-                    said = f"both have {left.count} pictures, so one rate is wrong; is it the right one's"
+                if left.count == right.count:  # so no image may be added
+                    said = f"both have {left.count} images, so one rate is wrong; is it the right one's"
                     way = f"-r {left.rate:g} -i {shlex.quote(str(right.path))}"
                 raise UsageError(
                     f"{left.path} has {left.rate:g} frames/s but {right.path} has {right.rate:g}; {said} "
@@ -120,7 +120,7 @@ class VideoPairs(Pairs):
         if not of_one_clock:  # two recorders, whose stamps begin at different times
             self.oddities.append(
                 f"the stamps of the right video begin {abs(late) * 1e-9:.3f} s "
-                f"{'after' if late > 0 else 'before'} those of the left one; their first pictures are taken "
+                f"{'after' if late > 0 else 'before'} those of the left one; their first images are taken "
                 "for one moment: is an eye late, cut its beginning off"
             )
         if is_even and (not of_one_clock or abs(late) <= NEAR * period):
@@ -130,23 +130,23 @@ class VideoPairs(Pairs):
         alone = left.count - len(found), right.count - len(found)
         if len(found) < PARTNERED * min(left.count, right.count):
             self.oddities.append(
-                f"{left.path}, {right.path}: the stamps of {alone[0]} pictures have no partner; both "
+                f"{left.path}, {right.path}: the stamps of {alone[0]} images have no partner; both "
                 "are paired by number: is that what they show?"
             )
             return None
         if any(alone):
             self.oddities.append(
-                f"{left.path}, {right.path}: {alone[0]} and {alone[1]} pictures have no partner at "
+                f"{left.path}, {right.path}: {alone[0]} and {alone[1]} images have no partner at "
                 "their time, and are left out; were they lost while recording?"
             )
         return found
 
     def _compare_lengths(self) -> None:
-        """Note what it means that pictures are paired by number, and one eye has more of them."""
+        """Note what it means that images are paired by number, and one eye has more of them."""
         left, right = self.left, self.right
         if right is None or not self.by_number or left.count == right.count:
             return
-        said = f"{right.path} has {right.count} pictures, {left.path} {left.count}"
+        said = f"{right.path} has {right.count} images, {left.path} {left.count}"
         if right.count > left.count:
             self.oddities.append(
                 f"{said}; were both begun at the same moment? What the left one has is played"
@@ -165,7 +165,7 @@ class VideoPairs(Pairs):
         if apart <= NEAR * period:
             return None
         by_time = left.count != right.count and abs(right.stamps[-1] - left.stamps[-1]) <= period
-        how, fits = "number", "took each picture together: then one rate is wrong"
+        how, fits = "number", "took each image together: then one rate is wrong"
         if by_time:
             how, fits = "time", "ended at one moment"
         self.oddities.append(
@@ -186,13 +186,13 @@ class VideoPairs(Pairs):
 
 
 class OneVideoPairs(Pairs):
-    """One video of both eyes: in halves or boxes of a picture, in alternating rows or pictures.
+    """One video of both eyes: in halves or boxes of an image, in alternating rows or images.
 
     Attributes:
-        size: width and height of an eye's picture, px.
+        size: width and height of an eye's image, px.
 
     Raises:
-        UsageError: its pictures cannot be split as asked.
+        UsageError: its images cannot be split as asked.
     """
 
     def __init__(self, video: Video, layout: Layout) -> None:
@@ -247,8 +247,8 @@ def _oddities(video: Video, layout: Layout) -> list[str]:
 
 
 def _turns(video: Video) -> I64:
-    """The turn of each picture [N] if the eyes come in turn; even: the first eye. The time between two
-    pictures tells how many were lost, so that a lost picture does not swap the eyes."""
+    """The turn of each image [N] if the eyes come in turn; even: the first eye. The time between two
+    images tells how many were lost, so that a lost image does not swap the eyes."""
     turns = np.arange(video.count)
     if video.stamps is not None and video.rate is not None:
         steps = np.maximum(1, np.rint(np.diff(video.stamps) * (video.rate * 1e-9))).astype(np.int64)

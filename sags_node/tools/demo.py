@@ -92,7 +92,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
 
 
 class Shown:
-    """What a display showed: the camera's picture, and what the overlay drew over it. For a missed
+    """What a display showed: the camera's image, and what the overlay drew over it. For a missed
     frame, what was there before."""
 
     def __init__(self, file: VideoFile, layers: Mapping[int, Layer]) -> None:

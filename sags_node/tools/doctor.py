@@ -98,7 +98,7 @@ def as_rows(looks: Iterable[Look]) -> list[dict[str, str]]:
 
 
 def _launched(config: LaunchConfig) -> list[Look]:
-    """Check what the launch file names: pictures, calibration, the robot, networks."""
+    """Check what the launch file names: images, calibration, the robot, networks."""
     source, robot, vision = config.source, config.robot, config.vision
     looks: list[Look] = []
     if isinstance(source, RecordedSource) and not isinstance(source, PhantomSource):
@@ -153,7 +153,7 @@ def _tried(look: Callable[[], object], found: str) -> Finding:
 
 
 def _check_rig(config: LaunchConfig) -> None:
-    """Read the calibration. Where the size of a camera's pictures is known without it, compare it.
+    """Read the calibration. Where the size of a camera's images is known without it, compare it.
 
     Raises:
         SagsError: it cannot be used.
@@ -163,7 +163,7 @@ def _check_rig(config: LaunchConfig) -> None:
         size = Layout(source.geometry).size(source.width, source.height, source.left)
         if size != (rig.left.width, rig.left.height):
             raise UsageError(
-                f"{config.rig} is for {size_text(rig.left.width, rig.left.height)} px, an eye's pictures are "
+                f"{config.rig} is for {size_text(rig.left.width, rig.left.height)} px, an eye's images are "
                 f"{size_text(*size)}; set source.width, source.height or source.geometry, or calibrate anew"
             )
 

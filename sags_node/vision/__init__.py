@@ -1,4 +1,4 @@
-"""What is seen in a picture: rectification, masks, depth, flow, and what is wrong with it.
+"""What is seen in an image: rectification, masks, depth, flow, and what is wrong with it.
 
 Imports config, kernels and rig.
 """

@@ -31,8 +31,8 @@ def correlate(left: F32, seen: F32, agreement: F32) -> None:
     """Compute the zero-mean normalised cross-correlation (ZNCC) of the windows around each pixel.
 
     Args:
-        left: rows of the left picture with its border.
-        seen: [h, w] the right picture, warped by the matches to these rows; at least 16 px wide.
+        left: rows of the left image with its border.
+        seen: [h, w] the right image, warped by the matches to these rows; at least 16 px wide.
         agreement: [h, w] result, -1..1.
     """
     height, width = seen.shape
@@ -73,7 +73,7 @@ def drop_wrong(agreement: F32, disparity: F32, good: F32, smallest: Any, largest
 
     It is also 0 for impossible disparities (px), where less than half of the patches are good, and where a
     nearer surface is matched to the right eye's pixel. The last stands in for a left-right check, since only
-    the left picture is matched.
+    the left image is matched.
     """
     height, width = disparity.shape
     nearest = np.empty(width, np.float32)  # by right column

@@ -24,13 +24,13 @@ BACK_AT = 0.8  # of the limits: a warning ends below it
 class Alignment:
     """How well rows agree, over the last fields; px of the working size."""
 
-    median: float  # how far below its row in the left picture a point lies in the right one
+    median: float  # how far below its row in the left image a point lies in the right one
     spread: float  # of that, between the tenth and the ninetieth percentile; 0 while too little is matched
     warning: str  # empty: they agree
 
 
 class RowErrors(NamedTuple):
-    """Row errors of one frame, sampled evenly over its picture."""
+    """Row errors of one frame, sampled evenly over its image."""
 
     errors: F32  # [h, w] px of the working size
     matched: Bool  # [h, w]
@@ -57,7 +57,7 @@ class RowMonitor:
         """Take the field [h, w] of one frame.
 
         Args:
-            row_error: px of a picture that is `width` px wide.
+            row_error: px of an image that is `width` px wide.
             known: where it matched.
         """
         step = -(-row_error.shape[1] // SAMPLES)

@@ -14,13 +14,13 @@ BLOCK = SIDE >> HALVINGS  # shrunk px
 LARGEST_DIFFERENCE = 1.0  # grey levels, mean over a block
 LARGEST_SHARE = 0.005  # of the blocks may differ more: a highlight flickers
 EVERY = 4  # px between the pixels that `is_repeat` compares
-# Largest RMS difference of a picture sent twice, grey levels. Over all: below a codec's noise (PSNR > 52 dB).
+# Largest RMS difference of an image sent twice, grey levels. Over all: below a codec's noise (PSNR > 52 dB).
 # In each block: below that of a shift by half a pixel (median 3 to 5). D4D's repeat has 1.5.
 REPEAT_RMS, REPEAT_BLOCK_RMS = 0.6, 2.0
 
 
 class StillScene:
-    """Compares pictures with those of the last frame in which something moved, not with the frame before:
+    """Compares images with those of the last frame in which something moved, not with the frame before:
     slow motion adds up and is seen."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class StillScene:
         self._eyes = None
 
     def __call__(self, pair: RectifiedPair) -> int:
-        """Return for how many frames in a row, this one included, pictures and pose have stayed the same;
+        """Return for how many frames in a row, this one included, images and pose have stayed the same;
         0: something moved."""
         eyes = [level(eye, min(HALVINGS, len(eye.halves))) for eye in pyramids(pair) if eye is not None]
         before, pose = self._eyes, pair.camera.T_world_cam
@@ -51,7 +51,7 @@ def _alike(a: F32, b: F32) -> bool:
 
 @kernel
 def _share_that_differs(a: F32, b: F32) -> Any:
-    """The share of blocks in which two pictures (with borders) differ."""
+    """The share of blocks in which two images (with borders) differ."""
     height, width = a.shape[0] - 2 * BORDER, a.shape[1] - 2 * BORDER
     rows, columns = max(1, height // BLOCK), max(1, width // BLOCK)  # the last ones take the rest
     sums, counts = np.zeros((rows, columns), np.float32), np.zeros((rows, columns), np.float32)
@@ -65,8 +65,8 @@ def _share_that_differs(a: F32, b: F32) -> Any:
 
 
 def is_repeat(a: RectifiedPair, b: RectifiedPair) -> bool:
-    """Tell whether two pairs show the same pictures, one pair sent twice. Unlike in a `StillScene`, nothing
-    is averaged before, for a camera's noise tells its pictures apart; and no block may differ, for something
+    """Tell whether two pairs show the same images, one pair sent twice. Unlike in a `StillScene`, nothing
+    is averaged before, for a camera's noise tells its images apart; and no block may differ, for something
     small may have moved."""
     return all(
         _are_same(x.full, y.full)
@@ -82,7 +82,7 @@ def _are_same(a: U8, b: U8) -> bool:
 
 @kernel
 def _mean_squares(a: U8, b: U8) -> Any:
-    """The mean squared difference over every fourth pixel of every fourth row: of the whole picture, and the
+    """The mean squared difference over every fourth pixel of every fourth row: of the whole image, and the
     largest of a block."""
     height, width = a.shape
     rows, columns = max(1, height // SIDE), max(1, width // SIDE)  # the last ones take the rest

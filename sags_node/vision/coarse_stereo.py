@@ -1,5 +1,5 @@
-"""A dense guess of the disparity in a small picture, by semi-global matching (Hirschmueller, PAMI 2008) along
-rows and columns: right to a pixel or so of the small picture, and smooth where there is no texture."""
+"""A dense guess of the disparity in a small image, by semi-global matching (Hirschmueller, PAMI 2008) along
+rows and columns: right to a pixel or so of the small image, and smooth where there is no texture."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ FAR = np.float32(1e9)  # no disparity costs so much
 
 
 def coarse_disparity(left: F32, right: F32, least: float, most: float) -> F32:
-    """Estimate the disparity [h, w] (px) between small pictures, given with their borders.
+    """Estimate the disparity [h, w] (px) between small images, given with their borders.
 
     Args:
         least, most: disparities to search, px.
@@ -57,7 +57,7 @@ def coarse_disparity(left: F32, right: F32, least: float, most: float) -> F32:
 def _differences(left: F32, right: F32, first: int, cost: F32) -> None:
     """cost[y, x, d] = |left[y, x] - right[y, x - first - d]|. Beyond its edge the right one is repeated."""
     height, width, count = cost.shape
-    turned = np.empty(width + first + count, np.float32)  # a row of the right picture from right to left
+    turned = np.empty(width + first + count, np.float32)  # a row of the right image from right to left
     for y in range(height):
         for x in range(width):
             turned[x] = right[y, width - 1 - x]
@@ -70,7 +70,7 @@ def _differences(left: F32, right: F32, first: int, cost: F32) -> None:
 
 @kernel
 def _sum_windows(cost: F32, sums: F32) -> None:
-    """Sums over windows of pixels; the pictures' edges are repeated. `cost` is overwritten."""
+    """Sums over windows of pixels; the images' edges are repeated. `cost` is overwritten."""
     height, width, count = cost.shape
     _sum_along(cost, width, count, height, width * count, sums)
     _sum_along(sums, height, width * count, width, count, cost)

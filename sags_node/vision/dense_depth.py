@@ -1,7 +1,7 @@
-"""From matches to the depth of every pixel of the working picture.
+"""From matches to the depth of every pixel of the working image.
 
 Each thread takes a band of rows, with as many around it as its windows need, through all stages: to pass
-whole pictures from stage to stage would take longer than to compute them. The result is the same for any
+whole images from stage to stage would take longer than to compute them. The result is the same for any
 number of threads.
 """
 
@@ -38,11 +38,11 @@ def depth_of_patches(
     """Compute depth (m, 0 unknown) and confidence [H, W] (0..1, 0 where the depth is unknown).
 
     Args:
-        clear: [h, w] pixels of the matching picture for which depth is wanted.
-        size: width and height of the result, px; a multiple of the matching picture's, plus a remainder.
+        clear: [h, w] pixels of the matching image for which depth is wanted.
+        size: width and height of the result, px; a multiple of the matching image's, plus a remainder.
         disparities: the smallest and the largest that are possible, px.
         radius: px, of the smoothing.
-        focal_baseline: px m, of the matching picture.
+        focal_baseline: px m, of the matching image.
     """
     depth, trust = np.empty((2, size[1], size[0]), np.float32)
     rows = len(clear)
@@ -62,11 +62,11 @@ def depth_of_pixels(
     disparities: tuple[float, float],
     focal_baseline: float,
 ) -> tuple[F32, F32]:
-    """Do the same from a disparity at every pixel of the matching picture [h, w] where it is `known`.
+    """Do the same from a disparity at every pixel of the matching image [h, w] where it is `known`.
 
     Args:
-        left: the matching picture with its border.
-        seen: [h, w] the right picture, warped by the disparity to the left one.
+        left: the matching image with its border.
+        seen: [h, w] the right image, warped by the disparity to the left one.
     """
     depth, trust = np.empty((2, size[1], size[0]), np.float32)
     limits = np.array([*disparities, focal_baseline], np.float32)
@@ -113,7 +113,7 @@ def _band(
 
 @kernel
 def _fetch(right: F32, disparity: F32, down: F32, begin: int, seen: F32) -> None:
-    """The right picture, warped by the matches to the left one, from row `begin` on."""
+    """The right image, warped by the matches to the left one, from row `begin` on."""
     one, border = np.float32(1), np.float32(BORDER)
     last_x, last_y = np.float32(right.shape[1] - 1) - EDGE, np.float32(right.shape[0] - 1) - EDGE
     for y in range(disparity.shape[0]):
@@ -132,7 +132,7 @@ def _finish(
     left: F32, seen: F32, disparity: F32, good: F32, clear: Bool, limits: F32,
     begin: int, low: int, high: int, depth: F32, trust: F32,
 ) -> None:  # fmt: skip
-    """Depth and trust of rows `low` to `high` of the matching picture; inputs begin at row `begin`."""
+    """Depth and trust of rows `low` to `high` of the matching image; inputs begin at row `begin`."""
     believed, found = np.empty((2, *disparity.shape), np.float32)
     correlate(left, seen, found)
     drop_wrong(found, disparity, good, limits[0], limits[1], believed)

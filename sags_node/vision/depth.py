@@ -57,7 +57,7 @@ class DepthChoice:
         stereo: matches the eyes, and judges a network's disparities.
 
     Raises:
-        UsageError: the pictures cannot be matched, or the network cannot be used.
+        UsageError: the images cannot be matched, or the network cannot be used.
     """
 
     def __init__(self, config: VisionConfig, rectifier: Rectifier) -> None:

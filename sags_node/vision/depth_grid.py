@@ -29,10 +29,10 @@ from sags_node.kernels.vectors import (
 )
 from sags_node.types import F32, Bool, DepthGrid, Observation
 
-CELLS = 80  # across the picture
+CELLS = 80  # across the image
 AROUND = 4  # cells to each side of one that are looked at
 EVERY = 2  # px between the pixels that are read; depth is matched no finer
-WIDTH = 640  # px: the errors below are those of a picture so wide
+WIDTH = 640  # px: the errors below are those of an image so wide
 FLOOR = 0.25  # px of disparity: calibration error (principal points, rows, lenses), which no match shows
 UNSUPPORTED = 1.0  # px: error of a match with which no neighbour agrees
 ROUGHNESS = 3.5  # times how far cells lie from the mean of their neighbours: nine of ten errors are smaller
@@ -63,7 +63,7 @@ def depth_grid(depth: F32, confidence: F32, tissue: Bool, focal: float, baseline
         )
     px = np.float32(width / WIDTH / (focal * (baseline or NOMINAL_BASELINE)))  # 1/m of one px of disparity
     line = -(-columns // LANES) * LANES + 2 * AROUND
-    sums = np.zeros((3, rows + 2 * AROUND, line), np.float32)  # nothing beyond the picture's edges
+    sums = np.zeros((3, rows + 2 * AROUND, line), np.float32)  # nothing beyond the image's edges
     _gather(depth, confidence, tissue, side, columns, sums)
     around = np.zeros((4, *sums.shape[1:]), np.float32)
     aside = side / focal  # width of a cell at a distance of 1

@@ -1,4 +1,4 @@
-"""Optical flow between consecutive pictures."""
+"""Optical flow between consecutive images."""
 
 import numpy as np
 
@@ -7,22 +7,22 @@ from sags_node.vision import inverse_search
 from sags_node.vision.pyramid import inner
 
 STEPS = 4  # of a patch's search, at most
-COARSE_STRIDE = 4  # px between patches in all but the largest picture
+COARSE_STRIDE = 4  # px between patches in all but the largest image
 
 
 class OpticalFlow:
-    """Inverse search from small pictures up to those of half the size. There is no refinement: callers
+    """Inverse search from small images up to those of half the size. There is no refinement: callers
     average over many places anyway. Making one costs nothing."""
 
     def __init__(self, stride: int) -> None:
-        """`stride`: px between patches in the pictures of half the size, at most 8."""
+        """`stride`: px between patches in the images of half the size, at most 8."""
         self._stride = stride
 
     def __call__(self, before: GrayPyramid, after: GrayPyramid, guess: F32 | None = None) -> F32:
-        """Estimate the flow [H // 2, W // 2, 2], in px of the whole pictures, from `before` to `after`.
+        """Estimate the flow [H // 2, W // 2, 2], in px of the whole images, from `before` to `after`.
 
         Args:
-            guess: [rows, columns, 2] px, motion in square cells over the picture, from which to search;
+            guess: [rows, columns, 2] px, motion in square cells over the image, from which to search;
                 None: no motion.
         """
         guess = np.zeros((1, 1, 2), np.float32) if guess is None else guess

@@ -1,10 +1,10 @@
 """Inverse search (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016): where patches
-of one picture lie in another.
+of one image lie in another.
 
-Patches of 8x8 px stand `stride` px apart; the last ones of a row or column end at the picture's edge. Each is
+Patches of 8x8 px stand `stride` px apart; the last ones of a row or column end at the image's edge. Each is
 moved by Gauss-Newton steps that use its own gradient (Baker and Matthews, IJCV 2004), so that everything but
 the differences is computed once. Brightness may differ by a constant from patch to patch. Good places spread:
-a patch first tries those of its neighbours. The pictures have borders, see `pyramid`.
+a patch first tries those of its neighbours. The images have borders, see `pyramid`.
 """
 
 from typing import Any
@@ -42,7 +42,7 @@ CHANNELS = 4  # of a pixel while patches are spread over it: the weights' sum, a
 
 
 def grid_shape(picture: F32, stride: int) -> tuple[int, int]:
-    """Return the rows and columns of patches in a picture with its border, at least as large as a patch."""
+    """Return the rows and columns of patches in an image with its border, at least as large as a patch."""
     rows, columns = (-(-(side - 2 * BORDER - PATCH) // stride) + 1 for side in picture.shape)
     return rows, columns
 
@@ -61,8 +61,8 @@ def start(picture: F32, stride: int, coarse: F32, coarse_stride: float, corner: 
     """Interpolate a field to search from out of a coarser one.
 
     Args:
-        picture: the one whose patches are to be searched.
-        coarse: [r, c, channels] px, of a picture `scale` times smaller; its samples stand `coarse_stride` px
+        image: the one whose patches are to be searched.
+        coarse: [r, c, channels] px, of an image `scale` times smaller; its samples stand `coarse_stride` px
             apart, the first one at pixel (corner, corner).
 
     Returns:
@@ -245,7 +245,7 @@ def _place(picture: F32, x: Any, y: Any) -> Any:
 
 @inlined
 def _between_pixels(picture: F32, at: int, line: int, w00: Any, w01: Any, w10: Any, w11: Any) -> Any:
-    """A block of a picture, each pixel interpolated from four by their weights."""
+    """A block of an image, each pixel interpolated from four by their weights."""
     return (
         w00 * load_block(picture, at, line)
         + w01 * load_block(picture, at + 1, line)
@@ -256,7 +256,7 @@ def _between_pixels(picture: F32, at: int, line: int, w00: Any, w01: Any, w10: A
 
 @inlined
 def _difference(S: F32, picture: F32, x: Any, y: Any) -> Any:
-    """Sum of squared differences, less their mean, between the patch in `S` and the 8x8 px of a picture from
+    """Sum of squared differences, less their mean, between the patch in `S` and the 8x8 px of an image from
     (x, y) on, counted from its border's corner."""
     at, w00, w01, w10, w11 = _place(picture, x, y)
     line = picture.shape[1]

@@ -1,4 +1,4 @@
-"""Features of a picture that are recognised in another one, however far they moved.
+"""Features of an image that are recognised in another one, however far they moved.
 
 Oriented binary features (Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011), matched
 where the best is clearly better than the second (Lowe, IJCV 2004). Landmarks are features of tissue that are
@@ -15,8 +15,8 @@ from sags_node.types import F32, I64, U8, Bool, GrayPyramid
 from sags_node.vision.pyramid import inner
 
 RATIO = 0.8  # of the distance to the second best match
-WIDTH = 360  # px, at most, of the picture in which they are looked for
-COUNT = 600  # features of a picture
+WIDTH = 360  # px, at most, of the image in which they are looked for
+COUNT = 600  # features of an image
 FAST_THRESHOLD = 5  # grey levels: tissue is smooth, and smoke takes contrast away
 LARGEST_TURN = 40.0  # degrees by which a match may turn
 FARTHEST = 0.3  # of the width, which a match may move
@@ -25,28 +25,28 @@ APART = 0.03  # of the width, by which it may differ from that motion
 # Of 600: the same tissue after up to two seconds of pulling, veiled, or covered by six tenths, has 12 to 390
 # such matches; other tissue, and the same turned or mirrored, up to 3.
 FEWEST = 8
-CELLS = 16  # across the picture, of a field of motion
+CELLS = 16  # across the image, of a field of motion
 NEAREST = 4  # matches that tell the motion of a cell
 
 
 class Features(NamedTuple):
-    """What can be recognised in a picture."""
+    """What can be recognised in an image."""
 
     places: F32  # [F, 2] px
     angles: F32  # [F] degrees
     codes: U8  # [F, 32] ORB
-    width: int  # px of the whole picture
+    width: int  # px of the whole image
 
 
 class Landmarks(NamedTuple):
-    """Places in two pictures."""
+    """Places in two images."""
 
-    before: F32  # [K, 2] px of the whole picture
+    before: F32  # [K, 2] px of the whole image
     after: F32  # [K, 2]
 
 
 def features_in(gray: U8, where: Bool | None, count: int, fast_threshold: int) -> Features:
-    """Find at most `count` features of a picture [H, W], where `where` [H, W] is True (None: everywhere).
+    """Find at most `count` features of an image [H, W], where `where` [H, W] is True (None: everywhere).
 
     Args:
         fast_threshold: grey levels by which a corner differs from what surrounds it.
@@ -60,7 +60,7 @@ def features_in(gray: U8, where: Bool | None, count: int, fast_threshold: int) -
 
 
 def matched(before: Features, after: Features) -> tuple[I64, I64]:
-    """Return the rows [K] in both pictures' features of the pairs that clearly look alike."""
+    """Return the rows [K] in both images' features of the pairs that clearly look alike."""
     none = np.zeros(0, np.int64)
     if min(len(before.codes), len(after.codes)) < 2:
         return none, none
@@ -71,7 +71,7 @@ def matched(before: Features, after: Features) -> tuple[I64, I64]:
 
 
 def features_of(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
-    """Find features of a picture, px of the whole one, where `tissue` [H, W] is True (None: everywhere)."""
+    """Find features of an image, px of the whole one, where `tissue` [H, W] is True (None: everywhere)."""
     halves = [inner(half) for half in pyramid.halves]
     small = next((half for half in halves if half.shape[1] <= WIDTH), halves[-1]).astype(np.uint8)
     width = pyramid.full.shape[1]
@@ -86,10 +86,10 @@ def features_of(pyramid: GrayPyramid, tissue: Bool | None = None) -> Features:
 
 
 def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmarks | None:
-    """Find landmarks of the earlier picture in the later one; None: so few that it may be another scene.
+    """Find landmarks of the earlier image in the later one; None: so few that it may be another scene.
 
     Args:
-        tissue: [H, W] of the earlier picture.
+        tissue: [H, W] of the earlier image.
     """
     first, second = features_of(before, tissue), features_of(after)
     if min(len(first.places), len(second.places)) < FEWEST:
@@ -107,7 +107,7 @@ def find_again(before: GrayPyramid, after: GrayPyramid, tissue: Bool) -> Landmar
 
 def motion(start: F32, end: F32, width: int, height: int) -> F32:
     """Return the motion from places [K, 2] to others [K, 2] as a field [rows, CELLS, 2] (px) of square cells
-    over a picture: in each cell the mean of the nearest motions, weighted by nearness."""
+    over an image: in each cell the mean of the nearest motions, weighted by nearness."""
     side = width / CELLS
     columns, rows = (
         np.arange(count) * side + (side - 1) / 2 for count in (CELLS, max(1, round(height / side)))

@@ -9,7 +9,7 @@ EDGE_MARGIN = 20 / 640  # of the width: depths and flow smear that far across an
 
 
 def clear_of_instruments(tissue: Bool, halvings: int) -> Bool:
-    """Find the pixels of a picture after so many halvings at and around which a mask [H, W] is all tissue."""
+    """Find the pixels of an image after so many halvings at and around which a mask [H, W] is all tissue."""
     height, width = (side >> halvings for side in tissue.shape)
     step = 1 << halvings
     small = np.ascontiguousarray(tissue[: height * step : step, : width * step : step])

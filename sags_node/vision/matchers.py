@@ -1,4 +1,4 @@
-"""Stereo matching of rectified gray pictures, at one level of their pyramids (`pyramid`)."""
+"""Stereo matching of rectified gray images, at one level of their pyramids (`pyramid`)."""
 
 from typing import NamedTuple
 
@@ -11,11 +11,11 @@ from sags_node.vision.inverse_search import CENTRE, search, start
 from sags_node.vision.pyramid import level
 
 PATCH_STRIDE = 4  # px between patches of 8 px
-COARSE_STRIDE = 4  # px between them in pictures smaller than the last
+COARSE_STRIDE = 4  # px between them in images smaller than the last
 SEARCH_STEPS = 3  # of a patch's search, at most
 WINDOW = 5  # patches: the window over which row errors are averaged and median disparities taken
-SMALL_WIDTH = 320  # px: a smaller whole picture is searched at half of its size, because of its noise
-GUESS_WIDTH = 120  # px, largest width of the picture in which a guess is made
+SMALL_WIDTH = 320  # px: a smaller whole image is searched at half of its size, because of its noise
+GUESS_WIDTH = 120  # px, largest width of the image in which a guess is made
 LARGEST_ROW_ERROR = 2.0  # px
 LARGEST_ROW_STEP = 0.35  # px from the mean row error around
 LARGEST_STEP = 1.5  # px from the median disparity around: a wrong match stands alone
@@ -24,9 +24,9 @@ TETHER = 0.7  # of the texture along rows: how firmly a patch is held to that me
 
 
 class Patches(NamedTuple):
-    """Where patches of the left picture lie in the right one; see `inverse_search`."""
+    """Where patches of the left image lie in the right one; see `inverse_search`."""
 
-    left: F32  # the pictures they were searched in, with their borders
+    left: F32  # the images they were searched in, with their borders
     right: F32
     stride: int  # px from patch to patch
     field: F32  # [rows, columns, 2] px to the right, which is minus the disparity, and down, the row error
@@ -36,15 +36,15 @@ class Patches(NamedTuple):
 def match_patches(
     left: GrayPyramid, right: GrayPyramid, disparities: tuple[float, float], halvings: int
 ) -> Patches:
-    """Match patches by inverse search, from a guess in a small picture up to the one wanted.
+    """Match patches by inverse search, from a guess in a small image up to the one wanted.
 
     On the smooth surface of organs it is more accurate than semi-global matching in less time, but it only
     refines a guess that is right to a few pixels. The guess is made afresh for every frame: it costs little,
     and there is no memory that could lock in an error.
 
     Args:
-        disparities: the smallest and the largest to search, px of the matching picture.
-        halvings: of the matching picture.
+        disparities: the smallest and the largest to search, px of the matching image.
+        halvings: of the matching image.
     """
     finest = halvings
     if finest == 0 and left.full.shape[1] < SMALL_WIDTH and left.halves:
@@ -61,7 +61,7 @@ def match_patches(
 def _find(
     left: GrayPyramid, right: GrayPyramid, disparities: tuple[float, float], halvings: int, finest: int
 ) -> tuple[F32, Bool]:
-    """The field and `good` of the patches of the picture after `finest` halvings."""
+    """The field and `good` of the patches of the image after `finest` halvings."""
     top = finest
     while top < len(left.halves) and left.full.shape[1] >> top > GUESS_WIDTH:
         top += 1
@@ -76,7 +76,7 @@ def _find(
         for _ in range(2):  # the second time places spread from the right and from below
             field = search(*pictures, COARSE_STRIDE, field, SEARCH_STEPS)
         stride, corner = COARSE_STRIDE, CENTRE
-    # Calibrations are off by a row or so, smoothly over the picture. A wrong match jumps to another row.
+    # Calibrations are off by a row or so, smoothly over the image. A wrong match jumps to another row.
     scale = 2 if k > finest else 1
     limit = LARGEST_ROW_ERROR / scale
     rows = cv2.blur(np.clip(field[..., 1], -limit, limit), (WINDOW, WINDOW))

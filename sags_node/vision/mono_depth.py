@@ -1,4 +1,4 @@
-"""Metric depth from a monocular network: each picture's relative inverse depth is fitted to known depth.
+"""Metric depth from a monocular network: each image's relative inverse depth is fitted to known depth.
 
 Such a network's inverse depth is right up to scale and shift.
 """
@@ -49,7 +49,7 @@ class MonoDepth:
     0.07 % nearer: that would add up.
 
     Args:
-        declared_depth: m, median of the first picture, for one camera alone.
+        declared_depth: m, median of the first image, for one camera alone.
         config: depth outside its range is taken for unknown.
 
     Attributes:
@@ -114,12 +114,12 @@ class MonoDepth:
         if self._declared is None:
             raise UsageError(
                 "one camera alone does not tell how far things are; set vision.onnx.declared_depth to the "
-                "distance to the middle of the first picture, m (docs/networks.md, 'One eye')"
+                "distance to the middle of the first image, m (docs/networks.md, 'One eye')"
             )
         values = relative[tissue & np.isfinite(relative)]
         middle = float(np.median(values)) if values.size else 0.0
         if middle <= 0:
-            raise DepthNetworkError("the network says nothing of the first picture's depth")
+            raise DepthNetworkError("the network says nothing of the first image's depth")
         self.is_declared = True
         return ScaleShift(1 / (self._declared * middle), 0.0, DECLARED_ERROR)
 
@@ -128,7 +128,7 @@ def fit_scale_shift(relative: F32, depth: F32, usable: Bool) -> ScaleShift | Non
     """Fit a robust line from relative inverse depth to 1 / depth; None: too few samples, or no rising line.
 
     It starts at the least median of squares among lines through two samples (Rousseeuw, 1984), goes on by
-    trimmed steps and ends with all inliers. So nearly half of the picture may have moved, or be wrong,
+    trimmed steps and ends with all inliers. So nearly half of the image may have moved, or be wrong,
     without pulling at the line. A line by least squares would be a little too flat wherever `relative` is
     noisy; fitted frame to frame, its depth would be flat after some seconds.
 

@@ -1,7 +1,7 @@
-"""How near tissue can be: the end of the disparities that are worth searching, found from the pictures.
+"""How near tissue can be: the end of the disparities that are worth searching, found from the images.
 
 A wide search costs time and accuracy where nothing is near, a narrow one gives near tissue the depth of what
-lies behind it. So now and then a small picture is searched as far as a scope can come, and the limit follows
+lies behind it. So now and then a small image is searched as far as a scope can come, and the limit follows
 what is found there.
 """
 
@@ -23,9 +23,9 @@ RETREAT = 10  # looks in a row without anything near, after which the limit goes
 ROOM = 0.7  # of the nearest depth that was found: tissue moves between two looks
 LEAST_SHARE = 0.02  # of the tissue that both eyes see: fewer pixels may be wrong matches, or an instrument's
 BEYOND, BEYOND_SHARE = 0.004, 0.1  # m: tissue too near to match is sought down to here; its share
-SEARCHED = 96  # disparities at most: more cost too much, and are found in a smaller picture as well
-WINDOW = 9  # px of the small picture, over which correlation is taken
-MATCHES = 0.8  # correlation of two windows; 99 % stay below in pictures that do not belong together
+SEARCHED = 96  # disparities at most: more cost too much, and are found in a smaller image as well
+WINDOW = 9  # px of the small image, over which correlation is taken
+MATCHES = 0.8  # correlation of two windows; 99 % stay below in images that do not belong together
 PLAIN = 2.0  # grey levels, standard deviation in a window: less cannot be matched
 
 
@@ -41,8 +41,8 @@ class NearLimit:
     def __init__(self, config: StereoConfig, focal_baseline: float) -> None:
         """
         Args:
-            config: a `min_depth` that it sets stays, whatever the pictures show.
-            focal_baseline: px m, of the whole picture.
+            config: a `min_depth` that it sets stays, whatever the images show.
+            focal_baseline: px m, of the whole image.
         """
         self.limit = self._usual = config.nearest
         self.findings: tuple[Finding, ...] = ()
@@ -53,7 +53,7 @@ class NearLimit:
         self._found: deque[float] = deque(maxlen=RETREAT)
 
     def look(self, t_capture_ns: int, left: GrayPyramid, right: GrayPyramid, tissue: Bool) -> None:
-        """Take the pictures of one frame and its tissue [H, W]; most frames are skipped."""
+        """Take the images of one frame and its tissue [H, W]; most frames are skipped."""
         first = self._looked_ns is None
         if self._is_set and self.limit <= NEAREST:
             return
@@ -95,7 +95,7 @@ def nearest_tissue(
     """Return the depth (m) of the nearest `share` of the tissue [H, W] that both eyes see; infinite: unknown.
 
     Args:
-        focal_baseline: px m, of the whole picture.
+        focal_baseline: px m, of the whole image.
         end: m, nearer is not searched.
     """
     width, halvings, most = left.full.shape[1], 0, focal_baseline / end

@@ -1,4 +1,4 @@
-"""Pictures and depth -> what the mapper may know of one frame."""
+"""Images and depth -> what the mapper may know of one frame."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ def observe(pair: RectifiedPair, tissue: Bool, measured: Measured) -> Observatio
 
 
 def resized(observation: Observation, scale: float) -> Observation:
-    """Return the observation with pictures of `scale` times the size. Masks and depths are not interpolated:
+    """Return the observation with images of `scale` times the size. Masks and depths are not interpolated:
     a mean across an edge is a surface that does not exist."""
     if scale == 1:
         return observation

@@ -44,7 +44,7 @@ class DepthNetwork:
         processor: where it runs, "cuda" or "cpu".
 
     Args:
-        size: width and height of the pictures it will get, px.
+        size: width and height of the images it will get, px.
         focal_baseline: focal length times baseline at that size, px m: for a network that gives depth.
 
     Raises:
@@ -90,7 +90,7 @@ class DepthNetwork:
         return _resized(numbers, self._size)
 
     def _run(self, left: U8, right: U8 | None) -> F32:
-        """The output's first channel [h, w], a map of the padded picture or coarser."""
+        """The output's first channel [h, w], a map of the padded image or coarser."""
         pictures: dict[Eye, U8] = {"left": left} if right is None else {"left": left, "right": right}
         feeds = {
             one.name: one.tensor(pictures, fit, self._normalization, self._said.color == "bgr")

@@ -1,4 +1,4 @@
-"""A user's ONNX file: it is opened with limits, described, and fed with pictures; its maps are read.
+"""A user's ONNX file: it is opened with limits, described, and fed with images; its maps are read.
 
 A network's description stands in the file itself, in a YAML file beside it, and in the launch file. Of
 these the later one wins.
@@ -29,7 +29,7 @@ PICTURE_CHANNELS = (1, 3)
 PAIR_CHANNELS = (2, 6)  # both eyes in one tensor, left first
 CHANNELS = (*PICTURE_CHANNELS, *PAIR_CHANNELS)
 GRAY_WEIGHTS = (0.299, 0.587, 0.114)
-COARSENESS = (1, 2, 4, 8)  # picture px per px of an output
+COARSENESS = (1, 2, 4, 8)  # image px per px of an output
 PROVIDERS = {"cuda": "CUDAExecutionProvider", "cpu": "CPUExecutionProvider"}
 TYPES: dict[str, type[np.generic]] = {
     "tensor(float)": np.float32,
@@ -131,14 +131,14 @@ class OnnxSession:
     def _tensor(self, declared: Any) -> Tensor:
         if declared.type not in TYPES:
             raise UsageError(
-                f"{self.name}: input {declared.name} is {declared.type}; a picture is uint8 or float: export "
-                "the network with pictures as its only inputs"
+                f"{self.name}: input {declared.name} is {declared.type}; an image is uint8 or float: export "
+                "the network with images as its only inputs"
             )
         shape = tuple(side if isinstance(side, int) and side > 0 else None for side in declared.shape)
         if any(side is not None and side > LARGEST_SIDE for side in shape):
             raise UsageError(
                 f"{self.name}: input {declared.name} is {list(declared.shape)}, more than {LARGEST_SIDE} px; "
-                "export the network for smaller pictures"
+                "export the network for smaller images"
             )
         return Tensor(declared.name, shape, TYPES[declared.type])
 
@@ -202,7 +202,7 @@ def _validated(tree: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 class Fit(NamedTuple):
-    """How a picture is brought to a network's size."""
+    """How an image is brought to a network's size."""
 
     inner: Size  # it is resized to this
     outer: Size  # and padded at the right and below to this
@@ -213,15 +213,15 @@ class Input:
     """One input of a network."""
 
     name: str
-    eyes: tuple[Eye, ...]  # whose pictures, one after the other in its channels
-    channels: int  # of one picture
+    eyes: tuple[Eye, ...]  # whose images, one after the other in its channels
+    channels: int  # of one image
     channels_first: bool
     dtype: type[np.generic]
     width: int | None  # px; None: any
     height: int | None
 
     def fit(self, size: Size, multiple: int) -> Fit:
-        """Return how a picture fits: resized to a side that the network fixes, padded where it is open."""
+        """Return how an image fits: resized to a side that the network fixes, padded where it is open."""
         inner = self.width or size[0], self.height or size[1]
         outer = (
             self.width or -(-size[0] // multiple) * multiple,
@@ -232,7 +232,7 @@ class Input:
     def tensor(
         self, pictures: Mapping[Eye, U8], fit: Fit, normalization: Normalization, bgr: bool
     ) -> NDArray[Any]:
-        """Make the network's input [1, C, h, w] or [1, h, w, C] from pictures [H, W, 3] RGB."""
+        """Make the network's input [1, C, h, w] or [1, h, w, C] from images [H, W, 3] RGB."""
         values = np.concatenate(
             [self._channels(pictures[eye], fit, normalization, bgr) for eye in self.eyes], 2
         )
@@ -259,7 +259,7 @@ class Input:
 
 
 def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tuple[Input, ...]:
-    """Tell how a network takes its pictures: one input is one picture or both in its channels, two are a
+    """Tell how a network takes its images: one input is one image or both in its channels, two are a
     pair, four are a pair at a small and at the full size.
 
     Args:
@@ -271,7 +271,7 @@ def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tupl
     if len(tensors) not in (1, 2, 4):
         raise UsageError(
             f"{name} takes {len(tensors)} inputs ({', '.join(t.name for t in tensors)}); a depth network "
-            "takes one picture, a pair, or a pair at two sizes: export it with those alone"
+            "takes one image, a pair, or a pair at two sizes: export it with those alone"
         )
     tensors = _ordered(tensors, said, name)
     shapes = [_layout(tensor, said, name) for tensor in tensors]
@@ -283,7 +283,7 @@ def recognise(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> tupl
         one = channels // len(seen)
         if one not in PICTURE_CHANNELS:
             raise UsageError(
-                f"{name}: input {tensor.name} has {channels} channels; a picture has 1 or 3, a pair 2 or 6"
+                f"{name}: input {tensor.name} has {channels} channels; an image has 1 or 3, a pair 2 or 6"
             )
         height, width = tensor.shape[2:] if first else tensor.shape[1:3]
         if said.size is not None:
@@ -310,7 +310,7 @@ def _layout(tensor: Tensor, said: NetworkFormat, name: str) -> tuple[int, bool]:
     if len(shape) != 4 or shape[0] not in (1, None):
         text = "x".join("?" if side is None else str(side) for side in shape)
         raise UsageError(
-            f"{name}: input {tensor.name} is {text}; a picture is 1x3xHxW or 1xHxWx3 with batch size 1"
+            f"{name}: input {tensor.name} is {text}; an image is 1x3xHxW or 1xHxWx3 with batch size 1"
         )
     first = said.layout == "nchw" if said.layout else shape[1] in CHANNELS or shape[3] not in CHANNELS
     return (shape[1] if first else shape[3]) or 3, first
@@ -332,7 +332,7 @@ def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Seque
 
 
 def maps_of(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
-    """Return an output as maps [C, h, w] of the padded picture, full size or coarser; None: it is no map.
+    """Return an output as maps [C, h, w] of the padded image, full size or coarser; None: it is no map.
 
     Args:
         values: [1, C, h, w], [1, h, w, C], [C, h, w], [h, w, C] or [h, w].
@@ -355,7 +355,7 @@ def sizes_of_maps(fit: Fit) -> str:
 
 
 def unfit(plane: F32, fit: Fit) -> F32:
-    """Return a map of the padded picture without the padding, [h, w] at size `fit.inner`."""
+    """Return a map of the padded image without the padding, [h, w] at size `fit.inner`."""
     if plane.shape[::-1] != fit.outer:
         plane = cv2.resize(plane, fit.outer, interpolation=cv2.INTER_LINEAR)
     return plane[: fit.inner[1], : fit.inner[0]]

@@ -1,4 +1,4 @@
-"""Gray pyramids, made once a frame for all that compares pictures: stereo, optical flow, and the test whether
+"""Gray pyramids, made once a frame for all that compares images: stereo, optical flow, and the test whether
 anything moved. A half is a level of half the size of the one before."""
 
 from typing import Any
@@ -9,13 +9,13 @@ import numpy as np
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, U8, GrayPyramid, Observation, RectifiedPair
 
-BORDER = 16  # px around every half: so far outside the picture a patch may lie
+BORDER = 16  # px around every half: so far outside the image a patch may lie
 SMALLEST_SIDE = 16  # px of the last half: two patches of the inverse search
 NARROW = 60  # px, least width of the largest half in a `narrowed` pyramid
 
 
 def gray_pyramid(picture: U8) -> GrayPyramid:
-    """Make the gray pyramid of an RGB picture [H, W, 3] or a gray one [H, W]."""
+    """Make the gray pyramid of an RGB image [H, W, 3] or a gray one [H, W]."""
     gray: U8 = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) if picture.ndim == 3 else picture
     height, width = gray.shape
     halves: list[F32] = []
@@ -31,21 +31,21 @@ def gray_pyramid(picture: U8) -> GrayPyramid:
 
 
 def pyramids(pair: RectifiedPair) -> tuple[GrayPyramid, GrayPyramid | None]:
-    """Return the pyramids of the left and the right picture: those that came with the pair, else new ones."""
+    """Return the pyramids of the left and the right image: those that came with the pair, else new ones."""
     if pair.gray is not None:
         return pair.gray
     return gray_pyramid(pair.left), None if pair.right is None else gray_pyramid(pair.right)
 
 
 def pyramid_of(observation: Observation) -> GrayPyramid:
-    """Return the pyramid of an observation's gray picture: the one that came with it, or else a new one."""
+    """Return the pyramid of an observation's gray image: the one that came with it, or else a new one."""
     pyramid = observation.pyramid
-    made = pyramid is not None and pyramid.full is observation.gray  # another picture may have been put in
+    made = pyramid is not None and pyramid.full is observation.gray  # another image may have been put in
     return pyramid if pyramid is not None and made else gray_pyramid(observation.gray)
 
 
 def level_count(width: int, height: int) -> int:
-    """Return how many halves a picture of this size has: at least one."""
+    """Return how many halves an image of this size has: at least one."""
     count = 1
     while min(width, height) >> count >= 2 * SMALLEST_SIDE:
         count += 1
@@ -53,19 +53,19 @@ def level_count(width: int, height: int) -> int:
 
 
 def with_border(gray: U8) -> F32:
-    """Return the whole picture [H, W] in the form of a half, with a border."""
+    """Return the whole image [H, W] in the form of a half, with a border."""
     return np.asarray(
         cv2.copyMakeBorder(gray, BORDER, BORDER, BORDER, BORDER, cv2.BORDER_REPLICATE), np.float32
     )
 
 
 def level(pyramid: GrayPyramid, halvings: int) -> F32:
-    """Return the picture after so many halvings, with its border."""
+    """Return the image after so many halvings, with its border."""
     return pyramid.halves[halvings - 1] if halvings > 0 else with_border(pyramid.full)
 
 
 def inner(bordered: F32) -> F32:
-    """Return a view of a picture without its border."""
+    """Return a view of an image without its border."""
     return bordered[BORDER:-BORDER, BORDER:-BORDER]
 
 

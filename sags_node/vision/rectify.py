@@ -1,4 +1,4 @@
-"""Raw stereo pictures -> row-aligned, undistorted pictures at the working size."""
+"""Raw stereo images -> row-aligned, undistorted images at the working size."""
 
 import time
 from functools import cache
@@ -26,9 +26,9 @@ from sags_node.vision.pyramid import gray_pyramid
 
 
 class _EyeMap:
-    """Where each working pixel of one eye lies in its raw picture. The look-up maps are made once.
+    """Where each working pixel of one eye lies in its raw image. The look-up maps are made once.
 
-    A raw picture much larger than the working one is shrunk before the look-up, so that fine texture is
+    A raw image much larger than the working one is shrunk before the look-up, so that fine texture is
     averaged instead of aliased. An eye that is rectified already needs no look-up, only a new size.
     """
 
@@ -64,7 +64,7 @@ class _EyeMap:
 
 def _resize(picture: U8, size: tuple[int, int]) -> U8:
     """Resizes, by area averaging only where it is needed: for ratios up to 1.5 it costs five times as much
-    for the same picture, and for ratios that are not whole numbers eight times as much."""
+    for the same image, and for ratios that are not whole numbers eight times as much."""
     height, width = picture.shape[:2]
     if (width, height) == size:
         return picture
@@ -93,7 +93,7 @@ class Rectifier:
         camera: the left rectified camera at the working size, at the world's origin.
         baseline: metres.
         path: of the calibration.
-        raw_size: width and height of the pictures it takes, px.
+        raw_size: width and height of the images it takes, px.
     """
 
     def __init__(
@@ -110,17 +110,17 @@ class Rectifier:
         self._published = None if published in (None, self._size) else Rectifier(rig, *published)
 
     def pictures(self, frame: StereoFrame) -> RectifiedPictures:
-        """Rectify the pictures of one frame, and make its gray ones. Any thread may do it ahead.
+        """Rectify the images of one frame, and make its gray ones. Any thread may do it ahead.
 
         Raises:
-            UsageError, SagsError: the pictures do not have the calibration's size, or that of each other.
+            UsageError, SagsError: the images do not have the calibration's size, or that of each other.
         """
         started = time.perf_counter()
         height, width = frame.left.shape[:2]
         if wrong := wrong_size(self.path, self.raw_size, (width, height)):
             raise UsageError(f"{wrong.what}; {wrong.fix}")
         if frame.right is not None:
-            self._check(frame.right, "right picture")
+            self._check(frame.right, "right image")
         left = self._left.image(frame.left)
         right = None if frame.right is None else self._right.image(frame.right)
         gray = gray_pyramid(left), None if right is None else gray_pyramid(right)
@@ -133,7 +133,7 @@ class Rectifier:
             made: its `pictures`, where they are made already.
 
         Raises:
-            SagsError: the pictures do not have the calibration's size.
+            SagsError: the images do not have the calibration's size.
             UsageError: the pose holds NaN or infinity.
         """
         made = made or self.pictures(frame)
@@ -157,7 +157,7 @@ class Rectifier:
         )
 
     def later(self, frame: StereoFrame) -> Published:
-        """Return a frame whose pictures are rectified when they are asked for."""
+        """Return a frame whose images are rectified when they are asked for."""
 
         @cache
         def picture(side: str) -> U8:
@@ -168,22 +168,22 @@ class Rectifier:
         return Published(self.camera, picture)
 
     def mask(self, mask: Bool) -> Bool:
-        """Rectify a mask of the raw left picture at the working size; False outside the raw picture.
+        """Rectify a mask of the raw left image at the working size; False outside the raw image.
 
         Raises:
-            SagsError: the mask does not have the pictures' size.
+            SagsError: the mask does not have the images' size.
         """
         self._check(mask, "mask")
         return self._left.mask(mask)
 
     def depth(self, depth: F32) -> F32:
-        """Resize the depth of the left rectified picture to the working size. It is not interpolated: a mean
+        """Resize the depth of the left rectified image to the working size. It is not interpolated: a mean
         across an edge is a surface that does not exist.
 
         Raises:
-            SagsError: the depth picture does not have the pictures' size.
+            SagsError: the depth image does not have the images' size.
         """
-        self._check(depth, "depth picture")
+        self._check(depth, "depth image")
         resized: F32 = cv2.resize(depth, self._size, interpolation=cv2.INTER_NEAREST_EXACT)
         return resized
 
@@ -192,4 +192,4 @@ class Rectifier:
         if picture.shape[:2] != (height, width):
             size = f"{picture.shape[1]}x{picture.shape[0]}"
             fix = "all that belongs to a frame needs one size: fix the source"
-            raise SagsError(f"the {name} is {size} px, the left picture {width}x{height}; {fix}")
+            raise SagsError(f"the {name} is {size} px, the left image {width}x{height}; {fix}")

@@ -18,24 +18,24 @@ from sags_node.vision.near_limit import NearLimit
 from sags_node.vision.pyramid import inner, level, pyramids
 
 FULL_SIZE_BELOW = 480  # px width: matching at half of less costs half of the accuracy and saves little
-SMALLEST_SIDE = 32  # px of the matching picture: four patches of the inverse search
+SMALLEST_SIDE = 32  # px of the matching image: four patches of the inverse search
 WIDEST = 1 / 3  # of the largest depth: a wider baseline makes the eyes' views differ too much
-SMOOTHING_RADIUS = 1 / 100  # of the matching picture's width
+SMOOTHING_RADIUS = 1 / 100  # of the matching image's width
 
 
 class StereoDepth:
-    """Depth of the left rectified picture. All that is kept from frame to frame, and changes it, is how near
+    """Depth of the left rectified image. All that is kept from frame to frame, and changes it, is how near
     tissue can be (`NearLimit`).
 
     Matching runs at the working size divided by the scale. A match is trusted as far as its
-    neighbourhood agrees with the place in the right picture that it was matched to: the confidence is 0 at a
+    neighbourhood agrees with the place in the right image that it was matched to: the confidence is 0 at a
     zero-mean normalised cross-correlation (ZNCC) of 0.57 and below, where the depth is unknown, and 1 at 1.
 
     Args:
         path: of the calibration.
 
     Raises:
-        UsageError: the pictures are too small to match, or the eyes too far apart for the depth range.
+        UsageError: the images are too small to match, or the eyes too far apart for the depth range.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class StereoDepth:
 
     def judge(self, pair: RectifiedPair, disparity: F32, tissue: Bool) -> tuple[F32, F32]:
         """Return depth and confidence from a disparity [H, W] (px; NaN or <= 0: unknown) of a network. As
-        with matched depth, it is trusted as far as the pictures agree."""
+        with matched depth, it is trusted as far as the images agree."""
         left, right = pyramids(pair)
         assert right is not None  # there is no disparity without
         self._near.look(pair.t_capture_ns, left, right, tissue)
@@ -119,7 +119,7 @@ class StereoDepth:
         )
 
     def _disparities(self) -> tuple[float, float]:
-        """The smallest and the largest that are matched, px of the matching picture."""
+        """The smallest and the largest that are matched, px of the matching image."""
         return self._smallest, min(self._focal_baseline / self._near.limit, self._size[0] - 1.0)
 
 

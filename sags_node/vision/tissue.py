@@ -17,7 +17,7 @@ from sags_node.vision.tissue_topic import NearestMask, NoMaskError, TopicMasks
 
 log = logging.getLogger(__name__)
 
-LARGEST_INSTRUMENTS = 0.5  # of the usable picture
+LARGEST_INSTRUMENTS = 0.5  # of the usable image
 FIRST_FRAMES = 5  # if all of them have more, the mask is inverted
 
 
@@ -25,7 +25,7 @@ class TissueMask:
     """The tissue mask of every frame: the session's own, a network's, another process's, or found without.
 
     Attributes:
-        usable: [H, W], False where no frame shows tissue: in what is excluded, and outside the raw picture.
+        usable: [H, W], False where no frame shows tissue: in what is excluded, and outside the raw image.
         problem: why the newest frame's mask is not the network's or the other process's; empty: it is, or
             there is none.
 
@@ -33,7 +33,7 @@ class TissueMask:
         masks: those of another process, for method topic.
 
     Raises:
-        UsageError: an excluded box does not lie in the raw picture, the network cannot be used, or nothing
+        UsageError: an excluded box does not lie in the raw image, the network cannot be used, or nothing
             receives masks.
     """
 
@@ -64,7 +64,7 @@ class TissueMask:
                 mask.
 
         Raises:
-            UsageError: the masks of a recording's first frames call most of the picture instrument.
+            UsageError: the masks of a recording's first frames call most of the image instrument.
         """
         if self._config.method == "none":
             return self.usable
@@ -72,7 +72,7 @@ class TissueMask:
         if tissue is None:
             tissue = ~self._find_instruments(pair.left, expected, pair.t_capture_ns)
         self._found = tissue
-        # The picture's border counts as tissue here: only instruments grow.
+        # The image's border counts as tissue here: only instruments grow.
         eroded: U8 = cv2.erode(tissue.view(np.uint8), self._neighbourhood)
         return eroded.view(np.bool_) & self.usable
 
@@ -119,7 +119,7 @@ class TissueMask:
         whose = {"onnx": "network's", "topic": "topic's"}.get(self._config.method, "session's")
         if is_live:
             raise NoMaskError(
-                f"so far the {whose} masks call over half of each picture instrument: the scope is outside, "
+                f"so far the {whose} masks call over half of each image instrument: the scope is outside, "
                 f"or they are upside down: {hint}"
             )
         self._frames_checked += self._topic is None or self._topic.is_new
@@ -127,14 +127,14 @@ class TissueMask:
             if self._segment is None:
                 hint = "white must be instrument in its files; source.instruments turns EndoNeRF's round"
             raise UsageError(
-                f"the {whose} masks call over half of each of the first {FIRST_FRAMES} pictures instrument "
+                f"the {whose} masks call over half of each of the first {FIRST_FRAMES} images instrument "
                 f"({share:.0%} now): upside down? {hint}. If they are right, begin later (source.start), or "
                 "find instruments without them: vision.tissue.method:=classical"
             )
 
 
 def _outside(config: TissueConfig, raw_size: tuple[int, int]) -> Bool:
-    """True outside the excluded boxes, [H, W] of the raw picture."""
+    """True outside the excluded boxes, [H, W] of the raw image."""
     width, height = raw_size
     outside = np.ones((height, width), np.bool_)
     for x, y, box_width, box_height in config.exclude:
@@ -146,7 +146,7 @@ def _outside(config: TissueConfig, raw_size: tuple[int, int]) -> Bool:
         ):
             raise UsageError(
                 f"vision.tissue.exclude: box {[x, y, box_width, box_height]} (x, y, width, height) is not "
-                f"inside the raw picture of {width}x{height}"
+                f"inside the raw image of {width}x{height}"
             )
         outside[y : y + box_height, x : x + box_width] = False
     return outside

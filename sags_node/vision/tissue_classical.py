@@ -6,7 +6,7 @@ import numpy as np
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, U8, Bool, RenderedView
 
-WIDTH = 320  # px that a picture is shrunk to; all px below are of that
+WIDTH = 320  # px that an image is shrunk to; all px below are of that
 WINDOW = 3  # px: means against noise
 DARK = 12  # grey level below which colour says nothing: the black border, shafts in shadow
 DARK_RED = 0.3  # of R + G + B, by which red exceeds green: a cavity, no shaft
@@ -18,7 +18,7 @@ COARSE = 4  # px of a coarse pixel, from which means over that window are taken
 
 # How much each sign counts: from 1 on their sum means instrument. Rounded from a logistic regression on D4D,
 # which did as well on the phantom as one made there. A coarse disparity brought nothing beside them.
-PALENESS = 1.2  # of 1 - redness / the picture's median redness
+PALENESS = 1.2  # of 1 - redness / the image's median redness
 LEAST_PALENESS = -0.5
 GOLD = 6.0  # of (min(R, G) - B) / (R + G + B)
 LARGEST_GOLD = 0.2
@@ -40,9 +40,9 @@ class InstrumentFinder:
     """Finds instruments and black borders, frame by frame.
 
     Tissue is redder than metal and plastic under any white balance, so redness (R - G) / (R + G + B) is
-    compared with the picture's own median; gold is a yellow that fat does not reach. Where the model is
+    compared with the image's own median; gold is a yellow that fat does not reach. Where the model is
     drawn, what is less red than it is suspect too: what has just come, jaws that mirror tissue. Regions of
-    enough evidence that come in from the picture's edge are instruments; a pale patch inside is a highlight,
+    enough evidence that come in from the image's edge are instruments; a pale patch inside is a highlight,
     fat or gauze.
 
     What is instrument only because it differs from the model, or was one before, is let go after
@@ -57,12 +57,12 @@ class InstrumentFinder:
         self._stamp_ns = 0
 
     def __call__(self, image: U8, expected: RenderedView | None = None, stamp_ns: int = 0) -> Bool:
-        """Find the instruments [H, W] of a picture [H, W, 3].
+        """Find the instruments [H, W] of an image [H, W, 3].
 
         Args:
-            expected: the model as it was drawn last; None: the picture is judged alone, and what was found
+            expected: the model as it was drawn last; None: the image is judged alone, and what was found
                 before is forgotten.
-            stamp_ns: of the picture.
+            stamp_ns: of the image.
         """
         height, width = image.shape[:2]
         size = min(width, WIDTH), max(1, round(height * min(1.0, WIDTH / width)))
@@ -75,7 +75,7 @@ class InstrumentFinder:
             if self._found is None:
                 self._found, self._trusted = np.zeros(red.shape, np.bool_), np.ones(red.shape, np.bool_)
                 self._held, self._stamp_ns = np.zeros(red.shape, np.float32), stamp_ns
-            # Not averaged: the model's picture has no noise, and reading all of it takes long.
+            # Not averaged: the model's image has no noise, and reading all of it takes long.
             sampled = cv2.resize(expected.colours.small, size, interpolation=cv2.INTER_NEAREST)
             drawn_red, drawn_green, drawn_blue = cv2.split(_mean(sampled * np.float32(1 / 255), WINDOW))
             doubtful = _doubtful(
@@ -91,7 +91,7 @@ class InstrumentFinder:
 
 
 def _evidence(red: U8, green: U8, blue: U8) -> tuple[F32, F32]:
-    """Return the evidence [h, w] of the channels [h, w] of a shrunk picture alone; and 0 on highlights, 1
+    """Return the evidence [h, w] of the channels [h, w] of a shrunk image alone; and 0 on highlights, 1
     elsewhere [h, w].
 
     A highlight has the mean evidence around it.
@@ -178,7 +178,7 @@ def _count_doubt(found: Bool, evidence: F32, step: float, held: F32, trusted: Bo
 
 
 def _regions(evidence: F32) -> Bool:
-    """Regions of evidence of at least 1 that touch the picture's edge and reach `SURE` somewhere."""
+    """Regions of evidence of at least 1 that touch the image's edge and reach `SURE` somewhere."""
     solid = (evidence >= 1).view(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, _disc(OPENING))
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _disc(CLOSING))

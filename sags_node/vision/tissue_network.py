@@ -26,14 +26,14 @@ MULTIPLE = 32  # px, of sides that the network leaves open
 
 
 class TissueNetwork:
-    """Takes one picture, and gives scores of classes, one score, or class numbers, at its size or coarser.
+    """Takes one image, and gives scores of classes, one score, or class numbers, at its size or coarser.
 
     The highest of several scores is the class. Whole numbers are classes. One score is a probability while it
-    lies within 0 and 1, else a logit; where it is high is class 1. How pictures are fed is described as for
+    lies within 0 and 1, else a logit; where it is high is class 1. How images are fed is described as for
     depth networks, in the file's metadata or a .yaml beside it; the default is RGB as for ImageNet.
 
     Args:
-        size: width and height of the pictures it will get, px.
+        size: width and height of the images it will get, px.
 
     Raises:
         UsageError: the file is missing or no such network.
@@ -48,7 +48,7 @@ class TissueNetwork:
         self._said = read_format(as_onnx, self._session.metadata)
         inputs = recognise(self._session.inputs, self._said, self._session.name)
         if len(inputs) != 1 or inputs[0].eyes != ("left",):
-            raise UsageError(f"{self._session.name} takes several pictures; a mask is made of the left one")
+            raise UsageError(f"{self._session.name} takes several images; a mask is made of the left one")
         self._input = inputs[0]
         self._fit: Fit = self._input.fit(size, self._said.multiple or MULTIPLE)
         self._is_logit = False
@@ -58,7 +58,7 @@ class TissueNetwork:
             raise UsageError(f"vision.tissue.path: {error}") from None
 
     def __call__(self, image: U8) -> Bool:
-        """Return the tissue [H, W] of a picture [H, W, 3] RGB.
+        """Return the tissue [H, W] of an image [H, W, 3] RGB.
 
         Raises:
             DepthNetworkError: the network failed, or its answer is no mask.
@@ -76,7 +76,7 @@ class TissueNetwork:
         return share > 0.5
 
     def _classes(self, outputs: Mapping[str, NDArray[Any]]) -> NDArray[np.intp]:
-        """Class numbers [h, w] of the padded picture."""
+        """Class numbers [h, w] of the padded image."""
         for name, values in outputs.items():
             scores = maps_of(values, self._fit)
             if scores is None or self._said.output not in (None, name):

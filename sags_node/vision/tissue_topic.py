@@ -1,4 +1,4 @@
-"""Tissue masks that another process makes of the published pictures, joined to the frames by time."""
+"""Tissue masks that another process makes of the published images, joined to the frames by time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +15,7 @@ SHAPE_TOLERANCE = 0.02  # of the ratio of width to height
 LARGEST_SIDE = 4096  # px of a mask
 WHITE = 128  # grey level from which on a pixel is white
 
-# Stamp (ns) and picture of the mask whose stamp is nearest to the one given; None: none has come.
+# Stamp (ns) and image of the mask whose stamp is nearest to the one given; None: none has come.
 NearestMask = Callable[[int], tuple[int, NDArray[Any]] | None]
 
 
@@ -26,7 +26,7 @@ class NoMaskError(SagsError):
 class TopicMasks:
     """The mask that was made of a frame, or of one within `tolerance` of it.
 
-    A mask is made of a published picture, so the newest frame's mask comes too late for it: the mask of the
+    A mask is made of a published image, so the newest frame's mask comes too late for it: the mask of the
     frame before is used. The node does not wait.
 
     Attributes:
@@ -53,7 +53,7 @@ class TopicMasks:
         """Return the tissue [H, W] of a rectified pair.
 
         Raises:
-            NoMaskError: none has come, none of this time, or it is no mask of this picture.
+            NoMaskError: none has come, none of this time, or it is no mask of this image.
         """
         found = self._nearest(pair.t_capture_ns)
         if found is None:
@@ -63,7 +63,7 @@ class TopicMasks:
         if abs(apart_ns) > self._tolerance_ns:
             when = "older" if apart_ns > 0 else "newer"
             raise NoMaskError(
-                f"the mask on {self._where} is {abs(apart_ns) * 1e-9:.3f} s {when} than the picture; "
+                f"the mask on {self._where} is {abs(apart_ns) * 1e-9:.3f} s {when} than the image; "
                 f"vision.tissue.tolerance is {self._tolerance_ns * 1e-9:g} s"
             )
         white = self._white(values, pair.left.shape[1], pair.left.shape[0])
@@ -72,13 +72,13 @@ class TopicMasks:
         return white if self._is_white else ~white
 
     def _white(self, values: NDArray[Any], width: int, height: int) -> Bool:
-        """Find where a mask is white, at the size of the picture [height, width]."""
+        """Find where a mask is white, at the size of the image [height, width]."""
         if values.ndim != 2 or values.dtype != np.uint8 or not values.size:
             raise NoMaskError(f"what comes on {self._where} is no mask: mono8 is expected, 255 is white")
         ratio = values.shape[1] / values.shape[0] * height / width
         if abs(ratio - 1) > SHAPE_TOLERANCE or max(values.shape) > LARGEST_SIDE:
             raise NoMaskError(
-                f"the mask on {self._where} has {values.shape[1]}x{values.shape[0]} px, the picture "
+                f"the mask on {self._where} has {values.shape[1]}x{values.shape[0]} px, the image "
                 f"{width}x{height}"
             )
         largest = int(values.max())

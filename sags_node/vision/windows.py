@@ -1,7 +1,7 @@
-"""Sums over square windows of a picture, a vector of pixels at a time, for kernels that need several at once.
+"""Sums over square windows of an image, a vector of pixels at a time, for kernels that need several at once.
 
-A row of sums over columns is gathered first, then summed along: `window_row` reads it. Pictures are at least
-16 px wide; the last pixels of a row may be done twice. Beyond a picture's edge its edge is repeated.
+A row of sums over columns is gathered first, then summed along: `window_row` reads it. Images are at least
+16 px wide; the last pixels of a row may be done twice. Beyond an image's edge its edge is repeated.
 """
 
 from typing import Any

@@ -32,7 +32,7 @@ def silent(done: int, of: int | None, what: str) -> None: ...
 
 
 def shown_pair(disparity: F32, noise: float = 0.0) -> tuple[RectifiedPair, F32]:
-    """A textured surface of this disparity [H, W] (px, of the right picture), and its depth (m) as the left
+    """A textured surface of this disparity [H, W] (px, of the right image), and its depth (m) as the left
     eye sees it; 0 where it does not see it."""
     rng = np.random.default_rng(3)
     spots = sum(s * cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), s) for s in (1.2, 3, 8))
@@ -180,7 +180,7 @@ def test_errors_along_z_and_to_the_surface() -> None:
 
 
 def write_ct_folder(folder: Path) -> None:
-    """A plane at 60 mm before another at 70 mm; the left half of the picture counts."""
+    """A plane at 60 mm before another at 70 mm; the left half of the image counts."""
     black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     for side in ("left", "right"):
         cv2.imwrite(str(folder / f"{side}.png"), black)

@@ -36,7 +36,7 @@ def test_settings_that_no_other_beats_in_both() -> None:
 
 def test_why_the_default_says_what_was_measured() -> None:
     fast, default, slow = row("fast", 20, 33), row("default", 32, 35), row("slow", 60, 37)
-    assert "best picture of all that stay within the camera's 33.3 ms" in why_default(
+    assert "best image of all that stay within the camera's 33.3 ms" in why_default(
         [default, fast, slow], 33.3
     )
     better = row("better", 30, 35.5)

@@ -131,7 +131,7 @@ def test_a_recording_that_is_too_short_is_named() -> None:
         tracked(frames=[2, 5000])
 
 
-# ---- methods that anchors stand beside: on a picture that moves as a whole, all know where its poi------
+# ---- methods that anchors stand beside: on an image that moves as a whole, all know where its poi------
 
 
 POINTS = np.array([[60.0, 50], [100, 60], [80, 80]])
@@ -157,7 +157,7 @@ def test_they_follow(follower: Callable[[np.ndarray, np.ndarray], Follower], mos
 
 @pytest.mark.parametrize("follower", [lucas_kanade, dense_flow])
 def test_what_was_lost_stays_lost(follower: Callable[[np.ndarray, np.ndarray], Follower]) -> None:
-    """The last point leaves the picture and comes back."""
+    """The last point leaves the image and comes back."""
     following = follower(picture(np.zeros(2)), np.array([*POINTS, [2.0, 50]]))
     assert following.follow(picture(np.array([-5.0, 0])))[1].tolist() == [True, True, True, False]
     assert following.follow(picture(np.zeros(2)))[1].tolist() == [True, True, True, False]

@@ -36,8 +36,8 @@ pytestmark = pytest.mark.live
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 MESSAGE_DATA = 1  # opcode
-SEQUENCE_PARAMETERS = 7  # type of the H.264 unit that a key picture begins with here
-KEY_EVERY = 30  # pictures
+SEQUENCE_PARAMETERS = 7  # type of the H.264 unit that a key image begins with here
+KEY_EVERY = 30  # images
 FRAME_TOPICS = [topic.name for topic in topics.TOPICS if topic.name != "parameters"]
 options = partial(options_of, FoxgloveOptions, port=0)
 
@@ -250,20 +250,20 @@ def test_pictures_come_as_h264_that_anybody_can_begin_with(tmp_path: Path) -> No
                 assert second.channels[name]["schemaName"] == "foxglove.CompressedVideo" and schema
     fields = [protobuf_bytes(message) for _, message in second.came[name]]
     assert all(each[4] == b"h264" and each[3].startswith(b"\x00\x00\x00\x01") for each in fields)
-    # A picture may go out while the server is still telling that somebody came.
+    # An image may go out while the server is still telling that somebody came.
     began = next(n for n, each in enumerate(fields) if each[3][4] & 31 == SEQUENCE_PARAMETERS)
-    assert began < KEY_EVERY / 3, "it is not left to wait for the next key picture"
+    assert began < KEY_EVERY / 3, "it is not left to wait for the next key image"
     decoder, pictures = av.CodecContext.create("h264", "r"), []
     for each in fields[began : began + 6]:
         pictures += decoder.decode(av.Packet(each[3]))
-    assert len(pictures) == 6, "a picture for each message from then on"
+    assert len(pictures) == 6, "an image for each message from then on"
     error = np.abs(pictures[-1].to_ndarray(format="rgb24").astype(int) - truth)
-    assert np.median(error) <= 12  # colour at half size, in a picture whose colour changes with every pixel
+    assert np.median(error) <= 12  # colour at half size, in an image whose colour changes with every pixel
     raw = WIDTH * HEIGHT * 3
     assert np.mean([len(message) for _, message in second.came[name][began + 1 : began + 6]]) < raw / 10
 
 
-@pytest.mark.fault("picture: what is unsure, or not drawn, in H.264")
+@pytest.mark.fault("image: what is unsure, or not drawn, in H.264")
 def test_h264_shows_what_has_alpha_over_black() -> None:
     """As the node's JPEG, and OpenIGTLink: what is unsure is faint, and what is not drawn is not there."""
     av = pytest.importorskip("av", reason="no H.264 without PyAV")

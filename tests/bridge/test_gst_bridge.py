@@ -56,7 +56,7 @@ def displays(run_dir: Path, **launches: str) -> Iterator[None]:
 
 
 def shown(file: Path) -> np.ndarray:
-    """All whole pictures that the pipeline has put out."""
+    """All whole images that the pipeline has put out."""
     data = np.fromfile(file, np.uint8) if file.exists() else np.empty(0, np.uint8)
     size = HEIGHT * WIDTH * 4
     return data[: len(data) // size * size].reshape(-1, HEIGHT, WIDTH, 4)
@@ -81,7 +81,7 @@ def test_both_eyes_come_to_the_pixel_and_what_is_old_becomes_the_key(tmp_path: P
             until(lambda: np.array_equal(shown(files["left"])[-1], expected[0]))
         until(lambda: np.array_equal(shown(files["left"])[-1], nothing))  # the overlay is gone
         count = len(shown(files["left"]))
-        until(lambda: len(shown(files["left"])) > count + 5)  # and the display gets pictures still
+        until(lambda: len(shown(files["left"])) > count + 5)  # and the display gets images still
     for n, file in enumerate(files.values()):
         for picture in shown(file):
             assert np.array_equal(picture, expected[n]) or np.array_equal(picture, nothing), (

@@ -81,7 +81,7 @@ def test_every_device_says_in_millimetres_what_the_node_says(tmp_path: Path, pro
     assert int(picture[4]) == weighted(truth.pair.left)
     assert render[:4] == [str(WIDTH), str(HEIGHT), "3", "1"]
 
-    # A pixel of the picture lies on the ray that it shows, 100 mm before the camera, turned as the world is.
+    # A pixel of the image lies on the ray that it shows, 100 mm before the camera, turned as the world is.
     T_picture = matrix(picture[5:])  # of pixels counted from the middle, as OpenIGTLink does
     pixel = np.array([70.0, 12.0])
     at = T_picture @ [pixel[0] - (WIDTH - 1) / 2, pixel[1] - (HEIGHT - 1) / 2, 0, 1]
@@ -404,5 +404,5 @@ def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         with pytest.raises(SagsError, match=f"port {port}.*choose another --port"):
             run_openigtlink(options(tmp_path, port=port), lambda *_: None, threading.Event())
-    with pytest.raises(UsageError, match="--send depth: there is picture"):
+    with pytest.raises(UsageError, match="--send depth: there is image"):
         run_openigtlink(options(tmp_path, send=("depth",)), lambda *_: None, threading.Event())

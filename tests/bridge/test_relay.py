@@ -118,7 +118,7 @@ def test_what_stops_is_taken_back_within_half_a_second(monkeypatch: pytest.Monke
 
 
 def test_lengths_without_a_unit_are_not_passed_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Peers would take them for metres. Pictures go on."""
+    """Peers would take them for metres. Images go on."""
     for lengths in (False, True):
         output = Output("pose", (Source("sags", POSE),), lengths=lengths)
         _, peer = bridged(monkeypatch, 1, output, 2.0, 3.0)

@@ -108,7 +108,7 @@ def test_only_what_is_read_is_asked_of_the_node(tmp_path: Path) -> None:
 
 
 def test_tf_knows_the_frame_of_the_right_eye(tmp_path: Path) -> None:
-    """A stock tf2 listener reads `/tf_static` so, and cannot place right pictures without."""
+    """A stock tf2 listener reads `/tf_static` so, and cannot place right images without."""
     info = ("/sags/right/camera_info", topics.CAMERA_INFO)
     with (
         plane_bridged(run_ros2, options(tmp_path)),

@@ -57,7 +57,7 @@ def words(*found: topics.Topic) -> list[str]:
 
 
 def test_ros_reads_all_topics_bit_by_bit_and_a_slow_node_holds_nobody_up(tmp_path: Path) -> None:
-    """The left picture has 640x512 px; all that comes of it is what was sent."""
+    """The left image has 640x512 px; all that comes of it is what was sent."""
     result = anchored()
     large = np.random.default_rng(0).integers(0, 256, (512, 640, 3), np.uint8)
     result = replace(result, pair=replace(result.pair, left=large))

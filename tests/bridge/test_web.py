@@ -236,7 +236,7 @@ AT_AGES = """([first, second]) => {
     return ways.map((way) => way.shownMs !== null);
   };
   return [at(Math.min(...shown) + first), at(Math.max(...shown) + second), (EMPTY)()];
-}""".replace("EMPTY", EMPTY)  # at once: a newer picture may still be on its way through the decoder
+}""".replace("EMPTY", EMPTY)  # at once: a newer image may still be on its way through the decoder
 
 
 @pytest.fixture

@@ -146,7 +146,7 @@ def with_P(folder: Path, row: int, column: int, factor: float, more: float = 0.0
 
 
 def in_pictures(folder: Path) -> None:
-    """K in units of the picture's width."""
+    """K in units of the image's width."""
     K = make_rig().left.K / [[640], [640], [1]]
     edit(folder, "left", {"camera_matrix": {"data": [float(k) for k in K.ravel()]}})
 
@@ -166,7 +166,7 @@ MIRROR = {"rectification_matrix": {"data": [1.0, 0, 0, 0, 1.0, 0, 0, 0, -1.0]}}
         (lambda folder: with_P(folder, 1, 1, 1, 2), "rectified fy differs"),
         (lambda folder: with_P(folder, 1, 2, 1, 2), "rectified cy differs"),
         (lambda folder: with_P(folder, 0, 0, 1, 2), "rectified fx differs"),
-        (lambda folder: edit(folder, "right", {"image_width": 720}), "same picture size"),
+        (lambda folder: edit(folder, "right", {"image_width": 720}), "same image size"),
         (lambda folder: edit(folder, "left", MIRROR), "not a rotation"),
         (in_pictures, "not plausible"),
         (

@@ -25,7 +25,7 @@ from sags_node.vision.rectify import Rectifier
 
 SIZE = 640, 512
 DISPARITIES = 8.0, 60.0  # px at the matching size
-Field = tuple[F32, Bool, int]  # row errors, where they are known, and the width of the picture they are of
+Field = tuple[F32, Bool, int]  # row errors, where they are known, and the width of the image they are of
 
 
 def rectified(session: Path, degrees: tuple[float, float, float]) -> tuple[U8, U8]:

@@ -42,7 +42,7 @@ def chess_folders(
 
 
 def exact_views(count: int = 18) -> list[StereoView]:
-    """The corners themselves, without pictures."""
+    """The corners themselves, without images."""
     rig, points = known_rig(), Chessboard(SQUARES, SQUARE).points.astype(np.float64)
     views = []
     for index, pose in enumerate(poses()[:count]):
@@ -197,7 +197,7 @@ def test_counts_that_differ(
     for file in right.iterdir():
         file.rename(right / f"r{file.stem}_.png")
     code, _, err = sags(left, right, *BOARD, "-o", tmp_path / "other")
-    assert code == 2 and "holds 7 pictures" in err and "holds 6" in err
+    assert code == 2 and "holds 7 images" in err and "holds 6" in err
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def test_counts_that_differ(
         (["left", "right", "--board", "charuco", "--marker-mm", "3", "--dictionary", "9X9"], "known are"),
         (["left", "right", "--marker-mm", "3"], "belong to --board charuco"),
         (["left", "right", "--legacy"], "belong to --board charuco"),
-        (["gone_left", "gone_right"], "picture folder gone_left does not exist"),
+        (["gone_left", "gone_right"], "image folder gone_left does not exist"),
     ],
 )
 def test_usage(tmp_path: Path, arguments: list[str], said: str) -> None:
@@ -303,7 +303,7 @@ def test_hints_name_what_is_lacking() -> None:
     ]
     hints = "\n".join(coverage_hints(views, flat, SIZE))
     assert "6 views are few" in hints
-    assert "the left picture has hardly any corners at top left, middle left, bottom left" in hints
+    assert "the left image has hardly any corners at top left, middle left, bottom left" in hints
     assert "tilted left and right by 0 degrees" in hints and "tilted up and down by 0 degrees" in hints
     assert "same distance" in hints
     tilted = flat.copy()

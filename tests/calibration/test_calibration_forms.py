@@ -390,7 +390,7 @@ def test_text_matrices_in_another_unit_say_which_one_and_how(tmp_path: Path, uni
 def test_text_matrices_that_are_refused(tmp_path: Path) -> None:
     folder = write_text(tmp_path / "rig")
     for unsized in (folder, write_pair(tmp_path / "pair", ".yml", PLUMB_BOB, T)):
-        assert "does not say the size of the pictures: give --size WxH" in refusal(unsized)
+        assert "does not say the size of the images: give --size WxH" in refusal(unsized)
     (folder / "calib.left.distortion.txt").write_text("a b c d e")
     assert "calib.left.distortion.txt holds something else than numbers" in refusal(folder, SIZE)
     (folder / "calib.left.distortion.txt").unlink()

@@ -1,4 +1,4 @@
-"""Planted errors, and pictures that tell them."""
+"""Planted errors, and images that tell them."""
 
 import json
 import re
@@ -93,7 +93,7 @@ def rectify_anew(rig: StereoRig, R: F64, T: F64) -> StereoRig:
 
 
 def half_size(rig: StereoRig) -> StereoRig:
-    """Calibrated with pictures of half the size; only the size in the files was edited."""
+    """Calibrated with images of half the size; only the size in the files was edited."""
     half = np.diag([0.5, 0.5, 1])
     left, right = (replace(eye, K=half @ eye.K) for eye in (rig.left, rig.right))
     return from_matrices(StereoRig(rig.name, left, right), 1.0)
@@ -127,7 +127,7 @@ def test_a_right_calibration_passes(subject: tuple[StereoRig, Pairs]) -> None:
 
 
 def test_rows_of_a_real_unrectified_pair(f7: tuple[StereoRig, Pairs]) -> None:
-    """This rig's rows are off by 1.5 px at the top of the picture, and agree in its middle. Features, found
+    """This rig's rows are off by 1.5 px at the top of the image, and agree in its middle. Features, found
     without the dense search, say so too: to half a pixel, since there are few of them at the edges."""
     rig, pairs = f7
     front, rows = check_pictures(rig, pairs)
@@ -152,18 +152,18 @@ def unchanged(given: Any) -> Any:
 
 
 NOTHING = "", ""
-# What is done to the rig and to the pictures; what pictures tell of it and its fix; what numbers alone tell.
+# What is done to the rig and to the images; what images tell of it and its fix; what numbers alone tell.
 PLANTED: dict[str, tuple[Any, Any, tuple[str, str], tuple[str, str]]] = {
-    "exchanged pictures": (
-        unchanged, exchanged, ("the pictures are exchanged", "calibration is in order"), NOTHING
+    "exchanged images": (
+        unchanged, exchanged, ("the images are exchanged", "calibration is in order"), NOTHING
     ),
     "exchanged files": (
-        exchanged_files, unchanged, ("exchanged in the calibration", "pictures are in order"), NOTHING
+        exchanged_files, unchanged, ("exchanged in the calibration", "images are in order"), NOTHING
     ),
     "wrong sign": (
-        with_T_negated, unchanged, ("has the wrong sign", "pictures are in order"), ("", "must be -fx")
+        with_T_negated, unchanged, ("has the wrong sign", "images are in order"), ("", "must be -fx")
     ),
-    "both ends exchanged": (exchanged_files, exchanged, ("pictures and calibration agree", ""), NOTHING),
+    "both ends exchanged": (exchanged_files, exchanged, ("images and calibration agree", ""), NOTHING),
     "millimetres": (in_unit("mm"), unchanged, ("", "--unit mm"), ("looks like millimetres", "--unit mm")),
     "centimetres": (in_unit("cm"), unchanged, ("", "--unit cm"), ("looks like centimetres", "--unit cm")),
     "inches": (in_unit("inch"), unchanged, ("", "--unit inch"), ("unusual", "--unit inch")),
@@ -255,7 +255,7 @@ def with_principal_point_moved(rig: StereoRig, x: float, y: float) -> StereoRig:
 
 @pytest.mark.parametrize("scale", [0.01, -0.01])
 def test_an_eye_of_another_scale_is_said_with_its_fix(phantom: tuple[StereoRig, Pairs], scale: float) -> None:
-    """The right picture is so much larger than the calibration says. What is said to set fixes it, and depth
+    """The right image is so much larger than the calibration says. What is said to set fixes it, and depth
     leans by what follows from disparity = f B / Z."""
     rig, pairs = phantom
     assert not [finding for finding in check_pictures(rig, pairs) if "scale" in finding.figures]
@@ -337,7 +337,7 @@ def test_an_offset_is_told_from_a_longer_baseline_where_depths_differ(
 def test_the_calibration_of_another_scope(phantom: tuple[StereoRig, Pairs]) -> None:
     rig, pairs = phantom
     finding = worst(check_pictures(with_right_turned(rig, (3.0, 0.0, 1.0)), pairs))
-    assert finding.level == "error" and "not of these pictures" in finding.fix
+    assert finding.level == "error" and "not of these images" in finding.fix
 
 
 def test_rectified_pictures_exchanged(data_folder: Path) -> None:
@@ -348,11 +348,11 @@ def test_rectified_pictures_exchanged(data_folder: Path) -> None:
     pairs = [(read_picture(left[0]), read_picture(right[0]))]
     rig = load_rig(ROOT / "calib/hamlyn_heart")
     assert worst(check_pictures(rig, pairs)).level == "ok"
-    assert "the pictures are exchanged" in worst(check_pictures(rig, exchanged(pairs))).what
+    assert "the images are exchanged" in worst(check_pictures(rig, exchanged(pairs))).what
 
 
 def test_principal_points_far_apart_are_not_taken_for_an_exchange(phantom: tuple[StereoRig, Pairs]) -> None:
-    """Rectified pictures whose right one is cut out farther to the right than the calibration says: points
+    """Rectified images whose right one is cut out farther to the right than the calibration says: points
     seem to lie behind the eyes, as in exchanged ones. Only whoever covers a lens can tell which it is."""
     rig, pairs = phantom
     rectifier = Rectifier(rig, rig.left.width, rig.left.height)
@@ -369,7 +369,7 @@ def test_principal_points_far_apart_are_not_taken_for_an_exchange(phantom: tuple
 
 
 def plain_rig(rectifier: Rectifier, shift: float) -> StereoRig:
-    """Of rectified pictures; the right eye's principal point lies `shift` px farther to the right."""
+    """Of rectified images; the right eye's principal point lies `shift` px farther to the right."""
     camera = rectifier.camera
     rig = rectified_rig("plain", camera.width, camera.height, camera.K, rectifier.baseline)
     return with_principal_point_moved(rig, shift, 0.0)
@@ -382,11 +382,11 @@ def rectified(rectifier: Rectifier, pair: tuple[U8, U8]) -> tuple[U8, U8]:
 
 
 def test_highlights_are_no_points_of_the_tissue(phantom: tuple[StereoRig, Pairs]) -> None:
-    """They are the sharpest thing in both pictures, and lie on the epipolar lines, but at another depth."""
+    """They are the sharpest thing in both images, and lie on the epipolar lines, but at another depth."""
     _, pairs = phantom
     left, right = (eye.copy() for eye in pairs[0])
     clean = match_eyes(left, right)
-    down = round(float(np.median(clean[:, 3] - clean[:, 1])))  # raw pictures: rows differ
+    down = round(float(np.median(clean[:, 3] - clean[:, 1])))  # raw images: rows differ
     rng = np.random.default_rng(3)
     shining = rng.uniform((60, 20), (290, 230), (25, 2)).astype(int)
     for x, y in np.repeat(shining, 4, axis=0) + rng.integers(-5, 6, (100, 2)):  # in clusters
@@ -448,7 +448,7 @@ def test_check_against_a_session_with_another_key(phantom_session: Path) -> None
     sides = ("left", "right"), ("right", "left")
     exchanged_source = [f"source.{eye}:={phantom_session / other}" for eye, other in sides]
     code, out, err = sags(phantom_session / "calib", "--session", phantom_session, *exchanged_source)
-    assert code == 1 and "the pictures are exchanged" in out and "cannot be used" in err
+    assert code == 1 and "the images are exchanged" in out and "cannot be used" in err
 
 
 def test_a_broken_calibration_is_checked_against_a_session(phantom_session: Path, tmp_path: Path) -> None:
@@ -487,7 +487,7 @@ def test_a_recording_without_a_launch_file_is_a_session_too(phantom_session: Pat
         (["{session}/calib", "--session", "{session}", "source.lefd:=x"], "source.lefd"),
         (["{session}/calib", "--session", "{session}", "--images", "a", "b"], "one of them is enough"),
         (["{session}/left"], "is no calibration; looked for"),
-        (["{session}/calib", "--images", "{session}/left", "{session}/calib"], "holds no picture"),
+        (["{session}/calib", "--images", "{session}/left", "{session}/calib"], "holds no image"),
     ],
 )
 def test_usage(phantom_session: Path, arguments: list[str], said: str) -> None:

@@ -74,7 +74,7 @@ def tracked(
     unit: float = 1.0,
     noise: float = 0.0,
 ) -> PoseTrack:
-    """The robot's poses; its clock is `offset_ms` ahead of the pictures', its length 1 is 1 m / `unit`.
+    """The robot's poses; its clock is `offset_ms` ahead of the images', its length 1 is 1 m / `unit`.
 
     `noise`: of each, degrees, and half as many mm; one standard deviation along each axis."""
     track, rng = PoseTrack(), np.random.default_rng(3)
@@ -183,7 +183,7 @@ def test_poses_of_another_time_are_said() -> None:
         solve_hand_eye(views, late, grid(), RIG, tracked(0, PERIOD).at)
     with pytest.raises(SagsError, match=r"9 of 9 views .* 10 are needed.* give a larger --views"):
         solve_hand_eye(views[:9], stamps[:9], grid(), RIG, tracked(0, PERIOD).at)
-    short = tracked(0, 0.5)  # 1.5 s of poses, ten pictures a second
+    short = tracked(0, 0.5)  # 1.5 s of poses, ten images a second
     with pytest.raises(SagsError, match=r"15 of 40 views .* 20 are needed"):
         solve_hand_eye(views, stamps, grid(), RIG, short.at)
 
@@ -353,7 +353,7 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
         f"robot.hand_eye:={tmp_path / 'hand_eye.yaml'}", "source.pace:=step", "source.rate:=5",
         "vision.width:=160", "vision.height:=120", "mapping.max_gaussians:=2000",
     ]  # fmt: skip
-    drawn: list[Camera] = []  # from where the figures' pictures were
+    drawn: list[Camera] = []  # from where the figures' images were
 
     def noting(backend: str, width: int, height: int) -> Rasterizer:
         made = make_rasterizer(backend, width, height)
@@ -383,7 +383,7 @@ def test_fits_and_figures_know_where_the_robot_says_the_scope_is(
         assert (off(1, frame.camera) < 0.1e-3) == (frame.frame_id == 1)
     assert min(off(1, camera) for camera in drawn) < 0.1e-3
 
-    # The poses end 2.95 s after the first picture: a second later there is none for the last four.
+    # The poses end 2.95 s after the first image: a second later there is none for the last four.
     late = open_session(recording, [*played, "robot.offset_ms:=1000"])
     assert len(read_clip(late, lambda number: False).train) == 20
     assert "4 frames are left out, since the robot tells no pose of them" in caplog.text

@@ -213,7 +213,7 @@ def test_a_right_video_that_ends_too_early_is_refused_before_it_plays(
     session, file = videos(user_files, right="short.mp4"), tmp_path / "out.json"
     command = ["eval", *session, "--hold-out", "0", "--pace", "step", "--out", file]
     for refused_one in (["run", *session], command):
-        said = f"short.mp4 has {SHORT} pictures", f"play what is there with source.frames:={SHORT}"
+        said = f"short.mp4 has {SHORT} images", f"play what is there with source.frames:={SHORT}"
         refused(2, *refused_one, said=said)
     assert not file.exists()
     assert sags("run", *session, f"source.frames:={SHORT}").exit_code == 0

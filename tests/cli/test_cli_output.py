@@ -238,7 +238,7 @@ GST = ("source.kind:=gst", "rig:=FILES/calib", "source.right:=videotestsrc")
 HAS_GST = find_library("gstapp-1.0") is not None
 NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says how that is, and what it says
     "a video": (("VIDEOS", "source.left:=FILES/gone.mp4"), "source", "gone.mp4 does not exist"),
-    "a video cut short": (("VIDEOS", "source.right:=FILES/short.mp4"), "source", "short.mp4 has 6 pictures"),
+    "a video cut short": (("VIDEOS", "source.right:=FILES/short.mp4"), "source", "short.mp4 has 6 images"),
     "videos that play": (("VIDEOS",), "source", "^ok: 12 frames of 320x256 px at 10 Hz;"),
     "a calibration": (("VIDEOS", "rig:=FILES/gone"), "calibration", "gone/left.yaml"),
     "a calibration of another size": (("VIDEOS", "rig:=FILES/double"), "calibration", "640x512"),
@@ -248,7 +248,7 @@ NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says how that
     "a camera's size": (
         (*CAMERAS, "rig:=FILES/calib"),
         "calibration",
-        "320x256 px, an eye's pictures are 640x480",
+        "320x256 px, an eye's images are 640x480",
     ),
     "a hand-eye calibration": (PUSHED, "hand-eye", "gone.yaml"),
     "a depth network": (("VIDEOS", "vision.onnx.path:=FILES/gone.onnx"), "depth network", "gone.onnx"),
@@ -263,7 +263,7 @@ NAMED_IN_A_LAUNCH = {  # what it names -> the launch, the row that says how that
     "a live box": (
         (*LIVE, "vision.tissue.exclude:=[[0,0,9000,5]]"),
         "pipeline",
-        "not inside the raw picture of 320x256",
+        "not inside the raw image of 320x256",
     ),
     "masks of another machine": (
         (*TOPIC, "vision.tissue.endpoint:=tcp://10.0.0.1:5600"),
@@ -501,7 +501,7 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     summary = pure_json(result.stdout)
     assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
     assert summary["overlay"]["saved"] == str(tmp_path / "demo/overlay.mp4")
-    assert "pictures of {width}x{height} px".format_map(summary["settings"]) in result.stderr
+    assert "images of {width}x{height} px".format_map(summary["settings"]) in result.stderr
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
     check_report(tmp_path / "demo", "overlay.mp4")  # the next one may replace it
 
@@ -521,7 +521,7 @@ def test_eval_says_what_it_found_in_a_dozen_lines(user_files: Path, tmp_path: Pa
     assert 5 <= len(lines) <= 12 and lines[-1].split() == ["report", f"{tmp_path}/report/report.html"]
     said = dict(line.split(None, 1) for line in lines)
     assert "dB PSNR of the next frame" in said["picture"] and "ms (p99)" in said["latency"]
-    assert "The picture before, shown again:" in said["picture"]
+    assert "The image before, shown again:" in said["picture"]
     all_figures = sags("eval", *session, "--verbose").stdout
     assert "of that, median of: rectify" in all_figures and len(all_figures.splitlines()) > 30
     assert "{" not in all_figures + result.stdout and "None" not in all_figures
@@ -548,7 +548,7 @@ def test_what_is_told_and_what_is_logged_are_one_line_each_in_one_form(
 ) -> None:
     """In a file each with its time, however long it is."""
     monkeypatch.setenv("COLUMNS", "80")
-    handler, long = terminal.log_handler(), "no new picture of both for 2 s, [bold] " * 9
+    handler, long = terminal.log_handler(), "no new image of both for 2 s, [bold] " * 9
     terminal.tell(f"warning: {long}")
     handler.handle(logging.LogRecord("sags_node", logging.WARNING, "a.py", 1, "no new %s", (long,), None))
     told, logged = capsys.readouterr().err.splitlines()

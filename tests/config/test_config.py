@@ -91,7 +91,7 @@ def test_a_word_that_is_a_path_elsewhere_is_none(tmp_path: Path) -> None:
 
 
 def test_a_key_that_a_sender_may_use_is_none_too_many() -> None:
-    """It sends each eye by itself, or both in one picture. Where a method is said, others' keys may stay."""
+    """It sends each eye by itself, or both in one image. Where a method is said, others' keys may stay."""
     source = load_launch(None, ["source:={kind: push, geometry: {first: right}}"]).source
     assert isinstance(source, PushSource) and source.geometry.first == "right"
     load_launch(None, ["vision.tissue:={method: classical, path: net.onnx}"])

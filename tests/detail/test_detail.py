@@ -1,4 +1,4 @@
-"""Detail of pictures in views: the kernel beside its twin, what is learnt, remembered and shown."""
+"""Detail of images in views: the kernel beside its twin, what is learnt, remembered and shown."""
 
 import itertools
 from dataclasses import replace
@@ -87,7 +87,7 @@ def carried(
     depth: F32, camera: Camera, source: SeenFrame, motion: F32 | None = None, share: float = 1.0,
     steady: bool = False,
 ) -> tuple[U8, U8]:  # fmt: skip
-    """A grey view with the picture of a source, and the share that each pixel got."""
+    """A grey view with the image of a source, and the share that each pixel got."""
     shown, taken = np.full((HEIGHT, WIDTH, 3), 90, np.uint8), np.zeros((HEIGHT, WIDTH), np.uint8)
     small, lent = coarse_camera(camera), source.lent(FOCAL)
     tiles = np.full((2, 3), share, np.float32)
@@ -109,7 +109,7 @@ def test_the_kernels_do_what_their_twin_does(aside: float, share: float) -> None
     shown, taken = carried(depth, camera, source, share=share)
     expected = twin(np.full_like(shown, 90), depth, camera, source, share)
     differs = np.abs(shown.astype(int) - expected).max(-1)
-    # Places in steps of 1/256 px along two axes, where a picture changes by up to 255 levels; three roundings
+    # Places in steps of 1/256 px along two axes, where an image changes by up to 255 levels; three roundings
     # to whole levels, and a share in steps of 1/255. Beside the step in depth there is one between two fourth
     # pixels.
     assert differs[:, 26:].max() <= share * 2 * 255 / 512 + 2.5 and differs[:, :14].max() == 0
@@ -117,7 +117,7 @@ def test_the_kernels_do_what_their_twin_does(aside: float, share: float) -> None
 
 
 def test_a_view_of_any_size_reaches_its_edges() -> None:
-    """Sizes that four does not divide, and a picture of another size than the source worked at."""
+    """Sizes that four does not divide, and an image of another size than the source worked at."""
     for width, height in ((61, 47), (64, 48), (33, 50)):
         camera = Camera(width, height, CAMERA.K, CAMERA.T_world_cam)
         picture: U8 = np.full((2 * HEIGHT, 2 * WIDTH, 3), 200, np.uint8)

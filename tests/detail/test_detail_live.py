@@ -1,4 +1,4 @@
-"""The detail of pictures from outside: a real node process and real sockets."""
+"""The detail of images from outside: a real node process and real sockets."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.live
 
 RENDER, DEPTH, VIEW = "left/render/image", "left/render/depth", "view/later/image"
 INPUT, MASK = "left/image_rect_color", "left/tissue_mask"
-AWAY = np.ones((11, 11), np.uint8)  # px: nearer to an instrument the render is not the picture
+AWAY = np.ones((11, 11), np.uint8)  # px: nearer to an instrument the render is not the image
 
 
 def test_the_left_render_is_the_picture_where_tissue_is_seen_and_says_how_old_the_rest_is(
@@ -28,7 +28,7 @@ def test_the_left_render_is_the_picture_where_tissue_is_seen_and_says_how_old_th
         names = [RENDER, INPUT, MASK, DEPTH, VIEW]
         got = client.collect(node.data, names, 20, START_SECONDS)
     assert node.stop() == 0, node.said()
-    # A frame that was begun before anybody looked is the model alone, and says nothing of pictures.
+    # A frame that was begun before anybody looked is the model alone, and says nothing of images.
     got[names[0]] = [one for one in got[names[0]] if "detail_age_ns" in one.meta]
     assert len(got[names[0]]) > 10
     by_stamp = [{one.meta["stamp_ns"]: one for one in got[name]} for name in names[:3]]

@@ -1,4 +1,4 @@
-"""The colours of a drawn picture: enlarged when somebody asks, once, from memory of their own."""
+"""The colours of a drawn image: enlarged when somebody asks, once, from memory of their own."""
 
 import threading
 import time

@@ -80,8 +80,8 @@ def test_rounding_changes_no_more_than_whether_a_splat_is_cut(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where alpha is 1/255, rounding decides whether a splat shows. In a large scene some always are so, and
-    one of them moves gradients by more than all rounding. Picture and gradients are then those of the twin
-    that decides likewise, and the picture and its gradients decide alike. Here one splat meets the cut in one
+    one of them moves gradients by more than all rounding. Image and gradients are then those of the twin
+    that decides likewise, and the image and its gradients decide alike. Here one splat meets the cut in one
     pixel."""
     view = camera()
     gaussians = random_gaussians(seed, 60, view)

@@ -35,7 +35,7 @@ PARTS = (  # of the package, that a frame goes through
     "model.alias_free",
 )  # fmt: skip
 ELSEWHERE = {"mapping.focus.sum_residuals", "mapping.focus._sum_row"}  # tests/mapping/test_focus.py
-# They read pictures in the pixel in which a Gaussian is seen. Four roundings of 6e-8 at 128 px are 3e-5 px.
+# They read images in the pixel in which a Gaussian is seen. Four roundings of 6e-8 at 128 px are 3e-5 px.
 # So near to a border, on either side and along two axes, lie 1.2e-4 of the places: either pixel is right.
 LOOKED_UP, NEAR_A_BORDER = {"mapping.surface._find_surface"}, 1e-3
 # They round to whole levels. Ten roundings of 6e-8 of 255 are 1.5e-4 of a level: so many are the next one.

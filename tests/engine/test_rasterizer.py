@@ -117,7 +117,7 @@ def test_agrees_on_a_larger_scene(backend: Backend) -> None:
 
 
 def test_a_jacobian_held_within_the_frustum(backend: Backend) -> None:
-    """Large Gaussians whose centres lie outside the widened frustum reach into the picture."""
+    """Large Gaussians whose centres lie outside the widened frustum reach into the image."""
     view = backend.camera(moved=True)
     rng = np.random.default_rng(11)
     pixels = rng.uniform([-60, -30], [-30, 60], (6, 2))
@@ -195,7 +195,7 @@ def test_quaternions_of_any_length_are_the_same_turn(backend: Backend) -> None:
 def test_just_in_front_of_the_near_plane_and_not_behind_it(
     backend: Backend, height: float, scale: float
 ) -> None:
-    """On the axis, beside the picture, far outside; then at the plane, on the camera and behind it."""
+    """On the axis, beside the image, far outside; then at the plane, on the camera and behind it."""
     view = backend.camera()
     z = NEAR_PLANE * np.array([height, height, height, 0.999, 1e-3, -1e-3, -1.0, -1e12])
     means = np.stack([z * [0, 0.45, 30, 0, 0, 0, 0, 0], z * [0, 0.1, -20, 0, 0, 0, 0, 0], z], 1)
@@ -219,7 +219,7 @@ def test_at_or_behind_the_near_plane_nothing_is_drawn(backend: Backend, z: float
 
 @pytest.mark.parametrize("factor", [0.03, 1e3, 1e6, 1e9])
 def test_a_larger_world_further_away_looks_the_same(backend: Backend, factor: float) -> None:
-    """Pictures do not know the unit of length: depths and derivatives scale, the rest stays."""
+    """Images do not know the unit of length: depths and derivatives scale, the rest stays."""
     view = backend.camera()
     gaussians = scene_of(random_gaussians(8, min(backend.count, 30), view), 2, True)
     larger = dataclasses.replace(
@@ -262,7 +262,7 @@ CROWDS = [(100_000, 0.9), (100_000, 0.01), (300, 0.01)]  # how many of which opa
 
 
 def test_a_crowd_on_one_pixel_follows_the_law_of_absorption(backend: Backend) -> None:
-    """n equal Gaussians behind each other, larger than the picture and smaller than a tile, whose rest beyond
+    """n equal Gaussians behind each other, larger than the image and smaller than a tile, whose rest beyond
     its border never fills: what is left is (1 - alpha)^n, down to 1e-4, where a tile stops. Those that it
     hides have no gradient."""
     view = camera(width=3, height=2, focal=30.0)

@@ -1,4 +1,4 @@
-"""Pictures that are carried along a model's motion to a moment between them."""
+"""Images that are carried along a model's motion to a moment between them."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ CAMERA = Camera(
 
 
 def sheet(shift_px: float) -> Gaussians:
-    """Grey Gaussians on a plane that covers the picture with room to spare, all moved to the right."""
+    """Grey Gaussians on a plane that covers the image with room to spare, all moved to the right."""
     x, y = np.meshgrid(np.arange(-24, WIDTH + 24, 4.0), np.arange(-24, HEIGHT + 24, 4.0))
     across, down = x.ravel() + shift_px - (WIDTH - 1) / 2, y.ravel() - (HEIGHT - 1) / 2
     means = np.stack([across, down, np.full(x.size, FOCAL)], 1).astype(np.float32) * np.float32(DEPTH / FOCAL)
@@ -39,13 +39,13 @@ def shown(middle_px: float, *around: Seen) -> F32:
 
 
 def off(picture: F32, truth: F32) -> float:
-    """Mean error away from the border, where a picture has come in."""
+    """Mean error away from the border, where an image has come in."""
     inner = np.s_[8:-8, 16:-16]
     return float(np.abs(picture[inner] - truth[inner]).mean())
 
 
 def test_detail_that_gaussians_lack_goes_where_they_go() -> None:
-    """A wave of 3 px times 2 pi moves by 6 px: the mean of both pictures as they are is grey."""
+    """A wave of 3 px times 2 pi moves by 6 px: the mean of both images as they are is grey."""
     before, after = seen(0), seen(6)
     truth = stripes(3)
     mean = before.picture / 2 + after.picture / 2
@@ -66,7 +66,7 @@ def test_an_instrument_is_not_carried_into_the_tissue() -> None:
     covered.picture[20:40, 30:50] = 1
     covered.tissue[20:40, 30:50] = False
     one = shown(0, covered, seen(0))
-    np.testing.assert_allclose(one, stripes(0), atol=1e-3)  # from the other picture
+    np.testing.assert_allclose(one, stripes(0), atol=1e-3)  # from the other image
     both = shown(0, covered, covered)
     inside = both[25:35, 35:45]
     np.testing.assert_allclose(inside, 0.5, atol=0.01)  # neither shows it: the Gaussians' grey
@@ -74,7 +74,7 @@ def test_an_instrument_is_not_carried_into_the_tissue() -> None:
 
 @pytest.mark.parametrize("moved", [0.0, 0.0005])
 def test_a_camera_that_moves_is_told_from_tissue_that_does(moved: float) -> None:
-    """Tissue at rest, seen from a place to the left: the picture lies to the right."""
+    """Tissue at rest, seen from a place to the left: the image lies to the right."""
     pose = np.eye(4)
     pose[0, 3] = -moved
     shift = FOCAL * moved / DEPTH

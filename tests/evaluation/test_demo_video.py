@@ -1,4 +1,4 @@
-"""The demo's video: what the overlay kept of each frame, and the picture that a display showed."""
+"""The demo's video: what the overlay kept of each frame, and the image that a display showed."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def drawn(rng: np.random.Generator) -> U8:
 
 
 def test_a_display_shows_what_was_drawn_and_for_a_missed_frame_what_was_there_before(tmp_path: Path) -> None:
-    """Layers leave out what is empty; over the picture nothing is different for it."""
+    """Layers leave out what is empty; over the image nothing is different for it."""
     rng = np.random.default_rng(0)
     pictures = rng.integers(0, 256, (4, HEIGHT, WIDTH, 3), np.uint8)
     rgba = drawn(rng)

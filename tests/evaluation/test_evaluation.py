@@ -207,7 +207,7 @@ def test_a_run_says_what_to_do_when_it_cannot_write(frames: list[StereoFrame]) -
 
 def test_a_perfect_model_is_measured_as_perfect(frames: list[StereoFrame]) -> None:
     summary = summary_of(measured_run(frames, SPEED / 0.8))
-    assert summary["online"]["psnr"] > 60  # the left pictures are its own renders, to the last bit
+    assert summary["online"]["psnr"] > 60  # the left images are its own renders, to the last bit
     assert summary["online"]["ssim"] > 0.999
     assert summary["predict"]["psnr"] > 45  # rounding to grey levels alone is 58 dB
     assert summary["predict_3"]["psnr"] > 45  # motion is even
@@ -225,7 +225,7 @@ def test_a_perfect_model_is_measured_as_perfect(frames: list[StereoFrame]) -> No
 
 
 def test_the_right_eye_is_measured_where_it_is_shown(frames: list[StereoFrame]) -> None:
-    """The truth drawn for it is better than the warp, whose depth is 2 mm off, and than the picture of the
+    """The truth drawn for it is better than the warp, whose depth is 2 mm off, and than the image of the
     frame before: tissue has moved since."""
     velocity = SPEED / 0.8
     assert summary_of(measured_run(frames, velocity))["right"] is None
@@ -410,7 +410,7 @@ def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_p
     order = [text.index(each) for each in ("overlay.mp4", "<h2>Pictures", "<h2>Over time", "<h2>Figures")]
     assert order == sorted(order)
     groups = text[order[-1] :]
-    assert "the picture before, shown again:" in groups and "stereo alone:" in groups
+    assert "the image before, shown again:" in groups and "stereo alone:" in groups
     assert "<td></td></tr><tr>" not in groups.replace("\n", "") and "None" not in groups and "{" not in groups
     sheet = cv2.imread(str(file.parent / "sheet.png"))
     assert sheet.shape == (4 * 288, 4 * 360, 3)
@@ -439,7 +439,7 @@ def test_a_plot_is_valid_svg_with_a_gap_where_nothing_is_known() -> None:
 
 def test_the_names_of_all_lines_of_a_report_lie_inside_it() -> None:
     long = "the model alone, of a frame that it learnt from"
-    names = [long, "left render, mostly this picture", "the picture before, again", "kept back, never seen"]
+    names = [long, "left render, mostly this image", "the image before, again", "kept back, never seen"]
     svg = line_plot("", [Series(name, "#123456", [(0, 1.0), (1, 2.0)]) for name in names], {})
     (width,) = re.findall(r'viewBox="0 0 ([0-9.]+)', svg)
     for name in names:
@@ -517,7 +517,7 @@ def test_a_recording_without_truth_is_measured_against_itself(session_folder: Pa
     assert found["forth_back"]["median_px"] < 2 and found["forth_back"]["lost"] < 0.5
     assert found["stereo"]["median_mm"] < 1.5 and found["stereo"]["motion"]["coverage"] > 0.9
     assert found["stereo"]["stereo_coverage"] < found["stereo"]["coverage"] <= 1
-    assert found["hidden"]["psnr"] > found["hidden"]["copy_psnr"]  # the sheet slides on, the last picture not
+    assert found["hidden"]["psnr"] > found["hidden"]["copy_psnr"]  # the sheet slides on, the last image not
     assert found["right"]["psnr"] > 20 and found["right"]["warp_psnr"] > 20
     for row in outcome.rows:
         assert all(figures.keys() <= set(MEANS[group]) for group, figures in row.figures.items())

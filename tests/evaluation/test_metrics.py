@@ -32,7 +32,7 @@ def half_mask(height: int = 96, width: int = 128) -> np.ndarray:
     return mask
 
 
-# ---- pictures --------------------------------------------------------------------------------------------
+# ---- images --------------------------------------------------------------------------------------------
 
 
 def test_psnr_of_known_noise() -> None:
@@ -85,7 +85,7 @@ def test_ssim_is_the_published_formula() -> None:
     other = np.clip(truth + 0.1 * picture(5, 32, 40) - 0.05, 0, 1)
     inner = np.zeros(truth.shape[:2], bool)
     inner[5:-5, 5:-5] = True
-    # windows of inner pixels see the frame of the picture too: make that frame equal in both
+    # windows of inner pixels see the frame of the image too: make that frame equal in both
     framed = np.where(inner[..., None], other, truth)
     expected = direct_ssim_map(framed, truth)[inner].mean()
     assert expected < 0.99

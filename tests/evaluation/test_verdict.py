@@ -53,13 +53,13 @@ def test_a_verdict_has_what_an_overlay_needs_first_with_units_and_baselines() ->
     assert said == {
         "speed": "268 of 300 frames shown at 27.6 frames/s, 32 missed",
         "latency": "39 ms (p50), 97 ms (p99) from the camera's stamp to sending; 314 ms for the first frame",
-        "picture": "36.9 dB PSNR of the next frame, the model alone 33.6 dB. The picture before, shown again:"
+        "picture": "36.9 dB PSNR of the next frame, the model alone 33.6 dB. The image before, shown again:"
         " 35.8 dB; near while tissue rests, but without depth, another view or hidden tissue",
         "points": "0.38 mm off (median), nine of ten within 0.88 mm;"
         " 33% lost with their Gaussians (anchors take new ones)",
         "overlay": "on 249 of 268 frames (93%), 39 ms (p50), 97 ms (p99) after the camera;"
         " 19 without: being pinned",
-        "right eye": "34.1 dB PSNR (left picture, warped: 32.6 dB)",
+        "right eye": "34.1 dB PSNR (left image, warped: 32.6 dB)",
         "hidden": "26.1 dB PSNR (the model alone: 22.9 dB; as it was last seen: 25.3 dB)",
         "quality": "rung 3 of 0 to 15 for most frames (1 to 14), 21,510 Gaussians on average, 640x512 px",
         "warnings": "frames_missed (16 frames)",
@@ -102,7 +102,7 @@ def test_a_run_frame_by_frame_is_not_called_live() -> None:
     said = dict(verdict(flat(step)))
     assert said["speed"].startswith("27.6 frames/s would be possible; frame by frame, 268 of 278 frames")
     assert said["latency"] == "39 ms (p50), 97 ms (p99) of work on a frame"
-    assert said["unseen"] == "35.7 dB PSNR on frames kept back (the picture before, shown again: 39.5 dB)"
+    assert said["unseen"] == "35.7 dB PSNR on frames kept back (the image before, shown again: 39.5 dB)"
 
 
 def test_what_is_not_known_is_not_said() -> None:
@@ -115,8 +115,8 @@ def test_figures_stand_in_groups_beside_their_baselines() -> None:
     found = groups(live())
     assert list(found) == list(TABLE) and headings(live()) == ["all frames", "motion"]
     shown = {(group, row[0]): row for group, rows in found.items() for row in rows}
-    what = ("Picture", "the model, PSNR over tissue")
-    assert shown[what] == (what[1], ["34.6 dB", "31.0 dB"], "the picture before, shown again: 35.8 dB")
+    what = ("Image", "the model, PSNR over tissue")
+    assert shown[what] == (what[1], ["34.6 dB", "31.0 dB"], "the image before, shown again: 35.8 dB")
     assert shown["Depth", "error, median"] == ("error, median", ["0.24 mm", ""], "stereo alone: 0.17 mm")
     assert shown["Points", "lost"][1] == ["33 %", ""]
     assert shown["Overlay", "not shown: being pinned"][1] == ["19"]

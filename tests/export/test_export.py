@@ -212,7 +212,7 @@ def test_the_video_goes_around_and_comes_back(scene: Scene, tmp_path: Path) -> N
     assert frames.shape == (24, 256, 320, 3) and row["holds"] == 24
     steps = np.abs(frames - np.roll(frames, 1, axis=0)).mean((1, 2, 3))
     assert frames.std((1, 2, 3)).min() > 10 and steps.min() > 1
-    assert steps[0] < 1.5 * steps[1:].max()  # from the last picture to the first
+    assert steps[0] < 1.5 * steps[1:].max()  # from the last image to the first
     assert np.abs(frames - np.roll(frames, 12, axis=0)).mean() > 2 * steps.mean()  # the other side
 
     still = tmp_path / "still.mp4"
@@ -238,7 +238,7 @@ def test_all_cameras_of_the_video_look_at_the_same_point(scene: Scene) -> None:
 def test_a_running_node_is_exported_as_it_is_now(
     phantom_session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Where time is short, a part of the picture is as it was before the frame's step.
+    # Where time is short, a part of the image is as it was before the frame's step.
     depth = TopicName("left/render/depth", ReceivedImage)
     with RunningNode(phantom_session, tmp_path, "mapping.iterations:=1") as node:
         with Subscriber([depth], run_dir=node.run_dir) as subscriber:

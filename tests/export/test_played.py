@@ -245,7 +245,7 @@ def darkened(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.fault("picture: black to the end of a recording that is exported")
+@pytest.mark.fault("image: black to the end of a recording that is exported")
 def test_frames_that_were_not_taken_in_have_no_points(darkened: Path, tmp_path: Path) -> None:
     into = ("--depth", tmp_path / "depth", "--tracks", tmp_path / "t.npz", "--lerobot", tmp_path / "lerobot")
     assert sags("export", darkened, "mapping.iterations:=1", *into).exit_code == 0
@@ -330,7 +330,7 @@ def test_videos_have_the_recordings_own_stamps(tmp_path: Path) -> None:
 
 
 def times_of(video: Path) -> list[float]:
-    """When each picture is shown, s."""
+    """When each image is shown, s."""
     with av.open(str(video)) as opened:
         return [float(frame.time) for frame in opened.decode(video=0)]
 

@@ -52,7 +52,7 @@ def by_the_formula(field: HexPlane, cells: torch.Tensor, points: torch.Tensor, t
 
 
 def bilinear(picture: torch.Tensor, across: torch.Tensor, down: torch.Tensor) -> torch.Tensor:
-    """Values [N, C] of a picture [rows, columns, C] at places from -1 to 1."""
+    """Values [N, C] of an image [rows, columns, C] at places from -1 to 1."""
     places = torch.stack([across, down], -1)[None, None]
     sampled = torch.nn.functional.grid_sample(
         picture.permute(2, 0, 1)[None], places, padding_mode="border", align_corners=True

@@ -90,7 +90,7 @@ def test_rows_that_are_not_taken_or_not_finite_stay(monkeypatch: pytest.MonkeyPa
 
 
 def test_the_3d_filter_is_that_of_the_kernels() -> None:
-    """Also of what lies behind the camera or outside its picture."""
+    """Also of what lies behind the camera or outside its image."""
     means = np.random.default_rng(0).normal(0, 0.1, (500, 3)).astype(np.float32)
     cameras = [camera(80, 64), camera(moved=True)]
     found = smoothing(torch.from_numpy(means), cameras).numpy()

@@ -164,7 +164,7 @@ def test_papers_count_with_the_masks_as_they_were_given(whole: Clip, phantom_ses
 
 
 def test_each_part_of_the_method_has_its_share_in_the_result(clip: Clip) -> None:
-    """The self-adaptive block, and both filters. The same settings twice give the same picture."""
+    """The self-adaptive block, and both filters. The same settings twice give the same image."""
     frame = clip.test[0]
 
     def drawn(**changed: Any) -> F32:
@@ -269,7 +269,7 @@ def test_between_two_frames_the_model_goes_straight(whole: Clip, refined: Refine
 
 
 def test_pictures_carried_along_the_motion_beat_their_mean(whole: Clip, refined: Refined) -> None:
-    """The phantom's tissue moves all the time, so that the mean of two pictures is blurred."""
+    """The phantom's tissue moves all the time, so that the mean of two images is blurred."""
     found = score_between(refined.fit, whole.test, {"first": (0, 5)})
     assert found is not None
     carried, mean = found["carried"], found["mean"]
@@ -436,7 +436,7 @@ def test_a_checkpoint_of_another_fit_is_refused(clip: Clip, tmp_path: Path) -> N
     with pytest.raises(UsageError, match="other training frames"):
         checkpoint.load(Fit(Clip(clip.train[1:], clip.test), settings), path)
     other = [dataclasses.replace(frame, image=frame.image[:, ::-1].copy()) for frame in clip.train[5:]]
-    with pytest.raises(UsageError, match=r"other pictures \(5 of 10, first in frame 6\);"):
+    with pytest.raises(UsageError, match=r"other images \(5 of 10, first in frame 6\);"):
         checkpoint.load(Fit(Clip([*clip.train[:5], *other], clip.test), settings), path)
     camera = clip.train[2].camera
     for what, change in {
@@ -665,7 +665,7 @@ def test_a_clip_too_long_for_its_memory_is_refused_at_once(clip: Clip) -> None:
         fitted(clip, dataclasses.replace(SMALL, max_gaussians=5_000_000, pixels_each=0.0))
 
 
-@pytest.mark.fault("memory: the pictures of a clip have no room")
+@pytest.mark.fault("memory: the images of a clip have no room")
 def test_a_clip_whose_pictures_have_no_room_is_refused_before_they_are_made(
     whole: Clip, phantom_session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -63,7 +63,7 @@ def test_colours_move_by_the_mean_residual_of_their_pixels(t_ns: int) -> None:
     refine(residuals, t_ns, np.zeros((5, columns.COUNT), np.float32), v_colors, contribution)
     moved = (residuals.at(t_ns) - before)[:, columns.COLOR]
     np.testing.assert_allclose(moved[:4], -0.1, rtol=0.01)
-    assert not moved[4].any()  # not in the picture
+    assert not moved[4].any()  # not in the image
 
 
 def test_more_than_the_memory_they_may_take_is_refused() -> None:

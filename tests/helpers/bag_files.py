@@ -1,4 +1,4 @@
-"""Bags of every kind, written by `rosbags`, with pictures whose every pixel is known."""
+"""Bags of every kind, written by `rosbags`, with images whose every pixel is known."""
 
 from collections.abc import Callable
 from pathlib import Path

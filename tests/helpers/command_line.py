@@ -20,7 +20,7 @@ from sags_node.cli.main import main
 
 S = TypeVar("S", str, bytes)
 
-# For a node that a test starts: ports that are free, and pictures of one size, however busy the machine is.
+# For a node that a test starts: ports that are free, and images of one size, however busy the machine is.
 RUN_HERE = ("publish.data:=[tcp://127.0.0.1:*]", "publish.control:=tcp://127.0.0.1:*", "vision.scale:=1")
 
 

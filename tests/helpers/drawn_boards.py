@@ -21,7 +21,7 @@ def known_rig() -> StereoRig:
 
 
 def poses() -> list[F64]:
-    """Board to left camera, [4, 4] m: all over the picture, tilted all ways, near and far."""
+    """Board to left camera, [4, 4] m: all over the image, tilted all ways, near and far."""
     rng = np.random.default_rng(5)
     made = []
     for index in range(18):

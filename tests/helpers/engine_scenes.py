@@ -24,7 +24,7 @@ DERIVATIVES = tuple(field.name for field in dataclasses.fields(Gradients))
 
 
 def as_bytes(picture: Any) -> U8:
-    """A picture 0..1, as a camera gives it."""
+    """An image 0..1, as a camera gives it."""
     return np.ascontiguousarray(np.rint(255 * np.clip(picture, 0, 1)), np.uint8)
 
 

@@ -11,7 +11,7 @@ Scene = tuple[Observation, Snapshot, RenderedView]
 
 
 def camera_in_front(width: int, height: int, focal: float) -> Camera:
-    """A camera without a pose that looks along z, its middle in the middle of the picture."""
+    """A camera without a pose that looks along z, its middle in the middle of the image."""
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
     return Camera(width, height, K, np.eye(4))
 

@@ -67,7 +67,7 @@ from sags_node.vision.onnx_depth import DepthNetwork
 from sags_node.vision.tissue_topic import TopicMasks
 
 LONGEST = 10.0  # s for one input
-MOST_MEMORY = 2 << 30  # bytes beyond those at the beginning: a 64 Mpx picture, decoded, and its copies
+MOST_MEMORY = 2 << 30  # bytes beyond those at the beginning: a 64 Mpx image, decoded, and its copies
 PARTS = b"|~|~"  # between the parts of a message of several
 NUMBERS = [
     struct.pack(order + kind, value)
@@ -495,7 +495,7 @@ TARGETS: dict[str, Target] = {
     "requests": Target(requests, answer),
     "messages": Target(messages, read_message),
     "masks": Target(masks, use_mask),
-    "thin pictures": Target(thin_files, lambda data, _: thin.decode("sags/thin", 0.01, data)),
+    "thin images": Target(thin_files, lambda data, _: thin.decode("sags/thin", 0.01, data)),
     "poses": Target(poses, read_pose),
     "pictures": Target(pictures, read_picture),
     **{kind: bag(kind) for kind in BAGS},
@@ -516,4 +516,4 @@ TARGETS: dict[str, Target] = {
     "networks": Target(networks, open_network),
     "videos": Target(films, read_film),
 }
-IN_MEMORY = {"requests", "messages", "masks", "thin pictures", "poses", "pictures"}
+IN_MEMORY = {"requests", "messages", "masks", "thin images", "poses", "pictures"}

@@ -43,7 +43,7 @@ def apart(one: float, other: float) -> float:
 
 
 def raw_file(file: Path, pictures: np.ndarray, rate: int, interlaced: bool = False) -> str:
-    """Write pictures [T, H, W, 3] (or gray [T, H, W] uint16) and return the launch string that plays them."""
+    """Write images [T, H, W, 3] (or gray [T, H, W] uint16) and return the launch string that plays them."""
     height, width = pictures.shape[1:3]
     rows = np.ascontiguousarray(pictures).view(np.uint8).reshape(len(pictures), height, -1)
     padding = -rows.shape[2] % 4  # GStreamer's rows end at multiples of 4 bytes

@@ -114,7 +114,7 @@ def check_sequence(messages: Sequence[Received]) -> int:
 
 
 def check_image(message: Received, encoding: str, width: int, height: int) -> np.ndarray:
-    """The picture, of the size and encoding expected."""
+    """The image, of the size and encoding expected."""
     check_meta(message, "sensor_msgs/msg/Image")
     channels = {"rgb8": [3], "rgba8": [4], "mono8": [], "32FC1": []}[encoding]
     assert message.meta["encoding"] == encoding

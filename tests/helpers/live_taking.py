@@ -10,7 +10,7 @@ from sags_node.types import StereoFrame
 
 
 class Taker:
-    """Of each frame: number painted into the left and the right picture."""
+    """Of each frame: number painted into the left and the right image."""
 
     def __init__(self, source: Source) -> None:
         self.numbers: list[tuple[int, int]] = []

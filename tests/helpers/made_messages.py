@@ -47,7 +47,7 @@ def changed(header: bytes, **fields: object) -> bytes:
 
 
 def damaged(depth: list[bytes], other: bytes) -> list[list[bytes]]:
-    """What is no message, of the parts of a depth picture and the header of another one."""
+    """What is no message, of the parts of a depth image and the header of another one."""
     topic, header, head, pixels = depth
     return [
         [topic],

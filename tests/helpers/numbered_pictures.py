@@ -1,4 +1,4 @@
-"""Stereo recordings of every kind whose pictures tell their frame number and their eye."""
+"""Stereo recordings of every kind whose images tell their frame number and their eye."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ WIDTH, HEIGHT = 32, 24
 
 
 def picture(number: int, eye: int = 0) -> U8:
-    """An RGB picture that tells its frame number (red) and its eye (blue)."""
+    """An RGB image that tells its frame number (red) and its eye (blue)."""
     return np.full((HEIGHT, WIDTH, 3), (10 * number, 100, 200 * eye), np.uint8)
 
 
@@ -42,7 +42,7 @@ def write_video(file: Path, pictures: list[U8], rate: float = 25.0, codec: str =
 
 
 def numbers(frames: list[StereoFrame]) -> list[int]:
-    """Frame numbers as the pictures show them; both eyes must show the same one."""
+    """Frame numbers as the images show them; both eyes must show the same one."""
     for frame in frames:
         assert (eye_of(frame.left), eye_of(frame.right)) == (0, 1)
         assert number_of(frame.left) == number_of(frame.right)

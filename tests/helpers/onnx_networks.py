@@ -81,7 +81,7 @@ def save_matcher(
     metadata: Mapping[str, str] | None = None,
     fault: str = "",
 ) -> Path:
-    """Block matching of two pictures over disparities of 0 to 40 px.
+    """Block matching of two images over disparities of 0 to 40 px.
 
     Args:
         size: width and height of the inputs; a text is any.
@@ -91,7 +91,7 @@ def save_matcher(
         output: full, half (of its size), 6187 (its name) or several.
         factor: of the disparity, in the output.
         depth_of: focal length times baseline (px m), for depth in metres instead of disparity.
-        fault: nan or error, where the left picture is nearly black.
+        fault: nan or error, where the left image is nearly black.
     """
     g = Graph()
 
@@ -165,7 +165,7 @@ def _faulty(g: Graph, left: str, disparity: str, fault: str) -> str:
 def save_table(
     path: Path, pictures: np.ndarray, maps: np.ndarray, expects: str = "imagenet", nhwc: bool = False
 ) -> Path:
-    """A monocular network that knows the pictures [N, H, W, 3] (uint8) and gives the map [N, H, W] of the one
+    """A monocular network that knows the images [N, H, W, 3] (uint8) and gives the map [N, H, W] of the one
     most like its input."""
     g = Graph()
     count, height, width, _ = pictures.shape

@@ -40,7 +40,7 @@ def play(
 
 
 def both(frame: StereoFrame, change: Callable[[U8], np.ndarray]) -> StereoFrame:
-    """A frame whose pictures are changed; what is beyond black and white is cut off."""
+    """A frame whose images are changed; what is beyond black and white is cut off."""
     assert frame.right is not None
     left, right = (np.clip(change(eye), 0, 255).astype(np.uint8) for eye in (frame.left, frame.right))
     return replace(frame, left=left, right=right)

@@ -1,4 +1,4 @@
-"""Processes that send pictures in the place of cameras."""
+"""Processes that send images in the place of cameras."""
 
 import os
 import subprocess

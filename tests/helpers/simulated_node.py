@@ -3,7 +3,7 @@
 Real are `Node` with all its loops, `Latest`, `LivePairs` and `SentPictures`, `Operations`, `TimeBudget`
 and `Ladder`, `Statistics`, `Publisher`, `ControlServer` and, at the consumer, `decode` and `Freshness`.
 Simulated are cameras, the work on a frame (it takes time, and fails now and then), the sockets, and who asks
-and listens. Views, thin pictures and the recorder are there and nobody asks for them.
+and listens. Views, thin images and the recorder are there and nobody asks for them.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class Pipeline:
 
 
 class Source:
-    """Two cameras whose pictures another program sends."""
+    """Two cameras whose images another program sends."""
 
     rate, frame_count = RATE, None
 
@@ -218,7 +218,7 @@ class Source:
         self.sent.stop()
 
     def _film(self, eye: str) -> None:
-        """Lost, late, doubled, outdated and future pictures, silence, and stamps that go back."""
+        """Lost, late, doubled, outdated and future images, silence, and stamps that go back."""
         world = self._run.world
         chance, offset, number = world.random, 0, 0
         while not self.sent.stopped.is_set():

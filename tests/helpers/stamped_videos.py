@@ -1,4 +1,4 @@
-"""Videos written packet by packet: any stamps, containers, codecs, tags; each picture tells its number."""
+"""Videos written packet by packet: any stamps, containers, codecs, tags; each image tells its number."""
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
@@ -49,7 +49,7 @@ def write(
     """A video of one stream.
 
     Args:
-        seconds: when each picture is shown; default: at the rate.
+        seconds: when each image is shown; default: at the rate.
         matrix: ITU code by which RGB becomes YUV; default: FFmpeg's, BT.601.
         ticks: of which stamps are multiples, 1/s.
         told: codes of matrix and range that the file is tagged with; default: none.

@@ -1,11 +1,11 @@
-"""A process that sends pairs of phantom pictures for a minute, for tests of sources that other programs feed.
+"""A process that sends pairs of phantom images for a minute, for tests of sources that other programs feed.
 
     python stereo_sender.py push ENDPOINT [key=value ...]
     python stereo_sender.py dds DOMAIN [key=value ...]
 
-The number of each pair is painted into both pictures (`read_number`), so that a mismatch shows; with
+The number of each pair is painted into both images (`read_number`), so that a mismatch shows; with
 `clock=1` the milliseconds of its stamp (of a minute), so that a wrong stamp shows. In the end it says how
-many pictures were left out because nobody took them in time.
+many images were left out because nobody took them in time.
 """
 
 import sys
@@ -34,7 +34,7 @@ def read_number(picture: U8) -> int:
 
 
 def push(endpoint: str, jpeg: bool) -> tuple[Callable[[U8, U8, int], None], Callable[[], int]]:
-    """What sends a pair, and how many pictures it has left out."""
+    """What sends a pair, and how many images it has left out."""
     from sags_node.client import FrameSender
 
     sender = FrameSender(endpoint)

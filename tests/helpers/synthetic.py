@@ -34,7 +34,7 @@ NORMAL, DISTANCE = np.array([-0.2, 0.1, 1.0]), 0.06  # the plane: NORMAL . p = D
 
 
 def plane_instruments() -> InstrumentStates:
-    """One whose tip is known, and one whose tip is beyond the picture."""
+    """One whose tip is known, and one whose tip is beyond the image."""
 
     def column(*first: float) -> F32:
         return np.array([first, np.full(len(first), np.nan)], np.float32)

@@ -1,4 +1,4 @@
-"""A node that is only its sockets and makes thin pictures."""
+"""A node that is only its sockets and makes thin images."""
 
 import time
 from collections.abc import Iterator

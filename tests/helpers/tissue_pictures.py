@@ -1,4 +1,4 @@
-"""Pictures of tissue and instruments, made so that it is known which is which."""
+"""Images of tissue and instruments, made so that it is known which is which."""
 
 import cv2
 import numpy as np

@@ -38,7 +38,7 @@ def texture(seed: int, shift: int = 0) -> U8:
 
 
 def made(folder: Path) -> Path:
-    """A sound recording: rectified pictures of both eyes in two kinds of files, masks and depth in 1e-5 m."""
+    """A sound recording: rectified images of both eyes in two kinds of files, masks and depth in 1e-5 m."""
     for side in ("left", "right", "masks", "depth"):
         (folder / side).mkdir(parents=True)
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
@@ -67,10 +67,10 @@ def edit(folder: Path, change: object) -> None:
 
 def test_a_sound_folder(tmp_path: Path) -> None:
     found = check_folder(made(tmp_path / "case"))
-    assert [each.what for each in found if each.level != "ok"] == ["no calibration lies beside the pictures"]
+    assert [each.what for each in found if each.level != "ok"] == ["no calibration lies beside the images"]
     said = "\n".join(each.what for each in found)
-    assert "4 pictures each" in said and f"disparity {DISPARITY}.0 px, rows agree" in said
-    assert "80 mm with 1e-05 m per count" in said and "10% of the picture is instrument" in said
+    assert "4 images each" in said and f"disparity {DISPARITY}.0 px, rows agree" in said
+    assert "80 mm with 1e-05 m per count" in said and "10% of the image is instrument" in said
     assert "source.left:=" in found[-1].what and "source.tools:=" in found[-1].what
 
 
@@ -161,12 +161,12 @@ PLANTED = {
             shutil.copytree(folder / "left", folder / "right", dirs_exist_ok=True)
             and [file.unlink() for file in (folder / "right").glob("*.tiff")]
         ),
-        "both eyes get the same picture",
+        "both eyes get the same image",
         "source.right",
     ),
     "exchanged": (exchanged, "eyes exchanged", "exchange left and right"),
     "interlaced": (interlaced, "left: interlaced", "deinterlace"),
-    "borders": (bordered, "black borders; the picture is 140x120 px at 20,0", "[20,0,140,120]"),
+    "borders": (bordered, "black borders; the image is 140x120 px at 20,0", "[20,0,140,120]"),
 }
 
 
@@ -200,7 +200,7 @@ def test_check_says_what_run_says(kind: str, tmp_path: Path, caplog: pytest.LogC
     assert len(said) == 2 + len(once) == (3 if kind == "videos" else 2) and said - checked == once
 
 
-@pytest.mark.parametrize("has_rig", [True, False])  # else a camera is guessed from some pictures
+@pytest.mark.parametrize("has_rig", [True, False])  # else a camera is guessed from some images
 def test_a_run_says_all_again_after_a_check_and_after_a_run(
     has_rig: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -276,7 +276,7 @@ def test_a_semicolon_in_a_name_does_not_part_a_message(tmp_path: Path) -> None:
             f"look at '{there}'; fill them",
         ),
         (f"cannot read {there}", f"cannot read {there}", ""),
-        (f"pictures of {there} are odd; {there.parent}", f"pictures of {there} are odd", str(there.parent)),
+        (f"images of {there} are odd; {there.parent}", f"images of {there} are odd", str(there.parent)),
         ("one; two; three", "one", "two; three"),
     ):
         assert parted("error", message) == Finding("error", what, fix)
@@ -338,11 +338,11 @@ def test_a_link_that_leads_nowhere_is_a_picture_that_cannot_be_read(tmp_path: Pa
     file = made(tmp_path) / "left/001.bmp"
     file.unlink()
     file.symlink_to("gone")
-    assert f"cannot read picture {file}" in str([each for each in odd(tmp_path) if each.level == "error"])
+    assert f"cannot read image {file}" in str([each for each in odd(tmp_path) if each.level == "error"])
 
 
 def shown(left: U8, right: U8) -> dict[str, tuple[U8, str]]:
-    """Both eyes in one picture, and how that is played."""
+    """Both eyes in one image, and how that is played."""
     rows = left.copy()
     rows[1::2] = right[1::2]
     dark = np.full_like(left, 20)
@@ -501,7 +501,7 @@ def test_the_command_that_plays_a_folder_with_spaces_is_one_for_a_shell(tmp_path
 def test_the_command(tmp_path: Path) -> None:
     folder = made(tmp_path / "case")
     found = figures_of("import", "--check", folder, "--json")
-    assert found[0]["what"] == "case is two folders of pictures"
+    assert found[0]["what"] == "case is two folders of images"
     refused(2, "import", "--check", tmp_path / "none", said=("does not exist",))
 
 
@@ -516,7 +516,7 @@ def write_eyes(folder: Path, left: list[U8], right: list[U8], right_rate: float 
 
 
 def moving(count: int, shift: int = 0) -> list[U8]:
-    """Pictures of a texture that goes up and down; truth is the arithmetic of where it is."""
+    """Images of a texture that goes up and down; truth is the arithmetic of where it is."""
     wide = np.vstack([texture(0, shift)] * 2)
     t = np.arange(count)
     places = np.round(20 + 12 * np.sin(0.7 * t) + 6 * np.sin(1.9 * t)).astype(int)
@@ -528,7 +528,7 @@ def moving(count: int, shift: int = 0) -> list[U8]:
     ("right", "rate", "said"),
     [
         (40, 30.0, ("25 frames/s", "has 30", "one rate is wrong")),
-        (25, 25.0, ("right.avi has 25 pictures, ", "left.avi 40", "source.frames:=25")),
+        (25, 25.0, ("right.avi has 25 images, ", "left.avi 40", "source.frames:=25")),
     ],
     ids=["another rate", "too short"],
 )
@@ -603,7 +603,7 @@ def test_an_eye_that_is_late_is_found(tmp_path: Path, late: int, how: str) -> No
 
 @pytest.mark.parametrize("late", [0, 14, -14])
 def test_of_videos_of_other_lengths_it_is_told_whether_one_was_begun_later(tmp_path: Path, late: int) -> None:
-    """Both count from zero: only their pictures tell. 0: the right one was ended sooner."""
+    """Both count from zero: only their images tell. 0: the right one was ended sooner."""
     left, right = moving(60), moving(60, -DISPARITY)
     folder = write_eyes(tmp_path / "case", left[max(0, -late) :], right[max(0, late) : 60 - 14 * (late == 0)])
     found = check_folder(folder)
@@ -623,9 +623,9 @@ def test_where_nothing_moves_no_eye_is_late(tmp_path: Path) -> None:
     assert "frames late" not in str(found)
 
 
-@pytest.mark.parametrize("what", ["empty", "pictures of one eye", "a wrong launch file", "text"])
+@pytest.mark.parametrize("what", ["empty", "images of one eye", "a wrong launch file", "text"])
 def test_what_cannot_be_played_has_exit_code_1(tmp_path: Path, what: str) -> None:
-    if what == "pictures of one eye":
+    if what == "images of one eye":
         cv2.imwrite(str(tmp_path / "a.png"), texture(0))
     if what == "a wrong launch file":
         (tmp_path / "launch.yaml").write_text("sorce: {}")
@@ -639,7 +639,7 @@ def test_a_calibration_beside_videos_is_compared_with_them(tmp_path: Path) -> No
     folder = write_eyes(tmp_path / "case", moving(40), moving(40, -DISPARITY))
     shutil.copytree(SESSION / "calib", folder / "calib")  # of 320x256 px
     (wrong,) = (each for each in check_folder(folder) if each.level == "error")
-    assert "the calibration is for 320x256 px, the pictures are 160x120" in wrong.what
+    assert "the calibration is for 320x256 px, the images are 160x120" in wrong.what
 
 
 @pytest.mark.parametrize("names", [

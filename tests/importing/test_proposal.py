@@ -75,7 +75,7 @@ def test_black_borders_are_cut_off(tmp_path: Path) -> None:
 
 
 def framed(left: int, right: int, eye: list[U8]) -> list[U8]:
-    """Pictures with black borders of so many columns, of the same size."""
+    """Images with black borders of so many columns, of the same size."""
     pictures = [picture.copy() for picture in eye]
     for picture in pictures:
         picture[:, :left] = picture[:, picture.shape[1] - right :] = 0
@@ -87,7 +87,7 @@ def test_borders_that_differ_between_the_eyes_give_one_crop(tmp_path: Path) -> N
     found = propose(both)
     x, _, width, _ = yaml.safe_load(set_by(found.launch)["source.geometry.crop"])
     assert abs(x - 16) <= 2 and abs(x + width - (320 - 24)) <= 2
-    assert not [each for each in found.findings if "borders; the picture" in each.what and each.level != "ok"]
+    assert not [each for each in found.findings if "borders; the image" in each.what and each.level != "ok"]
 
 
 @pytest.mark.parametrize("flip", ["none", "horizontal", "both"])
@@ -103,7 +103,7 @@ def test_borders_stay_where_the_calibration_is_of_whole_pictures(tmp_path: Path)
     both = videos(tmp_path, framed(12, 12, LEFT), framed(12, 12, RIGHT))
     found = propose(both, [f"rig:={SESSION / 'calib'}"])
     assert "source.geometry.crop" not in set_by(found.launch)
-    stay = [each for each in found.findings if "borders; the picture" in each.what]
+    stay = [each for each in found.findings if "borders; the image" in each.what]
     assert {(each.level, each.fix.partition(":")[0]) for each in stay} == {("ok", "the borders stay")}
     assert not [each for each in found.findings if each.level == "error"]
 

@@ -1,4 +1,4 @@
-"""Tools whose tips a robot tells: alone, corrected by the picture, and silent."""
+"""Tools whose tips a robot tells: alone, corrected by the image, and silent."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -85,7 +85,7 @@ def test_without_a_picture_it_is_where_the_robot_says_as_surely_as_it_says() -> 
 
 
 def test_the_picture_corrects_it_and_what_was_learnt_lasts_where_the_picture_ends() -> None:
-    """5 mm off. One row for one tool, also with its tip beyond the picture, where no tissue is seen."""
+    """5 mm off. One row for one tool, also with its tip beyond the image, where no tissue is seen."""
     look, E = Looking(), moved(0.003, -0.004, 0.0)
     seen = look(None)
     assert seen.sources.tolist() == [BY_PICTURE] and seen.confidence[0] >= SURE
@@ -112,7 +112,7 @@ def test_where_the_robot_falls_silent_the_picture_goes_on_under_the_same_number(
 
 
 def test_one_that_is_told_in_plain_sight_and_not_seen_there_is_not_sure() -> None:
-    """30 mm beside what the mask shows: two rows, of which the picture's is sure."""
+    """30 mm beside what the mask shows: two rows, of which the image's is sure."""
     look = Looking()
     for _ in range(4):
         assert look(look.truth).confidence[0] >= SURE
@@ -136,7 +136,7 @@ def test_what_is_seen_is_learnt_where_the_clock_was_set_back() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_false_tips_of_the_picture_are_passed_over(seed: int) -> None:
     """Kinematics 5 mm and 5 degrees off, of a tip that goes round for 20 s; it is seen to 1 mm, but one time
-    of five 20 mm beside. What is told as its error holds for nine of ten, whatever the picture shows."""
+    of five 20 mm beside. What is told as its error holds for nine of ten, whatever the image shows."""
     rng, arm, E = np.random.default_rng(seed), Arm(1, ERROR), moved(0.003, 0.004, 0, 5)
     off, told = [], []
     for number in range(200):

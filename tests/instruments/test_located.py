@@ -27,7 +27,7 @@ OUTSIDE = [((-40, 120), (360, 150)), ((300, 300), (360, 220))]  # from edge to e
 
 
 def instruments_in(tools: Bool | None, right: bool = True, plane: float = 0.08) -> InstrumentStates:
-    """Of the filmed pictures, before tissue that is a plane at a depth, m."""
+    """Of the filmed images, before tissue that is a plane at a depth, m."""
     scene = filmed()
     left, there = (
         cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (scene.pair.left, scene.pair.right)
@@ -40,7 +40,7 @@ def instruments_in(tools: Bool | None, right: bool = True, plane: float = 0.08) 
     return states
 
 
-# ---- in the picture --------------------------------------------------------------------------------------
+# ---- in the image --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle", range(0, 360, 30))
@@ -78,7 +78,7 @@ def test_what_does_not_come_from_the_edge_is_no_instrument() -> None:
     mask = bars(((100, 100), (200, 150)))
     assert outlines(mask, EVERYWHERE) == []
     usable = EVERYWHERE.copy()
-    usable[:, :110] = False  # e.g. a caption: there the picture ends
+    usable[:, :110] = False  # e.g. a caption: there the image ends
     assert len(outlines(mask, usable)) == 1
 
 
@@ -121,7 +121,7 @@ def test_ways_inside_of_a_mask_are_as_long_as_growing_says() -> None:
 
 
 def test_a_patch_agrees_where_it_is_found_again() -> None:
-    """In a picture that is shifted by 7.5 px, 2 down, brighter and flatter; not with what lies beyond it."""
+    """In an image that is shifted by 7.5 px, 2 down, brighter and flatter; not with what lies beyond it."""
     left = 128 + 700 * cv2.GaussianBlur(np.random.default_rng(0).uniform(-1, 1, (80, 200)), (0, 0), 3)
     right = cv2.warpAffine(left, np.array([[1, 0, -7.5], [0, 1, 2.0]]), (200, 80))
     pictures = np.rint(left).astype(np.uint8), np.rint(0.5 * right + 90).astype(np.uint8)

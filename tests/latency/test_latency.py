@@ -30,7 +30,7 @@ from sags_node.sources.push import PushedPictures
 from sags_node.types import U8, Camera, FrameResult
 
 MS = 1_000_000
-HELD = 0.2  # s, by which a chain is known to hold pictures
+HELD = 0.2  # s, by which a chain is known to hold images
 
 
 def numbered(number: int) -> U8:
@@ -60,7 +60,7 @@ def test_two_codes_in_one_exposure_are_not_taken_for_a_third() -> None:
 
 
 class Chain:
-    """A camera of 30 Hz before a node and a screen, on a clock that only the test moves. Every eighth picture
+    """A camera of 30 Hz before a node and a screen, on a clock that only the test moves. Every eighth image
     is lost, and every eleventh unreadable; numbers begin anew on the way."""
 
     def __init__(self, mapped_ms: float, wall_ms: float = 0.0) -> None:
@@ -125,7 +125,7 @@ def test_a_clock_that_is_set_meanwhile_changes_no_delay() -> None:
 
 
 def shows(left: U8, stamp_ns: int, frame_id: int) -> FrameResult:
-    """A node's result with this left picture."""
+    """A node's result with this left image."""
     result = plane_result(frame_id, stamp_ns)
     height, width = left.shape[:2]
     camera = Camera(width, height, result.pair.camera.K, np.eye(4))
@@ -133,7 +133,7 @@ def shows(left: U8, stamp_ns: int, frame_id: int) -> FrameResult:
 
 
 def show_late(node: Publisher, left: U8, stamp_ns: int, frame_id: int) -> None:
-    """As a node that holds pictures for `HELD` s."""
+    """As a node that holds images for `HELD` s."""
     while time.time_ns() < stamp_ns + HELD * 1e9:
         time.sleep(0.001)
     node.publish_result(shows(left, stamp_ns, frame_id), dropped=0)
@@ -163,7 +163,7 @@ def measuring(
 def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
     phantom_session: Path, tmp_path: Path
 ) -> None:
-    """By its own stamps: no picture leaves before `HELD` after its capture."""
+    """By its own stamps: no image leaves before `HELD` after its capture."""
     source = PushedPictures(PushSource(endpoint="tcp://127.0.0.1:*"), (320, 256))
     with publisher(tmp_path / "run") as node, source:
         codes = Pushed(source.endpoint, phantom_session, rate=20.0)
@@ -180,7 +180,7 @@ def test_a_chain_of_sockets_that_holds_pictures_is_at_least_so_slow(
 
 
 class Painted(Codes):
-    """Of pictures that the test itself publishes."""
+    """Of images that the test itself publishes."""
 
     hint = "are codes painted?"
 
@@ -190,7 +190,7 @@ class Painted(Codes):
 
 @contextmanager
 def overlaid(run_dir: Path, behind: int, codes: Painted) -> Iterator[NodeAddress]:
-    """Publishes coded pictures at up to 30 Hz, and an overlay `behind` pictures behind them; it is given."""
+    """Publishes coded images at up to 30 Hz, and an overlay `behind` images behind them; it is given."""
     with publisher(run_dir) as node, OverlayStream("overlay", run_dir, (0, 0, 255)) as overlay:
         stamps: list[int] = []
 
@@ -212,7 +212,7 @@ def overlaid(run_dir: Path, behind: int, codes: Painted) -> Iterator[NodeAddress
 @pytest.mark.live
 def test_an_overlay_ten_pictures_behind_is_measured(tmp_path: Path) -> None:
     def measured() -> dict[str, Any] | None:
-        """Where this process stood still most pictures are lost, and it is measured again."""
+        """Where this process stood still most images are lost, and it is measured again."""
         codes, ended = Painted(), threading.Event()
         with (
             overlaid(tmp_path, 10, codes) as overlay,
@@ -223,7 +223,7 @@ def test_an_overlay_ten_pictures_behind_is_measured(tmp_path: Path) -> None:
 
     found = until(measured)
     assert found["unknown"] == found["unreadable"] == 0
-    assert found["parts_ms"]["drawn"]["p50"] >= 10 * 33 - 50  # the picture itself leaves up to so much later
+    assert found["parts_ms"]["drawn"]["p50"] >= 10 * 33 - 50  # the image itself leaves up to so much later
 
 
 @pytest.mark.live
@@ -233,12 +233,12 @@ def test_an_overlay_that_is_behind_all_pictures_is_named(tmp_path: Path) -> None
 
         def tell(why: str) -> None:
             said.append(why)
-            if "pictures behind" in why or len(said) == 10:
+            if "images behind" in why or len(said) == 10:
                 stop.set()
 
-        with pytest.raises(SagsError, match="pictures behind"):
+        with pytest.raises(SagsError, match="images behind"):
             measure_latency(NodeAddress(run_dir=tmp_path), overlay, codes, 2.0, tell, stop)
-    assert "pictures behind" in said[-1]
+    assert "images behind" in said[-1]
 
 
 @pytest.mark.live

@@ -49,7 +49,7 @@ def moved(one: Scene, by: np.ndarray, kept: np.ndarray | None = None) -> Scene:
 
 
 def flat(frame: int) -> Scene:
-    """A picture in which nothing can be found again: only the Gaussians tell where the tissue went."""
+    """An image in which nothing can be found again: only the Gaussians tell where the tissue went."""
     return scene(frame, np.full((HEIGHT, WIDTH), 90, np.uint8))
 
 
@@ -235,7 +235,7 @@ def test_what_cannot_be_pinned_is_a_clear_error() -> None:
     observation.tissue[:, :20] = False
     observation.depth[30:40] = view.depth[30:40] = 0
     for pixel, message in (
-        ((-0.6, 5), "outside the left picture of 128x96"), ((50, 95.5), "outside"),
+        ((-0.6, 5), "outside the left image of 128x96"), ((50, 95.5), "outside"),
         ((10, 50), "instrument"), ((50, 65), "vision.tissue.exclude"), ((50, 35), "no depth"),
     ):  # fmt: skip
         with pytest.raises(SagsError, match=message):
@@ -329,7 +329,7 @@ def test_skipped_and_repeated_frames_keep_the_anchors(phantom_session: Path) -> 
     pipeline.anchors.add_pixel(160, 128, mapped.observation, mapped.snapshot, mapped.views["left"])
     again = pipeline.process(replace(first, frame_id=1, t_capture_ns=first.t_capture_ns + PERIOD_NS), budget)
     assert again.skipped.keys() == {"frame"} and len(again.anchors) == 1 and len(mapped.anchors) == 0
-    assert again.anchors.confidence[0] == 1  # the picture shows it still
+    assert again.anchors.confidence[0] == 1  # the image shows it still
     jumped = pipeline.process(later, budget)
     assert np.isfinite(jumped.anchors.points).all()
     pipeline.reset()
@@ -338,7 +338,7 @@ def test_skipped_and_repeated_frames_keep_the_anchors(phantom_session: Path) -> 
 
 
 def test_the_farther_it_is_carried_out_of_sight_the_less_sure_it_is() -> None:
-    """Also where it is in the picture, but the picture is no good."""
+    """Also where it is in the image, but the image is no good."""
     ways = {}
     for step in (0.0, 1e-3):
         anchors = Anchors()

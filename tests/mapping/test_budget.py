@@ -53,7 +53,7 @@ class Machine:
         return steps, self.now - started
 
     def play(self, frames: int, spike_at: int = -1, spike: str = "") -> list[tuple[int, int, float]]:
-        """A camera of 30 Hz and a slot in which the newest picture wins: number, steps and age when done, s,
+        """A camera of 30 Hz and a slot in which the newest image wins: number, steps and age when done, s,
         of each frame that was taken."""
         done: list[tuple[int, int, float]] = []
         began, number = self.now, 0
@@ -119,7 +119,7 @@ def test_the_time_that_a_frame_waited_is_gone() -> None:
 
 @pytest.mark.parametrize("part", ["before", "step", "after"])
 def test_one_spike_delays_no_frame_for_long_and_leaves_no_trace(part: str) -> None:
-    """After 80 ms more, three pictures have gone by; of those that are taken then, few are late."""
+    """After 80 ms more, three images have gone by; of those that are taken then, few are late."""
     machine = Machine()
     done = machine.play(200, spike_at=100, spike=part)
     spiked = next(i for i, (number, _, _) in enumerate(done) if number >= 100)
@@ -148,7 +148,7 @@ def test_depth_is_matched_as_often_as_the_rung_says_and_a_frame_later_where_one_
 
 
 def test_a_new_model_gets_its_first_steps_in_one_frame_or_leaves_them_to_the_next() -> None:
-    """30 steps of a slow machine would keep the first picture back for a second."""
+    """30 steps of a slow machine would keep the first image back for a second."""
     for cost, expected in ((0.030, 1 + int(FIRST_SECONDS / 0.030)), (0.5, LEAST_FIRST_STEPS)):
         machine, steps = Machine(), 0
         machine.budget.start()

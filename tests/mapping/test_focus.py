@@ -1,4 +1,4 @@
-"""Which tiles are worst, against numpy, and what may stand in the pictures."""
+"""Which tiles are worst, against numpy, and what may stand in the images."""
 
 import itertools
 from typing import Any
@@ -24,7 +24,7 @@ SHAPE = -(-HEIGHT // TILE_HEIGHT), -(-WIDTH // TILE_WIDTH)
 
 @pytest.fixture
 def scene() -> tuple[F32, U8, Bool]:
-    """Planes that show the picture well in some tiles and badly in others, with holes and instruments."""
+    """Planes that show the image well in some tiles and badly in others, with holes and instruments."""
     rng = np.random.default_rng(0)
     image = rng.integers(25, 231, (HEIGHT, WIDTH, 3), np.uint8)
     planes = np.empty((5, HEIGHT, WIDTH), np.float32)

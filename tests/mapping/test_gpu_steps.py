@@ -182,7 +182,7 @@ def test_a_broken_gradient_stops_its_nodes_only(pair: Pair, value: float) -> Non
 
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5])
 def test_the_worst_tiles_are_the_cpus(share: float) -> None:
-    """Of a picture that is no whole number of tiles, with pixels that do not count."""
+    """Of an image that is no whole number of tiles, with pixels that do not count."""
     rng = np.random.default_rng(0)
     height, width = VIEW.height - 3, VIEW.width - 5
     planes = rng.uniform(0, 1, (5, height, width)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A bad picture is not a new scene: the model waits, says why, and is the same afterwards."""
+"""A bad image is not a new scene: the model waits, says why, and is the same afterwards."""
 
 import time
 from collections.abc import Callable
@@ -70,20 +70,20 @@ def clean(session: Session, frames: list[StereoFrame]) -> list[FrameResult]:
 
 
 def leaves_no_trace(results: list[FrameResult], clean: list[FrameResult]) -> bool:
-    """Whether the model and its picture are in the end what they were before, and would have been."""
+    """Whether the model and its image are in the end what they were before, and would have been."""
     kept = np.isin(clean[FIRST - 1].snapshot.gaussians.ids, results[-1].snapshot.gaussians.ids)
     as_good = psnr(results[-1], clean[-1].observation) > psnr(clean[-1]) - 1.0
     return results[-1].epoch == 0 and bool(kept.mean() > 0.8) and as_good
 
 
-@pytest.mark.fault("picture: the right eye is black")
-@pytest.mark.fault("picture: the left eye is black")
-@pytest.mark.fault("picture: the eyes are exchanged")
-@pytest.mark.fault("picture: one eye twice")
-@pytest.mark.fault("picture: of another scene")
-@pytest.mark.fault("picture: far too bright")
-@pytest.mark.fault("picture: smoke")
-@pytest.mark.fault("picture: blood")
+@pytest.mark.fault("image: the right eye is black")
+@pytest.mark.fault("image: the left eye is black")
+@pytest.mark.fault("image: the eyes are exchanged")
+@pytest.mark.fault("image: one eye twice")
+@pytest.mark.fault("image: of another scene")
+@pytest.mark.fault("image: far too bright")
+@pytest.mark.fault("image: smoke")
+@pytest.mark.fault("image: blood")
 @pytest.mark.parametrize("code", FAULTS)
 def test_a_fault_is_said_and_leaves_no_trace(
     code: str, session: Session, frames: list[StereoFrame], clean: list[FrameResult]
@@ -104,7 +104,7 @@ def test_a_fault_is_said_and_leaves_no_trace(
 
 
 def frozen(frames: list[StereoFrame], during: range) -> list[StereoFrame]:
-    """The frames as a camera gives them; in `during` the pictures of the one before, under new stamps."""
+    """The frames as a camera gives them; in `during` the images of the one before, under new stamps."""
     last = frames[during.start - 1]
     shown = [both(last, np.array) if i in during else frame for i, frame in enumerate(frames)]
     return [
@@ -113,7 +113,7 @@ def frozen(frames: list[StereoFrame], during: range) -> list[StereoFrame]:
     ]
 
 
-@pytest.mark.fault("picture: both eyes of a live feed are frozen")
+@pytest.mark.fault("image: both eyes of a live feed are frozen")
 def test_a_live_feed_that_freezes_is_held_and_said(
     session: Session, frames: list[StereoFrame], clean: list[FrameResult]
 ) -> None:
@@ -128,7 +128,7 @@ def test_a_live_feed_that_freezes_is_held_and_said(
     assert leaves_no_trace(results, clean)
 
 
-@pytest.mark.fault("picture: both eyes of a live feed are frozen, and an anchor is pinned")
+@pytest.mark.fault("image: both eyes of a live feed are frozen, and an anchor is pinned")
 def test_a_pixel_of_a_picture_that_is_held_is_not_pinned(session: Session, frames: list[StereoFrame]) -> None:
     pipeline = Pipeline(session.config, session.rig)
     operations = Operations(NodeState(session.config, pipeline, None, None, ""), lambda *_: None)  # type: ignore[arg-type]
@@ -143,13 +143,13 @@ def test_a_pixel_of_a_picture_that_is_held_is_not_pinned(session: Session, frame
         if i == FIRST:
             assert pin(u=160, v=128)
     assert result.held
-    with pytest.raises(SagsError, match=r"frames are held: the same picture comes again.*pin when"):
+    with pytest.raises(SagsError, match=r"frames are held: the same image comes again.*pin when"):
         pin(u=160, v=128)
     x, y, z = result.snapshot.gaussians.means[0].tolist()
     assert pin(x=x, y=y, z=z)["depth_confidence"] < 0.05  # 0.8 s at 20 mm/s: five times what halves it
 
 
-@pytest.mark.fault("picture: both eyes of a live feed are frozen, and a view is opened")
+@pytest.mark.fault("image: both eyes of a live feed are frozen, and a view is opened")
 @pytest.mark.parametrize("why", ["held", "paused", "no frame comes"])
 def test_a_view_that_is_opened_while_nothing_new_is_seen_waits(
     session: Session, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch, why: str
@@ -198,7 +198,7 @@ def test_a_view_that_is_opened_while_nothing_new_is_seen_waits(
 
 
 def test_a_model_made_of_a_frozen_picture_is_not_shown(session: Session, frames: list[StereoFrame]) -> None:
-    """A reset while the feed is frozen: the picture is old, whatever the model."""
+    """A reset while the feed is frozen: the image is old, whatever the model."""
     given = frozen(frames[: FIRST + COUNT + 1], range(FIRST, FIRST + COUNT))
     pipeline, budget = Pipeline(session.config, session.rig), StepBudget(2)
     for i, frame in enumerate(given):
@@ -252,7 +252,7 @@ def test_what_nobody_watches_is_less_sure(session: Session, frames: list[StereoF
 def test_blood_is_seen_where_the_scene_has_its_colour_already(
     session: Session, frames: list[StereoFrame]
 ) -> None:
-    """It rises slowly, and a corner of the picture was as red before."""
+    """It rises slowly, and a corner of the image was as red before."""
 
     def corner(picture: U8) -> U8:
         marked = picture.copy()
@@ -273,7 +273,7 @@ def test_blood_is_seen_where_the_scene_has_its_colour_already(
     assert pipeline.map.restarts == 0
 
 
-@pytest.mark.fault("picture: one eye is late (simulated)")
+@pytest.mark.fault("image: one eye is late (simulated)")
 def test_what_was_measured_before_a_late_eye_was_noticed_is_doubted_once(
     session: Session, frames: list[StereoFrame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -337,7 +337,7 @@ def test_depth_is_as_sure_as_ever_at_a_rate_that_has_fallen(
     assert always > 0.5 and fallen > 0.9 * always
 
 
-@pytest.mark.fault("picture: of another scene, before and after a gap")
+@pytest.mark.fault("image: of another scene, before and after a gap")
 @pytest.mark.parametrize("between", ["black", "nothing"])
 def test_another_scene_has_not_lasted_while_nobody_looked(
     between: str, session: Session, frames: list[StereoFrame]

@@ -22,7 +22,7 @@ def noisy(picture: U8, seed: int) -> U8:
 
 
 def drawn(picture: U8) -> RenderedView:
-    """A model that looks like this picture."""
+    """A model that looks like this image."""
     camera = Camera(WIDTH, HEIGHT, np.eye(3), np.eye(4))
     plane = np.ones((HEIGHT, WIDTH), np.float32)
     return RenderedView(0, 0, camera, Colours(picture), plane, plane)
@@ -59,7 +59,7 @@ def test_highlights_stay_tissue_also_beside_an_instrument() -> None:
     lights = np.zeros((HEIGHT, WIDTH), np.bool_)
     lights[40:52, 60:72] = True
     lights[150:180, 250:258] = True  # touches the shaft
-    lights[0:10, 30:45] = True  # at the picture's edge
+    lights[0:10, 30:45] = True  # at the image's edge
     picture[lights] = 255
     for expected in (None, drawn(tissue)):
         found = InstrumentFinder()(picture, expected)

@@ -61,11 +61,11 @@ def play(
     spike: Callable[[int], float] = lambda number: 0.0,
     noise: float = 0.08,
 ) -> list[Played]:
-    """A camera of 30 Hz, the newest picture wins. A frame takes what its rung costs, times `slowness` of the
+    """A camera of 30 Hz, the newest image wins. A frame takes what its rung costs, times `slowness` of the
     time (s), with noise; the model has as many Gaussians as the rung allows some frames later.
 
     Args:
-        shape: how much dearer than the prices say Gaussians and pictures are on this machine.
+        shape: how much dearer than the prices say Gaussians and images are on this machine.
         spike: s that a frame of this number takes more, on any rung.
     """
     rng = np.random.default_rng(seed)

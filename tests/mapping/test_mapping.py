@@ -1,4 +1,4 @@
-"""The mapper's parts against known truth, and the mapper on pictures it must reproduce."""
+"""The mapper's parts against known truth, and the mapper on images it must reproduce."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def grid_points(depth: float = DEPTH) -> np.ndarray:
 
 
 def planes_of(image: np.ndarray, coverage: float, depth: float = 1.0) -> np.ndarray:
-    """[5, H, W] that show a picture, at that depth."""
+    """[5, H, W] that show an image, at that depth."""
     ones = np.ones(image.shape[:2], np.float32)
     picture = np.stack([*np.moveaxis(as_float(image), -1, 0), np.float32(depth) * ones, ones])
     return np.float32(coverage) * picture
@@ -156,7 +156,7 @@ def test_a_hole_without_depth_takes_that_of_its_neighbours() -> None:
 
 def test_candidates_need_residual_and_depth_to_agree_before_a_new_surface_is_believed() -> None:
     frame = observation()
-    planes = planes_of(frame.image, 1.0, 1.2 * DEPTH)  # the model is far behind, but the picture agrees
+    planes = planes_of(frame.image, 1.0, 1.2 * DEPTH)  # the model is far behind, but the image agrees
     assert len(densify.candidates(planes, frame, 0)[0]) == 0
     planes[:3] = 1 - planes[:3]
     planes[0] += 0.3
@@ -203,7 +203,7 @@ def test_where_the_machine_affords_fewer_those_that_show_least_go_but_none_that_
 
 
 def test_where_the_machine_affords_fewer_hidden_tissue_stays_as_likely_as_what_is_seen() -> None:
-    """A third of the picture lies under an instrument: none of it shows, and each is as good as the mean. So
+    """A third of the image lies under an instrument: none of it shows, and each is as good as the mean. So
     is what it begins to hide, of which little shows: with each step of the instrument that would be gone."""
     points = grid_points()
     model, seen, edge = model_of(points), observation(), WIDTH // 3
@@ -299,4 +299,4 @@ def test_a_jump_of_the_exposure_is_followed_at_once_and_begins_no_new_model() ->
     plain, jumped = play(1.0), play(0.75)
     assert jumped[-1].epoch == plain[-1].epoch
     for before, after in zip(plain[8:], jumped[8:], strict=True):
-        assert psnr(after) > psnr(before) - 0.5  # darker pictures have smaller errors, too
+        assert psnr(after) > psnr(before) - 0.5  # darker images have smaller errors, too

@@ -1,4 +1,4 @@
-"""The camera's pose from pictures: recovered where it is known, kept from outliers, found again when lost."""
+"""The camera's pose from images: recovered where it is known, kept from outliers, found again when lost."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from sags_node.tools.evaluation.trajectory import RigidOdometry, trajectory_erro
 from sags_node.types import F32, F64, Camera, FrameResult, StereoFrame
 
 BASELINE = 0.0043
-MOTION = np.array([2e-3, -1e-3, 1.5e-3, 0.01, -0.02, 0.015])  # m and rad: 15 px in the picture
+MOTION = np.array([2e-3, -1e-3, 1.5e-3, 0.01, -0.02, 0.015])  # m and rad: 15 px in the image
 
 
 def camera(T: F64 | None = None) -> Camera:
@@ -38,7 +38,7 @@ def camera(T: F64 | None = None) -> Camera:
 
 def seen_points(T: F64, stray: float, noise: float = 0.0, measured: float = 0.7) -> tuple[F32, F32, F32]:
     """Points [M, 3] at rest, and pixels and disparities at which a camera at T sees them; the share `stray`
-    of them, all on one side of the picture, has moved by 5 mm as one."""
+    of them, all on one side of the image, has moved by 5 mm as one."""
     rng = np.random.default_rng(0)
     pixels = rng.uniform([0, 0], [640, 512], (800, 2))
     pixels = pixels[np.argsort(pixels[:, 0])]
@@ -233,7 +233,7 @@ def test_instruments_in_nearly_half_of_the_picture_do_not_pull_the_pose(still: P
     assert found["ate_mm"] < 0.45 and found["rpe_deg"] < 0.08, found
 
 
-@pytest.mark.fault("picture: black for a second, scope moving")
+@pytest.mark.fault("image: black for a second, scope moving")
 def test_after_a_blackout_of_a_second_the_same_model_goes_on(deforming: Path) -> None:
     session, frames = opened(deforming)
     first, last = 4, 4 + round(RATE)
@@ -317,8 +317,8 @@ def test_of_several_pictures_the_oldest_says_where_the_camera_is(given: Given) -
     _, pipeline, results = given
     seen = results[-1].observation
     pose, aside, drifted = (seen.camera.T_world_cam.copy() for _ in range(3))
-    aside[0, 3] += 0.012  # m: so far that the next picture is kept beside it
-    drifted[1, 3] += 0.001  # m: what a later picture may have taken over
+    aside[0, 3] += 0.012  # m: so far that the next image is kept beside it
+    drifted[1, 3] += 0.001  # m: what a later image may have taken over
     first, later = (seen, aside), (replace(seen, camera=replace(seen.camera, T_world_cam=drifted)), pose)
     errors = []
     for offered in ([first, later], [later]):

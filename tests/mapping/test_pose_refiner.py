@@ -1,4 +1,4 @@
-"""Poses that a robot gives, put right by the picture: what is slow is the robot's."""
+"""Poses that a robot gives, put right by the image: what is slow is the robot's."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ def camera(T: F64) -> Camera:
 
 
 def refined(monkeypatch: pytest.MonkeyPatch, given: list[F64], seen: list[F64 | None]) -> list[F64]:
-    """What a refiner makes of given poses, where the picture says others, or nothing."""
+    """What a refiner makes of given poses, where the image says others, or nothing."""
     refiner = PoseRefiner(TissueMap(1))
     last: Any = SimpleNamespace()
     tracks = Tracks(np.zeros((1, 2), np.float32), 1 / RATE)
@@ -93,7 +93,7 @@ def test_the_way_to_a_pose_is_the_shortest() -> None:
 
 
 def test_a_robot_that_is_right_is_left_as_it_is() -> None:
-    """The pictures of a second move the poses by less than the breath that they show, and nothing is held."""
+    """The images of a second move the poses by less than the breath that they show, and nothing is held."""
     source = PhantomSource(seconds=2, width=160, height=128, camera_motion="sway")
     phantom = Phantom(source)
     pipeline = Pipeline(LaunchConfig(source=source, vision=VisionConfig(pose="refine")), phantom.rig)

@@ -23,7 +23,7 @@ PINNED = [(100, 100), (160, 128), (200, 150), (150, 180), (220, 90)]
 
 @cache
 def texture(seed: int) -> np.ndarray:
-    """Random blots of many sizes, on a sheet larger than the picture."""
+    """Random blots of many sizes, on a sheet larger than the image."""
     rng = np.random.default_rng(seed)
     sheet = np.zeros((HEIGHT + 200, WIDTH + 200), np.float32)
     for size in (1.5, 3, 6, 12):
@@ -34,7 +34,7 @@ def texture(seed: int) -> np.ndarray:
 
 
 def motion(turn: float, scale: float, shift: tuple[float, float]) -> np.ndarray:
-    """[2, 3]: pixels of the first picture -> pixels now."""
+    """[2, 3]: pixels of the first image -> pixels now."""
     matrix = cv2.getRotationMatrix2D((float(CENTRE[0]), float(CENTRE[1])), turn, scale)
     matrix[:, 2] += shift
     return matrix
@@ -85,7 +85,7 @@ def back(anchors: Anchors, seconds: float = 3.0, **how: object) -> AnchorStates:
         (0.0, 1.0, (50.0, -30.0)),
         (20.0, 1.0, (10.0, 20.0)),
         (-10.0, 1.15, (-20.0, 10.0)),
-        (0.0, 1.0, (-85.0, 0.0)),  # the first one 15 px from the picture's edge
+        (0.0, 1.0, (-85.0, 0.0)),  # the first one 15 px from the image's edge
     ],
 )
 def test_they_come_back_wherever_the_tissue_is(
@@ -121,7 +121,7 @@ def test_a_new_model_is_told_before_they_come_back() -> None:
         {"moved": motion(0, 1, (0, 0)) * [[-1], [1]] + [[0, 0, WIDTH - 1], [0, 0, 0]]},
         {"moved": motion(0, 1.5, (0, 0))},
     ],
-    ids=["other tissue", "mirrored", "nearer in the picture and not in depth"],
+    ids=["other tissue", "mirrored", "nearer in the image and not in depth"],
 )
 def test_what_is_not_the_same_tissue_is_refused(how: dict[str, object]) -> None:
     """Better no anchor than one on another place."""
@@ -188,7 +188,7 @@ def test_one_that_was_removed_does_not_come_back(monkeypatch: pytest.MonkeyPatch
     features = features_of(pyramid_of(observation), observation.tissue)
 
     def recalled() -> int:
-        """How many anchors, by any of the pictures remembered: one at a time."""
+        """How many anchors, by any of the images remembered: one at a time."""
         return max(len(remembered.look(features, ids)) for _ in range(MOST_PICTURES))
 
     assert recalled() == len(PINNED)

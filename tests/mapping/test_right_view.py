@@ -1,4 +1,4 @@
-"""The right eye of a stereo display: beside the left picture warped there, and what may not come into it."""
+"""The right eye of a stereo display: beside the left image warped there, and what may not come into it."""
 
 from dataclasses import replace
 from typing import Any
@@ -32,7 +32,7 @@ def played() -> tuple[Pipeline, list[FrameResult]]:
 
 
 def quality(result: FrameResult, picture: F32 | U8, known: Bool | None = None) -> float:
-    """PSNR of a picture for the right eye, dB, where that eye sees tissue, and where it is `known`."""
+    """PSNR of an image for the right eye, dB, where that eye sees tissue, and where it is `known`."""
     camera, right = result.pair.camera, result.pair.right
     assert right is not None
     depths = result.views["left"].depth[result.observation.tissue]
@@ -42,7 +42,7 @@ def quality(result: FrameResult, picture: F32 | U8, known: Bool | None = None) -
 
 
 def qualities(result: FrameResult) -> tuple[float, float]:
-    """Of the right view and of the warped left picture, where both are known."""
+    """Of the right view and of the warped left image, where both are known."""
     focal_px = float(result.pair.camera.K[0, 0])
     warp, there = warp_to_right(
         metrics.as_float(result.observation.image), result.observation.depth, focal_px, result.pair.baseline
@@ -69,7 +69,7 @@ def test_the_right_view_is_better_than_the_left_picture_warped_by_the_same_depth
 
 def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
     """Nobody looks, then somebody does, goes, and comes again; beside it a run in which nobody ever does.
-    The first picture that is seen is better than the model alone."""
+    The first image that is seen is better than the model alone."""
     looks = [False] * 4 + [True] * 4 + [False] * 2 + [True] * 2
     session = opened(f"source.frames:={len(looks)}", FEW)
     watched, alone = (Pipeline(session.config, session.rig) for _ in range(2))
@@ -147,7 +147,7 @@ def scene(played: tuple[Pipeline, list[FrameResult]]) -> Scene:
 def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
     played: tuple[Pipeline, list[FrameResult]], scene: Scene
 ) -> None:
-    """A right picture that is brighter by 0.2 everywhere: Gaussians take over half of what lacks.
+    """A right image that is brighter by 0.2 everywhere: Gaussians take over half of what lacks.
     What is hidden from the right eye learns nothing."""
     model, baseline = played[0].map.model, scene.result.pair.baseline
     tissue = scene.result.observation.tissue.copy()

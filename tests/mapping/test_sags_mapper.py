@@ -173,7 +173,7 @@ def test_a_reset_and_another_place_make_a_new_model_in_a_new_epoch(phantom_sessi
 def test_a_bad_model_is_made_anew_before_it_is_shown(
     phantom_session: Path, which: slice, value: float
 ) -> None:
-    """Beside it every later picture would seem too dark, too bright or of another scene, and be held."""
+    """Beside it every later image would seem too dark, too bright or of another scene, and be held."""
     pipeline, taken = pipeline_of(phantom_session, "source.frames:=8")
     before = played(pipeline, taken[:6])[-1]
     mapper_of(pipeline).field.table[:, which] = value

@@ -80,7 +80,7 @@ def test_slopes_show_more_than_the_best_colours() -> None:
 
 
 def test_noise_does_not_pile_up_in_slopes() -> None:
-    """On a gray picture with noise that changes every frame slopes stay as small as one step makes them."""
+    """On a gray image with noise that changes every frame slopes stay as small as one step makes them."""
     model, rng = model_of(2.0), np.random.default_rng(3)
     for _ in range(150):
         noise = rng.normal(0.5, 0.02, (VIEW.height, VIEW.width, 3))

@@ -1,4 +1,4 @@
-"""Splitting: identity stays, numbers stay, what is hidden stays, and the picture gets better."""
+"""Splitting: identity stays, numbers stay, what is hidden stays, and the image gets better."""
 
 from collections.abc import Callable
 
@@ -17,12 +17,12 @@ from sags_node.types import F32, F64, Bool, Camera, Colours, FrameResult, Observ
 HEIGHT, WIDTH, DEPTH = 60, 80, 0.08
 CAMERA = Camera(WIDTH, HEIGHT, np.array([[90.0, 0, 40], [0, 90.0, 30], [0, 0, 1]]), np.eye(4))
 Played = Callable[[int, bool], tuple[F64, list[FrameResult]]]
-COUNT, LARGE = 400, 7  # Gaussians, and the row of a large one in the middle of the picture
+COUNT, LARGE = 400, 7  # Gaussians, and the row of a large one in the middle of the image
 
 
 class Scene:
     """A grid of small Gaussians on a plane, every tenth of which hardly shows, and a large one, turned, where
-    the picture is wrong."""
+    the image is wrong."""
 
     def __init__(self) -> None:
         grid = np.stack(np.meshgrid(np.arange(2, WIDTH, 4), np.arange(2, HEIGHT, 3)), -1).reshape(-1, 2)

@@ -70,7 +70,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
         monkeypatch.setattr(owner, "__call__", counted)
 
     class Flow(OpticalFlow):
-        """That of the mapper; the watches have their own, of smaller pictures."""
+        """That of the mapper; the watches have their own, of smaller images."""
 
     monkeypatch.setattr(motion, "OpticalFlow", Flow)
     count(StereoDepth, "depth")
@@ -130,7 +130,7 @@ def test_a_rest_makes_up_for_the_depth_that_there_was_no_time_for(
 
 def test_one_wrong_depth_counts_once_while_nothing_moves(frames: list[StereoFrame]) -> None:
     """It is handed on from frame to frame, and three wrong ones in a row would take the tissue away. A tenth
-    of the picture: so large a hole would be filled at the wrong depth at once."""
+    of the image: so large a hole would be filled at the wrong depth at once."""
     play = Player()
     for frame in frames[:5]:
         depth = play(frame).observation.depth
@@ -202,7 +202,7 @@ def test_motion_is_followed_at_once_after_a_model_was_begun_while_nothing_moved(
 def test_what_is_drawn_in_parts_is_the_whole_model(
     frames: list[StereoFrame], overrides: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever the picture was not drawn anew, the model does not look different either. The right eye's
+    """Wherever the image was not drawn anew, the model does not look different either. The right eye's
     colours are more than the model's."""
     play = Player(*overrides)
     for frame in frames[:4]:
@@ -228,7 +228,7 @@ def test_what_is_drawn_in_parts_is_the_whole_model(
 
 
 def test_more_of_the_same_is_never_worse(frames: list[StereoFrame]) -> None:
-    """Against the picture without the noise: neither the steps nor the noise spoil what is there."""
+    """Against the image without the noise: neither the steps nor the noise spoil what is there."""
     play = Player()
     for frame in frames[:6]:
         last = play(frame)
@@ -276,7 +276,7 @@ WIDTH, HEIGHT, FOCAL, DISPARITY = 320, 256, 300.0, 16
 
 
 def test_tissue_that_creeps_is_followed() -> None:
-    """A tenth of a pixel per frame: most frames look still, and yet the model keeps up. Noise in the picture
+    """A tenth of a pixel per frame: most frames look still, and yet the model keeps up. Noise in the image
     that is compared makes least squares see less motion than there was (errors in variables), here a
     twentieth to a tenth less."""
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""What no recording promises: unusable pictures, damage in the model, cuts, long runs. The node goes on,
+"""What no recording promises: unusable images, damage in the model, cuts, long runs. The node goes on,
 shows nothing that is not finite, and finds back."""
 
 import itertools
@@ -82,7 +82,7 @@ def test_unusable_pictures_are_survived_and_left_behind(
     assert max(after[2:]) > before - 3.0, (before, after)
 
 
-@pytest.mark.fault("picture: the first one is black, noise or all instrument")
+@pytest.mark.fault("image: the first one is black, noise or all instrument")
 @pytest.mark.parametrize("name", ["black", "noise", "all instrument"])
 def test_an_unusable_first_picture_only_delays_the_start(
     session: Session, frames: list[StereoFrame], name: str
@@ -92,7 +92,7 @@ def test_an_unusable_first_picture_only_delays_the_start(
     assert psnr(play(pipeline, frames[1:6])[-1]) > 28
 
 
-@pytest.mark.fault("picture: another scene for three seconds")
+@pytest.mark.fault("image: another scene for three seconds")
 def test_a_cut_begins_a_new_model_in_a_new_epoch(session: Session, frames: list[StereoFrame]) -> None:
     """Another scene in front of the same cameras: here, the negative of the first."""
     negative = [both(frame, lambda eye: 255 - eye) for frame in frames]
@@ -244,7 +244,7 @@ def test_sizes_that_no_tile_divides(frames: list[StereoFrame], width: int, heigh
     assert psnr(play(Pipeline(session.config, session.rig), frames[:4])[-1]) > 28
 
 
-@pytest.mark.fault("picture: the same one again")
+@pytest.mark.fault("image: the same one again")
 def test_a_repeated_picture_is_not_mapped_again_but_keeps_its_own_stamp(
     session: Session, frames: list[StereoFrame]
 ) -> None:

@@ -51,7 +51,7 @@ def frame_of(result: FrameResult, **meta: Any) -> Frame:
 
 
 def sideways(depth: float) -> float:
-    """m, at a depth: nine of ten anchors are nearer, along each axis of the picture."""
+    """m, at a depth: nine of ten anchors are nearer, along each axis of the image."""
     return SIDEWAYS * WIDTH / CAMERA.K[0, 0] * depth
 
 

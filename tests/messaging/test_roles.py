@@ -35,7 +35,7 @@ def test_the_folder_of_a_key_is_its_role(tmp_path: Path) -> None:
     (clients / "listen").rename(clients / "Listen")  # must not give it more
     assert list(read_allow_list([clients / "Listen"]).values()) == [one]
     (clients / "Listen").rename(clients / "listen")
-    # Who may watch may not therefore hand pictures in.
+    # Who may watch may not therefore hand images in.
     assert {client.name for client in read_allow_list([clients], "source").values()} == {"in_"}
 
 

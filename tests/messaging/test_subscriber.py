@@ -265,7 +265,7 @@ def test_a_typed_name_is_a_name_of_that_type() -> None:
 
 
 def test_arrays_are_the_received_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures and clouds are not copied between ZeroMQ and the consumer."""
+    """Images and clouds are not copied between ZeroMQ and the consumer."""
     parts: list[np.ndarray] = []
 
     def receive_frames(socket: zmq.Socket[bytes], most: int) -> list[zmq.Frame]:
@@ -302,7 +302,7 @@ def _sender() -> Iterator[tuple[zmq.Socket[bytes], str]]:
 
 
 def _send(socket: zmq.Socket[bytes], subscriber: Subscriber, topic: str, seq: int) -> None:
-    """Send a good depth picture and wait until it has come."""
+    """Send a good depth image and wait until it has come."""
     while socket.poll(60_000 if seq == 1 else 0):
         if socket.recv() == b"\x01" + topic.encode():
             break

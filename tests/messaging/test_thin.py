@@ -1,4 +1,4 @@
-"""Thin pictures over real sockets: what comes, how large and exact it is, and what wrong requests hear."""
+"""Thin images over real sockets: what comes, how large and exact it is, and what wrong requests hear."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -154,7 +154,7 @@ def test_sags_topic_reads_them_like_the_whole(tmp_path: Path) -> None:
 
 
 def test_a_recording_of_everything_leaves_out_what_others_asked_for(tmp_path: Path) -> None:
-    """It has the whole pictures."""
+    """It has the whole images."""
     name = thin_name("thin/quarter/left/depth/png")
     with node_sockets(tmp_path) as running, making(running, plane_result()):
         recorder = Recorder(
@@ -190,7 +190,7 @@ def test_a_pause_loses_no_message_that_comes_after_it(tmp_path: Path) -> None:
         ("thin/half/0,0,1,9/left/depth/png", "has no pixel"),
         ("thin/half", "no thin topic"),
         ("thin/full/right/image_rect_color/jpeg", "with publish.right:=false, has no right eye"),
-        ("thin/full/90,0,10,10/left/depth/png", f"leaves the picture, which has {WIDTH}x{HEIGHT} px"),
+        ("thin/full/90,0,10,10/left/depth/png", f"leaves the image, which has {WIDTH}x{HEIGHT} px"),
     ],
 )
 def test_a_wrong_request_hears_why(name: str, said: str, tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_a_wrong_request_hears_why(name: str, said: str, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("thin/full/90,0,10,10/left/depth/png", "leaves the picture"),  # said with each frame
+        ("thin/full/90,0,10,10/left/depth/png", "leaves the image"),  # said with each frame
         ("thin/half/right/render/image/jpeg", "no right eye"),  # said once
     ],
 )
@@ -267,7 +267,7 @@ def test_no_name_begins_with_another() -> None:
     ] == []
 
 
-@pytest.mark.fault("memory: none is left for a thin picture")
+@pytest.mark.fault("memory: none is left for a thin image")
 def test_what_cannot_be_made_costs_its_topic_alone(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -291,7 +291,7 @@ def test_what_cannot_be_made_costs_its_topic_alone(
 
 
 def test_a_running_node_sends_colour_and_depth_over_20_mbit(tmp_path: Path) -> None:
-    """At half of 640x512 px and 30 Hz, as docs/wire.md says; and the whole picture comes beside."""
+    """At half of 640x512 px and 30 Hz, as docs/wire.md says; and the whole image comes beside."""
     size = ("vision.width:=640", "vision.height:=512")
     with RunningNode(SESSION, tmp_path, "source.pace:=realtime", *size) as node:
         jpeg, png = (f"thin/half/left/render/{name}" for name in ("image/jpeg", "depth/png"))

@@ -61,7 +61,7 @@ def test_figures_are_those_of_the_arrivals(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.fixture(scope="module")
 def overlay(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OverlayStream]:
-    """An overlay's own socket, served on a thread: a picture and `status` ten times a second."""
+    """An overlay's own socket, served on a thread: an image and `status` ten times a second."""
     run_dir = tmp_path_factory.mktemp("overlay") / "run"
     color_key(np.zeros((HEIGHT, WIDTH, 4), np.uint8), KEY)  # its kernel takes a second to load
     with OverlayStream("overlay", run_dir, KEY) as stream:

@@ -1,4 +1,4 @@
-"""Pictures stay right at other sizes and distances; the 3D filter where it belongs; exports draw the same."""
+"""Images stay right at other sizes and distances; the 3D filter where it belongs; exports draw the same."""
 
 import dataclasses
 from functools import cache, partial
@@ -47,7 +47,7 @@ SIDE = 256
 
 
 def texture() -> F32:
-    """Detail of all sizes, down to 2 px, [4 SIDE, 4 SIDE, 3]: a picture four times as fine as trained."""
+    """Detail of all sizes, down to 2 px, [4 SIDE, 4 SIDE, 3]: an image four times as fine as trained."""
     rng = np.random.default_rng(3)
     total = np.full((4 * SIDE, 4 * SIDE, 3), 0.5, np.float32)
     for cells in (16, 32, 64, 128):
@@ -57,13 +57,13 @@ def texture() -> F32:
 
 
 def shrunk(fine: F32, factor: float) -> F32:
-    """The picture `factor` times as large as trained, by averaging the four times finer one."""
+    """The image `factor` times as large as trained, by averaging the four times finer one."""
     size = round(SIDE * factor)
     return np.asarray(cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def pictured_wall(fine: F32) -> Observation:
-    """The picture on a wall 8 cm away."""
+    """The image on a wall 8 cm away."""
     gray = np.zeros((SIDE, SIDE), np.uint8)
     wall, *_ = flat_scene(camera_in_front(SIDE, SIDE, 250.0), np.zeros((0, 3), np.float32), gray, 0.08)
     return dataclasses.replace(wall, image=as_bytes(shrunk(fine, 1)))
@@ -94,7 +94,7 @@ def test_both_filters_beat_none_at_a_quarter_of_the_size(
 def test_both_filters_beat_none_from_four_times_the_distance(
     wall: tuple[Observation, dict[str, Trained]],
 ) -> None:
-    """The wall then fills a quarter of the picture, as the small picture shows it."""
+    """The wall then fills a quarter of the image, as the small image shows it."""
     observation, models = wall
     camera = moved(observation.camera, np.array([0, 0, -3 * 0.08]))
     quarter, first = SIDE // 4, SIDE * 3 // 8
@@ -162,7 +162,7 @@ def test_the_camera_that_sees_finest_counts() -> None:
 
 
 def test_what_no_camera_sees_takes_the_widest_filter() -> None:
-    """Beside the picture, behind the camera, not a number."""
+    """Beside the image, behind the camera, not a number."""
     means = np.array([[0, 0, 0.04], [0, 0, 0.08], [1, 0, 0.02], [0, 0, -0.02], [np.nan, 0, 1]], np.float32)
     found = smoothing_variances(means, [looking(120)])
     np.testing.assert_allclose(found[2:], found[1])

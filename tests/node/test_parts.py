@@ -77,7 +77,7 @@ def test_hand_over_drops_nothing() -> None:
 
 PERIOD = 1 / 30
 TAKEN_IN = plane_result()
-HELD = replace(TAKEN_IN, held="the left picture is black")
+HELD = replace(TAKEN_IN, held="the left image is black")
 
 
 class Node:
@@ -138,7 +138,7 @@ def test_a_node_that_takes_no_frame_in_is_not_well(monkeypatch: pytest.MonkeyPat
     assert node.publish(WAITING_AFTER - 3 * PERIOD, held=True).state == "running"
     said = node.publish(6 * PERIOD, held=True)
     assert content.health_answer(said) == {"healthy": False, "state": "held", "warnings": []}
-    assert said.rate_hz == pytest.approx(30)  # pictures go on
+    assert said.rate_hz == pytest.approx(30)  # images go on
     (part,) = content.diagnostics(said, 0).parts
     statuses = cdr.decode(bytes(part), topics.DIAGNOSTICS).status
     assert [int(status.level) for status in statuses[:2]] == [1, 0]  # of the node; of a stage, which works

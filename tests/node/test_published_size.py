@@ -65,7 +65,7 @@ def test_pictures_and_cameras_are_those_of_the_calibration_at_any_working_size(
     assert {name: picture.shape for name, picture in shown.items()} == {
         name: picture.shape for name, picture in whole.items()
     }
-    for eye in ("left", "right"):  # the camera's own pictures, to the bit
+    for eye in ("left", "right"):  # the camera's own images, to the bit
         assert np.array_equal(shown[f"{eye}/image_rect_color"], whole[f"{eye}/image_rect_color"])
         info = f"{eye}/camera_info"
         assert content.FRAME_CONTENT[info](small).cdr() == content.FRAME_CONTENT[info](full).cdr()
@@ -103,7 +103,7 @@ def test_a_pixel_that_is_asked_for_is_one_of_the_published_picture(phantom_sessi
     assert np.allclose(place, PINNED, atol=0.02)
     assert abs(depth - truth(phantom_session)[int(PINNED[1]), int(PINNED[0])]) < 1.5e-3
     assert np.allclose(published.anchors(result.pair, states).pixels[row], PINNED, atol=0.02)
-    with pytest.raises(SagsError, match=r"pixel \(320, 4\) is outside the left picture of 320x256 px"):
+    with pytest.raises(SagsError, match=r"pixel \(320, 4\) is outside the left image of 320x256 px"):
         beyond.result()
 
 

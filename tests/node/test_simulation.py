@@ -16,7 +16,7 @@ from simulation import StuckError, World
 
 SEEDS = 100
 FAILED_ONCE = (
-    6,  # a camera that was away for over 20 s after its first pictures ended the node
+    6,  # a camera that was away for over 20 s after its first images ended the node
     61,  # a pair that came twice was two frames of one stamp
     201914,  # a clock set back while stamps lagged: the bound of this test left the lag out
 )
@@ -28,7 +28,7 @@ def quiet(caplog: pytest.LogCaptureFixture) -> None:
 
 
 @pytest.mark.fault(
-    "frames: lost, late, doubled and wrongly stamped pictures, hangs, a wall clock that is set (simulated)"
+    "frames: lost, late, doubled and wrongly stamped images, hangs, a wall clock that is set (simulated)"
 )
 def test_what_must_hold_holds_for_every_seed() -> None:
     runs = [play(seed) for seed in sorted({*range(SEEDS), *FAILED_ONCE})]

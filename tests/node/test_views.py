@@ -436,7 +436,7 @@ def test_a_view_of_strain_that_nobody_measures_is_one_line_in_the_log(
 
 @pytest.mark.parametrize(("missed", "share"), [(False, SHARE), (True, LEAST_SHARE)])
 def test_work_that_is_not_shared_out_keeps_to_its_allowance(missed: bool, share: float) -> None:
-    """As thin pictures do: 12 ms for each frame at 30 Hz would be 36 % of a core."""
+    """As thin images do: 12 ms for each frame at 30 Hz would be 36 % of a core."""
     allowance, worked = Allowance(), 0
     pace = Pace(allowance)
     for _ in range(100):

@@ -44,7 +44,7 @@ pytestmark = pytest.mark.live
 
 MAX_AGE = 0.5  # s
 NOTICED = 0.1  # s more until it is noticed: what docs/wire.md promises
-FROZEN = 0.3  # s after the last new picture, from which on the node shows nothing
+FROZEN = 0.3  # s after the last new image, from which on the node shows nothing
 BUSY = 1.0  # s that a busy machine may take on top
 
 
@@ -254,7 +254,7 @@ def test_the_saved_video_is_whole_also_where_there_is_no_overlay(run_dir: Path, 
 
 @pytest.mark.usefixtures("node")
 def test_what_nobody_sees_is_not_counted_as_an_overlay(run_dir: Path, tmp_path: Path) -> None:
-    """Its lowest edge begins 20 pixels above the picture; the phantom moves there by 13."""
+    """Its lowest edge begins 20 pixels above the image; the phantom moves there by 13."""
     scene = tmp_path / "aside.yaml"
     scene.write_text("objects: [{shape: sphere, anchors: [{pixel: [160, 2], at: [0, -0.016, 0]}]}]")
     with overlay(run_dir, scene=scene) as (running, watcher):
@@ -335,7 +335,7 @@ def test_it_goes_blank_when_the_node_stops_is_reset_or_dies(
 
 
 class Scope(threading.Thread):
-    """Hands the phantom's pictures in, there and back, ten a second; frozen, the last pair over and over."""
+    """Hands the phantom's images in, there and back, ten a second; frozen, the last pair over and over."""
 
     def __init__(self, session: Path, endpoint: str) -> None:
         super().__init__(daemon=True)
@@ -358,7 +358,7 @@ class Scope(threading.Thread):
                 sender.send(*pair, stamp_ns)
 
 
-@pytest.mark.fault("picture: both eyes of a live feed are frozen, under an overlay")
+@pytest.mark.fault("image: both eyes of a live feed are frozen, under an overlay")
 def test_it_goes_blank_when_the_feed_freezes(phantom_session: Path, tmp_path: Path) -> None:
     """All stamps are fresh, and the node goes on."""
     run_dir, endpoint = tmp_path / "run", f"tcp://127.0.0.1:{free_port()}"
@@ -407,7 +407,7 @@ def test_it_goes_blank_when_the_clock_is_set_back_as_the_node_falls_silent(tmp_p
 
 
 def until_blank(watcher: Watcher) -> tuple[ReceivedImage, ReceivedImage]:
-    """The last picture that showed something, and the empty one after it, which came in time."""
+    """The last image that showed something, and the empty one after it, which came in time."""
     shown = watcher.pictures(1, drawn=True)[-1] if watcher.status()["state"] == "running" else None
     last_shown = (
         watcher.subscriber.latest("left/overlay/image") if shown is None else shown["left/overlay/image"]
@@ -428,7 +428,7 @@ def until_blank(watcher: Watcher) -> tuple[ReceivedImage, ReceivedImage]:
 
 
 def blank_in_time(watcher: Watcher) -> str:
-    """Wait for an empty picture, check that it came in time, and give the reason that status gives."""
+    """Wait for an empty image, check that it came in time, and give the reason that status gives."""
     until_blank(watcher)
     keyed = watcher.subscriber.wait("left/overlay/color_key", 60)
     assert isinstance(keyed, ReceivedImage)

@@ -108,7 +108,7 @@ def test_it_follows_the_surface_and_fades_to_the_rigid_motion_below() -> None:
     assert np.median((left / rigid)[rigid > 0.002]) < 0.25 and left.max() < 0.004  # half of the pull
     for depth, way in zip(depths[:-1], ways, strict=False):
         share = 1 - (depth / 0.02) ** 2 * (3 - 2 * depth / 0.02)
-        assert np.allclose(way, share * ways[0], atol=2e-6)  # the picture has the wall to 1e-8 m
+        assert np.allclose(way, share * ways[0], atol=2e-6)  # the image has the wall to 1e-8 m
     assert not ways[-1].any()
     drawn = [draw(node.frame(), [each])[..., 3] for each in (put, replace(put, vertices=None))]
     assert drawn[0].any() and not np.array_equal(*drawn)
@@ -180,7 +180,7 @@ def test_it_is_unsure_where_the_surface_is_farther_than_stated_and_than_depths_e
 
 @pytest.mark.parametrize(("share", "sure"), [(0.6, True), (1.0, False)])
 def test_only_what_is_surely_measured_of_the_tissue_that_matched_counts(share: float, sure: bool) -> None:
-    """A third of the picture shows something else: tissue that lay there before, an instrument, a guess."""
+    """A third of the image shows something else: tissue that lay there before, an instrument, a guess."""
     thing, _ = held(node := Node(), registration={"residual_p90_mm": 0.5, "share": share})
     other = np.broadcast_to(np.arange(SHAPE[1]) < SHAPE[1] // 3, SHAPE)
     depth = np.where(other, WALL - 0.02, WALL)

@@ -226,7 +226,7 @@ def test_the_newest_are_kept_in_their_order() -> None:
 
 
 def test_a_blank_overlay_says_why_for_some_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first picture is empty, at once, and so are those after 5.5 s; a new reason is said again."""
+    """The first image is empty, at once, and so are those after 5.5 s; a new reason is said again."""
     now = 0.0
     with OverlayStream("overlay", tmp_path, KEY) as stream, monkeypatch.context() as patched:
         patched.setattr("sags_node.clients.overlay.stream.time.monotonic", lambda: now)

@@ -226,7 +226,7 @@ def textured(seed: int, frame: int) -> Scene:
     return flat_scene(TEXTURED, means, picture.astype(np.uint8), 0.08, frame, frame * 100_000_000)
 
 
-@pytest.mark.fault("picture: tissue around an anchor looks otherwise, in full view (simulated)")
+@pytest.mark.fault("image: tissue around an anchor looks otherwise, in full view (simulated)")
 def test_what_one_visible_anchor_holds_is_unsure_until_it_is_recognised_again() -> None:
     """The tissue around it looks otherwise for fifteen seconds, in full view."""
     anchors, thing = Anchors(), held([{"pixel": [60, 45]}])
@@ -302,7 +302,7 @@ def test_so_is_that_of_a_single_anchor(at: tuple[float, ...], offset: float) -> 
     ],
 )  # fmt: skip
 def test_what_does_not_lie_at_its_anchors_is_refused(at: np.ndarray | None, around: Any, said: str) -> None:
-    """By more than its own size and 10 mm: it would flood the picture, or be nowhere."""
+    """By more than its own size and 10 mm: it would flood the image, or be nowhere."""
     thing, frame = of_file(at, 1e-3, around)
     for _ in range(5):
         assert thing.place(frame) is None
@@ -388,7 +388,7 @@ def test_it_waits_for_tissue_with_depth_and_for_the_node() -> None:
     unknown = replace(FRAME, depth=FRAME.depth * np.float32(np.nan), tissue=np.ones_like(FRAME.tissue))
     assert thing.place(unknown) is None and thing.reason == "no depth at pixel 65 30"
     assert held([]).place(unknown) is None
-    with pytest.raises(UsageError, match=r"pin 96 30 lies outside the left picture of 96x64"):
+    with pytest.raises(UsageError, match=r"pin 96 30 lies outside the left image of 96x64"):
         held([{"pixel": [96, 30]}]).place(FRAME)
     thing = held([{"pixel": [30, 30]}], pinner=(pinner := FakePinner()))
     pinner.refusal = SagsError("there are 256 anchors already")

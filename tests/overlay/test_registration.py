@@ -133,7 +133,7 @@ def test_the_surface_makes_it_better_than_the_pairs_and_no_worse_than_told(organ
 
 
 def test_what_lies_over_a_part_of_it_does_not_pull(organ: Organ) -> None:
-    """A fifth of the picture shows something 6 mm nearer, all over the model's middle."""
+    """A fifth of the image shows something 6 mm nearer, all over the model's middle."""
     clean = register(organ.model, organ.at, picked(organ, 0), organ.surface, organ.targets)
     depth = organ.depth.copy()
     depth[100:160, 110:200] -= 0.006
@@ -329,7 +329,7 @@ def test_what_the_command_refuses(node: RunningNode, organ: Organ, files: Path) 
     def first(**changed: Any) -> dict[str, Any]:
         return {"pairs": [{"at": pairs["pairs"][0]["at"]} | changed, *pairs["pairs"][1:]]}
 
-    says(2, first(pixel=[900, 3]), said=("pair 1", "outside the picture of 320x256"))
+    says(2, first(pixel=[900, 3]), said=("pair 1", "outside the image of 320x256"))
     never = 10**9  # overlays beside it pin some with each turn of the recording
     says(1, first(anchor=never), said=(f"pair 1: there is no anchor {never}; the node has ",))
     says(2, first(), said=("pairs.yaml: pairs.0", "either pixel: [u, v] or anchor: NUMBER"))

@@ -1,4 +1,4 @@
-"""A session from start to end over real sockets, on pictures of the phantom, whose truth is known."""
+"""A session from start to end over real sockets, on images of the phantom, whose truth is known."""
 
 import time
 from contextlib import ExitStack
@@ -60,10 +60,10 @@ def gone(points: F64, i: int) -> F64:
 
 
 class Film:
-    """Hands pictures in, each when the node has taken the last: none is left out on a busy machine.
+    """Hands images in, each when the node has taken the last: none is left out on a busy machine.
 
     Attributes:
-        shown: stamp of each picture -> number of the phantom's frame.
+        shown: stamp of each image -> number of the phantom's frame.
     """
 
     def __init__(self, sender: FrameSender, node: Subscriber, first: dict[int, PhantomFrame]) -> None:

@@ -110,7 +110,7 @@ def test_both_eyes_show_the_same_surface(swaying: Phantom, frames: list[PhantomF
 
 
 def test_colors_stick_to_the_material(swaying: Phantom, frames: list[PhantomFrame]) -> None:
-    """Between frames a tracked point keeps its chroma, though it moves over the picture by several pixels."""
+    """Between frames a tracked point keeps its chroma, though it moves over the image by several pixels."""
     rig = swaying.rig
 
     def chroma(frame: PhantomFrame, points: F64) -> np.ndarray:

@@ -39,7 +39,7 @@ COUNT = 10
 
 
 def assert_frames(frames: list[StereoFrame], numbers: list[int], tolerance: int = 0) -> None:
-    """These pictures of `bag_files.picture`, with the stamps they were taken at."""
+    """These images of `bag_files.picture`, with the stamps they were taken at."""
     assert [frame.t_capture_ns for frame in frames] == [START + number * 40 * MS for number in numbers]
     for frame, number in zip(frames, numbers, strict=True):
         assert frame.t_capture_right_ns - frame.t_capture_ns == 2 * MS
@@ -198,7 +198,7 @@ def test_compressed_mosaics_are_taken_apart(pattern: str, kind: str) -> None:
 def test_a_stream_in_compressed_messages_is_named(said: str) -> None:
     body = np.frombuffer(b"\0\0\0\1\x67" + bytes(99), np.uint8)
     message = ROS2.types[files.COMPRESSED](files.header(ROS2, START), said, body)
-    with pytest.raises(SagsError, match=rf"left: '{said}' is a stream of pictures.*; make a video"):
+    with pytest.raises(SagsError, match=rf"left: '{said}' is a stream of images.*; make a video"):
         decode_picture(bytes(ROS2.serialize_cdr(message, files.COMPRESSED)), files.COMPRESSED, "left")
 
 
@@ -330,7 +330,7 @@ def test_the_usual_names_are_found_among_others(tmp_path: Path) -> None:
 def test_a_topic_of_the_wrong_type(tmp_path: Path) -> None:
     path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, 2))
     with pytest.raises(
-        UsageError, match=r"camera_info in .* is sensor_msgs/msg/CameraInfo, not a picture topic"
+        UsageError, match=r"camera_info in .* is sensor_msgs/msg/CameraInfo, not an image topic"
     ):
         play(path, left="/rig/left/camera_info", right="/rig/right/image_raw")
     config = BagSource(path=path, left_info="/rig/left/image_raw")
@@ -364,11 +364,11 @@ def test_pairs_are_mutual_nearest_and_near_enough() -> None:
 
 def test_a_picture_without_partner_is_left_out_and_poses_are_of_the_left_pictures(tmp_path: Path) -> None:
     rows = files.stereo_rows(ROS2, infos=False)
-    del rows[7], rows[4]  # the right picture 3 and the left picture 2
+    del rows[7], rows[4]  # the right image 3 and the left image 2
     bag = files.write_rosbag2(tmp_path / "bag", rows)
     assert_frames(play(bag), [0, 1, 4, 5, 6, 7, 8, 9])
     poses = np.tile(np.eye(4), (9, 1, 1))
-    poses[:, 0, 3] = np.array([0, 1, 3, 4, 5, 6, 7, 8, 9]) * 1e-3  # of the left pictures that are there
+    poses[:, 0, 3] = np.array([0, 1, 3, 4, 5, 6, 7, 8, 9]) * 1e-3  # of the left images that are there
     np.savez(tmp_path / "poses.npz", T_world_cam=poses)
     came = [frame.T_world_cam[0, 3] for frame in play(bag, poses=tmp_path / "poses.npz")]  # type: ignore[index]
     np.testing.assert_allclose(came, np.array([0, 1, 4, 5, 6, 7, 8, 9]) * 1e-3)

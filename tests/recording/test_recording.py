@@ -200,7 +200,7 @@ def test_each_file_can_be_read_alone(split_bag: Path) -> None:
         assert own["relative_file_paths"] == [file.name] and own["message_count"] == len(alone)
         counts = {t["topic_metadata"]["name"]: t["message_count"] for t in own["topics_with_message_count"]}
         assert counts["/sags/tf"] == sum(message.topic == "/sags/tf" for message in alone)
-        if file.name != "bag_0.mcap":  # where they may come after the first pictures
+        if file.name != "bag_0.mcap":  # where they may come after the first images
             assert set(attached) == {"parameters.json", "calib/left.yaml", "calib/right.yaml"}
             assert notes["sags"]["session"] == "session-1"
     assert joined == content(list(read_messages(split_bag)))

@@ -279,7 +279,7 @@ def test_a_recorder_says_that_nothing_comes(tmp_path: Path, monkeypatch: pytest.
 
 @pytest.mark.fault("disk: too slow for the recorder")
 def test_a_disk_that_is_too_slow_costs_messages_that_are_counted(tmp_path: Path) -> None:
-    """Room for two depth pictures and no more: a burst cannot be kept."""
+    """Room for two depth images and no more: a burst cannot be kept."""
     run_dir = tmp_path / "run"
     most = 2.5 * 4 * WIDTH * HEIGHT / 1e6
     options = RecordOptions(

@@ -1,4 +1,4 @@
-"""A ROS 2 camera of rclpy's own: two picture topics, their camera_info, and a pose. Runs without our package.
+"""A ROS 2 camera of rclpy's own: two image topics, their camera_info, and a pose. Runs without our package.
 
 python camera.py SECONDS RATE WIDTH HEIGHT
 """

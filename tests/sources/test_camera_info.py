@@ -1,4 +1,4 @@
-"""What is said of a recording's cameras: by camera_info, by names, and by the rows of the pictures."""
+"""What is said of a recording's cameras: by camera_info, by names, and by the rows of the images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.types import Eye, RectifiedPair, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
-# ---- pictures that are rectified already -----------------------------------------------------------------
+# ---- images that are rectified already -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_names_that_say_it(name: Path | str, rectified: bool) -> None:
 def test_a_calibration_that_does_not_say_P_is_told_of(
     says_P: bool, converted: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Who rectified the pictures may have kept all of them, with another focal length."""
+    """Who rectified the images may have kept all of them, with another focal length."""
     rig, file = load_rig(SESSION / "calib"), tmp_path / "stereo.yml"
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
     T, size = rig.T_right_left, (rig.left.width, rig.left.height)
@@ -65,7 +65,7 @@ def test_a_calibration_that_does_not_say_P_is_told_of(
         assert code == 0, said
         file = tmp_path / "converted"
     as_named(load_rig(file), Path("left_rectified"), Path("right_rectified"))
-    assert ("does not say how pictures were rectified" in caplog.text) != says_P
+    assert ("does not say how images were rectified" in caplog.text) != says_P
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def said_bag(
     rois: Sequence[tuple[int, int, int, int]] = 2 * [(0, 0, 0, 0)],
     **options: object,
 ) -> Path:
-    """A bag whose camera_info says one after the other of these, each with a pair of pictures."""
+    """A bag whose camera_info says one after the other of these, each with a pair of images."""
     rows: list[Row] = []
     for number, eyes in enumerate(said):
         stamp = START + number * 40 * MS
@@ -190,7 +190,7 @@ def test_a_calibration_that_changes_is_refused_and_its_parts_can_be_played(tmp_p
 
 
 def test_what_is_read_out_and_binned(tmp_path: Path) -> None:
-    """A point of the sensor lies in the picture where offset and division put it, REP 104: the middle of the
+    """A point of the sensor lies in the image where offset and division put it, REP 104: the middle of the
     first binned pixel is the middle of 2 x 3 pixels of the sensor."""
     sensor = [replace(eye, width=160, height=200) for eye in eyes(80.0)]
     roi, binning = (20, 30, 2 * WIDTH, 3 * HEIGHT), (2, 3)
@@ -228,7 +228,7 @@ def test_other_models_are_refused(model: str, tmp_path: Path) -> None:
 
 
 def test_turned_pictures_need_a_calibration_of_their_own(tmp_path: Path) -> None:
-    """As pictures that are cut need one: camera_info is of what the cameras send."""
+    """As images that are cut need one: camera_info is of what the cameras send."""
     path, turned = said_bag(tmp_path, [eyes(80.0)]), "source.geometry.flip:=both"
     with pytest.raises(UsageError, match=r"camera_info is of .*flip: both turns .*leave flip out.*set rig"):
         open_session(path, [turned])
@@ -270,7 +270,7 @@ def test_squeezed_eyes_of_a_topic_are_told_of_and_guessed_so(tmp_path: Path) -> 
 
 
 def clocks(folder: Path, count: int, ahead_ms: int) -> Path:
-    """Pictures of one moment in both eyes, of which the right one is stamped by a clock that is ahead."""
+    """Images of one moment in both eyes, of which the right one is stamped by a clock that is ahead."""
     rows: list[Row] = []
     for number in range(count):
         for eye, side in enumerate(("left", "right")):
@@ -292,7 +292,7 @@ def test_clocks_that_differ_are_told_and_can_be_set(ahead_ms: int, tmp_path: Pat
 
 def test_eyes_that_are_not_of_one_moment_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = files.write_rosbag2(tmp_path / "bag", files.stereo_rows(ROS2, skew_ms=16.4))
-    said = "right pictures were taken 16.4 ms after the left ones"
+    said = "right images were taken 16.4 ms after the left ones"
     open_session(path)  # says it once in a process; a check says it in its own way
     assert said in caplog.text
     assert any(said in finding.what and finding.level == "warning" for finding in check_folder(path))

@@ -249,7 +249,7 @@ def test_masks_of_the_other_polarity_are_refused_and_can_be_flipped(clip: Path) 
         write(clip / f"masks/{number:06d}.png", 255 - instrument(number))
     with pytest.raises(UsageError) as caught:
         play(clip)
-    assert "masks would take 98% of the picture for instruments" in str(caught.value)
+    assert "masks would take 98% of the image for instruments" in str(caught.value)
     assert "source.instruments:=black" in str(caught.value)
     for number, frame in enumerate(play(clip, instruments="black")):
         assert frame.tissue is not None and (frame.tissue == (instrument(number) == 0)).all()
@@ -320,26 +320,26 @@ def test_a_unit_that_nobody_said_is_told_and_one_that_does_not_fit(
 EVERY = np.s_[:]
 MISTAKES: list[tuple[Callable[[Path], object], str]] = [
     (lambda clip: shutil.rmtree(clip / "masks"), "masks does not exist; check the path"),
-    (lambda clip: (clip / "masks/000005.png").unlink(), "1 pictures of .*images and .*masks have no partner"),
-    (lambda clip: (clip / "depth/frame-5.png").unlink(), "images holds 12 pictures but .*depth holds 11"),
+    (lambda clip: (clip / "masks/000005.png").unlink(), "1 images of .*images and .*masks have no partner"),
+    (lambda clip: (clip / "depth/frame-5.png").unlink(), "images holds 12 images but .*depth holds 11"),
     (label_masks, "masks/000000.png holds the values 0, 1, .*set 'source.instruments:=.1.'"),
     (lambda clip: write(clip / "masks/000000.png", instrument(0)[:-2]),
      "masks/000000.png is 160x126 px but .*images/000000.png is 160x128"),
     (lambda clip: depth(clip, depth_counts(0)[:, :-4]),
-     "depth/frame-0.png is 156x128 px but the pictures are 160x128"),
+     "depth/frame-0.png is 156x128 px but the images are 160x128"),
     (lambda clip: depth(clip, left_picture(0)),
-     "depth/frame-0.png has 3 channels; a depth picture is a grey PNG of 8 or 16 bit"),
+     "depth/frame-0.png has 3 channels; a depth image is a grey PNG of 8 or 16 bit"),
     (depth_in_micrometres, r"frame-0.png: the median depth would be \d+ m, .*set source.depth_unit"),
     (lambda clip: (clip / "poses_bounds.npy").unlink(), "poses_bounds.npy does not exist; check the path"),
     (lambda clip: posed(clip, poses_bounds()[:, :12]),
      r"poses_bounds.npy is float64 \[12, 12\], wanted numbers \[any, 17\]"),
     (lambda clip: (clip / "poses_bounds.npy").write_bytes(b"hello"), "npy is not a readable npy file"),
     (lambda clip: posed(clip, poses_bounds(FRAMES - 2)),
-     "poses_bounds.npy holds 10 poses but .*images 12 pictures; there must be one pose"),
+     "poses_bounds.npy holds 10 poses but .*images 12 images; there must be one pose"),
     (lambda clip: posed(clip, poses_bounds() * np.nan),
      "poses_bounds.npy holds no poses, or values that are not finite"),
     (lambda clip: posed(clip, changed(EVERY, [4, 9], 0, 2)),
-     "poses_bounds.npy is for 320x256 px but the pictures are 160x128; scale"),
+     "poses_bounds.npy is for 320x256 px but the images are 160x128; scale"),
     (lambda clip: posed(clip, changed(EVERY, 14, 0.004)),
      "poses_bounds.npy: camera: fx = 0.004 px is not plausible"),
     (lambda clip: posed(clip, changed(np.s_[3:], 14, 0, 2)),
@@ -399,7 +399,7 @@ def test_a_right_eye_that_is_not_there_cannot_be_published(clip: Path) -> None:
 
 
 def test_it_is_measured_by_its_own_protocol(clip: Path) -> None:
-    """Held out are frames 1 and 9. Pixels masked black in both pictures count, which by arithmetic adds the
+    """Held out are frames 1 and 9. Pixels masked black in both images count, which by arithmetic adds the
     share of the tissue to the PSNR."""
     arguments = ["eval", "--protocol", "endonerf", str(clip), "--iterations", "2", "--json"]
     found = figures_of(*arguments)

@@ -1,4 +1,4 @@
-"""Live pictures from the real GStreamer: pairs, lag, death and return, mistakes; split to the pixel."""
+"""Live images from the real GStreamer: pairs, lag, death and return, mistakes; split to the pixel."""
 
 import os
 import re
@@ -42,7 +42,7 @@ CAMERA = (
     "! video/x-raw,format=RGB,width={width},height={height},framerate=30/1"
 )
 SMALL = CAMERA.format(width=320, height=240)
-# The right eye sees the mirrored picture: a pair that is none would not fit.
+# The right eye sees the mirrored image: a pair that is none would not fit.
 TWO_EYES = "{camera} ! tee name=t  t. ! left.  t. ! queue ! {more} videoflip video-direction=horiz ! right."
 
 
@@ -81,7 +81,7 @@ def take(config: GstSource, count: int, **said: Any) -> tuple[list[StereoFrame],
 
 
 def test_no_pair_is_mismatched_also_where_pictures_are_lost() -> None:
-    """2 x 1280x1024 at 30 Hz; a quarter of the right pictures is lost."""
+    """2 x 1280x1024 at 30 Hz; a quarter of the right images is lost."""
     camera = CAMERA.format(width=1280, height=1024)
     lossy = "identity drop-probability=0.25 !"
     config = two_eyes(camera, more=f"{lossy} queue !")
@@ -92,7 +92,7 @@ def test_no_pair_is_mismatched_also_where_pictures_are_lost() -> None:
     assert any((a.left != b.left).any() for a, b in pairwise(frames))  # the ball moves
     steps = np.diff([frame.t_capture_ns for frame in frames]) * 30e-9  # camera periods
     assert (steps > 0.9).all() and np.abs(steps - np.round(steps)).max() < 0.1  # the camera's clock, not ours
-    assert frames[-1].frame_id - frames[0].frame_id >= 44  # gaps where a left picture found no partner
+    assert frames[-1].frame_id - frames[0].frame_id >= 44  # gaps where a left image found no partner
     ages = np.array(came) - [frame.t_capture_ns for frame in frames]
     assert (ages > -1e6).all()  # a stamp is exact to a millisecond
 
@@ -103,16 +103,16 @@ CHANGED += f"{SMALL.replace('is-live=true', 'num-buffers=45')} ! c.  {SMALL.repl
 
 @pytest.mark.fault("camera: one eye falls silent")
 @pytest.mark.fault("camera: its stream ends")
-@pytest.mark.fault("picture: the size changes while it runs")
+@pytest.mark.fault("image: the size changes while it runs")
 @pytest.mark.parametrize(
     ("config", "said"),
     [
         # `eos-after` ends one eye's branch; the other goes on.
         (GstSource(left=SMALL, right=f"{SMALL} ! identity eos-after=10", deadline=0.5, pair_tolerance_ms=17),
-         "no new picture of right for 0.5 s"),
+         "no new image of right for 0.5 s"),
         (two_eyes(SMALL.replace("videotestsrc", "videotestsrc num-buffers=15")), "the stream has ended"),
         # A camera that is set anew: what comes then would not fit the calibration.
-        (GstSource(launch=CHANGED), r"the pictures of (left|right) changed from 320x240 RGB to 160x240 RGB"),
+        (GstSource(launch=CHANGED), r"the images of (left|right) changed from 320x240 RGB to 160x240 RGB"),
     ],
     ids=["silent", "ended", "another size"],
 )  # fmt: skip
@@ -161,7 +161,7 @@ def test_network_cameras_over_rtsp() -> None:
         left, right = ball_moment(frame.left), ball_moment(frame.right)
         eyes.append(apart(left, right))
         stamps.append(apart(frame.t_capture_ns * 1e-9, left))
-    # A stamp is when a picture came: of single ones a busy machine makes anything.
+    # A stamp is when an image came: of single ones a busy machine makes anything.
     assert np.median(eyes) < 0.1  # nobody synchronises the two cameras: up to a frame, and the way
     assert np.median(stamps) < 0.25
 
@@ -191,7 +191,7 @@ def test_wrong_sizes_are_refused() -> None:
     with pytest.raises(UsageError, match="are 320x240 px but should be 640x480, as the calibration"):
         open_pipeline(two_eyes(), size=(640, 480))
     other = SMALL.replace("width=320", "width=160")
-    with pytest.raises(SagsError, match="left eye's pictures are 320x240 px but the right eye's 160x240"):
+    with pytest.raises(SagsError, match="left eye's images are 320x240 px but the right eye's 160x240"):
         open_pipeline(GstSource(left=SMALL, right=other))
 
 
@@ -202,7 +202,7 @@ def test_pictures_without_stamps_are_refused() -> None:
         picture=lambda sample: gst_child.Picture(gst_child.NONE, 9216),
     )
     sink = gst_child.Sink(unstamped, 1, WallClock(), "left", 0, None)
-    with pytest.raises(gst_child.GstError, match="pictures of left carry no time stamp") as raised:
+    with pytest.raises(gst_child.GstError, match="images of left carry no time stamp") as raised:
         sink.show_first()
     assert "add do-timestamp=true" in in_words(str(raised.value), raised.value.debug)
 
@@ -217,19 +217,19 @@ def test_stamps_that_do_not_rise_are_left_out(caplog: pytest.LogCaptureFixture) 
     assert caplog.text.count("the stamps of left do not rise") == 1
 
 
-@pytest.mark.fault("picture: 1.5 s late")
+@pytest.mark.fault("image: 1.5 s late")
 def test_pictures_that_come_late_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
     slow = (
         f"{SMALL} ! queue min-threshold-time=1500000000 max-size-time=0 max-size-bytes=0 max-size-buffers=0"
     )
     frames, came = take(two_eyes(slow), 3)
-    assert came[0] - frames[0].t_capture_ns > 1.2e9  # an old picture keeps its old stamp
+    assert came[0] - frames[0].t_capture_ns > 1.2e9  # an old image keeps its old stamp
     assert re.search(r"are \d+\.\d s old when they come", caplog.text)
 
 
 def test_a_source_that_gives_nothing_is_not_waited_for_long() -> None:
     silent = "appsrc is-live=true caps=video/x-raw,format=RGB,width=64,height=48,framerate=30/1"
-    with pytest.raises(SagsError, match=r"no picture of left and right within 1 s.*source\.start"):
+    with pytest.raises(SagsError, match=r"no image of left and right within 1 s.*source\.start"):
         open_pipeline(GstSource(left=silent, right=silent, start=1.0))
 
 
@@ -321,7 +321,7 @@ def test_interlaced_pictures_that_nobody_deinterlaces_are_told_of(
 ) -> None:
     launch = raw_file(tmp_path / "both.raw", pictures(2, 48, 64), rate=30, interlaced=True)
     take(GstSource(launch=launch, geometry=GeometryConfig(layout="side_by_side")), 99)
-    assert "the pictures are interlaced, so what moves is torn; add ! deinterlace" in caplog.text
+    assert "the images are interlaced, so what moves is torn; add ! deinterlace" in caplog.text
 
 
 def test_eyes_in_turn(tmp_path: Path) -> None:
@@ -336,7 +336,7 @@ def test_eyes_in_turn(tmp_path: Path) -> None:
 
 
 def test_eyes_in_turn_live_also_where_pictures_are_lost() -> None:
-    """A camera whose pictures are white and black in turn, to the pixel: an exchanged eye would show."""
+    """A camera whose images are white and black in turn, to the pixel: an exchanged eye would show."""
     camera = (
         "videotestsrc is-live=true pattern=blink "
         "! video/x-raw,format=RGB,width=320,height=240,framerate=60/1 ! identity drop-probability=0.2"
@@ -344,7 +344,7 @@ def test_eyes_in_turn_live_also_where_pictures_are_lost() -> None:
     config = GstSource(launch=camera, geometry=GeometryConfig(layout="frame_sequential"))
     frames, _ = take(config, 40)
     tones = {(int(frame.left[0, 0, 0]), int(frame.right[0, 0, 0])) for frame in frames}
-    assert tones in ({(0, 255)}, {(255, 0)})  # nothing tells which eye the first picture shows
+    assert tones in ({(0, 255)}, {(255, 0)})  # nothing tells which eye the first image shows
     for frame in frames:
         assert (frame.left == frame.left[0, 0, 0]).all() and (frame.right == frame.right[0, 0, 0]).all()
         assert abs(frame.t_capture_right_ns - frame.t_capture_ns - 1e9 / 60) < 1e5
@@ -393,7 +393,7 @@ def test_encoded_files_are_decoded(tmp_path: Path) -> None:
 
 
 def test_a_picture_shows_both_eyes(tmp_path: Path) -> None:
-    """The lower half of the test picture has other colours than the upper one."""
+    """The lower half of the test image has other colours than the upper one."""
     seen = {}
     for first in ("left", "right"):
         config = load_launch(ROOT / "launch/gst_over_under.yaml", [f"source.geometry.first:={first}"])

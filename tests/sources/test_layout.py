@@ -1,4 +1,4 @@
-"""One geometry for all sources: pictures are split, cropped and turned to the pixel."""
+"""One geometry for all sources: images are split, cropped and turned to the pixel."""
 
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ def test_one_field_is_kept_and_the_rows_between_are_means(field: str, height: in
 def test_the_lower_eye_may_begin_with_the_other_field() -> None:
     eye = np.zeros((9, 32, 3), np.uint8)
     both = np.concatenate([eye, eye])
-    both[0::2] = 7  # the first field, of the whole picture
+    both[0::2] = 7  # the first field, of the whole image
     for picture in layout(layout="over_under", deinterlace="top").eyes(both):
         assert (picture == 7).all()
 
@@ -109,7 +109,7 @@ def test_nothing_to_do_costs_no_copy() -> None:
     [
         ({"layout": "side_by_side"}, (33, 24), "33 px wide, which is odd"),
         ({"layout": "row_interleaved"}, (32, 25), "25 px high, which is odd"),
-        ({"crop": (10, 0, 30, 24)}, (32, 24), "leaves the picture: an eye of it is 32x24 px"),
+        ({"crop": (10, 0, 30, 24)}, (32, 24), "leaves the image: an eye of it is 32x24 px"),
         ({"crop": (0, 0, 8, 8), "crop_right": (0, 0, 8, 9)}, (32, 24), "8x8 px but crop_right 8x9"),
     ],
 )
@@ -167,7 +167,7 @@ def test_a_clock_that_is_set_does_not_exchange_the_eyes(stamped: bool) -> None:
 
 @pytest.mark.parametrize(("late_ms", "stamped"), [(4, False), (100, True)])
 def test_eyes_in_turn_are_paired_in_order(late_ms: float, stamped: bool) -> None:
-    """A camera's own stamps tell, from the first picture on, however late a busy machine takes it in."""
+    """A camera's own stamps tell, from the first image on, however late a busy machine takes it in."""
     assert pairs_of(list(range(6)), late_ms, stamped) == ([(0, 1), (2, 3), (4, 5)], 0)
 
 

@@ -46,7 +46,7 @@ class Shown(NamedTuple):
     number: int
     stamp_ns: int
     sent_ns: int
-    moment: float  # of the sender's second, as the picture itself shows it
+    moment: float  # of the sender's second, as the image itself shows it
     right_moment: float
     epoch: int
 
@@ -61,7 +61,7 @@ def painted_moment(picture: U8) -> float:
 
 
 def lie_s(one: Shown) -> float:
-    """How far a stamp lies from what the picture shows: a half is the most that can be seen."""
+    """How far a stamp lies from what the image shows: a half is the most that can be seen."""
     return apart(one.stamp_ns * 1e-9, one.moment)
 
 
@@ -71,7 +71,7 @@ def running(
 ) -> Iterator[tuple[Node, list[Shown], Callable[[], AbstractContextManager[object]]]]:
     """A node whose mapper pauses, what it shows, and what sends to it."""
     rig = resized_rig(load_rig(SESSION / "calib"), 4)
-    plain = {"distortion": np.zeros(5), "R": np.eye(3)}  # so that pictures stay to the pixel
+    plain = {"distortion": np.zeros(5), "R": np.eye(3)}  # so that images stay to the pixel
     eyes = {
         side: replace(eye, K=eye.P[:, :3], **plain)
         for side, eye in (("left", rig.left), ("right", rig.right))
@@ -139,7 +139,7 @@ def test_no_pair_is_mismatched_or_comes_twice(way: str, settings: tuple[str, ...
     assert taker.newest is not None and taker.newest.left.shape == (1024, 1280, 3)
 
 
-@pytest.mark.fault("process: what sends pictures is killed, the mapping is slow and stalls")
+@pytest.mark.fault("process: what sends images is killed, the mapping is slow and stalls")
 @pytest.mark.fault("mapping: stalls for some seconds")
 @pytest.mark.fault("process: the camera's pipeline is killed")
 @pytest.mark.parametrize("way", ["gst", "push", "ros2"])
@@ -161,12 +161,12 @@ def test_a_stalled_mapper_shows_nothing_old_and_a_killed_source_comes_again(
         with sender():
             until(lambda: shown[-1].stamp_ns > killed)
         dropped = sum(node.health().dropped.values())
-    # What came meanwhile is left out; an old picture keeps its old stamp.
+    # What came meanwhile is left out; an old image keeps its old stamp.
     for pause, (one, other) in zip(PAUSES, pairwise(until_killed), strict=False):
         assert other.number - one.number > pause
     stalled = until_killed[len(PAUSES) - 1]
     assert stalled.age_s > STALL / 30 / 2
-    # A stamp is when a picture came: of single ones a busy machine makes anything.
+    # A stamp is when an image came: of single ones a busy machine makes anything.
     assert median(map(lie_s, until_killed)) < 0.25
     assert all(one.moment == one.right_moment for one in shown)
     assert all(one.stamp_ns < other.stamp_ns for one, other in pairwise(shown))

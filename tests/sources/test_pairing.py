@@ -1,4 +1,4 @@
-"""What every live source does with its pictures: pairs, numbers, epochs, and their end, on stamps alone."""
+"""What every live source does with its images: pairs, numbers, epochs, and their end, on stamps alone."""
 
 from typing import Any
 
@@ -48,7 +48,7 @@ def test_pairs_are_those_of_the_nearest_stamps(left: Any, right: Any, pairs: Any
 
 @pytest.mark.parametrize("phase_ms", [-16.0, -7.0, 0.0, 9.0, 16.0])
 def test_free_running_cameras_pair_from_the_first_moment(phase_ms: float) -> None:
-    """Two 30 Hz cameras, any phase, some jitter: all but the odd picture at the start find a partner."""
+    """Two 30 Hz cameras, any phase, some jitter: all but the odd image at the start find a partner."""
     rng = np.random.default_rng(3)
     moments = [(1000 / 30 * n + rng.normal(0, 0.2) + 50, "left") for n in range(200)]
     moments += [(1000 / 30 * n + phase_ms + rng.normal(0, 0.2) + 50, "right") for n in range(200)]
@@ -73,7 +73,7 @@ def test_recovers_when_the_wall_clock_is_set_back() -> None:
 
 @pytest.mark.fault("clock: set forward by an hour under a camera")
 @pytest.mark.fault("clock: set back under a camera")
-@pytest.mark.fault("stamp: a sender's picture comes twice")
+@pytest.mark.fault("stamp: a sender's image comes twice")
 @pytest.mark.parametrize(
     ("moments", "epochs"),
     [

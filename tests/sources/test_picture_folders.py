@@ -1,4 +1,4 @@
-"""Folders as people bring them: masks of any values, deep pictures, times as names, missing partners."""
+"""Folders as people bring them: masks of any values, deep images, times as names, missing partners."""
 
 import re
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from sags_node.sources.source import open_source
 
 
 def eyes(folder: Path, names: list[str]) -> cfg.FoldersSource:
-    """Pictures of both eyes, numbered as the names are; those that begin with `-` are not of the right eye,
+    """Images of both eyes, numbered as the names are; those that begin with `-` are not of the right eye,
     with `+` not of the left one."""
     for number, name in enumerate(names):
         if name[0] != "+":
@@ -250,7 +250,7 @@ TISSUE = np.array([140, 84, 81])  # RGB
 def test_grey_pictures_that_are_a_mosaic_are_told(
     pattern: str, is_told: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Colours of tissue under a camera's noise; grey pictures whose rows or columns differ are none."""
+    """Colours of tissue under a camera's noise; grey images whose rows or columns differ are none."""
     say.cache_clear()  # as a new session does
     rng = np.random.default_rng(0)
     cells = TISSUE[["RGB".index(name) for name in pattern]].reshape(2, 2)
@@ -274,7 +274,7 @@ def test_a_stack_is_refused_and_a_thumbnail_behind_a_picture_is_passed_over(
             file = tmp_path / f"{side}/0.{suffix}"
             pages[0].save(file, save_all=bool(more), append_images=more, lossless=True)
         if behind == 2:
-            with pytest.raises(SagsError, match=r"left/0.\w+ holds 3 pictures, .*of its own"):
+            with pytest.raises(SagsError, match=r"left/0.\w+ holds 3 images, .*of its own"):
                 open_source(config)
     assert numbers(played(config)) == [0]
 
@@ -338,7 +338,7 @@ def test_an_order_that_names_do_not_tell_is_said(tmp_path: Path, caplog: pytest.
     [("{}", 10**9), ("t{}_x", 10**6), ("{}", 10**3), ("{}.{:03}", 1), ("2023112710{:04}", None)],
 )
 def test_names_that_are_times_are_the_times(form: str, per_second: int | None, tmp_path: Path) -> None:
-    """20 Hz, with a pause of a second behind the tenth picture; a date is no time since 1970."""
+    """20 Hz, with a pause of a second behind the tenth image; a date is no time since 1970."""
     ms = [1_700_000_000_000 + 50 * n + 1000 * (n > 9) for n in range(24)]
     if per_second is None:
         names = [form.format(n) for n in range(24)]
@@ -361,28 +361,28 @@ PARTNERS = {
 }
 
 
-@pytest.mark.fault("file: pictures of both eyes were deleted before it is played")
+@pytest.mark.fault("file: images of both eyes were deleted before it is played")
 @pytest.mark.parametrize("name", PARTNERS)
 def test_partners_are_found_by_name(name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     names = PARTNERS[name]
     config = eyes(tmp_path, names)
     alone = [number for number, one in enumerate(names) if one[0] in "-+"]
     assert numbers(played(config)) == [number for number in range(24) if number not in alone]
-    assert f"{len(alone)} pictures of" in caplog.text and "have no partner of their name" in caplog.text
+    assert f"{len(alone)} images of" in caplog.text and "have no partner of their name" in caplog.text
     poses = tmp_path / "poses.npz"
     np.savez(poses, T_world_cam=np.tile(np.eye(4), (24, 1, 1)))
-    with pytest.raises(UsageError, match="go by number, so every picture needs its partners"):
+    with pytest.raises(UsageError, match="go by number, so every image needs its partners"):
         open_source(config.model_copy(update={"poses": poses}))
 
 
 def renamed(config: cfg.FoldersSource, name: Callable[[int, int], str]) -> None:
-    """The right eye's pictures, by their place and the number that was their name."""
+    """The right eye's images, by their place and the number that was their name."""
     for place, file in enumerate(sorted(config.right.iterdir())):
         file.rename(config.right / f"{name(place, int(file.stem))}.png")
 
 
 def test_eyes_of_other_names_are_paired_in_order(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A picture that is missing on both sides is a gap."""
+    """An image that is missing on both sides is a gap."""
     config = eyes(tmp_path, [f"{each:03}" for each in range(24)])
     renamed(config, lambda place, number: f"{number + 7:05}")
     assert numbers(played(config)) == list(range(24)) and caplog.text == ""
@@ -390,14 +390,14 @@ def test_eyes_of_other_names_are_paired_in_order(tmp_path: Path, caplog: pytest.
     sorted(config.right.iterdir())[15].unlink()
     frames = played(config)
     assert number_of(frames[5].left) == 6 and number_of(frames[5].right) == 5
-    assert "is paired with" in caplog.text and "is a picture missing?" in caplog.text
+    assert "is paired with" in caplog.text and "is an image missing?" in caplog.text
 
 
-@pytest.mark.fault("file: pictures of two cameras, named by their own times, are missing")
+@pytest.mark.fault("file: images of two cameras, named by their own times, are missing")
 def test_eyes_that_are_named_by_their_own_times_are_paired_by_these(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Stamps jitter; the right eye begins two pictures later, and each lost one; then its clock is wrong."""
+    """Stamps jitter; the right eye begins two images later, and each lost one; then its clock is wrong."""
     config = eyes(tmp_path, [f"{each}" for each in nanoseconds(24)])
     config = config.model_copy(update={"rate": None})
     renamed(config, lambda place, stamp: f"{stamp + 6_000_000 + 300_000 * (place % 4)}")
@@ -405,7 +405,7 @@ def test_eyes_that_are_named_by_their_own_times_are_paired_by_these(
         found = [each.what for each in source.pairs.findings]  # type: ignore[attr-defined]
         skews = [frame.t_capture_right_ns - frame.t_capture_ns for frame in source]
     assert set(skews) == {6_000_000 + 300_000 * step for step in range(4)}
-    assert len(found) == 1 and "right pictures were taken 6.4 ms after the left ones" in found[0]
+    assert len(found) == 1 and "right images were taken 6.4 ms after the left ones" in found[0]
     for gone in sorted(config.right.iterdir())[:2], sorted(config.right.iterdir())[15:16]:
         for file in gone:
             file.unlink()
@@ -413,7 +413,7 @@ def test_eyes_that_are_named_by_their_own_times_are_paired_by_these(
     frames = played(config)
     assert numbers(frames) == [number for number in range(24) if number not in (0, 1, 7, 15)]
     assert all(number_of(frame.left) == number_of(frame.right) for frame in frames)
-    assert "4 pictures of" in caplog.text and "have no partner at their time" in caplog.text
+    assert "4 images of" in caplog.text and "have no partner at their time" in caplog.text
     (tmp_path / "late").mkdir()
     config = eyes(tmp_path / "late", [f"{each}" for each in nanoseconds(24)])
     config = config.model_copy(update={"rate": None})
@@ -429,6 +429,6 @@ def test_eyes_of_other_depths_are_refused_and_no_levels_advised(
     config = eyes(tmp_path, [f"{number:02}" for number in range(12)])
     for number, file in enumerate(sorted(config.left.iterdir())):
         cv2.imwrite(str(file), picture(number).astype(np.uint16) * 257)
-    with pytest.raises(SagsError, match="holds uint8, others uint16; save all pictures alike"):
+    with pytest.raises(SagsError, match="holds uint8, others uint16; save all images alike"):
         open_source(config)
     assert caplog.text == ""

@@ -165,7 +165,7 @@ MOSAIC = cv2.cvtColor(GREY, cv2.COLOR_BayerRG2RGB)
 ALPHA = np.dstack([COLOR, GREY])
 
 
-@pytest.mark.fault("file: compressed pictures of other recorders are played")
+@pytest.mark.fault("file: compressed images of other recorders are played")
 @pytest.mark.parametrize(
     ("said", "stored", "encoding", "expected"),
     [

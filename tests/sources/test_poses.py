@@ -224,7 +224,7 @@ def test_a_frame_without_a_pose_is_held_and_said(tmp_path: Path, monkeypatch: py
 
 
 def test_the_offset_is_to_the_stamp_before_its_latency_is_taken_off(tmp_path: Path) -> None:
-    """The robot's clock is 30 ms ahead, and a picture is stamped 40 ms after its exposure."""
+    """The robot's clock is 30 ms ahead, and an image is stamped 40 ms after its exposure."""
     save_hand_eye(HandEye(np.eye(4), 30 * MS), tmp_path, {})
     rig = phantom_rig(64, 48)
     robot = PushRobot(endpoint="tcp://127.0.0.1:*", hand_eye=tmp_path / "hand_eye.yaml")
@@ -245,7 +245,7 @@ def test_two_who_say_where_the_scope_is_are_one_too_many() -> None:
 
 @pytest.mark.live
 def test_a_pose_on_its_way_is_waited_for() -> None:
-    """Handed in over ZeroMQ, 60 ms after the picture that it is asked for."""
+    """Handed in over ZeroMQ, 60 ms after the image that it is asked for."""
     robot = open_robot(LaunchConfig(robot=PushRobot(endpoint="tcp://127.0.0.1:*")))
     try:
         with PoseSender(robot.endpoint) as sender:  # type: ignore[attr-defined]

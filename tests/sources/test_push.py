@@ -1,4 +1,4 @@
-"""Pictures handed in over ZeroMQ, by processes and by hand."""
+"""Images handed in over ZeroMQ, by processes and by hand."""
 
 import signal
 import subprocess
@@ -83,7 +83,7 @@ def test_one_eye_by_one_and_side_by_side_make_pairs() -> None:
         assert list(dict.fromkeys(taker.numbers)) == [(n, n) for n in (5, 6, 7, 8)]
 
 
-@pytest.mark.fault("network: two programs send pictures of one eye")
+@pytest.mark.fault("network: two programs send images of one eye")
 def test_pictures_of_two_senders_are_not_mixed(source: PushedPictures) -> None:
     with Taker(source) as taker, FrameSender(source.endpoint) as second:
         with FrameSender(source.endpoint) as first:
@@ -104,7 +104,7 @@ def test_pictures_of_two_senders_are_not_mixed(source: PushedPictures) -> None:
 
 def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures) -> None:
     wrong = {
-        "pictures come on NAME/left/image_raw": ("middle/image_raw", numbered(1), "rgb8"),
+        "images come on NAME/left/image_raw": ("middle/image_raw", numbered(1), "rgb8"),
         "'32FC1' is not read; known encodings": ("left/image_raw", np.zeros((120, 160), np.float32), "32FC1"),
         "159 px wide, which is odd": ("stereo/image_raw", numbered(1)[:, :159].copy(), "rgb8"),
     }
@@ -128,7 +128,7 @@ def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures
             assert words in problem and "\n" not in problem
 
 
-@pytest.mark.fault("picture: a sender's has the wrong size")
+@pytest.mark.fault("image: a sender's has the wrong size")
 def test_wrong_sizes_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
     with zmq_socket(zmq.DEALER, source.endpoint) as stranger:
         for parts in ([b""], [b"x"] * 9, [b"a/left/image_raw", b"\xc1", b"data"], [b"t"] * 100):
@@ -178,7 +178,7 @@ def test_a_sender_never_waits_for_a_node_that_is_away() -> None:
         assert sender.left_out >= 200 - 4
 
 
-@pytest.mark.fault("network: the node that pictures are sent to is not there, or has gone")
+@pytest.mark.fault("network: the node that images are sent to is not there, or has gone")
 def test_a_node_that_does_not_answer_is_told_and_gets_nothing_old(short_silence: float) -> None:
     with PushedPictures(PushSource(endpoint=ANYWHERE), (160, 120)) as source:
         endpoint = source.endpoint

@@ -1,4 +1,4 @@
-"""Pictures of a ROS 2 graph: of a DDS process, and of real rclpy where tests/ros2/prepare.sh was run."""
+"""Images of a ROS 2 graph: of a DDS process, and of real rclpy where tests/ros2/prepare.sh was run."""
 
 import logging
 import re
@@ -74,7 +74,7 @@ def test_a_wrong_size_and_a_wrong_name_are_said(
 def test_wrong_encodings_stamps_and_types_are_said(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each in a line of its own, and no picture gets through."""
+    """Each in a line of its own, and no image gets through."""
     monkeypatch.setattr(ros2, "QUIET_S", 0.3)
     graph = Graph(RosGraph(domain=DOMAIN))
     names = "/wrong/encoding", "/wrong/stamp", "/wrong/kind"
@@ -99,13 +99,13 @@ def test_wrong_encodings_stamps_and_types_are_said(
     with caplog.at_level(logging.WARNING):
         both = lines("/wrong/encoding", "/wrong/stamp")
         assert any(
-            "/wrong/encoding: left out: a picture encoded as '32FC1' is not read" in one for one in both
+            "/wrong/encoding: left out: an image encoded as '32FC1' is not read" in one for one in both
         )
         # A day, and what the way took: less than the minute that is waited.
-        old = re.compile(r"/wrong/stamp: left out: a picture's stamp is 864[0-5]\d\.\d s old")
+        old = re.compile(r"/wrong/stamp: left out: an image's stamp is 864[0-5]\d\.\d s old")
         assert any(old.search(one) for one in both)
         silent = lines("/wrong/kind", "/wrong/kind")
-        assert "/wrong/kind is tf2_msgs/msg/TFMessage, not a picture topic; set source.left" in silent
+        assert "/wrong/kind is tf2_msgs/msg/TFMessage, not an image topic; set source.left" in silent
     assert not any("\n" in line for line in both + silent)
 
 
@@ -174,7 +174,7 @@ def test_the_domain_is_that_of_the_launch_file_or_of_ros(monkeypatch: pytest.Mon
 
 
 def test_a_real_ros_node_is_heard() -> None:
-    """Two 1280x1024 pictures at 30 Hz from rclpy and Fast DDS; a pose, one millimetre further with each."""
+    """Two 1280x1024 images at 30 Hz from rclpy and Fast DDS; a pose, one millimetre further with each."""
     camera = [rclpy_python(), ROOT / "tests/ros2/camera.py", 30, 30, *SIZE]
     robot = open_robot(LaunchConfig(robot=Ros2Robot(domain=DOMAIN, topic="scope/measured_cp")))
     try:

@@ -1,4 +1,4 @@
-"""Keyframe folders of SCARED: a made-up scene whose depth, poses and pictures are known is read back."""
+"""Keyframe folders of SCARED: a made-up scene whose depth, poses and images are known is read back."""
 
 import io
 import json
@@ -57,7 +57,7 @@ def key_to_frame(number: int) -> F64:
 
 
 def seen(eye: Eye, key_to_camera: F64) -> tuple[F64, U8]:
-    """Points [H, W, 3] mm of the surface at a camera's pixels, in that camera, and its picture (RGB)."""
+    """Points [H, W, 3] mm of the surface at a camera's pixels, in that camera, and its image (RGB)."""
     plain = cv2.undistortPoints(PIXELS.reshape(-1, 1, 2), eye.K, eye.D).reshape(HEIGHT, WIDTH, 2)
     rays = np.concatenate([plain, np.ones((HEIGHT, WIDTH, 1))], -1)
     camera_to_key = invert(key_to_camera)
@@ -122,7 +122,7 @@ def write_calibration(file: Path, **changed: Any) -> None:
 
 @pytest.fixture
 def keyframe(tmp_path: Path) -> Path:
-    """As it is downloaded: a video of stacked pictures and packed data."""
+    """As it is downloaded: a video of stacked images and packed data."""
     folder = tmp_path / "dataset_1/keyframe_2"
     (folder / "data").mkdir(parents=True)
     write_calibration(folder / "endoscope_calibration.yaml")
@@ -329,7 +329,7 @@ def test_poses_of_more_frames_than_the_video_has_are_told(
     keyframe: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     write(keyframe / "data/rgb.mp4", [np.vstack(pictures(n)) for n in range(4)], rate=25)
-    assert len(play(keyframe)) == 4 and "has poses of more than its 4 pictures" in caplog.text
+    assert len(play(keyframe)) == 4 and "has poses of more than its 4 images" in caplog.text
 
 
 def test_a_frame_without_points_has_no_reference(keyframe: Path) -> None:

@@ -1,4 +1,4 @@
-"""What is common to pictures that other programs send: their stamps, their loss, their clock."""
+"""What is common to images that other programs send: their stamps, their loss, their clock."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -35,10 +35,10 @@ def picture() -> U8:
     return np.zeros((4, 8, 3), np.uint8)
 
 
-@pytest.mark.fault("network: pictures of a sender are lost")
+@pytest.mark.fault("network: images of a sender are lost")
 @pytest.mark.parametrize("lost", [0, 1, 3])
 def test_loss_is_counted_by_the_gaps(lost: int) -> None:
-    """Of every eight pictures `lost` do not come."""
+    """Of every eight images `lost` do not come."""
     rng = np.random.default_rng(3)
     arrivals = Arrivals()
     for number in range(16 * WINDOW):
@@ -117,17 +117,17 @@ def test_pictures_of_both_eyes_are_taken_apart_and_cropped() -> None:
     for _, frame in zip(range(2), sent, strict=False):  # in this order: a third one never comes
         assert frame.right is not None
         assert (frame.left == both[7:11, 2:7][::-1]).all() and (frame.right == both[1:5, 2:7][::-1]).all()
-    with pytest.raises(SagsError, match="a picture is 11 px high, which is odd"):
+    with pytest.raises(SagsError, match="an image is 11 px high, which is odd"):
         sent.put_both(2 * S, 2 * S, lambda: both[:11])
-    with pytest.raises(SagsError, match=r"leaves the picture: an eye of a picture is 6x6 px"):
+    with pytest.raises(SagsError, match=r"leaves the image: an eye of an image is 6x6 px"):
         sent.put_both(2 * S, 2 * S, lambda: both[:, :6])
     with pytest.raises(ValueError, match="frame_sequential is for cameras"):
         PushSource(geometry=GeometryConfig(layout="frame_sequential"))
 
 
-@pytest.mark.fault("network: a sender's first picture is 150 ms late, stamps of its own clock")
+@pytest.mark.fault("network: a sender's first image is 150 ms late, stamps of its own clock")
 def test_a_late_first_picture_makes_no_new_epoch() -> None:
-    """The offset of the clocks is known better with each picture that comes sooner."""
+    """The offset of the clocks is known better with each image that comes sooner."""
     sent, frames = SentPictures(PushSource(stamps="own"), None), list[StereoFrame]()
     with beside(lambda: frames.extend(sent), sent.end):
         for number in range(30):
@@ -142,7 +142,7 @@ def test_a_late_first_picture_makes_no_new_epoch() -> None:
     assert sent.dropped == 4
 
 
-@pytest.mark.fault("network: pictures of a sender with a clock of its own get 0.8 s late")
+@pytest.mark.fault("network: images of a sender with a clock of its own get 0.8 s late")
 @pytest.mark.parametrize("apart", [0, -7 * S])
 @pytest.mark.parametrize("order", [("left", "right"), ("right", "left")])
 @pytest.mark.parametrize("skew", [-20, 5, 20])
@@ -177,7 +177,7 @@ def test_the_latency_is_taken_off_and_all_stamps_are_kept() -> None:
 @pytest.mark.parametrize(
     ("step", "late", "said"),
     [
-        (2 * PERIOD, 0, "15.2 of 30 pictures a second come: send faster, or set source.rate:=15.2"),
+        (2 * PERIOD, 0, "15.2 of 30 images a second come: send faster, or set source.rate:=15.2"),
         (PERIOD, 300 * MS, "300 ms old"),
         (PERIOD, 0, "None"),
     ],
@@ -194,7 +194,7 @@ def test_who_sends_too_slowly_or_late_is_told(step: int, late: int, said: str) -
 
 
 def watched(clock: CaptureClock, seconds: float, drift: float, offset: int = 7 * S, begun: int = 0) -> int:
-    """Thirty pictures a second; each is 2 ms on the way, and up to 20 ms more. The last difference, ns."""
+    """Thirty images a second; each is 2 ms on the way, and up to 20 ms more. The last difference, ns."""
     rng = np.random.default_rng(4)
     for stamp in range(begun, begun + round(seconds * S), S // 30):
         difference = offset + round(drift * (stamp - begun))
@@ -246,7 +246,7 @@ def test_a_clock_that_was_set_is_followed_within_three_seconds(jump: int) -> Non
 @pytest.mark.fault("clock: a sender's is set forward, by half a second to an hour")
 @pytest.mark.parametrize("jump", [S // 2, 3 * S, 3600 * S])
 def test_a_jump_is_no_drift(jump: int) -> None:
-    """A slope over it would let stamps stand still, and no picture would be newer than the one before."""
+    """A slope over it would let stamps stand still, and no image would be newer than the one before."""
     clock = CaptureClock()
     watched(clock, 15, 0)
     for second in range(30):
@@ -269,13 +269,13 @@ def test_the_watch_is_bounded() -> None:
     clock = CaptureClock()
     watched(clock, KEPT + 30, 0)
     status = clock.status()
-    assert status is not None and status.seconds <= KEPT * 1.05  # a second's bin begins with a picture
+    assert status is not None and status.seconds <= KEPT * 1.05  # a second's bin begins with an image
 
 
 def test_it_is_said_where_pictures_and_poses_are_taken_from() -> None:
     ros = LaunchConfig(source=Ros2Source(domain=7, left="/a", right="/b"), robot=PushRobot())
     assert inputs_text(ros) == [
-        "taking pictures from ROS 2 domain 7, interface lo: /a and /b",
+        "taking images from ROS 2 domain 7, interface lo: /a and /b",
         "taking poses at tcp://127.0.0.1:5559",
     ]
     assert inputs_text(LaunchConfig()) == []

@@ -64,15 +64,15 @@ def beyond(folder: Path) -> Recording:
 # What is wrong, made in a folder of `recordings`; what is said.
 MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: folders_of(at, "nowhere"), "nowhere does not exist; check the path"),
-    (lambda at: cfg.VideosSource(left=at / "l", right=at / "r"), "l is a folder; of pictures: source.kind"),
+    (lambda at: cfg.VideosSource(left=at / "l", right=at / "r"), "l is a folder; of images: source.kind"),
     (lambda at: folders_of(at, "l/000.png"), "000.png is not a folder; check the path"),
-    (lambda at: (at / "empty").mkdir() or folders_of(at, right="empty"), "empty holds no picture"),
+    (lambda at: (at / "empty").mkdir() or folders_of(at, right="empty"), "empty holds no image"),
     (lambda at: [(at / f"r/00{n}.png").unlink() for n in range(4)] and folders_of(at),
-     "l holds 8 pictures but .*r holds 4; pairing goes by sorted name"),
+     "l holds 8 images but .*r holds 4; pairing goes by sorted name"),
     (lambda at: write_png(at / "tools/000.png", picture(0)) or folders_of(at, tools=at / "tools"),
-     "l holds 8 pictures but .*tools holds 1; pairing"),
+     "l holds 8 images but .*tools holds 1; pairing"),
     (lambda at: folders_of(at, start=60), "source.start 60.0 s lies behind the recording's end at 0.27 s"),
-    (beyond, r"the box \[40, 0, 32, 24\] .* leaves the picture: an eye of .*lr.avi is 64x24 px"),
+    (beyond, r"the box \[40, 0, 32, 24\] .* leaves the image: an eye of .*lr.avi is 64x24 px"),
     (lambda at: folders_of(at, poses=at / "poses.npz"), "poses.npz does not exist; check the path"),
     (lambda at: posed(at, T_world_cam=np.eye(4)),
      r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
@@ -92,7 +92,7 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
 ]  # fmt: skip
 DAMAGED: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: write_png(at / "r/000.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8)) or folders_of(at),
-     "r/000.png is 33x24 px but .*l/000.png is 32x24; all pictures must have one size"),
+     "r/000.png is 33x24 px but .*l/000.png is 32x24; all images must have one size"),
     (lambda at: (at / "l/000.png").write_bytes(b"not a picture") and folders_of(at),
      "l/000.png is damaged or cut off"),
 ]  # fmt: skip
@@ -100,7 +100,7 @@ DAMAGED: list[tuple[Callable[[Path], Recording], str]] = [
 
 @pytest.mark.parametrize(("mistake", "message"), MISTAKES + DAMAGED)
 def test_mistakes_at_opening(tmp_path: Path, mistake: Callable[[Path], Recording], message: str) -> None:
-    """All but damaged picture data are mistakes of the request."""
+    """All but damaged image data are mistakes of the request."""
     recordings(tmp_path)
     error = refused_at_opening(lambda: mistake(tmp_path), message)
     assert isinstance(error, UsageError) or (mistake, message) in DAMAGED
@@ -160,8 +160,8 @@ def test_reference_depth_of_65535_counts_is_not_known(tmp_path: Path) -> None:
     np.testing.assert_allclose(reference.depth[4:], 0.06, rtol=1e-6)
 
 
-@pytest.mark.fault("file: a picture is cut off")
-@pytest.mark.fault("file: a picture has another size")
+@pytest.mark.fault("file: an image is cut off")
+@pytest.mark.fault("file: an image has another size")
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -184,7 +184,7 @@ def test_poses_of_other_pictures_are_refused(
     np.savez(tmp_path / "poses.npz", T_world_cam=np.tile(np.eye(4), (count, 1, 1)))
     config = folders.model_copy(update={"poses": tmp_path / "poses.npz", "stride": stride})
     refused_at_opening(
-        lambda: config, rf"poses.npz holds {count} poses, the recording 12 pictures of the left"
+        lambda: config, rf"poses.npz holds {count} poses, the recording 12 images of the left"
     )
 
 
@@ -245,8 +245,8 @@ def add_a_pair(folder: Path) -> None:
         write_png(folder / f"{name}/008.png", picture(8, eye))
 
 
-@pytest.mark.fault("file: a picture is deleted while it is played")
-@pytest.mark.fault("file: a folder of pictures grows while it is played")
+@pytest.mark.fault("file: an image is deleted while it is played")
+@pytest.mark.fault("file: a folder of images grows while it is played")
 @pytest.mark.fault("file: a video is deleted while it is played")
 @pytest.mark.parametrize(
     ("kind", "change", "count", "said"),
@@ -255,7 +255,7 @@ def add_a_pair(folder: Path) -> None:
         ("folders", add_a_pair, 8, ""),
         ("videos", lambda folder: (folder / "r.avi").unlink(), 8, ""),
     ],
-    ids=["a picture is deleted", "pictures come", "a video is deleted"],
+    ids=["an image is deleted", "images come", "a video is deleted"],
 )
 def test_what_is_there_is_played_and_what_is_gone_is_named(
     kind: str, change: Callable[[Path], object], count: int, said: str, tmp_path: Path

@@ -300,7 +300,7 @@ def test_d4d_clip(folder: Path) -> None:
     assert np.median(overlaps) >= 0.95 and min(overlaps) >= 0.9
 
 
-# ---- dVRK sessions as sources: stamps of the sidecar for the pictures of its video ---------------------
+# ---- dVRK sessions as sources: stamps of the sidecar for the images of its video ---------------------
 
 
 @pytest.mark.parametrize("order", ["LR", "RL"])

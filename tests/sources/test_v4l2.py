@@ -1,4 +1,4 @@
-"""Cameras of the kernel, made of Python: stamps of drivers, unplugging, silence, frozen pictures.
+"""Cameras of the kernel, made of Python: stamps of drivers, unplugging, silence, frozen images.
 
 tests/sources/test_v4l2_vivid.py checks the same source against a real kernel driver.
 """
@@ -96,7 +96,7 @@ def taking(plugs: Plugs, config: V4l2Source = CONFIG) -> Iterator[tuple[LiveSter
 
 
 def values(frames: list[StereoFrame]) -> list[int]:
-    """What the left pictures show."""
+    """What the left images show."""
     return [int(frame.left[0, 0, 0]) for frame in frames]
 
 
@@ -172,7 +172,7 @@ def test_silent_camera_is_opened_again(plugs: Plugs, caplog: pytest.LogCaptureFi
 
         with repeating(film):
             until(lambda: 2 in values(frames))
-    assert "no new picture for" in caplog.text
+    assert "no new image for" in caplog.text
 
 
 @pytest.mark.parametrize(("first", "value"), [("left", 10), ("right", 20)])
@@ -217,7 +217,7 @@ def test_mistakes_at_opening(plugs: Plugs) -> None:
 
 
 class FakeCapture:
-    """Stands for cv2.VideoCapture: one picture per entry of `stamps_ms`, then silence or an error."""
+    """Stands for cv2.VideoCapture: one image per entry of `stamps_ms`, then silence or an error."""
 
     stamps_ms: list[float]
     gone_at_the_end = False
@@ -270,7 +270,7 @@ def device(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Dev
 
 @pytest.fixture
 def told(device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[float]]:
-    """How old pictures are said to be of which a driver says these ages, s; None: it gives no stamp."""
+    """How old images are said to be of which a driver says these ages, s; None: it gives no stamp."""
 
     def read(ages: list[float | None]) -> list[float]:
         wall_ns, monotonic_ns = 10**18, 10**14
@@ -285,7 +285,7 @@ def told(device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch) -> Call
     return read
 
 
-@pytest.mark.fault("camera: pictures wait in its driver while the process is stopped")
+@pytest.mark.fault("camera: images wait in its driver while the process is stopped")
 @pytest.mark.parametrize("before", [[], [0.02]], ids=["the first", "later"])
 @pytest.mark.parametrize("stopped_s", [0.9, 1.1, 3.0, 3600.0])
 def test_what_waited_in_the_driver_keeps_its_age(
@@ -306,7 +306,7 @@ def test_stamps_of_a_clock_of_its_own_are_found_out(told: Callable[..., list[flo
     assert told([1000.0] * 60)[STRANGE:] == [0.0] * (60 - STRANGE)
 
 
-@pytest.mark.fault("camera: the driver gives one picture again and again")
+@pytest.mark.fault("camera: the driver gives one image again and again")
 def test_frozen_picture_is_no_picture(device: Callable[..., Device]) -> None:
     now = time.monotonic() * 1e3
     camera = device([now, now, now, now + 1])
@@ -319,7 +319,7 @@ def test_frozen_picture_is_no_picture(device: Callable[..., Device]) -> None:
 def test_more_than_eight_bits_are_kept(
     device: Callable[..., Device], monkeypatch: pytest.MonkeyPatch, fourcc: str, bits: int
 ) -> None:
-    """OpenCV hands such pictures over as bytes in a row when it is not to convert them."""
+    """OpenCV hands such images over as bytes in a row when it is not to convert them."""
     counts = np.linspace(0, 2**bits - 1, 32).astype(np.uint16)
 
     def read(self: FakeCapture) -> tuple[bool, np.ndarray]:
@@ -333,7 +333,7 @@ def test_more_than_eight_bits_are_kept(
 
 
 def test_device_that_fails_says_so(device: Callable[..., Device]) -> None:
-    with pytest.raises(SagsError, match="video0 stopped delivering pictures"):
+    with pytest.raises(SagsError, match="video0 stopped delivering images"):
         device([], gone=True).read(0.1)
     with pytest.raises(SagsError, match=r"camera /dev/video-none does not exist; (present: |there is no)"):
         Device("/dev/video-none", CONFIG)

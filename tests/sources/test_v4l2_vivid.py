@@ -59,7 +59,7 @@ def test_two_cameras_give_pairs(guest: dict[str, Any]) -> None:
     assert pairs["left_advances"] and pairs["right_advances"] and pairs["ids_advance"]
     assert pairs["largest_skew_ms"] <= 20
     assert 0 <= pairs["age_ms"] < 5000  # stamps are of this wall clock
-    assert pairs["contrast"] > 20 and pairs["pictures_differ"]  # vivid's moving test picture
+    assert pairs["contrast"] > 20 and pairs["pictures_differ"]  # vivid's moving test image
 
 
 def test_one_camera_side_by_side(guest: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Video files by their own stamps and counts: pictures tell their number, so what comes is known exactly."""
+"""Video files by their own stamps and counts: images tell their number, so what comes is known exactly."""
 
 from collections.abc import Callable
 from fractions import Fraction
@@ -59,7 +59,7 @@ def test_pictures_are_counted_and_found_in_every_container(tmp_path: Path, name:
 
 
 def tracks(file: Path, pixels: str, shown: list[np.ndarray], raw: str = "rgb24") -> Path:
-    """Lossless, with one picture in each track."""
+    """Lossless, with one image in each track."""
     with av.open(str(file), "w") as container:
         streams = [container.add_stream("ffv1", RATE) for _ in shown]
         for stream, picture in zip(streams, shown, strict=True):
@@ -86,7 +86,7 @@ def same(numbers: list[int]) -> list[tuple[int, int]]:
 
 
 def eye(file: Path, numbers: list[int], begin: float = 0.0, rate: float = RATE, **how: object) -> Path:
-    """What one eye's recorder kept; every picture has the stamp of its number."""
+    """What one eye's recorder kept; every image has the stamp of its number."""
     return write(
         file, pictures(numbers, file.stem == "r"), [begin + number / rate for number in numbers], **how
     )  # type: ignore[arg-type]
@@ -131,11 +131,11 @@ def test_pictures_of_one_moment_are_a_pair(
     assert numbers_of(frames) == same(expected)
     since = np.array([frame.t_capture_ns - frames[0].t_capture_ns for frame in frames]) * 1e-9
     true = (np.array(expected) - expected[0]) / RATE
-    assert np.abs(since - true).max() < 0.0131  # jitter of two pictures, and whole milliseconds
+    assert np.abs(since - true).max() < 0.0131  # jitter of two images, and whole milliseconds
 
 
 def with_truth(folder: Path, lefts: list[int]) -> dict[str, object]:
-    """Poses and tracks of each picture of the left eye, which tell the picture's number."""
+    """Poses and tracks of each image of the left eye, which tell the image's number."""
     T_world_cam = np.tile(np.eye(4), (len(lefts), 1, 1))
     T_world_cam[:, 0, 3] = np.array(lefts) * 1e-3
     np.savez(folder / "poses.npz", T_world_cam=T_world_cam)
@@ -151,7 +151,7 @@ def check_truth(frames: list[StereoFrame], numbers: list[int]) -> None:
 
 
 @pytest.mark.fault(
-    "file: one eye's pictures were lost while recording, and poses are of all of the other eye's"
+    "file: one eye's images were lost while recording, and poses are of all of the other eye's"
 )
 def test_poses_and_references_go_by_the_picture_of_the_left_eye(tmp_path: Path) -> None:
     left, right = eye(tmp_path / "l.mkv", without(9)), eye(tmp_path / "r.mkv", without(20, 21))
@@ -183,7 +183,7 @@ def test_files_of_other_rates_are_refused_also_with_gaps(tmp_path: Path) -> None
             open_source(pair_of(tmp_path, left, right))
 
 
-@pytest.mark.parametrize("lost", [(), (17,)], ids=["even", "a picture lost"])
+@pytest.mark.parametrize("lost", [(), (17,)], ids=["even", "an image lost"])
 @pytest.mark.parametrize(("first", "later"), [("left", 1), ("right", -1)])
 @pytest.mark.parametrize("stride", [1, 2])
 def test_eyes_in_turn_keep_the_time_between_them(
@@ -196,7 +196,7 @@ def test_eyes_in_turn_keep_the_time_between_them(
 
 
 def test_playing_begins_where_it_is_told_and_keeps_the_files_pace(tmp_path: Path) -> None:
-    """A pause of 20 s: no picture is early, and `source.start` is a time of the file."""
+    """A pause of 20 s: no image is early, and `source.start` is a time of the file."""
     seconds = [n / RATE + (20 if n >= 15 else 0) for n in ALL]
     left, right = (write(tmp_path / f"{s}.mp4", pictures(ALL, s == "r"), seconds) for s in "lr")
     config = pair_of(tmp_path, left, right)
@@ -214,7 +214,7 @@ def test_playing_begins_where_it_is_told_and_keeps_the_files_pace(tmp_path: Path
 
 
 def hidden(file: Path) -> Path:
-    """Cut without encoding: an edit list hides the first twelve pictures."""
+    """Cut without encoding: an edit list hides the first twelve images."""
     return write(file, pictures(ALL), [(n - 12) / RATE for n in ALL], muxer={"avoid_negative_ts": "disabled"})
 
 
@@ -238,7 +238,7 @@ def test_stamps_that_begin_anew_are_passed_over(tmp_path: Path, caplog: pytest.L
         (tmp_path / f"{side}.ts").write_bytes(b"".join(parts))
     frames = played(pair_of(tmp_path, tmp_path / "l.ts", tmp_path / "r.ts"))
     assert numbers_of(frames) == same([*range(40), *range(40)])
-    assert "begin anew near picture" in caplog.text and f"-i {tmp_path / 'l.ts'} NEW" in caplog.text
+    assert "begin anew near image" in caplog.text and f"-i {tmp_path / 'l.ts'} NEW" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -268,7 +268,7 @@ def test_a_file_that_is_cut_off_is_told_from_a_whole_one(
     video = Video(cut)
     assert 0 < video.count < 120 and "cut off" in video.cut_off
     shown = [video.read(number) for number in range(video.count)]
-    assert video.stamps is not None  # of pictures that refer to later ones the last may be missing
+    assert video.stamps is not None  # of images that refer to later ones the last may be missing
     rate = 25 if name == "a.mxf" else RATE
     numbers = np.rint((video.stamps - video.stamps[0]) * (rate * 1e-9)).tolist()
     assert [number_in(picture) for picture in shown if picture is not None] == numbers
@@ -369,7 +369,7 @@ def test_a_picture_that_the_file_turns_or_mirrors_comes_upright(
 
 
 def test_even_files_whose_rates_differ_a_little_are_paired_by_time_and_it_is_told(tmp_path: Path) -> None:
-    """As many pictures at both rates are another matter: one rate is wrong, or an eye runs on its own."""
+    """As many images at both rates are another matter: one rate is wrong, or an eye runs on its own."""
     rate = Fraction(249, 10)
     left = write(tmp_path / "l.mkv", pictures(range(200)), rate=25)
     for count, how in ((199, "time"), (200, "number")):
@@ -406,7 +406,7 @@ def test_bits_that_a_deep_video_does_not_use_are_told(tmp_path: Path, bits: int,
 
 
 def test_what_a_picture_a_second_shows_is_no_file_that_is_cut_off(tmp_path: Path) -> None:
-    """Pictures that are decoded before others are shown: the last is decoded two seconds before its turn."""
+    """Images that are decoded before others are shown: the last is decoded two seconds before its turn."""
     file = write(tmp_path / "a.mp4", pictures(range(20)), [10.0 * n for n in range(20)], ticks=1000)
     assert (Video(file).count, Video(file).cut_off, Video(file).rate) == (20, "", 0.1)
 
@@ -448,6 +448,6 @@ def test_the_check_says_what_stamps_and_pixels_say(tmp_path: Path) -> None:
     found = check_folder(tmp_path)
     said = "\n".join(each.what for each in found)
     assert "error" not in {each.level for each in found} and " late" not in said
-    assert "left.MTS: its stamps have a gap behind picture 8, as long as 1 pictures" in said
-    assert "1 and 1 pictures have no partner at their time" in said
+    assert "left.MTS: its stamps have a gap behind image 8, as long as 1 images" in said
+    assert "1 and 1 images have no partner at their time" in said
     assert "pixels are 1.33 times as wide as high" in said

@@ -35,7 +35,7 @@ def test_the_node_makes_one_frame_for_each_update_and_nothing_between(rate: floa
             shown.append(moment.t_capture_ns)
         feed.close()
     assert shown == sorted(set(shown)), "a new one each time"
-    assert set().union(*made) == set(FOUR), "no picture that nobody looks at"
+    assert set().union(*made) == set(FOUR), "no image that nobody looks at"
     near = moment.pictures[DEPTH][1:], plane_depth(plane.pair.camera)[::4, ::4][1:]
     np.testing.assert_allclose(*near, atol=2.6e-5)
     assert moment.pictures[LEFT].shape == (HEIGHT // 2, WIDTH // 2, 3)
@@ -61,7 +61,7 @@ def test_of_a_frame_that_was_not_taken_in_its_picture_alone_is_shown(tmp_path: P
         moment = feed.now(FOUR)
         feed.close()
     assert set(moment.pictures) == {LEFT} and moment.camera is None and moment.splats is None
-    assert moment.problem == "waiting for the model of this picture"
+    assert moment.problem == "waiting for the model of this image"
 
 
 def test_of_the_overlay_the_picture_of_exactly_that_frame_is_shown(tmp_path: Path) -> None:

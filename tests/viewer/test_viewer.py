@@ -121,7 +121,7 @@ def test_splats_keep_shape_and_colour(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sorted(many.scales[:, 0] * 1e3) == pytest.approx([2, 3, 4]), "those that cover most"
 
 
-# ---- pictures and figures --------------------------------------------------------------------------------
+# ---- images and figures --------------------------------------------------------------------------------
 
 
 FOUR = next(iter(VIEWS))

@@ -1,4 +1,4 @@
-"""What counts as a scene in which nothing moves, and what as a picture that was sent twice."""
+"""What counts as a scene in which nothing moves, and what as an image that was sent twice."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,7 +30,7 @@ def pair(left: np.ndarray, right: np.ndarray | None, T_world_cam: Any = None) ->
 
 
 class Watched:
-    """A `StillScene` that is shown pictures with fresh camera noise."""
+    """A `StillScene` that is shown images with fresh camera noise."""
 
     def __init__(self, sigma: float = NOISE, eyes: int = 2) -> None:
         self._scene = StillScene()
@@ -109,7 +109,7 @@ def test_an_instrument_that_enters_moves(width: int, height: int) -> None:
 
 
 def test_a_camera_that_moves_before_an_even_wall_moves() -> None:
-    """The picture does not show it, the pose does."""
+    """The image does not show it, the pose does."""
     watched, picture, T = Watched(), np.full((256, 320, 3), 128, np.float32), np.eye(4)
     assert [watched(picture), watched(picture)] == [0, 1]
     T[0, 3] = 0.01
@@ -126,7 +126,7 @@ def test_what_is_forgotten_and_other_eyes_are_no_predecessor() -> None:
 
 @pytest.mark.parametrize(("x", "y"), [(0, 0), (131, 100), (640 - 45, 512 - 45)])
 def test_a_small_piece_that_moved_is_no_repeat(x: int, y: int) -> None:
-    """A twentieth of the width, by a pixel, in a picture without noise: over all it is less than what a codec
+    """A twentieth of the width, by a pixel, in an image without noise: over all it is less than what a codec
     does to a repeat."""
     picture = texture(640, 512).round().astype(np.uint8)
     moved = with_a_shifted_patch(picture, x, y, 32)

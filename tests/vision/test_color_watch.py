@@ -1,4 +1,4 @@
-"""Red and blue that are exchanged are told by check and run alike; sound pictures are not called so."""
+"""Red and blue that are exchanged are told by check and run alike; sound images are not called so."""
 
 from contextlib import closing
 from pathlib import Path
@@ -24,7 +24,7 @@ def exchanged(picture: U8) -> U8:
 
 
 def recorded(folder: Path, eyes: str) -> Path:
-    """Pictures of the phantom whose right and left `eyes` are exchanged."""
+    """Images of the phantom whose right and left `eyes` are exchanged."""
     for frame in frames_of(opened("source.frames:=6")):
         shown = both(frame, exchanged) if eyes == "exchanged" else frame
         for side, eye in (("left", shown.left), ("right", shown.right)):
@@ -33,7 +33,7 @@ def recorded(folder: Path, eyes: str) -> Path:
     return folder
 
 
-@pytest.mark.fault("picture: red and blue are exchanged")
+@pytest.mark.fault("image: red and blue are exchanged")
 @pytest.mark.parametrize("eyes", ["exchanged", "as they are"])
 def test_a_folder_is_told_by_check_and_run_alike(eyes: str, tmp_path: Path) -> None:
     folder = recorded(tmp_path, eyes)

@@ -33,7 +33,7 @@ def grid_of(depth: np.ndarray, tissue: np.ndarray | None = None) -> DepthGrid:
 
 
 def of_pixels(cells: np.ndarray, side: float) -> np.ndarray:
-    """A grid as a picture."""
+    """A grid as an image."""
     return np.repeat(np.repeat(cells, int(side), 0), int(side), 1)[:HEIGHT, :WIDTH]
 
 
@@ -52,7 +52,7 @@ def fogged(pair: RectifiedPair) -> RectifiedPair:
 
 @pytest.mark.parametrize("fault", ["none", "fog", "noise"])
 def test_predicted_errors_cover_the_real_ones(fault: str) -> None:
-    """What is said to be within 3 mm is so in nine of ten pixels; and clear pictures are sure."""
+    """What is said to be within 3 mm is so in nine of ten pixels; and clear images are sure."""
     source = PhantomScene(width=WIDTH, height=HEIGHT, noise=0.04 if fault == "noise" else 0.01)
     phantom = Phantom(source)
     rectifier = Rectifier(phantom.rig, WIDTH, HEIGHT)
@@ -70,7 +70,7 @@ def test_predicted_errors_cover_the_real_ones(fault: str) -> None:
     errors, bounds = np.concatenate(real), np.concatenate(predicted)
     sure = confidence_of(bounds) >= SURE
     assert np.percentile(errors[sure], 90) <= HALVING
-    assert (errors <= bounds).mean() >= 0.85  # 0.9 is what is promised, on the average of all pictures
+    assert (errors <= bounds).mean() >= 0.85  # 0.9 is what is promised, on the average of all images
     if fault == "none":
         assert sure.mean() > 0.8
         assert np.median(bounds) < HALVING / 2
@@ -165,7 +165,7 @@ def test_a_measurement_that_contradicts_makes_unsure() -> None:
 
 
 def test_a_hole_is_filled_with_what_it_does_not_know_for_sure() -> None:
-    """The picture has no hole, and its depth says that it was borrowed."""
+    """The image has no hole, and its depth says that it was borrowed."""
     depth = np.full(SHAPE, DEPTH, np.float32)
     depth[80:180, 100:220] = 0
     frame = observation(depth, np.ones(SHAPE, bool))

@@ -1,4 +1,4 @@
-"""A live feed that repeats its picture is found; one that only looks alike, and a recording, are not."""
+"""A live feed that repeats its image is found; one that only looks alike, and a recording, are not."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -26,7 +26,7 @@ def live(i: int, rate: float, left: U8, right: U8 | None) -> StereoFrame:
 
 
 def feed(rate: float = 30.0, eyes: int = 2, start: int = 0) -> Iterator[StereoFrame]:
-    """The same pictures for ever, in memory of their own."""
+    """The same images for ever, in memory of their own."""
     i = start
     while True:
         yield live(i, rate, picture(0), picture(1) if eyes == 2 else None)
@@ -59,11 +59,11 @@ def test_it_is_over_with_the_first_picture_that_differs() -> None:
     assert again.index(True) >= 9
 
 
-Change = Callable[[U8, int], U8]  # of a picture in a frame
+Change = Callable[[U8, int], U8]  # of an image in a frame
 
 
 def shown(change: Change, captions: tuple[Box, ...] = (), rate: float = 30.0) -> list[bool]:
-    """Which of two seconds' frames are held, of a feed that shows one picture but for the change."""
+    """Which of two seconds' frames are held, of a feed that shows one image but for the change."""
     watch, eyes = FreezeWatch(captions), [cv2.resize(picture(seed), (320, 240)) for seed in (0, 1)]
     return [
         told(watch, live(i, rate, *(change(eye.copy(), i) for eye in eyes))) for i in range(round(2 * rate))
@@ -80,7 +80,7 @@ def dot(eye: U8, i: int) -> U8:
 
 
 def noisy(sigma: float, every: int = 1) -> Change:
-    """Of a sensor; with `every` of a codec, whose pictures are equal from one key frame to the next."""
+    """Of a sensor; with `every` of a codec, whose images are equal from one key frame to the next."""
 
     def change(eye: U8, i: int) -> U8:
         moment = i // every
@@ -94,7 +94,7 @@ def both(first: Change, second: Change) -> Change:
     return lambda eye, i: second(first(eye, i), i)
 
 
-@pytest.mark.fault("picture: a live feed is frozen under a caption that goes on, or with key frames")
+@pytest.mark.fault("image: a live feed is frozen under a caption that goes on, or with key frames")
 @pytest.mark.parametrize(
     "change",
     [caption(1), caption(3), caption(30, 270, 20), dot, both(caption(3), dot), noisy(1, 9), noisy(2, 15),
@@ -106,7 +106,7 @@ def test_a_caption_or_key_frames_hide_no_frozen_feed(change: Change) -> None:
 
 
 def test_what_the_user_leaves_out_counts_for_nothing() -> None:
-    """A monitor's curves over a tenth of the picture, up to its middle."""
+    """A monitor's curves over a tenth of the image, up to its middle."""
     box = (0, 100, 320, 24)
 
     def curves(eye: U8, i: int) -> U8:
@@ -134,7 +134,7 @@ def test_what_moves_in_the_middle_or_widely_is_alive(size: int) -> None:
 
 
 def test_a_picture_that_hardly_changes_for_two_seconds_is_said() -> None:
-    """Behind a codec that refines it a frozen picture looks as a scene at rest: it is not held."""
+    """Behind a codec that refines it a frozen image looks as a scene at rest: it is not held."""
     watch, eye = FreezeWatch(), cv2.resize(picture(0), (320, 240))
     for i in range(75):
         refined = eye.copy()

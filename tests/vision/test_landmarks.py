@@ -28,7 +28,7 @@ def tissue() -> U8:
 
 
 def pulled(picture: U8, by: float) -> tuple[U8, F32]:
-    """The picture bent: its middle moved by so many px right and up, its rim held. And where each pixel comes
+    """The image bent: its middle moved by so many px right and up, its rim held. And where each pixel comes
     from, [H, W, 2]."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     share = np.exp(-(((columns - WIDTH / 2) / (WIDTH / 4)) ** 2) - ((rows - HEIGHT / 2) / (HEIGHT / 4)) ** 2)
@@ -43,13 +43,13 @@ def everywhere(pyramid: GrayPyramid) -> np.ndarray:
 
 
 def test_pulled_tissue_is_found_where_it_went(tissue: U8) -> None:
-    """By a tenth of the picture, far beyond what a search from the same place finds."""
+    """By a tenth of the image, far beyond what a search from the same place finds."""
     after, origin = pulled(tissue, WIDTH / 10)
     first, second = gray_pyramid(tissue), gray_pyramid(after)
     found = find_again(first, second, everywhere(first))
     columns, rows = np.rint(found.after).astype(int).T
     errors = np.linalg.norm(origin[rows, columns] - found.before, axis=1)
-    assert np.percentile(errors, 90) < 2 * 1.2**7  # px: one of ORB's smallest picture, of half the size
+    assert np.percentile(errors, 90) < 2 * 1.2**7  # px: one of ORB's smallest image, of half the size
     back = motion(found.after, found.before, WIDTH, HEIGHT)
     here = np.dstack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))).astype(np.float32)
     truth = cv2.resize(origin - here, back.shape[1::-1], interpolation=cv2.INTER_AREA)

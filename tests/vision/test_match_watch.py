@@ -51,7 +51,7 @@ def codes_at(
 
     Args:
         kept: which frames come, again and again.
-        row: how far below its row in the left picture a point lies in the right one, on the right.
+        row: how far below its row in the left image a point lies in the right one, on the right.
         lasting: px of that, there from the beginning: the calibration fits badly.
     """
     watch, found = MatchWatch(), {}
@@ -108,7 +108,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def warned(recording: Path, delay: int, rung: int, kept: str) -> set[str]:
-    """All codes of a run on one rung whose right pictures are so many frames old."""
+    """All codes of a run on one rung whose right images are so many frames old."""
     session = open_session(recording, ["source.pace:=step"])
     frames = played(session.config.source)
     pipeline, budget, codes = Pipeline(session.config, session.rig), StepBudget(1, RUNGS[rung]), set()
@@ -119,7 +119,7 @@ def warned(recording: Path, delay: int, rung: int, kept: str) -> set[str]:
     return codes
 
 
-@pytest.mark.fault("picture: one eye is three frames late, and every sixth frame is matched")
+@pytest.mark.fault("image: one eye is three frames late, and every sixth frame is matched")
 def test_what_a_slow_node_says_of_a_late_eye_is_that(recording: Path) -> None:
     """Every third frame matched of every second: 200 ms apart. No other cause is blamed."""
     assert warned(recording, 3, 0, "10") == {"eyes_late"}

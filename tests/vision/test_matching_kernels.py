@@ -35,7 +35,7 @@ def bordered(picture: F32) -> F32:
     return np.ascontiguousarray(cv2.copyMakeBorder(picture, *sides, cv2.BORDER_REPLICATE), np.float32)
 
 
-# ---- gray pictures ---------------------------------------------------------------------------------------
+# ---- gray images ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("width", "height"), [(128, 96), (131, 67), (33, 32), (20, 90)])

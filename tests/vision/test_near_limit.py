@@ -1,4 +1,4 @@
-"""How near tissue may be follows the pictures: an organ at 15 mm gets its own depth, not the background's."""
+"""How near tissue may be follows the images: an organ at 15 mm gets its own depth, not the background's."""
 
 from dataclasses import replace
 from itertools import islice
@@ -34,7 +34,7 @@ Shown = list[tuple[RectifiedPair, F32 | None]]
 
 def shown(source: Path, scale: float, count: int = 3, *overrides: str) -> Shown:
     """Pairs half a second apart, and their true depth: a rig whose baseline is `scale` times as long as it
-    was sees the same pictures of tissue that is so much nearer."""
+    was sees the same images of tissue that is so much nearer."""
     session = open_session(source, ["source.pace:=step", *overrides])
     right = session.rig.right
     P = right.P.copy()
@@ -55,7 +55,7 @@ def everywhere(pair: RectifiedPair) -> np.ndarray:
 
 
 def test_near_tissue_gets_its_own_depth() -> None:
-    """As right as the same pictures are at their usual distance, from the first frame on."""
+    """As right as the same images are at their usual distance, from the first frame on."""
     errors, coverage = {}, {}
     for scale in (1.0, NEAR):
         (pair, truth), *_ = shown(PHANTOM, scale, 1)

@@ -119,7 +119,7 @@ FIXED = (WIDTH, HEIGHT)
         ({"size": (300, "h")}, PAIR | {"size": (300, 240)}),  # the height alone is open
         ({"names": ("left", "a_right")}, OPEN | {"inputs": ("left", "a_right")}),  # the right one is first
         ({"factor": -1.0}, OPEN | {"scale": -1}),  # RAFT-Stereo's
-        ({"factor": 1 / 320}, OPEN | {"scale": 320}),  # widths of the picture
+        ({"factor": 1 / 320}, OPEN | {"scale": 320}),  # widths of the image
         ({"output": "half"}, OPEN),
         ({"output": "half", "factor": 0.5}, OPEN | {"scale": 2}),  # px of the smaller map
         ({"output": "several"}, OPEN | {"output": "final"}),
@@ -214,7 +214,7 @@ AS_ODD = {"normalization": "unit", "multiple": 1, "meaning": "disparity"}
         ({"x": [1, 3, 64, 96]}, "same", "multiple: 10", "multiple: 10 px, but file or size fix 96x64"),
         (MATCHER, "", "{size: [128, 96], multiple: 10}", "multiple: 10 px, but file or size fix 128x96"),
         ({"x": [1, 3, 64, 96]}, "sequence", "multiple: 32", "network.onnx gives no tensor: outputs: out seq"),
-        ({"x": [1, 10]}, "same", "", "network.onnx: input x is 1x10; a picture is"),
+        ({"x": [1, 10]}, "same", "", "network.onnx: input x is 1x10; an image is"),
         ({"x": [4, 3, "h", "w"]}, "same", "", "network.onnx: .*batch size 1"),
         ({"a": PICTURE, "b": PICTURE, "c": PICTURE}, "same", "", r"network.onnx takes 3 inputs \(a, b, c\)"),
         ({"a": [1, 5, 64, 64], "b": [1, 5, 64, 64]}, "same", "", "network.onnx: .*a (has 5|is 1x5x64x64)"),
@@ -335,7 +335,7 @@ def test_a_network_replaces_the_matcher(
 
 @pytest.fixture
 def unwatched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Dark pictures are taken in: else no network would ever see one."""
+    """Dark images are taken in: else no network would ever see one."""
     monkeypatch.setattr(PairWatch, "judge", lambda self, evidence, judged: judged)
     monkeypatch.setattr(SceneWatch, "judge", lambda self, evidence, judged: judged)
 
@@ -355,7 +355,7 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     assert failed == [False, True, False, True, True, True, True, True]  # the last: not tried any more
     result = results[1]
     matched, _ = pipeline.depth.stereo(result.pair, result.observation.tissue)
-    kept = result.observation.depth > 0  # all but specks, of which so dark a picture has some
+    kept = result.observation.depth > 0  # all but specks, of which so dark an image has some
     assert np.array_equal(result.observation.depth[kept], matched[kept])
     assert np.count_nonzero(kept) > 0.5 * np.count_nonzero(matched)
     statistics = Statistics()
@@ -377,7 +377,7 @@ def test_where_it_fails_the_matcher_takes_over_and_says_so(
     [
         ({"factor": -1.0}, ""),
         ({"output": "half", "factor": 0.5}, ""),  # px of the smaller map
-        ({"factor": 1 / 320}, ""),  # widths of the picture
+        ({"factor": 1 / 320}, ""),  # widths of the image
         ({"names": ("second", "first")}, ""),  # the eyes are exchanged
         ({}, "vision.onnx.scale:=1.2"),
     ],
@@ -472,7 +472,7 @@ def test_one_eye_beside_stereo_is_aligned_to_it(
 
 
 def knocked(frame: StereoFrame, aside: int) -> StereoFrame:
-    """The right eye turned: its picture stands 3 px lower."""
+    """The right eye turned: its image stands 3 px lower."""
     assert frame.right is not None
     height, width = frame.right.shape[:2]
     shift = np.array([[1, 0, aside], [0, 1, 3]], np.float32) * (1, 1, height / HEIGHT)

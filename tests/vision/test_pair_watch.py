@@ -1,4 +1,4 @@
-"""Whether both eyes show what they should: empty, equal and exchanged pictures are noticed, others not."""
+"""Whether both eyes show what they should: empty, equal and exchanged images are noticed, others not."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -125,7 +125,7 @@ def test_real_recordings_are_let_pass_and_exchanged_ones_noticed(launch: str, da
     said = watched(session, [_exchanged(frame) for frame in frames])
     assert all("exchanged" in warning for warning in said[NEEDED - 1 :])
     said = watched(session, [replace(frame, right=frame.left) for frame in frames])
-    assert all("the same picture" in warning for warning in said[NEEDED - 1 :])
+    assert all("the same image" in warning for warning in said[NEEDED - 1 :])
 
 
 # ---- what is wrong ---------------------------------------------------------------------------------------
@@ -136,17 +136,17 @@ def _exchanged(frame: StereoFrame) -> StereoFrame:
 
 
 WRONG: dict[str, tuple[Spoil, str]] = {
-    "black left": (lambda f: replace(f, left=np.zeros_like(f.left)), "the left picture is black: check"),
-    "noisy black": (lambda f: replace(f, right=_plain(f, (4, 4, 4), 6.0)), "the right picture is black"),
-    "video black": (lambda f: replace(f, right=_plain(f, (16, 16, 16))), "the right picture is black"),
-    "white": (lambda f: replace(f, right=_plain(f, (255, 255, 255))), "the right picture is white: lower"),
-    "blue": (lambda f: replace(f, left=_plain(f, (0, 0, 200))), "the left picture is of one colour: check"),
-    "grey": (lambda f: replace(f, right=_plain(f, (128, 128, 128))), "the right picture is of one colour"),
-    "both black": (spoilt(np.zeros_like), "the left picture is black"),
-    "one eye twice": (lambda f: replace(f, right=f.left), "both eyes show the same picture"),
+    "black left": (lambda f: replace(f, left=np.zeros_like(f.left)), "the left image is black: check"),
+    "noisy black": (lambda f: replace(f, right=_plain(f, (4, 4, 4), 6.0)), "the right image is black"),
+    "video black": (lambda f: replace(f, right=_plain(f, (16, 16, 16))), "the right image is black"),
+    "white": (lambda f: replace(f, right=_plain(f, (255, 255, 255))), "the right image is white: lower"),
+    "blue": (lambda f: replace(f, left=_plain(f, (0, 0, 200))), "the left image is of one colour: check"),
+    "grey": (lambda f: replace(f, right=_plain(f, (128, 128, 128))), "the right image is of one colour"),
+    "both black": (spoilt(np.zeros_like), "the left image is black"),
+    "one eye twice": (lambda f: replace(f, right=f.left), "both eyes show the same image"),
     "captured twice": (
         lambda f: replace(f, left=_noisy(f.left), right=_jpeg(_noisy(f.left * 0.8 + 10))),
-        "both eyes show the same picture",
+        "both eyes show the same image",
     ),
     "exchanged": (_exchanged, "left and right seem to be exchanged: exchange"),
 }
@@ -161,7 +161,7 @@ def test_what_is_wrong_is_said_and_how_to_fix_it(
     assert warnings[: NEEDED - 1] == [""] * (NEEDED - 1)  # one bad frame is none
     assert all(warning.startswith(said) for warning in warnings[NEEDED - 1 :]), warnings
     if name == "both black":
-        assert "the right picture is black" in warnings[-1]
+        assert "the right image is black" in warnings[-1]
     else:
         assert len(set(warnings[NEEDED - 1 :])) == 1 and ";" not in warnings[-1]
 
@@ -203,8 +203,8 @@ LASTING: dict[str, tuple[Callable[[StereoFrame, StereoFrame], StereoFrame], str,
 }
 
 
-@pytest.mark.fault("picture: the left eye is frozen")
-@pytest.mark.fault("picture: the right eye is frozen")
+@pytest.mark.fault("image: the left eye is frozen")
+@pytest.mark.fault("image: the right eye is frozen")
 @pytest.mark.parametrize("name", LASTING)
 def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
     name: str, session: Session, moving: list[StereoFrame]
@@ -225,12 +225,12 @@ def test_an_eye_is_compared_with_the_other_and_with_a_moment_ago(
             assert not found
 
 
-@pytest.mark.fault("picture: blurred after the lens was out for cleaning")
+@pytest.mark.fault("image: blurred after the lens was out for cleaning")
 @pytest.mark.parametrize("between", ["black", "nothing"])
 def test_a_blur_that_begins_while_nobody_looks_has_not_lasted(
     between: str, session: Session, moving: list[StereoFrame]
 ) -> None:
-    """Twelve seconds in which no picture was seen make no blur usual."""
+    """Twelve seconds in which no image was seen make no blur usual."""
     first, out = moving[:10], [both(moving[9], np.zeros_like)] * 120
     given = stamped([*first, *out, *map(BLURRED, moving[10:20])])
     if between == "nothing":
@@ -280,7 +280,7 @@ def test_a_picture_of_nothing_tells_nothing(level: int) -> None:
 def test_the_pipeline_warns_also_while_frames_are_skipped(
     noise: float, session: Session, frames: list[StereoFrame]
 ) -> None:
-    """A cable is pulled, and nothing moves any more: equal pictures are left out, and where depth comes with
+    """A cable is pulled, and nothing moves any more: equal images are left out, and where depth comes with
     the session those that are equal but for noise are not matched."""
     pipeline = Pipeline(session.config, session.rig)
     rng = np.random.default_rng(0)
@@ -296,10 +296,10 @@ def test_the_pipeline_warns_also_while_frames_are_skipped(
     assert skipped == {0.0: {"frame"}, 2.0: {"depth", "motion"}, 12.0: set()}[noise]
     content = diagnostics(replace(health(), warnings=pipeline.warnings), 0)
     statuses = decode(b"".join(content.parts), "diagnostic_msgs/msg/DiagnosticArray").status
-    assert "the right picture is black" in " ".join(status.message for status in statuses)
+    assert "the right image is black" in " ".join(status.message for status in statuses)
 
 
-# ---- How well a picture agrees with the model: exposure, misfit and structure. ----
+# ---- How well an image agrees with the model: exposure, misfit and structure. ----
 
 
 GAIN = np.array([1.2, 1.0, 0.8], np.float32)

@@ -1,4 +1,4 @@
-"""Rectified pictures and masks: where points land, and which rows agree."""
+"""Rectified images and masks: where points land, and which rows agree."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -105,14 +105,14 @@ def test_the_frame_pose_is_the_camera_pose() -> None:
 def test_pictures_of_another_size_are_refused() -> None:
     rectifier = Rectifier(load_rig(ROOT / "calib/d4d"), 640, 512)
     good, bad = np.zeros((540, 675, 3), np.uint8), np.zeros((480, 640, 3), np.uint8)
-    with pytest.raises(SagsError, match="the right picture is 640x480 px, the left picture 675x540"):
+    with pytest.raises(SagsError, match="the right image is 640x480 px, the left image 675x540"):
         rectifier(make_frame(good, bad))
     with pytest.raises(SagsError, match="have another shape"):
         rectifier(make_frame(bad, bad))
     twice = np.zeros((1080, 1350, 3), np.uint8)
     with pytest.raises(SagsError, match=f"sags calib convert {ROOT / 'calib/d4d'} -o FOLDER --scale 2$"):
         rectifier(make_frame(twice, twice))
-    with pytest.raises(SagsError, match="mask is 640x480 px, the left picture 675x540"):
+    with pytest.raises(SagsError, match="mask is 640x480 px, the left image 675x540"):
         rectifier.mask(np.zeros((480, 640), np.bool_))
 
 
@@ -134,7 +134,7 @@ def test_masks_go_the_way_of_the_pictures() -> None:
 def test_outside_the_raw_picture_there_is_no_tissue() -> None:
     plain = load_rig(ROOT / "calib/d4d")
     P = plain.left.P.copy()
-    P[0, 2] += 100  # the rectified picture looks 100 px past the raw one's left edge
+    P[0, 2] += 100  # the rectified image looks 100 px past the raw one's left edge
     eye = Eye(675, 540, plain.left.K, plain.left.distortion, plain.left.R, P)
     everything = Rectifier(StereoRig("shifted", eye, plain.right), 675, 540).mask(
         np.ones((540, 675), np.bool_)

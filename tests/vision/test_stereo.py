@@ -45,7 +45,7 @@ def texture(width: int, seed: int = 0) -> U8:
 
 
 def plane_pair(a: float, b: float, c: float) -> tuple[RectifiedPair, F32]:
-    """A textured plane of disparity a + b x + c y (px) in the left picture, and that disparity."""
+    """A textured plane of disparity a + b x + c y (px) in the left image, and that disparity."""
     left = texture(WIDTH)
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     source = (x + a + c * y) / (1 - b)  # the left column that the right column x shows
@@ -65,11 +65,11 @@ def test_slanted_plane(scale: int, median_px: float, p99_px: float) -> None:
     depth, confidence = stereo(pair, ALL)
     known = depth > 0
     error = np.abs(to_disparity(depth) - truth)[known]
-    visible = np.s_[:, 60:]  # columns whose match lies inside the right picture
+    visible = np.s_[:, 60:]  # columns whose match lies inside the right image
     assert known[visible].mean() > 0.95
     assert np.median(error) < median_px
     assert np.percentile(error, 99) < p99_px
-    unseen = np.arange(WIDTH) + 2 * scale < truth  # left of what the right picture shows
+    unseen = np.arange(WIDTH) + 2 * scale < truth  # left of what the right image shows
     assert known[unseen].mean() < 0.01
     assert depth.dtype == confidence.dtype == np.float32
     assert depth.shape == confidence.shape == (HEIGHT, WIDTH)
@@ -292,9 +292,9 @@ def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def test_large_disparities_and_highlights_of_a_beating_heart(data_folder: Path) -> None:
-    """No reference here: the right picture, fetched by the depth found, must look like the left one.
+    """No reference here: the right image, fetched by the depth found, must look like the left one.
 
-    Rows above 70 hold instruments; columns left of 100 are not in the right picture.
+    Rows above 70 hold instruments; columns left of 100 are not in the right image.
     """
     folder = data_folder / "hamlyn_invivo_001_100"
     rectifier = Rectifier(load_rig(ROOT / "calib/hamlyn_heart"), 360, 288)

@@ -77,12 +77,12 @@ def test_an_instrument_may_come_close_for_a_while() -> None:
 
 
 def save_segmenter(path: Path, answer: str, fault: bool = False) -> Path:
-    """Redness R - G of a picture fed as for ImageNet: tissue where it is above 40 grey levels.
+    """Redness R - G of an image fed as for ImageNet: tissue where it is above 40 grey levels.
 
     Args:
         answer: logit, probability, scores (of grey, nothing, tissue), labels, or half (the logit, coarser);
             numbers: of classes, 1 an instrument and 3 tissue, as floats.
-        fault: not finite where the picture is nearly black.
+        fault: not finite where the image is nearly black.
     """
     g = Graph()
     weights = np.array([0.229, -0.224, 0.0], np.float32)[None, :, None, None] * 255
@@ -235,13 +235,13 @@ def test_a_late_mask_is_carried_along_until_its_tolerance_is_over() -> None:
         assert np.array_equal(find_tissue(frame, rectifier(frame)), TRUTH)
         assert find_tissue.problem == ""
     assert find_tissue(frames[4], rectifier(frames[4])).all()
-    assert "0.133 s older than the picture; vision.tissue.tolerance is 0.1 s" in find_tissue.problem
+    assert "0.133 s older than the image; vision.tissue.tolerance is 0.1 s" in find_tissue.problem
     sender.sent[5 * FRAME_NS] = SENT
     assert np.array_equal(find_tissue(frames[5], rectifier(frames[5])), TRUTH)
     assert find_tissue.problem == ""
     sender.sent = {20 * FRAME_NS: SENT}
     assert find_tissue(frames[5], rectifier(frames[5])).all()
-    assert "newer than the picture" in find_tissue.problem
+    assert "newer than the image" in find_tissue.problem
 
 
 def test_masks_of_another_size_are_resized() -> None:
@@ -259,7 +259,7 @@ def test_masks_of_another_size_are_resized() -> None:
     [
         (np.full((HEIGHT, WIDTH, 3), 255, np.uint8), "is no mask: mono8 is expected"),
         (np.ones((HEIGHT, WIDTH), np.float32), "is no mask"),
-        (np.full((WIDTH, HEIGHT), 255, np.uint8), "has 256x320 px, the picture 320x256"),
+        (np.full((WIDTH, HEIGHT), 255, np.uint8), "has 256x320 px, the image 320x256"),
         (np.full((16 * HEIGHT, 16 * WIDTH), 255, np.uint8), "has 5120x4096 px"),
         (np.ones((HEIGHT, WIDTH), np.uint8), "no value above 1: 255 is white"),
         (np.empty((0, 0), np.uint8), "is no mask"),

@@ -100,7 +100,7 @@ def test_masks_come_and_go_and_the_frames_go_on(home: Path) -> None:
         with masker(home):
             until(lambda: not warning(client))
             until(lambda: fits(subscriber, frames=20) > 10)
-        assert "older than the picture" in until(lambda: warning(client))
+        assert "older than the image" in until(lambda: warning(client))
         assert fits(subscriber, frames=10) < 5  # found without: other pixels
         # None waits for its mask: that would take `TOLERANCE` each time, by the node's own clock.
         assert client.request("get_status", timeout=30)["stage_ms"]["mask"] < 1e3 * TOLERANCE
@@ -110,7 +110,7 @@ def test_masks_come_and_go_and_the_frames_go_on(home: Path) -> None:
 
 
 def fits(subscriber: Subscriber, frames: int) -> int:
-    """In how many of so many frames the node's mask is the example's, made of a picture not long before."""
+    """In how many of so many frames the node's mask is the example's, made of an image not long before."""
     pictures: list[np.ndarray] = []
     last, count = None, 0
     for _ in range(frames):
@@ -143,7 +143,7 @@ def test_the_picture_goes_out_before_its_frame_is_mapped(home: Path) -> None:
 
 
 def test_the_overlays_video_is_whole_all_the_same(home: Path, tmp_path: Path) -> None:
-    """It must not take a picture that is ahead for a frame whose rest is missing."""
+    """It must not take an image that is ahead for a frame whose rest is missing."""
     video = tmp_path / "overlay.mp4"
     command = ["-m", "sags_node", "overlay", "--run-dir", str(home / "sags"), "--json", "--force"]
     environment = {**os.environ, "XDG_RUNTIME_DIR": str(home)}

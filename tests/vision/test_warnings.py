@@ -38,7 +38,7 @@ from sags_node.tools.evaluation.run import RunFacts
 from sags_node.tools.evaluation.summary import summarise
 from sags_node.types import Camera, Finding, NodeHealth
 
-BLACK = Finding("right_eye_black", "the right picture is black: check the light")
+BLACK = Finding("right_eye_black", "the right image is black: check the light")
 ROWS = Finding("rows_differ", "rows of the eyes differ by 1.2 px: the calibration no longer fits")
 
 
@@ -84,7 +84,7 @@ def test_a_code_that_nobody_could_look_up_is_refused() -> None:
 
 
 def test_codes_stand_beside_the_words() -> None:
-    black, other = BLACK, Finding("left_eye_plain", "the left picture is of one colour: check the lens")
+    black, other = BLACK, Finding("left_eye_plain", "the left image is of one colour: check the lens")
     said = replace(health(), warnings=by_stage([black, ROWS, other]))
     fields = json.loads(json.dumps(status(said, None)))
     assert fields["warnings"] == {"eyes": f"{black.text}; {other.text}", "calibration": ROWS.text}
@@ -168,7 +168,7 @@ def test_a_line_when_it_begins_and_one_when_it_is_over() -> None:
 
 
 def test_the_mark_says_what_is_wrong_and_stays_on_the_rim() -> None:
-    assert headlines(by_code({"eyes": (BLACK,)})) == ["the right picture is black"]
+    assert headlines(by_code({"eyes": (BLACK,)})) == ["the right image is black"]
     many = {str(number): f"number {number}: fix it" for number in range(5)}
     assert headlines(many) == ["number 0", "number 1 (and 3 more)"]
     rgba = np.zeros((512, 640, 4), np.uint8)

@@ -1,4 +1,4 @@
-"""Pictures as small files: a receiver of ROS 2 with default settings loses larger ones.
+"""Images as small files: a receiver of ROS 2 with default settings loses larger ones.
 
 Colour becomes JPEG; masks, confidence and overlays PNG. Depth becomes a PNG as ROS' `compressedDepth` makes
 it: steps of equal disparity, as stereo measures. All are made coarser until they are small enough.
@@ -32,19 +32,19 @@ Pack = Callable[[NDArray[Any]], tuple[bytes, str]]  # the file, and ROS' name of
 
 
 def suffix(topic: topics.Topic) -> str:
-    """Return the suffix that ROS' image_transport gives to the topic of a picture's file."""
+    """Return the suffix that ROS' image_transport gives to the topic of an image's file."""
     return "/compressedDepth" if _is_depth(topic.name) else "/compressed"
 
 
 class Compressor:
-    """The compressor of one picture topic."""
+    """The compressor of one image topic."""
 
     def __init__(self, topic: topics.Topic) -> None:
         self._ways = _ways(topic)  # the finest first
         self._chosen = 0
 
     def __call__(self, received: Received) -> bytes:
-        """Return the `sensor_msgs/CompressedImage` of a picture; too large only where none is coarser."""
+        """Return the `sensor_msgs/CompressedImage` of an image; too large only where none is coarser."""
         assert isinstance(received, ReceivedImage)
         file, form = self._ways[self._chosen](received.array)
         while len(file) > LARGEST and self._chosen < len(self._ways) - 1:
@@ -56,7 +56,7 @@ class Compressor:
 
 
 def over_black(rgba: U8) -> U8:
-    """A picture [H, W, 4] over black, [H, W, 3]."""
+    """An image [H, W, 4] over black, [H, W, 3]."""
     shown: U8 = cv2.cvtColor(cv2.cvtColor(rgba, cv2.COLOR_RGBA2mRGBA), cv2.COLOR_RGBA2RGB)
     return shown
 

@@ -1,6 +1,6 @@
 """`sags bridge foxglove`: every topic of a node, live in Foxglove, by its WebSocket.
 
-The messages are the node's own: ROS 2 CDR, byte for byte, stamped with the time of capture. Pictures are
+The messages are the node's own: ROS 2 CDR, byte for byte, stamped with the time of capture. Images are
 offered as H.264 too, for thin links.
 """
 
@@ -43,7 +43,7 @@ class FoxgloveOptions(ServerOptions):
 
 
 def outputs(options: FoxgloveOptions) -> list[Output]:
-    """Return a channel for each topic of the node and of an overlay, and another for pictures as H.264."""
+    """Return a channel for each topic of the node and of an overlay, and another for images as H.264."""
     period = 0.0 if options.rate is None else 1 / options.rate
     has_video, channels = importlib.util.find_spec("av") is not None, []
     for ns, offered in ((options.node.ns, topics.TOPICS), (options.overlay.ns, topics.OVERLAY_TOPICS)):
@@ -215,7 +215,7 @@ class _Messages:
 
 
 class _Video:
-    """Pictures in H.264."""
+    """Images in H.264."""
 
     def __init__(self, output: Output, context: foxglove.Context) -> None:
         from sags_node.clients.bridge.h264 import (

@@ -1,4 +1,4 @@
-"""A layout for Foxglove: pictures, cloud with anchors, figures and what is wrong, at once."""
+"""A layout for Foxglove: images, cloud with anchors, figures and what is wrong, at once."""
 
 import json
 from collections.abc import Iterable

@@ -1,7 +1,7 @@
 """`sags bridge gst`: the overlay on its key colour into GStreamer pipelines, for displays with chroma keying.
 
-Each eye is a pipeline in a process of its own, which gets BGRx pictures at the display's rate, new or not. A
-picture is replaced by the key colour alone, which displays show as nothing, as soon as it is too old.
+Each eye is a pipeline in a process of its own, which gets BGRx images at the display's rate, new or not. An
+image is replaced by the key colour alone, which displays show as nothing, as soon as it is too old.
 """
 
 import fcntl
@@ -32,7 +32,7 @@ class GstOptions:
     """How `sags bridge gst` runs; the defaults are those of the command."""
 
     overlay: NodeAddress
-    left: str | None = None  # the pipeline behind that eye's pictures, as for gst-launch-1.0
+    left: str | None = None  # the pipeline behind that eye's images, as for gst-launch-1.0
     right: str | None = None
     rate: float = 60.0  # Hz of the display
     max_age: float = MAX_AGE
@@ -51,7 +51,7 @@ def run_gst(options: GstOptions, ready: Callable[[], None], stop: threading.Even
     eyes = {"left": options.left, "right": options.right}
     launches = {eye: launch for eye, launch in eyes.items() if launch is not None}
     if not launches:
-        raise UsageError("give --left, --right or both: what comes behind the pictures of that eye")
+        raise UsageError("give --left, --right or both: what comes behind the images of that eye")
     ns = options.overlay.ns
     outputs = [Output(eye, (Source(ns, f"{eye}/overlay/color_key"),)) for eye in launches]
     outputs.append(Output("key", (Source(ns, "status"),)))
@@ -67,7 +67,7 @@ def run_gst(options: GstOptions, ready: Callable[[], None], stop: threading.Even
 
 
 class _Displays(Outlet):
-    """The outlet: one pipeline for each eye, from its first picture on."""
+    """The outlet: one pipeline for each eye, from its first image on."""
 
     def __init__(self, launches: Mapping[str, str], options: GstOptions) -> None:
         self._launches, self._options = launches, options
@@ -112,8 +112,8 @@ class Display:
     """One eye's pipeline, and the thread that writes to it.
 
     Args:
-        launch: the pipeline behind the pictures, as for gst-launch-1.0.
-        size: height and width of a picture, px.
+        launch: the pipeline behind the images, as for gst-launch-1.0.
+        size: height and width of an image, px.
         key: RGB, what the display shows as nothing.
         rate: Hz.
 
@@ -143,7 +143,7 @@ class Display:
         self._thread.start()
 
     def show(self, picture: U8, seconds: float) -> None:
-        """Show a picture [H, W, 3] for at most `seconds`."""
+        """Show an image [H, W, 3] for at most `seconds`."""
         self._shown = (_bgrx(picture), time.monotonic() + seconds)
 
     def blank(self) -> None:

@@ -1,4 +1,4 @@
-"""Pictures as H.264 for thin links, by PyAV: each message is one picture (Annex B)."""
+"""Images as H.264 for thin links, by PyAV: each message is one image (Annex B)."""
 
 from fractions import Fraction
 
@@ -10,15 +10,15 @@ from av.video.reformatter import Colorspace
 from sags_node.clients.bridge.compressed import over_black
 from sags_node.types import U8
 
-RATE = 30.0  # Hz of the pictures, from which the largest bit rate follows
-KEY_EVERY = 30  # pictures: who comes, or has lost one, sees something within a second
-BITS_PER_PIXEL = 0.2  # of a picture: 2 Mbit/s at 640x512 and 30 Hz, with tissue still sharp
+RATE = 30.0  # Hz of the images, from which the largest bit rate follows
+KEY_EVERY = 30  # images: who comes, or has lost one, sees something within a second
+BITS_PER_PIXEL = 0.2  # of an image: 2 Mbit/s at 640x512 and 30 Hz, with tissue still sharp
 
 
 class Encoder:
-    """The encoder of one stream of pictures, whose size may change.
+    """The encoder of one stream of images, whose size may change.
 
-    No picture refers to a later one, and each key picture says all that a decoder must know.
+    No image refers to a later one, and each key image says all that a decoder must know.
     """
 
     def __init__(self) -> None:
@@ -26,10 +26,10 @@ class Encoder:
         self._number = 0
 
     def encode(self, picture: U8, key: bool = False) -> bytes:
-        """Encode a picture [H, W, 3], or [H, W, 4] over black (H.264 has no alpha), cut to even sizes.
+        """Encode an image [H, W, 3], or [H, W, 4] over black (H.264 has no alpha), cut to even sizes.
 
         Args:
-            key: make it a key picture, which refers to no other.
+            key: make it a key image, which refers to no other.
         """
         height, width = (side - side % 2 for side in picture.shape[:2])
         if self._codec is None or (self._codec.height, self._codec.width) != (height, width):

@@ -43,7 +43,7 @@ class Status(MessageBase):  # type: ignore[misc]  # pyigtl has no types
 
 
 def image(picture: U8, T_ras_pixel: F64) -> MessageBase:
-    """IMAGE of a picture [H, W, C] uint8; `T_ras_pixel` [4, 4] takes (column, row, 0, 1) to mm."""
+    """IMAGE of an image [H, W, C] uint8; `T_ras_pixel` [4, 4] takes (column, row, 0, 1) to mm."""
     return ImageMessage(picture[None], T_ras_pixel, "ras")
 
 

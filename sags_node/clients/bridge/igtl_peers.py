@@ -16,7 +16,7 @@ from sags_node.clients.bridge import igtl
 from sags_node.messaging.security import RateLimitedLog
 
 MOST_PEERS = 8
-SEND_BUFFER = 1 << 18  # bytes in the kernel: less than a picture, so that nothing old waits there
+SEND_BUFFER = 1 << 18  # bytes in the kernel: less than an image, so that nothing old waits there
 STUCK_MS = 15_000  # a peer that takes nothing for so long is cut off, or such peers would keep others out
 LOOK = 0.05  # s between calls of `idle`
 

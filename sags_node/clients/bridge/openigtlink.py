@@ -1,7 +1,7 @@
-"""`sags bridge openigtlink`: pictures, surface, anchors and camera for 3D Slicer, PLUS and others.
+"""`sags bridge openigtlink`: images, surface, anchors and camera for 3D Slicer, PLUS and others.
 
 Lengths are millimetres. Directions are those of Slicer (RAS): an optical frame with x right, y down and z
-forward is turned to R = -x, A = -y, S = z, so that Slicer's axial view shows a picture upright. This holds
+forward is turned to R = -x, A = -y, S = z, so that Slicer's axial view shows an image upright. This holds
 for the world and for the camera; they are no directions of a patient.
 """
 
@@ -56,7 +56,7 @@ ANCHORS = TopicName("anchors", ReceivedCloud)
 OVERLAY = TopicName("left/overlay/image", ReceivedImage)
 
 RAS = np.diag([-1.0, -1.0, 1.0, 1.0])  # of an optical frame; its own inverse
-PLANE = 100.0  # mm before the camera: where a picture lies in 3D
+PLANE = 100.0  # mm before the camera: where an image lies in 3D
 SEEN, UNSURE, HIDDEN = (60, 220, 60, 255), (240, 160, 40, 255), (230, 60, 60, 255)  # RGBA of anchors
 LEAST_SEEN = 0.5  # of an anchor's visibility
 STATE, ANSWER, PIN, REQUEST = "SagsState", "SagsAnswer", "SagsPin", "SagsRequest"
@@ -116,7 +116,7 @@ def run_openigtlink(options: IgtlOptions, ready: Callable[[str, int], None], sto
     offered = outputs(options)
     if importlib.util.find_spec("crcmod._crcfunext") is None:
         log.warning(
-            "crcmod was installed without a C compiler: pictures take seconds; install gcc, then crcmod anew"
+            "crcmod was installed without a C compiler: images take seconds; install gcc, then crcmod anew"
         )
     with (
         closing(OpenIgtLink(options)) as bridge,
@@ -135,7 +135,7 @@ class OpenIgtLink(Outlet):
 
     def __init__(self, options: IgtlOptions) -> None:
         self._step, self._max_age = options.surface_step, options.max_age
-        # Of pictures that are shown: a black one of that size, and its pose.
+        # Of images that are shown: a black one of that size, and its pose.
         self._shapes: dict[str, tuple[U8, F64]] = {}
         self._pins = Pins()
         self._answers: deque[Callable[[], list[int]]] = deque()  # for the peers' thread
@@ -289,7 +289,7 @@ def _anchors(cloud: ReceivedCloud) -> MessageBase | None:
     return igtl.points(_ras(places[known]), names, colors)
 
 
-# Of each IMAGE: the pictures that it is made of, with their channels, and how.
+# Of each IMAGE: the images that it is made of, with their channels, and how.
 PICTURES: dict[str, tuple[dict[TopicName[ReceivedImage], int], Callable[[Frame], U8]]] = {
     "Picture": ({PICTURE: 3}, lambda frame: frame[PICTURE].array),
     "Render": ({RENDER: 4}, lambda frame: over_black(frame[RENDER].array)),
@@ -304,7 +304,7 @@ def _ras(places: F64) -> F64:
 
 
 def _before_camera(K: F64) -> F64:
-    """The pose of a picture [4, 4]: from (column, row, 0, 1) to mm in the camera's RAS axes, at `PLANE`."""
+    """The pose of an image [4, 4]: from (column, row, 0, 1) to mm in the camera's RAS axes, at `PLANE`."""
     T = np.eye(4)
     T[0, 0], T[1, 1] = PLANE / K[0, 0], PLANE / K[1, 1]
     T[:3, 3] = [-PLANE * K[0, 2] / K[0, 0], -PLANE * K[1, 2] / K[1, 1], PLANE]
@@ -313,7 +313,7 @@ def _before_camera(K: F64) -> F64:
 
 
 def _written(dark: U8, reason: str) -> U8:
-    """A black picture with the reason written on it."""
+    """A black image with the reason written on it."""
     scale = max(dark.shape[0] / 1000, 0.4)
     written = dark.copy()
     place, font = (8, dark.shape[0] // 2), cv2.FONT_HERSHEY_SIMPLEX

@@ -1,7 +1,7 @@
 """`sags bridge ros2`: every topic of a node in a ROS 2 graph, as ROS users expect it. No ROS is needed.
 
 The messages are the node's own, byte for byte. Small ones are sent, too, for receivers with ROS 2's default
-settings: compressed pictures, and fewer points. What has stopped is not sent again; `/diagnostics` says why.
+settings: compressed images, and fewer points. What has stopped is not sent again; `/diagnostics` says why.
 """
 
 import logging
@@ -35,7 +35,7 @@ ATTEND = 0.1  # s between looks at who reads
 STALE = 3  # the level of a diagnostic status
 TWO = "two nodes publish in this graph under one name; stop one of them, or give it another ns"
 PACE = 50e6  # bytes/s at which a stock receiver on a loaded machine empties its buffer
-ENOUGH = 4 << 20  # bytes of a receive buffer: with that much a raw picture and depth get through
+ENOUGH = 4 << 20  # bytes of a receive buffer: with that much a raw image and depth get through
 
 Make = Callable[[Received], bytes]
 
@@ -112,7 +112,7 @@ def _of_topic(ns: str, topic: topics.Topic, options: Ros2Options, optional: bool
 
 
 def _delivery(topic: topics.Topic, max_age: float) -> Delivery:
-    """The QoS that ROS users expect: best effort for pictures and clouds, reliable for small messages."""
+    """The QoS that ROS users expect: best effort for images and clouds, reliable for small messages."""
     if topic.type == topics.TF:
         return Delivery(reliable=True, depth=100, lifespan=max_age)
     if topic.type == topics.DIAGNOSTICS:
@@ -150,7 +150,7 @@ def _tell_of_buffers() -> None:
     if default is not None and default < ENOUGH:
         log.warning(
             "receivers of ROS 2 have a buffer of %d kB on this machine (net.core.rmem_default; rmem_max: %d "
-            "kB) and lose raw pictures: let them read .../compressed, or: sudo sysctl -w "
+            "kB) and lose raw images: let them read .../compressed, or: sudo sysctl -w "
             "net.core.rmem_default=16777216, and start them anew",
             default // 1000,
             (most or default) // 1000,
@@ -293,7 +293,7 @@ def _thinned(received: Received, most: int) -> bytes:
 
 
 def _eyes(received: Received) -> bytes:
-    """The pose of the right eye in the left eye's frame: its pictures are in a frame of their own."""
+    """The pose of the right eye in the left eye's frame: its images are in a frame of their own."""
     assert isinstance(received, ReceivedCameraInfo)
     T = np.eye(4)
     T[0, 3] = -received.P[0, 3] / received.P[0, 0]

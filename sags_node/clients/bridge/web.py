@@ -101,7 +101,7 @@ def _served(options: WebOptions, requests: Requests, stop: threading.Event) -> t
         sock=listener,
         origins=[None, *pages],  # None: a client that is no browser, so it runs no page of somebody else
         process_request=_page,
-        compression=None,  # pictures do not become smaller by that, and it takes long
+        compression=None,  # images do not become smaller by that, and it takes long
         open_timeout=HANDSHAKE,
         close_timeout=HANDSHAKE,
         ping_interval=ALIVE,

@@ -37,7 +37,7 @@ class Moment(NamedTuple):
 
 
 class Ledger:
-    """Codes that were shown, and pictures in which they were looked for.
+    """Codes that were shown, and images in which they were looked for.
 
     Args:
         first: name of the moment at which a code is shown.
@@ -53,7 +53,7 @@ class Ledger:
         self._shown[number].append(at)
 
     def seen(self, number: int | None, stamps: Mapping[str, int], at: Moment) -> None:
-        """Note a picture in which a code was looked for.
+        """Note an image in which a code was looked for.
 
         Args:
             number: of the code that was read in it; None: no code could be read.
@@ -62,10 +62,10 @@ class Ledger:
         self._seen.append((number, dict(stamps), at))
 
     def figures(self, since: Moment, until: Moment) -> dict[str, Any]:
-        """Return the latencies of codes shown between two moments, each to the first picture that shows it.
+        """Return the latencies of codes shown between two moments, each to the first image that shows it.
 
         Returns:
-            codes, read, lost (codes in no picture), unreadable (pictures without a code), unknown (pictures
+            codes, read, lost (codes in no image), unreadable (images without a code), unknown (images
             with a code that was not shown before), clock_set (codes that count in total_ms only, as the wall
             clock was set meanwhile), total_ms, and parts_ms by the name of the stage that ends each part.
         """

@@ -17,9 +17,9 @@ PICTURE = TopicName("left/image_rect_color", ReceivedImage)
 OVERLAY = TopicName("left/overlay/image", ReceivedImage)
 SETTLED = 2.0  # s after the first code; only later codes count, as a model has begun by then
 LAST = 1.0  # s within which the last code must be seen
-LOOK = 0.1  # s, the longest wait for a picture
+LOOK = 0.1  # s, the longest wait for an image
 REMIND = 5.0  # s without a code until that is said, and said again
-WAITING = 64  # pictures that are kept until their overlay comes: `LAST` at 60 Hz
+WAITING = 64  # images that are kept until their overlay comes: `LAST` at 60 Hz
 
 
 def measure_latency(
@@ -30,10 +30,10 @@ def measure_latency(
     tell: Callable[[str], object],
     stop: threading.Event,
 ) -> dict[str, object]:
-    """Measure when codes come back in what a screen would show: the node's left picture with its overlay.
+    """Measure when codes come back in what a screen would show: the node's left image with its overlay.
 
     Args:
-        overlay: where overlays come from, for which each picture waits; None: pictures without overlay.
+        overlay: where overlays come from, for which each image waits; None: images without overlay.
         seconds: how long codes count, beginning `SETTLED` after the first one that is seen.
         tell: called with what it waits for.
         stop: ends it early.
@@ -47,7 +47,7 @@ def measure_latency(
     ledger, reader = codes.ledger, Reader()
     newest: Received | None = None
     since, ends_at, remind_at = None, math.inf, time.monotonic() + REMIND
-    apart: str | None = None  # why an overlay that came has no picture
+    apart: str | None = None  # why an overlay that came has no image
     leading, kept = ((node, PICTURE), KEPT) if overlay is None else ((overlay, OVERLAY), WAITING)
     with (
         Subscriber.at(node, [PICTURE], kept=kept, may_be_absent=True) as pictures,
@@ -59,14 +59,14 @@ def measure_latency(
             if since is None and now > remind_at:
                 remind_at = now + REMIND
                 silent = codes.problem or apart or pictures.problem(PICTURE) or subscriber.problem(leading[1])
-                tell(f"waiting: {silent or 'there is no code in the pictures'}")
+                tell(f"waiting: {silent or 'there is no code in the images'}")
             if came is None:
                 continue
             newest = came
             frame = pictures.aligned([PICTURE], came.stamp_ns, LOOK)
             if frame is None:
                 blank = came.meta.frame_id < 0
-                apart = "the overlay is blank" if blank else f"overlays are over {WAITING} pictures behind"
+                apart = "the overlay is blank" if blank else f"overlays are over {WAITING} images behind"
                 continue
             apart, picture = None, frame[PICTURE]
             stamps = {"captured": picture.stamp_ns, "published": picture.meta.publish_ns}

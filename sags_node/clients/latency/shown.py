@@ -1,4 +1,4 @@
-"""ArUco codes that cameras can read, shown in pictures that are pushed to a node, or on a web page."""
+"""ArUco codes that cameras can read, shown in images that are pushed to a node, or on a web page."""
 
 import http
 import json
@@ -32,19 +32,19 @@ Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=1e13)]
 
 
 def cells(number: int) -> U8:
-    """The code of a number as a picture [CELLS, CELLS], 0 or 255."""
+    """The code of a number as an image [CELLS, CELLS], 0 or 255."""
     return np.asarray(cv2.aruco.generateImageMarker(_DICTIONARY, number % NUMBERS, CELLS), np.uint8)
 
 
 def paint(picture: U8, number: int) -> None:
-    """Paint a number into the upper left corner of a picture [H, W, 3], over half of its height."""
+    """Paint a number into the upper left corner of an image [H, W, 3], over half of its height."""
     cell = picture.shape[0] // 2 // (CELLS + 2)
     whole = np.pad(cells(number), 1, constant_values=255).repeat(cell, 0).repeat(cell, 1)
     picture[: len(whole), : len(whole)] = whole[..., None]
 
 
 class Reader:
-    """Reads the number of a picture."""
+    """Reads the number of an image."""
 
     def __init__(self) -> None:
         exact = cv2.aruco.DetectorParameters()
@@ -52,7 +52,7 @@ class Reader:
         self._detector = cv2.aruco.ArucoDetector(_DICTIONARY, exact)
 
     def read(self, picture: U8) -> int | None:
-        """The number that a picture [H, W, 3] shows; None: none, or several."""
+        """The number that an image [H, W, 3] shows; None: none, or several."""
         _, ids, _ = self._detector.detectMarkers(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))
         return int(ids.ravel()[0]) if ids is not None and len(ids) == 1 else None
 
@@ -76,7 +76,7 @@ class Codes(Closes):
 
 
 class Pushed(Codes):
-    """Pushes the pictures of a session to a node, both eyes with a code in the upper left corner.
+    """Pushes the images of a session to a node, both eyes with a code in the upper left corner.
 
     Args:
         endpoint: of a node with `source.kind: push`.
@@ -84,7 +84,7 @@ class Pushed(Codes):
         rate: Hz.
     """
 
-    hint = "does the node take pictures (source.kind: push), of this size and at this endpoint?"
+    hint = "does the node take images (source.kind: push), of this size and at this endpoint?"
 
     def __init__(self, endpoint: str, session: Path, rate: float) -> None:
         self.ledger = Ledger("sent")
@@ -222,5 +222,5 @@ def _answer(request: BaseHTTPRequestHandler, status: http.HTTPStatus, text: str)
 def _picture(file: Path) -> U8:
     picture = cv2.imread(str(file))
     if picture is None:
-        raise SagsError(f"{file} is no picture that can be read")
+        raise SagsError(f"{file} is no image that can be read")
     return np.asarray(picture[..., ::-1], np.uint8)

@@ -1,4 +1,4 @@
-"""`sags overlay`: meshes held by the tissue, drawn over the live picture; `sags register` places them.
+"""`sags overlay`: meshes held by the tissue, drawn over the live image; `sags register` places them.
 
 Imports config, kernels, media, messaging and registration.
 """

@@ -6,7 +6,7 @@ mean zero; C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machin
 interpolates that over the surface, by how sure each anchor's depth is. A vertex moves with the surface in
 front of it on its ray, the less the deeper it lies below. Rays and depths are those of the pinning's frame.
 
-Anchors are used, since the picture corrects them, they tell how sure they are, and they come back after they
+Anchors are used, since the image corrects them, they tell how sure they are, and they come back after they
 were lost. Control nodes and Gaussians do none of that, and are replaced over time.
 """
 
@@ -28,7 +28,7 @@ from sags_node.types import F32, F64, I64, Bool
 
 FOLLOWERS = 64  # a quarter of a node's anchors; 32 leave twice the error on the phantom
 LEAST_FOLLOWERS = 3
-RIM = 25  # px, of the picture and of instruments: an anchor needs 12 px of tissue on each side
+RIM = 25  # px, of the image and of instruments: an anchor needs 12 px of tissue on each side
 STILL = 0.5e-3  # m; an anchor wanders by this much on tissue that is still
 LEAST_ERROR = 0.3e-3  # m, of an anchor's depth
 LEAST_SHARE = 1e-3  # the least weight of an anchor, by its confidence above `SURE_OF_ANCHOR`
@@ -132,7 +132,7 @@ def _field(vertices: F64, depth: float, frame: TissueFrame, T: F64) -> _Field:
 
     if frame.confidence is None:
         raise SagsError("the node does not say how sure its depth is")
-    edges = np.pad(frame.tissue, 1).view(np.uint8)  # of the picture, too
+    edges = np.pad(frame.tissue, 1).view(np.uint8)  # of the image, too
     room = cv2.erode(edges, np.ones((RIM, RIM), np.uint8))[1:-1, 1:-1] > 0
     free = transform(invert(T), frame.surface(room & (frame.confidence >= SURE)).points).astype(np.float32)
     if len(free):

@@ -90,7 +90,7 @@ class Placed:
         return np.asarray(transform(T, self.body.vertices if self.vertices is None else self.vertices))
 
     def draw(self, camera: Camera, z: F32, rgba: U8, colors: U8 | None = None) -> F64:
-        """Draw what one eye sees of it into a picture [H, W, 4] with depths [H, W] (m), in place. Return its
+        """Draw what one eye sees of it into an image [H, W, 4] with depths [H, W] (m), in place. Return its
         vertices [V, 3] (m, in camera coordinates). `colors` are [T, 4]; default: as it is lit."""
         T_cam_body = invert(camera.T_world_cam) @ self.T_world_body
         local = self.shape(T_cam_body)
@@ -159,7 +159,7 @@ def color_key(rgba: U8, key: tuple[int, int, int]) -> U8:
 
 
 def over(picture: U8, rgba: U8) -> U8:
-    """The picture [H, W, 3] with the overlay [H, W, 4] over it."""
+    """The image [H, W, 3] with the overlay [H, W, 4] over it."""
     rows, columns = np.nonzero(rgba[..., 3])
     alpha = rgba[rows, columns, 3:].astype(np.float32) / 255
     shown = picture.copy()

@@ -77,7 +77,7 @@ class HeldObject:
         self._session = ""  # of the node in which it was pinned
         self._states: list[Anchor] = []
         self._model: F64 | None = None  # [k, 3] m, points of the object that lie at the anchors
-        self._right = np.zeros(3)  # where the picture's x axis pointed when it was pinned
+        self._right = np.zeros(3)  # where the image's x axis pointed when it was pinned
         self._normal: F64 | None = None
         self._lost: str | None = None
         self._body = body
@@ -89,7 +89,7 @@ class HeldObject:
         self._refused: str | None = None  # for good
         self._misread = self._misreadings()
         self._doubt: str | None = None  # about its `at`, once their unit is known, or about its places
-        self._size: tuple[int, int] | None = None  # of the picture that its pixels are meant in: the first
+        self._size: tuple[int, int] | None = None  # of the image that its pixels are meant in: the first
         self._begun_s: float | None = None  # place in the recording at which it was pinned first, s
         self._held_s: float | None = None  # of the newest frame in which its anchors were known
         self._began_anew = False  # the recording did, since it was lost
@@ -123,7 +123,7 @@ class HeldObject:
         """The pose [4, 4] of the object in the world, or None and a `reason`. Pins it when it is not yet.
 
         Raises:
-            UsageError: a pixel to pin it to lies outside the picture.
+            UsageError: a pixel to pin it to lies outside the image.
         """
         T, self.reason, self.unsure = None, self._unready(frame), None
         if self.reason is None:
@@ -236,7 +236,7 @@ class HeldObject:
         height, width = frame.depth.shape
         if not self.spec.anchors:
             pixel = _middle(frame)
-            return "no tissue in the picture" if pixel is None else [{"u": pixel[0], "v": pixel[1]}]
+            return "no tissue in the image" if pixel is None else [{"u": pixel[0], "v": pixel[1]}]
         self._size = self._size or (width, height)
         requests: list[Request] = []
         for anchor in self.spec.anchors:
@@ -246,7 +246,7 @@ class HeldObject:
             u, v = scale_pixels(np.array(anchor.pixel), self._size, (width, height)).tolist()
             if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
                 raise UsageError(
-                    f"{self._where} {u:g} {v:g} lies outside the left picture of {width}x{height} px"
+                    f"{self._where} {u:g} {v:g} lies outside the left image of {width}x{height} px"
                 )
             if not frame.tissue[round(v), round(u)]:
                 return f"pixel {u:g} {v:g} shows no tissue: an instrument, or vision.tissue.exclude"

@@ -13,7 +13,7 @@ from sags_node.types import U8
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 MARGIN = 4  # px around the words
-MOST_LINES = 2  # more would hide the picture
+MOST_LINES = 2  # more would hide the image
 COLOR = (255, 170, 0)  # of warnings
 ENDS = "..."
 

@@ -36,7 +36,7 @@ def fill(pixels: F64, depths: F64, triangles: I32, colors: U8, z: F32, rgba: U8)
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if area == 0.0:
             continue
-        # Factors of barycentric weights over depth: 1 / z is linear in the picture, z is not.
+        # Factors of barycentric weights over depth: 1 / z is linear in the image, z is not.
         over_a, over_b, over_c = 1 / (area * depths[a]), 1 / (area * depths[b]), 1 / (area * depths[c])
         first_x, last_x = max(0, math.ceil(min(ax, bx, cx))), min(width - 1, math.floor(max(ax, bx, cx)))
         first_y, last_y = max(0, math.ceil(min(ay, by, cy))), min(height - 1, math.floor(max(ay, by, cy)))
@@ -76,7 +76,7 @@ def hide(
     """
     height, width = z.shape
     next_instrument = np.empty(width + 1, np.int64)  # at or right of each column of the left eye
-    next_instrument[width] = width  # beyond the left eye's picture nobody knows
+    next_instrument[width] = width  # beyond the left eye's image nobody knows
     for y in range(height):
         for x in range(width - 1, -1, -1):
             next_instrument[x] = next_instrument[x + 1] if tissue[y, x] else x

@@ -42,7 +42,7 @@ def register_live(
         What was found, see `Registration.figures`; and the content of the scene file, None if it was refused.
 
     Raises:
-        UsageError: the file cannot be used, or a pixel lies outside the picture.
+        UsageError: the file cannot be used, or a pixel lies outside the image.
         SagsError: no node, no frames, no calibration, or a picked point has no depth.
     """
     mesh = surface_of(model, scale)
@@ -123,7 +123,7 @@ def _place_in(pair: PairSpec, number: int, frame: TissueFrame) -> F64 | None:
     u, v = pair.pixel
     height, width = frame.depth.shape
     if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
-        raise UsageError(f"pair {number}: pixel {u:g} {v:g} lies outside the picture of {width}x{height} px")
+        raise UsageError(f"pair {number}: pixel {u:g} {v:g} lies outside the image of {width}x{height} px")
     at = round(v), round(u)
     if not (frame.tissue[at] and frame.depth[at] > 0 and frame.confidence[at] >= SURE):
         return None

@@ -1,6 +1,6 @@
 """`sags overlay`: virtual geometry held by anchors in the tissue, published for both eyes of a display.
 
-It fails transparent: when anything it needs is stale, missing or lost, empty pictures are sent and `status`
+It fails transparent: when anything it needs is stale, missing or lost, empty images are sent and `status`
 says why. The video itself does not pass through here, so nothing here can hide it.
 """
 
@@ -45,10 +45,10 @@ log = logging.getLogger(__name__)
 
 PICTURE = TopicName("left/image_rect_color", ReceivedImage)
 MAX_AGE = 0.5  # s since capture; an older overlay is taken away
-WAIT_FOR_FRAME = 0.05  # s; also how soon a stale picture is noticed
+WAIT_FOR_FRAME = 0.05  # s; also how soon a stale image is noticed
 WAIT_FOR_REST = 0.05  # s for what belongs to the frame
 PATIENCE = 5.0  # s for the very first frame, before it is said that none comes
-UNSEEN = "nothing of it is in sight: beyond the picture, or behind an instrument"
+UNSEEN = "nothing of it is in sight: beyond the image, or behind an instrument"
 REMEMBERED = 54_000  # durations: half an hour at 30 Hz
 RECENT = 300  # durations that the figures in `status` are of
 
@@ -63,7 +63,7 @@ class OverlayOptions:
     pin: tuple[float, float] | None = None  # u v, of the built-in shape; default: middle of the tissue
     shape: str = "target"
     seconds: float | None = None  # default: until Ctrl-C
-    save: Path | None = None  # .mp4 for every picture, .png for the last one with the overlay
+    save: Path | None = None  # .mp4 for every image, .png for the last one with the overlay
     layers: Path | None = None  # the file of `Layers`
     force: bool = False  # it may replace a file
     max_age: float = MAX_AGE
@@ -126,7 +126,7 @@ class _Overlay:
         tell: Callable[[str], object],
     ) -> None:
         self._options, self._clock = options, clock
-        # A mask comes with every frame, also while the camera is lost, and never before the picture.
+        # A mask comes with every frame, also while the camera is lost, and never before the image.
         self._leading = NEEDED[0] if options.save is None else TISSUE
         wanted: list[str] = [*NEEDED, CONFIDENCE, RIGHT_INFO, *([] if options.save is None else [PICTURE])]
         wanted += [INSTRUMENTS] if scene.asks_for_instruments else []
@@ -154,7 +154,7 @@ class _Overlay:
         """Draw every frame that comes.
 
         Raises:
-            UsageError: a pixel lies outside the picture, or the node's keys do not fit.
+            UsageError: a pixel lies outside the image, or the node's keys do not fit.
             SagsError: no frame came, or the node refuses this client or has no control socket.
         """
         seconds = self._options.seconds

@@ -14,7 +14,7 @@ from sags_node.files import check_file, whole, writing
 from sags_node.media.video_file import VideoFile
 from sags_node.types import U8
 
-RATE = 30.0  # Hz that the video's header begins with; its pictures have their own stamps
+RATE = 30.0  # Hz that the video's header begins with; its images have their own stamps
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ def read_layers(file: Path) -> dict[int, Layer]:
 
 
 class Output:
-    """Every picture as .mp4, or the last one with the overlay as .png; None: nothing is kept.
+    """Every image as .mp4, or the last one with the overlay as .png; None: nothing is kept.
 
     Args:
         force: replace a file that exists.
@@ -110,7 +110,7 @@ class Output:
         self.saved: str | None = None  # what has been written
 
     def add(self, picture: U8, with_overlay: bool, stamp_ns: int) -> None:
-        """Add a picture [H, W, 3] RGB with its capture time. If a video can get no more, that is logged once.
+        """Add an image [H, W, 3] RGB with its capture time. If a video can get no more, that is logged once.
 
         Raises:
             SagsError: the video cannot be begun.
@@ -130,7 +130,7 @@ class Output:
                 self._video.add(picture, stamp_ns)
             except OSError as error:
                 self._failed = error
-                log.warning("%s gets no more pictures: %s; the overlay goes on", self._file, error.strerror)
+                log.warning("%s gets no more images: %s; the overlay goes on", self._file, error.strerror)
 
     def close(self) -> None:
         """Finish the file.

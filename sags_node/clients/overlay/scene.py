@@ -58,7 +58,7 @@ Margin = Annotated[float, AfterValidator(_margin)]
 class AnchorSpec(Section):
     """One point of the tissue that holds an object."""
 
-    pixel: tuple[float, float] | None = Field(None, description="u v of the left picture, first good frame")
+    pixel: tuple[float, float] | None = Field(None, description="u v of the left image, first good frame")
     place: Place | None = Field(None, description="x y z in the world, m")
     at: Place | None = Field(None, description="the point of the object that lies there, see `at_units`")
 

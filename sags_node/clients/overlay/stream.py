@@ -1,7 +1,7 @@
-"""What the overlay publishes on its own socket: both eyes' pictures, and what it says of itself.
+"""What the overlay publishes on its own socket: both eyes' images, and what it says of itself.
 
-A picture is never left standing: when nothing fresh can be drawn, an empty one is sent at once and again
-every `BLANK_PERIOD`. For the first `SAID` seconds, these pictures say why on their lower edge.
+An image is never left standing: when nothing fresh can be drawn, an empty one is sent at once and again
+every `BLANK_PERIOD`. For the first `SAID` seconds, these images say why on their lower edge.
 """
 
 import time
@@ -21,8 +21,8 @@ from sags_node.messaging.sockets import Closes
 from sags_node.messaging.topics import OVERLAY_TOPICS
 from sags_node.types import F32, U8
 
-BLANK_PERIOD = 0.5  # s between two empty pictures
-SAID = 5.0  # s for which empty pictures say why
+BLANK_PERIOD = 0.5  # s between two empty images
+SAID = 5.0  # s for which empty images say why
 STATUS_PERIOD = 1.0  # s
 EYES = {"left": cdr.LEFT_FRAME, "right": cdr.RIGHT_FRAME}
 
@@ -49,7 +49,7 @@ class OverlayStream(Closes):
         self._state: tuple[str, str | None, tuple[str, ...], set[tuple[int, str]]] | None = None
         self._epoch = 0
         self.reason: str | None = (
-            "waiting for the node"  # why nothing is shown; None: the last picture sent is an overlay
+            "waiting for the node"  # why nothing is shown; None: the last image sent is an overlay
         )
         self.shown_ns: int | None = None  # capture time of the frame shown last, while it is shown
         self._shown_at = 0.0  # monotonic s
@@ -77,7 +77,7 @@ class OverlayStream(Closes):
         """Send the overlay [H, W, 4] of each eye that is looked at, for the frame captured at `stamp_ns`, or
         for what is expected `ahead_ns` later.
 
-        An eye that has no picture gets an empty one.
+        An eye that has no image gets an empty one.
         """
         self.reason, self.shown_ns, self._epoch = None, stamp_ns, epoch
         self._shown_at = time.monotonic()
@@ -95,10 +95,10 @@ class OverlayStream(Closes):
     def blank(self, reason: str, size: tuple[int, int] | None = None) -> None:
         """Show nothing, because of `reason`; to be called again and again while that is so.
 
-        An empty picture belongs to no frame: its stamp is the time at which it is sent.
+        An empty image belongs to no frame: its stamp is the time at which it is sent.
 
         Args:
-            size: height and width of the node's pictures, where they are known; default: as before.
+            size: height and width of the node's images, where they are known; default: as before.
         """
         new, now = self.reason is None, time.monotonic()
         if reason != self.reason:
@@ -112,7 +112,7 @@ class OverlayStream(Closes):
                 self._send(eye, self.notice(), -1, stamp_ns)
 
     def notice(self, size: tuple[int, int] | None = None) -> U8:
-        """Return the picture in place of an overlay: empty, or for `SAID` with the reason. `size`: see
+        """Return the image in place of an overlay: empty, or for `SAID` with the reason. `size`: see
         `blank`."""
         rgba, since = self._empty(size), time.monotonic() - self._blank_since
         if self.reason is not None and BLANK_PERIOD <= since < BLANK_PERIOD + SAID:

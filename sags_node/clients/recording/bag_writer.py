@@ -202,7 +202,7 @@ class BagWriter:
         self._parts.append(_Part(f"{self.folder.resolve().name}_{len(self._parts)}.mcap"))
         self._file = (self.folder / self._parts[-1].file).open("xb")
         self._file_bytes = 0
-        # Chunks are small and not compressed: pictures hardly shrink, and time is short.
+        # Chunks are small and not compressed: images hardly shrink, and time is short.
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile="ros2", library=f"sags-node {__version__}")
         for say in self._beginning:

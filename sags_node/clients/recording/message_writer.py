@@ -1,4 +1,4 @@
-"""From messages of the wire to a bag: topics, compressed pictures; calibration and parameters attached."""
+"""From messages of the wire to a bag: topics, compressed images; calibration and parameters attached."""
 
 from pathlib import Path
 from typing import Literal
@@ -37,7 +37,7 @@ class MessageWriter:
     """Writes messages as they came into a new bag.
 
     Args:
-        compression: of 8-bit pictures. `jpeg` takes colour pictures only: alpha, masks and what lies on a key
+        compression: of 8-bit images. `jpeg` takes colour images only: alpha, masks and what lies on a key
             colour must stay exact and become PNG. Depth is never compressed.
         limits: of each file in the bag.
 
@@ -107,7 +107,7 @@ class MessageWriter:
 
 
 def _compressed(message: Message, data: bytes, form: str) -> bytes:
-    """The CDR of the compressed picture."""
+    """The CDR of the compressed image."""
     encoding = message.meta.encoding
     options = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY) if form == "jpeg" else PNG
     try:

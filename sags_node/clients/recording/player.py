@@ -310,7 +310,7 @@ def _original_stamp(message: BagMessage) -> int:
 def outgoing(message: BagMessage, stamp_ns: int) -> tuple[str, Content]:
     """Return the topic (without leading slash) and the content to send, stamped `stamp_ns`.
 
-    A compressed picture becomes a raw one on the topic it was made of, as consumers of a node know it.
+    A compressed image becomes a raw one on the topic it was made of, as consumers of a node know it.
 
     Raises:
         SagsError: the message is damaged.
@@ -346,7 +346,7 @@ def _parts(message: BagMessage, bulk: int, after: int, stamp_ns: int) -> tuple[B
 
 
 def _picture(message: BagMessage, stamp_ns: int) -> Content | None:
-    """The content of a picture; None: it is valid, but this protocol has no such encoding or layout."""
+    """The content of an image; None: it is valid, but this protocol has no such encoding or layout."""
     ros = cdr.decode(message.data, topics.IMAGE)
     dtype, channels = cdr.IMAGE_ENCODINGS.get(ros.encoding, ("uint8", 0))
     row_bytes = ros.width * channels * np.dtype(dtype).itemsize

@@ -74,7 +74,7 @@ class Recorder:
         self._topics: dict[str, _Topic] = {}
         self._rejected = 0
         self._why_rejected: str | None = None  # the reason of the first one
-        self._refused: set[str] = set()  # thin pictures that the node cannot make
+        self._refused: set[str] = set()  # thin images that the node cannot make
         self._is_mixed = False  # two nodes are recorded, which was warned of
         self._bytes = 0
         self._free: int | None = None  # free bytes of the disk
@@ -175,7 +175,7 @@ class Recorder:
                     yield Arrived(message, received_ns)
 
     def _refuse(self, topic: str, why: str) -> None:
-        """Note that the node cannot make a thin picture."""
+        """Note that the node cannot make a thin image."""
         self._refused.add(topic)
         if not self._topics and len(self._refused) == len(set(self._options.topics)):
             raise SagsError(why)  # nothing else is recorded

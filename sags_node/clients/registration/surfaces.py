@@ -78,7 +78,7 @@ def _all_round(count: int) -> F64:
 
 
 def evenly(shape: tuple[int, ...]) -> tuple[int, tuple[slice, slice]]:
-    """Return a spacing in px that leaves about `POINTS` pixels of a picture [H, W], and their slices."""
+    """Return a spacing in px that leaves about `POINTS` pixels of an image [H, W], and their slices."""
     every = max(1, int(np.sqrt(shape[0] * shape[1] / POINTS)))
     return every, np.s_[every // 2 :: every, every // 2 :: every]
 
@@ -93,7 +93,7 @@ class Surface:
 
     @classmethod
     def of_depth(cls, depth: F32, confidence: F32, tissue: Bool, camera: Camera) -> Surface:
-        """Take about `POINTS`, evenly, from the tissue in a depth picture [H, W] (m; 0 or NaN: unknown)."""
+        """Take about `POINTS`, evenly, from the tissue in a depth image [H, W] (m; 0 or NaN: unknown)."""
         every, at = evenly(depth.shape)
         rows, columns = np.nonzero((depth[at] > 0) & tissue[at] & (confidence[at] >= LEAST))
         pixels = np.stack([columns, rows], -1) * every + every // 2

@@ -10,14 +10,14 @@ from sags_node.confidence import SURE
 
 STEP = 1e-4  # m per count of a depth in the page
 GUESS = 1 << 15  # the bit that marks a depth as not sure; a depth of 0: unknown
-# Runs in the page. A picture's depth lies behind it as base64 of little-endian uint16.
+# Runs in the page. An image's depth lies behind it as base64 of little-endian uint16.
 SCRIPT = """<script>
 (() => {
   let at = null;
   const depth = ({ columns, rows, bar, left, width, height, depths, unit }) => {
     const [across, down] = at === null || !at[2].isConnected ? [-1, -1] : [at[0] * columns, at[1] * rows];
     const column = Math.floor(across), row = Math.floor(down), v = (down - row - bar) / (1 - bar);
-    if (across < 0 || v < 0 || left[row * columns + column] !== "1") return "point at a picture";
+    if (across < 0 || v < 0 || left[row * columns + column] !== "1") return "point at an image";
     const place = 2 * (Math.floor(v * height) * width + Math.floor((across - column) * width));
     const bytes = atob(depths), steps = bytes.charCodeAt(place) + 256 * bytes.charCodeAt(place + 1);
     const said = ((steps & 0x7fff) / 10).toFixed(1) + " " + unit;

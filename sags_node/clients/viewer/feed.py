@@ -1,6 +1,6 @@
 """What a running node shows at this moment, and why nothing is shown when there is nothing.
 
-The node may come, go and come back: the feed connects by itself and drops what is old. Pictures come thin, as
+The node may come, go and come back: the feed connects by itself and drops what is old. Images come thin, as
 small JPEG and PNG files, and only those that somebody looks at.
 """
 
@@ -42,8 +42,8 @@ SPLAT_FIELDS = {"scale_0", "rot_w", "f_dc_0", "opacity", "id"}
 ANCHOR_FIELDS = {"id", "visibility", "confidence", "depth_confidence", "age"}
 
 MAX_AGE = 1.0  # s; older content is not shown
-WAIT_FOR_PICTURE = MAX_AGE  # s; a picture that comes later is old
-WAIT_FOR_REST = 0.3  # s for what belongs to a picture
+WAIT_FOR_PICTURE = MAX_AGE  # s; an image that comes later is old
+WAIT_FOR_REST = 0.3  # s for what belongs to an image
 
 _STATES = {
     "starting": "the node is starting: waiting for the first frame",
@@ -102,7 +102,7 @@ class Feed:
     def __init__(self, node: NodeAddress, clock: NodeClock | None = None) -> None:
         self._clock = clock
         self._frame: dict[str, Received] | None = None  # the newest that came as a whole
-        self._shown: Received | None = None  # the picture of the last moment
+        self._shown: Received | None = None  # the image of the last moment
         names = (*WHOLE, *PICTURES)
         rates = dict.fromkeys(names, LEAST_HZ)
         self._subscriber = Subscriber.at(
@@ -111,10 +111,10 @@ class Feed:
         self._overlay = OverlayFeed(node.run_dir)
 
     def now(self, pictures: Iterable[str], overlaid: Iterable[str] = (), steady: bool = False) -> Moment:
-        """Return what may be shown now. Wait up to `WAIT_FOR_PICTURE` for a picture newer than the last one.
+        """Return what may be shown now. Wait up to `WAIT_FOR_PICTURE` for an image newer than the last one.
 
         Args:
-            pictures: those of `PICTURES` that are looked at. The node makes no others.
+            images: those of `PICTURES` that are looked at. The node makes no others.
             overlaid: eyes whose overlay is looked at.
             steady: let the node go on sending until the next call, which follows at once; else it sends one
                 frame for each call, and nothing in between.
@@ -158,7 +158,7 @@ class Feed:
         except WireError as error:  # a damaged file, or no pose
             return Moment(f"the node sends what cannot be read: {error}", status, overlay=overlay)
         return Moment(
-            problem=None if camera is not None else "waiting for the model of this picture",
+            problem=None if camera is not None else "waiting for the model of this image",
             status=status,
             pictures=shown,
             camera=camera,
@@ -177,7 +177,7 @@ class Feed:
             self._clock.close()
 
     def _problem(self, subscriber: Subscriber, status: Status) -> str | None:
-        """Why nothing may be shown: first by the node's state, then by the age of its pictures."""
+        """Why nothing may be shown: first by the node's state, then by the age of its images."""
         why = subscriber.refusal or subscriber.absent
         if not status.state:
             return why or f"waiting for a node at {subscriber.endpoint}"
@@ -189,7 +189,7 @@ class Feed:
         if newest is None:
             return "waiting for the left camera"
         if (age := newest.age(subscriber.now_ns())) > MAX_AGE:
-            return f"stale for {age:.1f} s: no picture comes"
+            return f"stale for {age:.1f} s: no image comes"
         return subscriber.problem(LEFT, MAX_AGE)
 
     def _is_fresh(self, shown: Received, newest: Received) -> bool:
@@ -223,7 +223,7 @@ def _records(cloud: Received | None, fields: set[str]) -> NDArray[Any] | None:
 
 
 def _camera(frame: Mapping[str, Received]) -> Camera | None:
-    """The left camera of a whole frame; None where only its picture came."""
+    """The left camera of a whole frame; None where only its image came."""
     info, pose = frame.get(INFO), frame.get(POSE)
     if not isinstance(info, ReceivedCameraInfo) or not isinstance(pose, ReceivedRos):
         return None

@@ -1,4 +1,4 @@
-"""What `sags overlay` on this machine publishes: its pictures, and the state of its objects."""
+"""What `sags overlay` on this machine publishes: its images, and the state of its objects."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +11,7 @@ from sags_node.types import U8
 
 NS = "overlay"  # default namespace of its topics and its connection file
 EYES = {eye: TopicName(f"{eye}/overlay/image", ReceivedImage) for eye in ("left", "right")}
-LEAST_HZ = 1e-3  # Hz; it is looked at now and then, so lost pictures are no fault
+LEAST_HZ = 1e-3  # Hz; it is looked at now and then, so lost images are no fault
 WAIT = 0.1  # s for the overlay of a frame: it takes some ms to draw
 SILENT_AFTER = 2.5  # s without a `status`, which comes every second
 

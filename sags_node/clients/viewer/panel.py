@@ -1,4 +1,4 @@
-"""The controls in the browser: status, pictures, plots, anchors, and what can be asked of the node."""
+"""The controls in the browser: status, images, plots, anchors, and what can be asked of the node."""
 
 import html
 import time
@@ -24,7 +24,7 @@ from sags_node.messaging.control import ControlClient
 from sags_node.types import F64
 
 ANSWER_TIME = 20.0  # s; recordings take seconds
-WIDTH = 400  # px, of pictures and controls
+WIDTH = 400  # px, of images and controls
 PLOT_HEIGHT = 80  # px
 NOTICE_TIME = 6.0  # s
 JPEG_QUALITY = 80
@@ -91,7 +91,7 @@ class Panel:
         client.gui.main_panel.set_width(min(WIDTH, client.camera.image_width // 2))
 
     def show(self, moment: Moment) -> None:
-        """Bring status, pictures, plots and the list of anchors up to date."""
+        """Bring status, images, plots and the list of anchors up to date."""
         self._moment = moment
         self._unit = "no unit" if "uncalibrated" in moment.status.warning_codes else "mm"
         self._say(moment)
@@ -188,7 +188,7 @@ class Panel:
 
     def _build_pictures(self) -> None:
         panel = self._gui.add_panel()
-        with panel.add_tab("Pictures and figures"):
+        with panel.add_tab("Images and figures"):
             views = tuple(VIEWS)
             self._view = self._gui.add_dropdown("Show", views, initial_value=views[0])
             self._depth = self._gui.add_html("")

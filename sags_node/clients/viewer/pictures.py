@@ -1,4 +1,4 @@
-"""Pictures of the newest frame on one sheet: of both eyes, of the model, its depth and error, the overlay."""
+"""Images of the newest frame on one sheet: of both eyes, of the model, its depth and error, the overlay."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT,
 from sags_node.quality.gallery import TILE_WIDTH, Picture, depth_range, depth_tile, error_tile, shrunk
 from sags_node.types import U8
 
-# The topics that each picture is made of.
+# The topics that each image is made of.
 NEEDS = {
     "Left input": (LEFT,),
     "Model": (MODEL,),
@@ -36,7 +36,7 @@ VIEWS = {
     "Stereo overlay": ("Left overlay", "Right overlay"),
 }
 COLUMNS = 2
-BAR = 24  # px above each picture
+BAR = 24  # px above each image
 RANGE_MEMORY = 0.9  # weight of the last depth range, so that the colours do not flicker
 _GROUND, _MARKED = 36, (255, 169, 77)
 _NOTHING = np.zeros((0, 0), np.uint8)
@@ -55,10 +55,10 @@ class Sheet:
         self.shown = (0.0, 1.0)
         self.fixed: tuple[float, float] | None = None
         self._followed: tuple[float, float] | None = None
-        self._height = round(TILE_WIDTH * 0.8)  # of a tile; that of the last picture
+        self._height = round(TILE_WIDTH * 0.8)  # of a tile; that of the last image
 
     def draw(self, moment: Moment, view: str, remark: str = "") -> U8:
-        """Draw the pictures of a view [h, w, 3], RGB; a place is left empty where nothing is new."""
+        """Draw the images of a view [h, w, 3], RGB; a place is left empty where nothing is new."""
         model = _model(moment.pictures)
         if DEPTH in moment.pictures and TISSUE in moment.pictures:
             self._follow(model)
@@ -120,7 +120,7 @@ def overlaid_in(view: str) -> list[str]:
 
 
 def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
-    """The pictures of a frame, resized to its mask and depth: all that follows costs time per pixel."""
+    """The images of a frame, resized to its mask and depth: all that follows costs time per pixel."""
     tissue = pictures.get(TISSUE, _NOTHING)
     size = tissue.shape[::-1]
     truth, render = (
@@ -134,6 +134,6 @@ def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
 
 
 def _blended(picture: U8, drawn: U8) -> U8:
-    """The overlay [H, W, 4], not premultiplied, over the picture [h, w, 3]."""
+    """The overlay [H, W, 4], not premultiplied, over the image [h, w, 3]."""
     small = cv2.resize(drawn, picture.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
     return np.asarray(picture + small[..., 3:] / 255 * (small[..., :3] - picture), np.uint8)

@@ -1,4 +1,4 @@
-"""What a browser may keep of a moment: a picture of its page, and the model as files of `sags export`."""
+"""What a browser may keep of a moment: an image of its page, and the model as files of `sags export`."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ Exporter = Callable[[Gaussians, Camera, int, str], bytes]  # a model, a camera, 
 
 
 def screenshot(client: viser.ClientHandle, sheet: U8) -> bytes:
-    """The browser's 3D scene, beside it the sheet of pictures: a PNG file.
+    """The browser's 3D scene, beside it the sheet of images: a PNG file.
 
     Raises:
         SagsError: the browser does not answer.

@@ -1,4 +1,4 @@
-"""The 3D scene in the browser: Gaussians, the left camera with its picture, and anchors.
+"""The 3D scene in the browser: Gaussians, the left camera with its image, and anchors.
 
 Its unit is the millimetre, because viser keeps covariances as float16: those of tissue in square metres
 would vanish. Its axes are the node's world: x right, y down, z away from the first left camera (OpenCV).
@@ -22,7 +22,7 @@ from sags_node.types import F64, U8, Camera
 
 UNIT = 1e-3  # m
 FRUSTUM = 12.0  # mm deep
-PICTURE_WIDTH = 240  # px, of the picture in the frustum
+PICTURE_WIDTH = 240  # px, of the image in the frustum
 JPEG_QUALITY = 80
 STEP = 4096  # their number is filled up to a multiple of this
 NEAR = 1.0  # mm; nothing closer is drawn
@@ -77,7 +77,7 @@ class Scene:
             client.camera.position = transform(pose, eye * UNIT) / UNIT
             client.camera.look_at = transform(pose, np.array([0.0, 0.0, self._depth]) * UNIT) / UNIT
             client.camera.up_direction = -pose[:3, 1]
-            client.camera.near = 1.1 * FRUSTUM if through else NEAR  # beyond the picture in the frustum
+            client.camera.near = 1.1 * FRUSTUM if through else NEAR  # beyond the image in the frustum
             if through and self.camera is not None:
                 client.camera.fov = _fov(self.camera)
 

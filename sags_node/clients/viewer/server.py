@@ -40,7 +40,7 @@ def serving(host: str, port: int, insecure: bool) -> Iterator[tuple[viser.ViserS
     """The server and its address, until the end of the block.
 
     On loopback, only pages of this server may open its websocket: else any page that the user has open could
-    read the pictures and press the buttons. With `insecure`, pages of any host name may open it, on its port.
+    read the images and press the buttons. With `insecure`, pages of any host name may open it, on its port.
 
     Args:
         port: 0 for any free one.

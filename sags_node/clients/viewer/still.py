@@ -1,6 +1,6 @@
 """The page covers itself when nothing comes from here: it alone knows that a link, or this process, hangs."""
 
-SILENT_AFTER = 6.0  # s; an update by `run` takes 5.3 s where pictures come late and the browser is slow
+SILENT_AFTER = 6.0  # s; an update by `run` takes 5.3 s where images come late and the browser is slow
 # Runs in the page, before viser. Its status comes every second, also to a page that has folded it away: it is
 # heard where viser's own thread hands it over. A page that was busy itself gets a second look.
 SCRIPT = """<script>

@@ -153,7 +153,7 @@ class GpuRefiner(Refiner):
 
 
 class Picture:
-    """Draws pictures of one size on the GPU, and compares them with a frame.
+    """Draws images of one size on the GPU, and compares them with a frame.
 
     Attributes:
         rasterizer: draws them.

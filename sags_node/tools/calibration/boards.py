@@ -1,4 +1,4 @@
-"""Calibration boards and their corners in pictures."""
+"""Calibration boards and their corners in images."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -16,7 +16,7 @@ PREFIX = "DICT_"
 
 
 class Seen(NamedTuple):
-    """A board in one picture."""
+    """A board in one image."""
 
     ids: I64  # [n] of the board's corners
     corners: F32  # [n, 2] px
@@ -38,10 +38,10 @@ class Board(Protocol):
         """Corners [N, 3] on the board, m, z = 0."""
 
     def find(self, gray: U8) -> Seen | None:
-        """The corners in a picture [H, W]; None where the board is not seen."""
+        """The corners in an image [H, W]; None where the board is not seen."""
 
     def explain(self, gray: U8) -> str:
-        """Return in words what a picture [H, W] shows instead of this board; empty: that is not known."""
+        """Return in words what an image [H, W] shows instead of this board; empty: that is not known."""
 
 
 class Chessboard:
@@ -121,7 +121,7 @@ class Charuco:
 
 
 def find_in_both(board: Board, name: str, left: U8, right: U8) -> StereoView | None:
-    """The corners that both pictures [H, W, 3] (RGB) of one moment show; None where there are too few."""
+    """The corners that both images [H, W, 3] (RGB) of one moment show; None where there are too few."""
     in_left = board.find(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY))
     in_right = None if in_left is None else board.find(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
     if in_left is None or in_right is None:

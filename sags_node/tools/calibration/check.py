@@ -1,4 +1,4 @@
-"""`sags calib check`: a calibration, alone or against the pictures it is for."""
+"""`sags calib check`: a calibration, alone or against the images it is for."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -42,8 +42,8 @@ FOUND_BACK = 0.7  # px: largest distance at which a patch is matched back to its
 
 Progress = Callable[[int, int], None]
 Launched = Callable[[Path, Sequence[str]], LaunchConfig]
-GOOD_ROWS = (0.7, 2.0)  # px of the full picture, median and 90 %
-FIRST_PAIRS = 2  # that tell whether pictures were rectified
+GOOD_ROWS = (0.7, 2.0)  # px of the full image, median and 90 %
+FIRST_PAIRS = 2  # that tell whether images were rectified
 DISPARITY_MARGIN = 4.0  # px beyond those of matched points
 
 
@@ -57,11 +57,11 @@ def check_calibration(
     progress: Progress | None = None,
     launched: Launched = load_launch,
 ) -> list[Finding]:
-    """Look over a calibration, or the one a session uses, and compare it with pictures where there are some.
+    """Look over a calibration, or the one a session uses, and compare it with images where there are some.
 
     Args:
-        path: a calibration of any known form, or a session, which is then compared with its own pictures.
-        session: launch file or recording whose pictures are used.
+        path: a calibration of any known form, or a session, which is then compared with its own images.
+        session: launch file or recording whose images are used.
         images: pairs of files or of folders.
         overrides: `key:=value` of the session.
         size, metres: as in `read_rig`.
@@ -69,7 +69,7 @@ def check_calibration(
 
     Raises:
         UsageError: a path is wrong, or nothing known is there.
-        SagsError: pictures cannot be read.
+        SagsError: images cannot be read.
     """
     own = None if find_form(path) is not None else _launched(path, overrides, launched)
     config = own if session is None else launched(session, overrides)
@@ -101,21 +101,21 @@ def read_calibration(
 def judge(
     rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = (), metres: float | None = None
 ) -> list[Finding]:
-    """Look over a calibration, and compare it with raw pictures where there are some."""
+    """Look over a calibration, and compare it with raw images where there are some."""
     findings = check_eyes(rig)
     if is_wrong(findings):
         return findings
     findings += check_pair(rig, metres)
-    if rig.left.P[0, 3] == rig.right.P[0, 3]:  # without a baseline pictures tell nothing
+    if rig.left.P[0, 3] == rig.right.P[0, 3]:  # without a baseline images tell nothing
         return findings
     return findings + (check_pictures(rig, pairs, depths) if pairs else [])
 
 
 def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 | None] = ()) -> list[Finding]:
-    """Return what raw pictures say of a rig whose numbers are sound.
+    """Return what raw images say of a rig whose numbers are sound.
 
     Args:
-        depths: what is known of each pair's depth, [H, W] m of the left rectified picture, 0 unknown.
+        depths: what is known of each pair's depth, [H, W] m of the left rectified image, 0 unknown.
     """
     height, width = pairs[0][0].shape[:2]
     if wrong := wrong_size(rig.path, (rig.left.width, rig.left.height), (width, height)):
@@ -136,7 +136,7 @@ def check_pictures(rig: StereoRig, pairs: Sequence[Pair], depths: Sequence[F32 |
 
 
 def rectified_before(config: LaunchConfig) -> bool:
-    """Tell whether the first pictures of a session show that they were rectified, though their names do not
+    """Tell whether the first images of a session show that they were rectified, though their names do not
     say so; False where they cannot be read."""
     try:
         rig = _rig_of(config, None, None)
@@ -183,10 +183,10 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
         if error is not None:
             measured.append(error)
     if not measured:
-        return Finding("warning", "too little matches densely to measure rows", "give sharper pictures")
+        return Finding("warning", "too little matches densely to measure rows", "give sharper images")
     median, p90, matched = (float(figure) for figure in np.median(measured, axis=0))
     figures = {"row_median_px": round(median, 3), "row_p90_px": round(p90, 3), "matched": round(matched, 3)}
-    what = f"rows agree to {median:.2f} px (median), {p90:.2f} px (90 %), over {matched:.0%} of the picture"
+    what = f"rows agree to {median:.2f} px (median), {p90:.2f} px (90 %), over {matched:.0%} of the image"
     if median <= GOOD_ROWS[0] and p90 <= GOOD_ROWS[1]:
         return Finding("ok", what, "", figures)
     fix = "depth suffers: calibrate again, with the scope as it is used"
@@ -203,11 +203,11 @@ def _check_rows(rig: StereoRig, pairs: Sequence[Pair], rows: Rows) -> Finding:
 
 
 class RowError(NamedTuple):
-    """The row errors of a rectified pair, px of the full pictures."""
+    """The row errors of a rectified pair, px of the full images."""
 
     median: float
     p90: float
-    matched: float  # share of the picture, 0..1
+    matched: float  # share of the image, 0..1
 
 
 def measure_rows(left: U8, right: U8, smallest: float, largest: float) -> RowError | None:

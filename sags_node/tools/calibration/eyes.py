@@ -1,4 +1,4 @@
-"""What a source gives for each eye, as one picture: is it split, cropped and turned as it should be?"""
+"""What a source gives for each eye, as one image: is it split, cropped and turned as it should be?"""
 
 import threading
 import time
@@ -12,7 +12,7 @@ from sags_node.errors import SagsError
 from sags_node.sources.source import open_source
 from sags_node.types import U8, StereoFrame
 
-WIDEST = 960  # px of an eye in the picture
+WIDEST = 960  # px of an eye in the image
 LINES = 8  # drawn across both eyes: the same tissue must lie near the same line
 SILENT_S = 20.0  # a source may give no frame for so long
 LINE, TEXT, SHADE = (255, 220, 0), (255, 255, 255), (0, 0, 0)  # RGB
@@ -24,7 +24,7 @@ def look(config: LaunchConfig, seconds: float) -> tuple[U8, dict[str, Any]]:
     Returns:
         The last pair side by side [h, w, 3] RGB, and what was found: `width`, `height` (px), `frames_per_s`,
         `skew_ms` (stamp of the right eye minus the left one's), `age_ms` (from capture until the frame was
-        here) and `dropped` (pictures without a partner).
+        here) and `dropped` (images without a partner).
 
     Raises:
         SagsError: the source fails, or gives no frame.
@@ -42,7 +42,7 @@ def look(config: LaunchConfig, seconds: float) -> tuple[U8, dict[str, Any]]:
         timer.cancel()
         dropped = source.dropped
     if first is None or last is None:
-        raise SagsError(f"no pair of pictures came within {seconds + SILENT_S:g} s")
+        raise SagsError(f"no pair of images came within {seconds + SILENT_S:g} s")
     took_ns = last.t_capture_ns - first.t_capture_ns
     return _side_by_side(last), {
         "width": last.left.shape[1],

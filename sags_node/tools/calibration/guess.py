@@ -1,4 +1,4 @@
-"""A rig for eyes that nobody has calibrated: usual optics, and the rows that their own pictures show."""
+"""A rig for eyes that nobody has calibrated: usual optics, and the rows that their own images show."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,13 +16,13 @@ from sags_node.tools.calibration.pictures import Pair
 from sags_node.tools.calibration.rows import FEWEST_MATCHES, rectified_rows
 from sags_node.types import F64, Eye, StereoRig
 
-LOOKED_AT = 4  # pairs of pictures
+LOOKED_AT = 4  # pairs of images
 EVERY = 10  # frames from one pair to the next
 ROUNDS = 3  # of fitting: turning an eye also moves columns, and these change rows
 
 
 def guess_rig(source: Source) -> StereoRig:
-    """A rig for the pictures of a source, with depth up to an unknown scale; not `metric`.
+    """A rig for the images of a source, with depth up to an unknown scale; not `metric`.
 
     Raises:
         SagsError: it gives no frame.
@@ -32,7 +32,7 @@ def guess_rig(source: Source) -> StereoRig:
 
 
 def with_equal_rows(rig: StereoRig, pairs: Sequence[Pair]) -> StereoRig:
-    """The rig with its right eye turned and zoomed until the rows of pictures agree; unchanged where too
+    """The rig with its right eye turned and zoomed until the rows of images agree; unchanged where too
     little matches."""
     matches = np.concatenate([np.empty((0, 4)), *(match_eyes(*pair) for pair in pairs)])
     if len(matches) < FEWEST_MATCHES:
@@ -46,7 +46,7 @@ def with_equal_rows(rig: StereoRig, pairs: Sequence[Pair]) -> StereoRig:
 
 
 def _turned(eye: Eye, pitch: float, roll: float, scale: float) -> Eye:
-    """The eye with points higher by `pitch` + `roll` x at distance 1, a picture `scale` times as large."""
+    """The eye with points higher by `pitch` + `roll` x at distance 1, an image `scale` times as large."""
     turn: F64 = cv2.Rodrigues(np.array([pitch, 0.0, -roll]))[0]
     K = np.diag([scale, scale, 1.0]) @ eye.K
     K[:2, 2] = eye.K[:2, 2]
@@ -54,7 +54,7 @@ def _turned(eye: Eye, pitch: float, roll: float, scale: float) -> Eye:
 
 
 def first_pairs(source: Source, count: int = LOOKED_AT) -> tuple[tuple[int, int], float, list[Pair]]:
-    """The width and height of an eye's picture, px, the aspect ratio of its pixels, and some pairs; no pairs
+    """The width and height of an eye's image, px, the aspect ratio of its pixels, and some pairs; no pairs
     where there is one eye.
 
     Raises:

@@ -36,7 +36,7 @@ def calibrate_hand_eye(
     source = config.source
     if not isinstance(source, RecordedSource) or not isinstance(config.robot, BagRobot):
         raise UsageError(
-            "a hand-eye calibration needs a recording with pictures and poses: record both topics (ros2 bag "
+            "a hand-eye calibration needs a recording with images and poses: record both topics (ros2 bag "
             "record), then set source.kind:=bag and robot.kind:=bag"
         )
     playing = spread(source, count)
@@ -88,6 +88,6 @@ def hand_eye_table(summary: dict[str, Any]) -> Table:
     made.add_row("camera on the hand", f"{place} mm; {sure}")
     made.add_row(
         "clocks",
-        f"robot - pictures {summary['offset_ms']:.1f} ms, sure to {summary['offset_sure_to_ms']:.1f} ms",
+        f"robot - images {summary['offset_ms']:.1f} ms, sure to {summary['offset_sure_to_ms']:.1f} ms",
     )
     return made

@@ -63,7 +63,7 @@ def solve_hand_eye(
 
     Args:
         views: of one board that lies still.
-        stamps: when each was taken, by the pictures' clock, ns.
+        stamps: when each was taken, by the images' clock, ns.
         points: [N, 3] m, the board's corners by id.
 
     Raises:
@@ -91,7 +91,7 @@ def solve_hand_eye(
     errors = np.array([np.sqrt(np.mean(np.sum(part.reshape(-1, 2) ** 2, 1))) for part in corners])
     if np.sqrt(np.mean(errors**2)) > LARGEST_ERROR:
         raise SagsError(
-            f"the poses fit the pictures only to {np.sqrt(np.mean(errors**2)):.1f} px: the board must lie "
+            f"the poses fit the images only to {np.sqrt(np.mean(errors**2)):.1f} px: the board must lie "
             "still, the poses must be of what carries this camera, and the rig must fit the scope"
         )
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0)) * spread
@@ -147,7 +147,7 @@ def _check_scale(residuals: _Residuals) -> None:
     (parameters, _, scaled), (_, _, spread) = (_least_squares(residuals, steps) for steps in (SCALED, STEPS))
     if abs(parameters[-1]) > LARGEST_SCALE and scaled < BETTER * spread:
         raise SagsError(
-            f"by the pictures the scope moved {1 + parameters[-1]:.3f} times as far as the robot says: "
+            f"by the images the scope moved {1 + parameters[-1]:.3f} times as far as the robot says: "
             "measure the board's squares (--square-mm), also of the stereo calibration, and check the "
             "robot's unit"
         )

@@ -1,4 +1,4 @@
-"""Taking pictures of a board from a running source: only views that add something, held still."""
+"""Taking images of a board from a running source: only views that add something, held still."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +31,7 @@ def grab_views(
         tell: called for each frame with the number of views and what to do.
 
     Returns:
-        Both picture folders.
+        Both image folders.
 
     Raises:
         UsageError: the folder holds something, or the source has no right eye.
@@ -39,7 +39,7 @@ def grab_views(
     """
     sides = folder / "left", folder / "right"
     if any(file.is_file() for file in folder.rglob("*")):  # empty folders of an earlier attempt may stay
-        raise UsageError(f"{folder} is not empty; name a new folder, or calibrate from the pictures in it")
+        raise UsageError(f"{folder} is not empty; name a new folder, or calibrate from the images in it")
     with writing(folder):
         for side in sides:
             side.mkdir(parents=True, exist_ok=True)

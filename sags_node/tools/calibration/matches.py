@@ -1,11 +1,11 @@
-"""Points that both raw pictures of a stereo pair show, found without the calibration they are to judge."""
+"""Points that both raw images of a stereo pair show, found without the calibration they are to judge."""
 
 import cv2
 import numpy as np
 
 from sags_node.types import F64, U8, Bool
 
-FEATURES = 3000  # of each picture
+FEATURES = 3000  # of each image
 CONTRAST = 0.01  # least contrast of a SIFT feature: tissue has little
 LARGEST_RATIO = 0.8  # best to second best descriptor distance (Lowe, IJCV 2004, section 7.1)
 HIGHLIGHT = 245  # grey level
@@ -15,7 +15,7 @@ LEAST = 16  # matches for an epipolar geometry worth the name
 
 
 def match_eyes(left: U8, right: U8) -> F64:
-    """The pixels of the same points in both pictures, [M, 4]: x, y in the left one, x, y in the right one.
+    """The pixels of the same points in both images, [M, 4]: x, y in the left one, x, y in the right one.
 
     These are SIFT features away from highlights that are each other's best match and fit one epipolar
     geometry, whichever it is. Where they disagree with a calibration, the calibration is wrong.

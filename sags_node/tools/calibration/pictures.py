@@ -1,4 +1,4 @@
-"""Stereo pictures to check a calibration with: files, folders, or some frames of a session."""
+"""Stereo images to check a calibration with: files, folders, or some frames of a session."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,11 +18,11 @@ LIVE_STRIDE = 15  # frames from one pair of live cameras to the next
 
 
 def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
-    """Read the pictures of pairs of files, or of pairs of folders.
+    """Read the images of pairs of files, or of pairs of folders.
 
     Raises:
         UsageError: there are none, left and right are not equally many, or one is a video.
-        SagsError: a picture is damaged, or of another size than the others.
+        SagsError: an image is damaged, or of another size than the others.
     """
     files: list[tuple[Path, Path]] = []
     for left, right in named:
@@ -38,7 +38,7 @@ def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
     sizes = {picture.shape[1::-1] for pair in pairs for picture in pair}
     if len(sizes) > 1:
         said = " and ".join(size_text(*size) for size in sorted(sizes))
-        raise SagsError(f"pictures of {said} px: give those of one rig, all of one size")
+        raise SagsError(f"images of {said} px: give those of one rig, all of one size")
     return pairs
 
 

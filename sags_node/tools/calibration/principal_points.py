@@ -1,6 +1,6 @@
 """Whether the eyes' principal points differ, from matches whose depth is known.
 
-In rectified pictures disparity = f B / Z + c, where c is how much farther to the right the left eye's
+In rectified images disparity = f B / Z + c, where c is how much farther to the right the left eye's
 principal point lies than the calibration says. Matches alone cannot show c: every other depth fits them as
 well. Only depths from elsewhere do, and only where these are right: an error of theirs looks the same. In
 heights it is otherwise: rows must agree whatever the depth (`rows`).
@@ -15,7 +15,7 @@ from sags_node.checks import Finding
 from sags_node.tools.calibration.rows import FEWEST_MATCHES, fit_without_outliers, rectified_rows
 from sags_node.types import F32, F64, StereoRig
 
-NOTICED = 0.1  # px of the full picture: reference depths and matches are no more exact
+NOTICED = 0.1  # px of the full image: reference depths and matches are no more exact
 SLOPE = 0.03  # of the depth, over `AROUND`: more is an edge, and its depth belongs to either side
 AROUND = 9  # px
 OUTLIER = 3.0 * 1.4826  # times the median distance: 3 sigma
@@ -25,8 +25,8 @@ def judge_known_depths(rig: StereoRig, matches: Sequence[F64], depths: Sequence[
     """Return what known depths say of a rig's principal points; nothing where there are too few.
 
     Args:
-        matches: of each picture pair, [M, 4] raw pixels, as `match_eyes` gives them.
-        depths: of the same pairs, [H, W] m of the left rectified picture, 0 unknown; None: not known.
+        matches: of each image pair, [M, 4] raw pixels, as `match_eyes` gives them.
+        depths: of the same pairs, [H, W] m of the left rectified image, 0 unknown; None: not known.
     """
     known = []
     for found, picture in zip(matches, depths, strict=True):
@@ -53,7 +53,7 @@ def judge_known_depths(rig: StereoRig, matches: Sequence[F64], depths: Sequence[
         "depth_median_m": round(depth, 4),
         "nearer_mm": round(nearer, 3),
     }
-    spread = f"{offset:+.2f} px ({min(each):+.2f} to {max(each):+.2f} in {len(each)} pictures)"
+    spread = f"{offset:+.2f} px ({min(each):+.2f} to {max(each):+.2f} in {len(each)} images)"
     if abs(offset) < NOTICED:
         return [Finding("ok", f"disparities fit the known depths to {spread}", "", figures)]
     where = f"{abs(nearer):.1f} mm too {'near' if nearer > 0 else 'far'}"
@@ -65,14 +65,14 @@ def judge_known_depths(rig: StereoRig, matches: Sequence[F64], depths: Sequence[
         what += f"; a baseline longer by {scale - 1:.1%} and {free:+.2f} px fit as well"
     fixed = rig.right.K[0, 2] - offset
     fix = (
-        "calibrate again with a board near and far; or, if the known depths are not from these pictures "
+        "calibrate again with a board near and far; or, if the known depths are not from these images "
         f"(say, structured light or CT), set cx in camera_matrix of right.yaml to {fixed:.2f}"
     )
     return [Finding("warning", what, fix, figures)]
 
 
 def _disparities(rig: StereoRig, matches: F64, depth: F32) -> F64:
-    """Seen and expected disparity, [M, 2] px of the rectified pictures, away from edges of the depth."""
+    """Seen and expected disparity, [M, 2] px of the rectified images, away from edges of the depth."""
     rows = rectified_rows(rig, matches)
     K = rig.left.P[:, :3]
     pixels = cv2.undistortPoints(matches[:, None, :2], rig.left.K, rig.left.distortion, R=rig.left.R, P=K)

@@ -1,5 +1,5 @@
 """What matched points say of a calibration: do rows agree, is tissue in front of both eyes, and if not, which
-end is wrong, the calibration or the pictures.
+end is wrong, the calibration or the images.
 
 Nothing is remapped: the raw pixels of a match go through the calibration, so that other readings of it (eyes
 exchanged, a sign, another size) are tried at no cost.
@@ -29,23 +29,23 @@ SURE_SCALE = 4.0  # times its standard error
 EXPLAINED = 0.7  # px: where turn and scale leave more, the lenses are off too, and no scale fixes depth
 ROUNDS = 10  # of fitting and leaving out outliers
 TINY = 1e-12  # so that an exact fit keeps all
-ALIGNED = (0.35, 1.0)  # px at a width of 640 px or less, median and 90 %: row errors of rectified pictures
+ALIGNED = (0.35, 1.0)  # px at a width of 640 px or less, median and 90 %: row errors of rectified images
 WORSE = 2.0  # times larger: the row errors of these after they are rectified once more
 RECTIFIED = "rectified:=true"
-PICTURES_EXCHANGED = "the pictures are exchanged: the left ones come from the right camera"
+PICTURES_EXCHANGED = "the images are exchanged: the left ones come from the right camera"
 PLAUSIBLE_DEPTH = (0.005, 1.0)  # m, the median: in an endoscope's view
 
 
 class Rows(NamedTuple):
     """Matches in the rectified cameras' pixels."""
 
-    errors: F64  # [M] px, how far below its row in the left picture a point lies in the right one
+    errors: F64  # [M] px, how far below its row in the left image a point lies in the right one
     disparities: F64  # [M] px
     in_front: float  # share of points in front of both eyes
     median: float  # px, of the errors without their sign
     p90: float
     turn: tuple[float, float]  # degrees, pitch and roll of one eye that explain the errors best; with them:
-    scale: float  # by how much larger the right picture is than its calibration says, 0.01: 1 %
+    scale: float  # by how much larger the right image is than its calibration says, 0.01: 1 %
     scale_error: float  # standard error of that
     left_over: float  # px, RMS of the errors that turn and scale leave
 
@@ -57,7 +57,7 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A hypothesis of how calibration and pictures belong together."""
+    """A hypothesis of how calibration and images belong together."""
 
     rows: Rows
     what: str
@@ -78,13 +78,13 @@ def rectified_rows(rig: StereoRig, matches: F64) -> Rows:
 
 
 def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
-    """Return what the matches [M, 4] (raw pixels) of a picture pair, or of several, say of a rig.
+    """Return what the matches [M, 4] (raw pixels) of an image pair, or of several, say of a rig.
 
-    An error says which end is wrong: the calibration or the pictures.
+    An error says which end is wrong: the calibration or the images.
     """
     if len(matches) < FEWEST_MATCHES:
         what = f"{len(matches)} points found in both eyes: too few to judge rows"
-        return [Finding("warning", what, "give more pictures, sharp and with texture")]
+        return [Finding("warning", what, "give more images, sharp and with texture")]
     as_is, *others = _readings(rig, matches)
     fitting = [reading for reading in (as_is, *others) if reading.rows.in_front >= IN_FRONT]
     limit = LARGEST_ROW_ERROR * rig.left.width
@@ -100,13 +100,13 @@ def judge_matches(rig: StereoRig, matches: F64) -> list[Finding]:
         return [_rows_differ(as_is.rows)]
     if as_is.rows.in_front < IN_FRONT:
         what = f"only {as_is.rows.in_front:.0%} of the points lie in front of both eyes"
-        fix = "the calibration is not of these pictures, or they show no stereo pair"
+        fix = "the calibration is not of these images, or they show no stereo pair"
         return [Finding("error", what, fix, _figures(as_is.rows))]
     return _depth(rig, as_is.rows)
 
 
 def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
-    """Warn where rows agree in the pictures as they are, and less after rectification: they are rectified
+    """Warn where rows agree in the images as they are, and less after rectification: they are rectified
     already. Matches [M, 4] as in `judge_matches`."""
     if len(matches) < FEWEST_MATCHES or not rectifies(rig):
         return []
@@ -116,7 +116,7 @@ def judge_rectified(rig: StereoRig, matches: F64) -> list[Finding]:
     if not aligned or after.median < WORSE * before.median or after.p90 < WORSE * before.p90:
         return []
     what = (
-        f"rows agree to {before.median:.2f} px (median) as the pictures are, and to {after.median:.2f} px "
+        f"rows agree to {before.median:.2f} px (median) as the images are, and to {after.median:.2f} px "
         "once this calibration has rectified them: they are rectified already"
     )
     figures = {"rows_as_they_are_px": round(before.median, 3), "rows_rectified_px": round(after.median, 3)}
@@ -129,13 +129,13 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
     exchanged = rectified_rows(replace(rig, left=rig.right, right=rig.left), matches)
     exchanged_files = Reading(
         exchanged,
-        "the eyes are exchanged in the calibration: left.yaml is of the camera that took the right pictures",
-        f"{EXCHANGE_FILES}; the pictures are in order",
+        "the eyes are exchanged in the calibration: left.yaml is of the camera that took the right images",
+        f"{EXCHANGE_FILES}; the images are in order",
     )
     wrong_sign = Reading(
         rows._replace(in_front=1 - rows.in_front),
         "T, or projection_matrix[3] of the right eye, has the wrong sign: points would lie behind the eyes",
-        "change that sign in the calibration; the pictures are in order",
+        "change that sign in the calibration; the images are in order",
     )
     if _signed_baseline(rig) > 0:
         yield Reading(rows, "", "")
@@ -148,7 +148,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
     else:
         yield Reading(
             rows,
-            "pictures and calibration agree that the left eye stands to the right of the other",
+            "images and calibration agree that the left eye stands to the right of the other",
             "exchange left and right of the source, and both files of the calibration",
         )
         yield from (exchanged_files, wrong_sign) if rig.left.P[0, 3] < 0 else (wrong_sign, exchanged_files)
@@ -157,7 +157,7 @@ def _readings(rig: StereoRig, matches: F64) -> Iterator[Reading]:
     if size is not None:
         yield Reading(
             rectified_rows(_other_size(rig, 1 / size), matches),
-            f"camera_matrix is for pictures of {size:.3g} times the size that the calibration states",
+            f"camera_matrix is for images of {size:.3g} times the size that the calibration states",
             f"multiply camera_matrix and projection_matrix by {1 / size:.3g}, or calibrate at full size",
         )
 
@@ -183,15 +183,15 @@ def _other_directions(rig: StereoRig, matches: F64) -> Iterator[Reading]:
 
 
 def _exchanged_or_shifted(rows: Rows) -> Finding:
-    """The error where rows fit either way, as in rectified pictures, and points lie behind the eyes."""
+    """The error where rows fit either way, as in rectified images, and points lie behind the eyes."""
     shift = float(np.percentile(-rows.disparities, 98))
     what = (
         f"{PICTURES_EXCHANGED}; or their principal points differ by at least {shift:.0f} px more than the "
         "calibration says"
     )
     fix = (
-        "cover the left eye's lens: if the right picture goes dark, exchange left and right of the source; "
-        "if not, calibrate again with pictures as they come now"
+        "cover the left eye's lens: if the right image goes dark, exchange left and right of the source; "
+        "if not, calibrate again with images as they come now"
     )
     return Finding("error", what, fix, _figures(rows))
 
@@ -223,7 +223,7 @@ def _figures(rows: Rows) -> dict[str, float]:
 
 
 def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
-    """Tell whether one eye's picture is larger than its calibration says: its rows then drift apart over the
+    """Tell whether one eye's image is larger than its calibration says: its rows then drift apart over the
     height, and depth leans over the width. Nothing where both have one scale."""
     if not rows.scale_differs:
         return []
@@ -233,7 +233,7 @@ def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
         f"{_scale_said(rows)}. If its columns are like its rows, depth leans by {abs(leans):.1f} mm in "
         f"100 px at {depth * 1e3:.0f} mm, too {'near' if leans > 0 else 'far'} on the right"
     )
-    fix = "calibrate again with zoom, focus and picture size as they are used, and the board up to the edges"
+    fix = "calibrate again with zoom, focus and image size as they are used, and the board up to the edges"
     if rows.left_over <= EXPLAINED:
         fx, fy = (rig.right.K[k, k] * (1 + rows.scale) for k in (0, 1))
         fix += f"; until then set fx to {fx:.2f} and fy to {fy:.2f} in camera_matrix of right.yaml"
@@ -250,7 +250,7 @@ def judge_scale(rig: StereoRig, rows: Rows) -> list[Finding]:
 
 def _scale_said(rows: Rows) -> str:
     return (
-        f"beside the left picture the right one is {abs(rows.scale):.1%} "
+        f"beside the left image the right one is {abs(rows.scale):.1%} "
         f"{'larger' if rows.scale > 0 else 'smaller'} than the calibration says: rows drift apart by "
         f"{100 * abs(rows.scale):.1f} px in 100 px down"
     )
@@ -267,12 +267,12 @@ def _rows_differ(rows: Rows) -> Finding:
     if rows.scale_differs:
         what += f"; {_scale_said(rows)}"
         figures["scale"] = round(rows.scale, 4)
-    fix = "the calibration is not of these pictures (another scope, zoom or focus): calibrate again"
+    fix = "the calibration is not of these images (another scope, zoom or focus): calibrate again"
     return Finding("error", what, fix, figures)
 
 
 def _turn(errors: F64, left: F64) -> tuple[tuple[float, float], float, float, float]:
-    """Fit row errors [M] of points `left` [M, 2] of the left picture, all at distance 1, without wrong
+    """Fit row errors [M] of points `left` [M, 2] of the left image, all at distance 1, without wrong
     matches: pitch and roll (degrees), scale and its standard error, and the RMS that these leave."""
     design = np.column_stack([np.ones(len(errors)), left])
     found, kept = fit_without_outliers(design, errors, WRONG_MATCH)
@@ -311,7 +311,7 @@ def _depth(rig: StereoRig, rows: Rows) -> list[Finding]:
         return [Finding("error", what, fix, figures)]
     per_pixel = depth**2 / (rig.left.P[0, 0] * _signed_baseline(rig))
     what = (
-        f"the pictures' points lie in front of both eyes, at {depth * 1e3:.0f} mm; matches cannot show "
+        f"the images' points lie in front of both eyes, at {depth * 1e3:.0f} mm; matches cannot show "
         f"whether the principal points differ sideways: 0.1 px would be {0.1 * per_pixel * 1e3:.2f} mm there"
     )
     return [Finding("ok", what, "", figures)]

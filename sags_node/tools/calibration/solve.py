@@ -49,7 +49,7 @@ def calibrate(
     Args:
         views: of one board.
         points: [N, 3] m, the board's corners by id.
-        size: width and height of the pictures, px.
+        size: width and height of the images, px.
         coefficients: of radial distortion: 2, 3 or 6 (rational_polynomial).
 
     Raises:
@@ -61,7 +61,7 @@ def calibrate(
             lost = f" ({len(dropped)} more did not fit)" if dropped else ""
             raise SagsError(
                 f"{len(used)} usable views of the board{lost}; {FEWEST_VIEWS} are needed, 20 are good: take "
-                "more pictures, with the whole picture covered and the board tilted"
+                "more images, with the whole image covered and the board tilted"
             )
         solution = _solve(name, used, points, size, coefficients, dropped)
         worst = solution.errors.max(1)
@@ -76,7 +76,7 @@ def calibrate(
     if solution.error > LARGEST_ERROR:
         raise SagsError(
             f"the views fit one rig only to {solution.error:.1f} px: check --squares, that the board is "
-            "flat, and that left and right pictures of a pair were taken at the same moment"
+            "flat, and that left and right images of a pair were taken at the same moment"
         )
     return solution
 

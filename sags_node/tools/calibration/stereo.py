@@ -1,4 +1,4 @@
-"""`sags calib stereo`: from pictures of a board to a checked calibration on disk."""
+"""`sags calib stereo`: from images of a board to a checked calibration on disk."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -19,14 +19,14 @@ from sags_node.tools.calibration.rows import rectified_rows
 from sags_node.tools.calibration.solve import Solution, calibrate
 from sags_node.types import F32, F64
 
-GRID = 3  # cells along each side of the picture
+GRID = 3  # cells along each side of the image
 FEWEST_IN_CELL = 10  # corners, over all views
 GOOD_VIEWS = 15
 TILT_SPAN = 25.0  # degrees between the extremes: with less, focal length and distance cannot be told apart
 DISTANCE_SPAN = 1.25  # farthest distance divided by the nearest
 ROW_NAMES, COLUMN_NAMES = ("top", "middle", "bottom"), ("left", "centre", "right")
 
-LOOKED_AT = 5  # pictures to tell what is seen instead of the board
+LOOKED_AT = 5  # images to tell what is seen instead of the board
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Calibrated:
     solution: Solution
     size: tuple[int, int]  # px
     pairs: int
-    unseen: list[str]  # pictures without the whole board in both eyes
+    unseen: list[str]  # images without the whole board in both eyes
     hints: list[str]
 
 
@@ -48,7 +48,7 @@ def calibrate_folders(
     coefficients: int = 2,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Calibrated:
-    """Calibrate a rig from two folders of pictures of a board, paired by sorted name.
+    """Calibrate a rig from two folders of images of a board, paired by sorted name.
 
     Raises:
         UsageError: the folders cannot be read or paired.
@@ -134,7 +134,7 @@ def _eyes(solution: Solution) -> Any:
 
 
 def _instead(board: Board, pictures: FolderPairs) -> str:
-    """Return in words what most of the first pictures show instead of the board."""
+    """Return in words what most of the first images show instead of the board."""
     said: Counter[str] = Counter()
     for index in range(min(LOOKED_AT, pictures.count)):
         pair = pictures.at(index)
@@ -149,7 +149,7 @@ def coverage_hints(views: Sequence[StereoView], board_poses: F64, size: tuple[in
 
     Args:
         board_poses: [V, 4, 4] m, board to left camera.
-        size: width and height of the pictures, px.
+        size: width and height of the images, px.
     """
     hints = []
     if len(views) < GOOD_VIEWS:
@@ -158,7 +158,7 @@ def coverage_hints(views: Sequence[StereoView], board_poses: F64, size: tuple[in
         empty = _empty_cells(np.concatenate(corners), size)
         if empty:
             hints.append(
-                f"the {eye} picture has hardly any corners at {', '.join(empty)}: hold the board there"
+                f"the {eye} image has hardly any corners at {', '.join(empty)}: hold the board there"
             )
     normals = board_poses[:, :3, 2] * np.sign(board_poses[:, 2:3, 2])
     for axis, how in ((0, "left and right"), (1, "up and down")):

@@ -49,11 +49,11 @@ class Aside:
     def __call__(self, shown: MappedFrame, number: int, left: U8, draw: Draw) -> dict[str, dict[str, float]]:
         """Measure `view_2` to `view_20`, named by their distance in mm: dB after a fit of gain and offset,
         where the left eye sees the place too. `psnr` of what is shown, `model_psnr` of the model alone,
-        `warp_psnr` of the left picture, warped by the frame's own stereo depth.
+        `warp_psnr` of the left image, warped by the frame's own stereo depth.
 
         Args:
             number: of the frame in the recording.
-            left: [H, W, 3] the rectified picture.
+            left: [H, W, 3] the rectified image.
             draw: what a view shows, and the model alone in it, [H, W, 3] 0..1 each.
         """
         camera = shown.snapshot.camera

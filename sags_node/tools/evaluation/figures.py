@@ -56,11 +56,11 @@ def _paper(what: str, group: str) -> tuple[Figure, Figure]:
     return _psnr(f"{what}, masked pixels counted as equal", f"{group}.paper_psnr"), ssim
 
 
-_COPY = "the picture before, shown again"
+_COPY = "the image before, shown again"
 _BEFORE = f"{_COPY}: {{:.1f}} dB"
 _WORTH = "near while tissue rests, but without depth, another view or hidden tissue"
 _STEREO = "stereo alone"
-_WARP = "left picture, warped"
+_WARP = "left image, warped"
 _AHEAD = (
     ("predict", "one frame ahead"),
     ("predict_2", "two frames ahead"),
@@ -143,11 +143,11 @@ TABLE: dict[str, list[Figure]] = {
         *_times("processor time for a frame", "cpu_ms"),
         Figure("steps of refinement for a frame", "iterations_per_frame", "", 1),
     ],
-    "Picture": [
+    "Image": [
         _psnr("the model, PSNR over tissue", "online.psnr", _COPY, "predict.copy_psnr"),
         Figure("the model, SSIM (1: equal)", "online.ssim", "", 3),
         Figure("the model, LPIPS (0: equal)", "online.lpips", "", 3),
-        _psnr("left render, mostly the frame's own picture", "shown.psnr", _COPY, "predict.copy_psnr"),
+        _psnr("left render, mostly the frame's own image", "shown.psnr", _COPY, "predict.copy_psnr"),
         Figure("left render, SSIM", "shown.ssim", "", 3),
         Figure("left render, LPIPS", "shown.lpips", "", 3),
         *(_psnr(f"predicted {ahead}", f"{key}.psnr", _COPY, f"{key}.copy_psnr") for key, ahead in _AHEAD),
@@ -172,7 +172,7 @@ POOLED = ("depth_confidence", "track", "pose", "forth_back")
 
 def _means() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for figure in (*TABLE["Picture"], *TABLE["Right eye and hidden tissue"], *TABLE["Depth"]):
+    for figure in (*TABLE["Image"], *TABLE["Right eye and hidden tissue"], *TABLE["Depth"]):
         for whole in (figure.key, figure.baseline_key):
             group, _, key = whole.partition(".")
             if key and group not in POOLED and key not in found.setdefault(group, []):
@@ -321,11 +321,11 @@ def _latency(figures: Flat) -> str:
 
 
 def _picture(figures: Flat) -> str:
-    """The line on the picture: how good a view of the next frame is, as a frame's left render is mostly its
-    own picture. Of a live run, whose views are not known, it is on that render."""
+    """The line on the image: how good a view of the next frame is, as a frame's left render is mostly its
+    own image. Of a live run, whose views are not known, it is on that render."""
     shown = {
         "predict.psnr": "of the next frame",
-        "shown.psnr": "of the frame itself, mostly its own picture",
+        "shown.psnr": "of the frame itself, mostly its own image",
         "online.psnr": "by the model",
     }
     for key, name in shown.items():

@@ -10,7 +10,7 @@ from sags_node.types import F32, U8, Bool
 FRAMES = 30  # in a row
 BLOCK = 8  # px: camera noise of 4 grey levels has half a level left in the mean of a block
 STILL = 1.0  # grey level: standard deviation in time of a block's mean, up to which nothing moves there
-LEAST = 0.2  # share of the picture: with less still tissue the scene moves, and what seems still is plain
+LEAST = 0.2  # share of the image: with less still tissue the scene moves, and what seems still is plain
 
 
 class Flicker:
@@ -33,7 +33,7 @@ class Flicker:
         """Take in the next frame.
 
         Args:
-            picture: [H, W, 3] the input of the left eye.
+            image: [H, W, 3] the input of the left eye.
             shown: what the run made of it.
 
         Returns:

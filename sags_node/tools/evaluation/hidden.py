@@ -1,4 +1,4 @@
-"""How well hidden tissue is shown: boxes of a recording's pictures are hidden from the node for a while."""
+"""How well hidden tissue is shown: boxes of a recording's images are hidden from the node for a while."""
 
 from collections.abc import Callable
 
@@ -32,7 +32,7 @@ def measure_hidden(
 ) -> dict[int, dict[str, float]]:
     """Play a recording with boxes hidden; return the figures of their pixels by frame number.
 
-    `psnr` of what is shown there, `model_psnr` of the model alone, `copy_psnr` of the last picture in which
+    `psnr` of what is shown there, `model_psnr` of the model alone, `copy_psnr` of the last image in which
     they were seen, shown again; dB, each the mean over the boxes.
 
     Args:
@@ -45,7 +45,7 @@ def measure_hidden(
     budget, boxes = pipeline.make_budget(), _boxes(camera.width, camera.height)
     every = np.logical_or.reduce(boxes)
     found: dict[int, dict[str, float]] = {}
-    before: F32 | None = None  # the last picture that showed the boxes
+    before: F32 | None = None  # the last image that showed the boxes
     number = until = 0
     with source as playing:
         for frame in playing:
@@ -86,6 +86,6 @@ def _boxes(width: int, height: int) -> list[Bool]:
 
 
 def _small(view: RenderedView) -> U8:
-    """The picture that consumers are shown of a view, at the working size."""
+    """The image that consumers are shown of a view, at the working size."""
     size = view.camera.width, view.camera.height
     return view.rgb if view.shown is None else cv2.resize(view.shown.rgb, size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""Learned perceptual picture distance (LPIPS v0.1, SqueezeNet backbone).
+"""Learned perceptual image distance (LPIPS v0.1, SqueezeNet backbone).
 
 R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018.
 """
@@ -27,7 +27,7 @@ _SCALE = (0.458, 0.448, 0.450)
 
 
 class Lpips:
-    """The distance of two pictures; 0 for identical ones, about 0.5 for unrelated ones."""
+    """The distance of two images; 0 for identical ones, about 0.5 for unrelated ones."""
 
     def __init__(self, weights: Path) -> None:
         """Read the weights: an npz with the arrays of the original network under their own names.
@@ -47,7 +47,7 @@ class Lpips:
             raise UsageError(f"{weights} is no LPIPS SqueezeNet file: it lacks {missing[0]}")
 
     def __call__(self, picture: F32, truth: F32, tissue: Bool) -> float:
-        """Distance of two pictures [H, W, 3] RGB 0..1, both multiplied by the mask [H, W] first.
+        """Distance of two images [H, W, 3] RGB 0..1, both multiplied by the mask [H, W] first.
 
         NaN when the mask is empty.
         """

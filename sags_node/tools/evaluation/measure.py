@@ -40,7 +40,7 @@ PREDICTED = 3  # frames ahead, at most
 
 Figures = dict[str, float]
 Progress = Callable[[str, int], None]  # what is going on, frames done
-OnPicture = Callable[[int, U8], None]  # a frame's number and its rectified left picture
+OnPicture = Callable[[int, U8], None]  # a frame's number and its rectified left image
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class _Recorded:
 
     frame: StereoFrame
     pair: RectifiedPair
-    truth: F32  # [H, W, 3] the left picture, 0..1
+    truth: F32  # [H, W, 3] the left image, 0..1
     seconds: float  # on the recording's clock
 
 
@@ -148,7 +148,7 @@ class Measurer:
     ) -> None:
         """
         Args:
-            rectifier: pictures are compared at its size; smaller ones are enlarged.
+            rectifier: images are compared at its size; smaller ones are enlarged.
             config: what was run.
             receipt: takes note of what is compared.
             on_picture: called with each frame of the recording.
@@ -169,7 +169,7 @@ class Measurer:
         self._pose = config.vision.pose
         self._on_picture = on_picture
         self._rigid = RigidOdometry()
-        self._before: F32 | None = None  # the camera's picture of the frame before
+        self._before: F32 | None = None  # the camera's image of the frame before
         self._earlier: deque[_Mapped] = deque(maxlen=PREDICTED)  # the latest first
         self._detail = Detail(Lessons()) if config.publish.detail else None
         self._memory, self._matched = Memory(), Matched()
@@ -230,7 +230,7 @@ class Measurer:
         if isinstance(shown, MappedFrame):
             row.figures["online"] = found
             return self._mapped(now, shown, row, costly)
-        # What a live node shows of a frame has the detail of that frame's picture.
+        # What a live node shows of a frame has the detail of that frame's image.
         row.figures["online" if self._detail is None else "shown"] = found
         if self._before is not None:
             row.figures["predict"] = {"copy_psnr": metrics.psnr(self._before, now.truth, shown.tissue)}
@@ -298,7 +298,7 @@ class Measurer:
             self._detail.learn_ahead(before.lent, expected, now.lent)
 
     def _lent(self, shown: MappedFrame, pair: RectifiedPair) -> SeenFrame:
-        """A frame as it lends its picture to views of other moments."""
+        """A frame as it lends its image to views of other moments."""
         snapshot, left, camera = shown.snapshot, pair.left, shown.snapshot.camera
         lent = SeenFrame(
             pair.t_capture_ns, camera, snapshot.gaussians, lambda: left, shown.tissue, shown.depth,
@@ -312,7 +312,7 @@ class Measurer:
 
     def _predict(self, before: _Mapped, shown: MappedFrame, now: _Recorded, frames: int) -> Figures:
         """`psnr` of the view predicted for a moment some frames ahead, `model_psnr` of the model alone in it,
-        and `copy_psnr` of the picture of `before`, shown again."""
+        and `copy_psnr` of the image of `before`, shown again."""
         expected = extrapolated(before.shown.snapshot, now.seconds - before.recorded.seconds)
         guess, model = self._view(before, expected, shown.snapshot.camera, frames)
         pictures = {"psnr": guess, "model_psnr": model, "copy_psnr": before.recorded.truth}
@@ -343,7 +343,7 @@ class Measurer:
         return row
 
     def _between(self, before: _Mapped, held: _HeldOut, after: _Mapped) -> Figures:
-        """The PSNR of a held-out frame drawn once the next one is known, of both pictures carried there, and
+        """The PSNR of a held-out frame drawn once the next one is known, of both images carried there, and
         of the mean of both as they are."""
         (start, first), (end, last) = (
             (each.recorded.seconds, each.recorded.truth) for each in (before, after)
@@ -359,7 +359,7 @@ class Measurer:
         return {name: metrics.psnr(picture, held.truth, held.tissue) for name, picture in pictures.items()}
 
     def _quality(self, picture: F32, now: _Recorded, tissue: Bool, costly: bool) -> Figures:
-        """How near a picture [H, W, 3] is to the recorded one where there is tissue [H, W]."""
+        """How near an image [H, W, 3] is to the recorded one where there is tissue [H, W]."""
         truth = now.truth
         figures = {"psnr": metrics.psnr(picture, truth, tissue), "ssim": metrics.ssim(picture, truth, tissue)}
         if self._options.paper_psnr:
@@ -381,7 +381,7 @@ class Measurer:
 
     def _right_eye(self, shown: MappedFrame, now: _Recorded) -> dict[str, Figures]:
         if self._usable_right is None:
-            exclude = self._config.vision.tissue.exclude  # boxes of the raw pictures, burnt into both eyes
+            exclude = self._config.vision.tissue.exclude  # boxes of the raw images, burnt into both eyes
             self._usable_right = right_pixels(self._rectifier, now.frame, exclude)
         before = self._earlier[0].recorded.pair.right if self._earlier else None
         figures = right_figures(shown, now.pair, self._usable_right, self._rasterizer, before)

@@ -43,29 +43,29 @@ def between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A moment with its picture."""
+    """A moment with its image."""
 
     gaussians: Gaussians
     camera: Camera
     picture: F32  # [H, W, 3] RGB 0..1
     tissue: Bool  # [H, W]
-    weight: float  # of the picture in the mean, more than 0
+    weight: float  # of the image in the mean, more than 0
 
 
 def carried(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, around: Sequence[Seen]) -> F32:
-    """The mean of some pictures, carried along the model's motion to where the tissue is at another moment.
+    """The mean of some images, carried along the model's motion to where the tissue is at another moment.
 
-    Gaussians cannot say all of a picture's detail, but they know where everything went. Where nothing moves
-    this is the mean of the pictures, whose noise is less than that of each.
+    Gaussians cannot say all of an image's detail, but they know where everything went. Where nothing moves
+    this is the mean of the images, whose noise is less than that of each.
 
     Args:
-        rasterizer: for pictures of the camera's size.
+        rasterizer: for images of the camera's size.
         middle: the Gaussians at that moment.
         camera: that sees it.
-        around: the moments with pictures.
+        around: the moments with images.
 
     Returns:
-        [H, W, 3] RGB 0..1; where no picture shows tissue, what the Gaussians show.
+        [H, W, 3] RGB 0..1; where no image shows tissue, what the Gaussians show.
     """
     total = np.zeros((camera.height, camera.width, 3), np.float32)
     weights = np.zeros((camera.height, camera.width, 1), np.float32)
@@ -85,7 +85,7 @@ def carried(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, around: S
 
 
 def _displaced(rasterizer: Rasterizer, middle: Gaussians, camera: Camera, seen: Seen) -> F32:
-    """Where each pixel's tissue is in the picture of `seen`, [H, W, 2] px: displaced by the mean displacement
+    """Where each pixel's tissue is in the image of `seen`, [H, W, 2] px: displaced by the mean displacement
     of the Gaussians drawn at the pixel. A Gaussian that is unknown in `seen` counts as not displaced."""
     pixels, _ = project(camera, middle.means)
     displacement = np.zeros_like(middle.colors)

@@ -1,4 +1,4 @@
-"""An HTML page that opens anywhere: its pictures and plots are embedded."""
+"""An HTML page that opens anywhere: its images and plots are embedded."""
 
 import base64
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ def page(title: str, parts: Sequence[str]) -> str:
 
 
 def picture_uri(tile: U8) -> str:
-    """An RGB picture [H, W, 3] as JPEG, for `src`."""
+    """An RGB image [H, W, 3] as JPEG, for `src`."""
     return "data:image/jpeg;base64," + base64.b64encode(encoded(".jpg", tile)).decode()
 
 
@@ -60,7 +60,7 @@ def plot_grid(plots: Sequence[str]) -> str:
 
 
 def encoded(suffix: str, picture: U8) -> bytes:
-    """The file of an RGB picture [H, W, 3], .jpg or .png."""
+    """The file of an RGB image [H, W, 3], .jpg or .png."""
     options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
     _, data = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
     return bytes(data)

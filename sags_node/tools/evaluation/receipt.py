@@ -19,7 +19,7 @@ class Receipt:
     def __init__(self, rig: StereoRig, size: tuple[int, int], lpips_weights: Path | None) -> None:
         """
         Args:
-            rig: that the pictures were rectified by.
+            rig: that the images were rectified by.
             size: width and height at which they were compared, px.
         """
         self._calibration = rig_digest(rig)

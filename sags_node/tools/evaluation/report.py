@@ -1,4 +1,4 @@
-"""A run on one page: its video, what it was worth, pictures, plots over time, and every figure."""
+"""A run on one page: its video, what it was worth, images, plots over time, and every figure."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -41,7 +41,7 @@ def write_report(
     pictures: Sequence[Picture],
     video: str | None = None,
 ) -> Path:
-    """Write `report.html` (below 2 MB, and whole but for its video) and `sheet.png` (its pictures) into
+    """Write `report.html` (below 2 MB, and whole but for its video) and `sheet.png` (its images) into
     `folder`.
 
     Args:
@@ -104,7 +104,7 @@ def _pictures(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -> str
             for name, tile in zip(COLUMNS, line, strict=True)
         )
         lines.append(f"<h3>frame {picture.frame_id}, {picture.psnr:.1f} dB{note}</h3>")
-        lines.append(f'<div class="pictures">{cells}</div>')
+        lines.append(f'<div class="images">{cells}</div>')
     return "\n".join(lines)
 
 
@@ -144,12 +144,12 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
         off, against = "stereo", "from the frame's own stereo: mm"
     plots = [
         line_plot(
-            "How near the picture is to the camera's: PSNR, dB; higher is better",
+            "How near the image is to the camera's: PSNR, dB; higher is better",
             [
-                series("left render, mostly this picture", BLUE, "shown.psnr"),
+                series("left render, mostly this image", BLUE, "shown.psnr"),
                 series("a frame ahead", ORANGE, "predict.psnr"),
                 series("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
-                series("the picture before, again", GREY, "predict.copy_psnr"),
+                series("the image before, again", GREY, "predict.copy_psnr"),
                 series("kept back, never seen", GREEN, "heldout.psnr", dots=True),
             ],
             spans,
@@ -173,7 +173,7 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
             "Right eye and hidden tissue: PSNR, dB; higher is better",
             [
                 series("right eye", ORANGE, "right.psnr"),
-                series("left picture, warped", GREY, "right.warp_psnr"),
+                series("left image, warped", GREY, "right.warp_psnr"),
                 series("hidden tissue", BLUE, "hidden.psnr", dots=True),
                 series("as it was last seen", GREY, "hidden.copy_psnr", dots=True),
             ],

@@ -26,7 +26,7 @@ from sags_node.vision.rectify import Rectifier
 
 MOST = 150  # frames of the recording that are played: five seconds, so that long ones can be measured too
 GROUPS = ("right", "novel", "stereo")  # groups of a frame's figures that come from the first of these runs
-STEPS = 16  # places of points along each side of the picture
+STEPS = 16  # places of points along each side of the image
 
 
 def measure_second(
@@ -123,7 +123,7 @@ def _mirrored(frame: StereoFrame, last: StereoFrame) -> StereoFrame:
 
 def _points(first: MappedFrame) -> F64:
     """Places [P, 3] m of the tissue in the camera of a frame, where the model has Gaussians: evenly spaced in
-    the picture."""
+    the image."""
     height, width = first.depth.shape
     rows, columns = (np.round((np.arange(STEPS) + 0.5) / STEPS * side - 0.5) for side in (height, width))
     v, u = (each.ravel().astype(int) for each in np.meshgrid(rows, columns, indexing="ij"))

@@ -159,7 +159,7 @@ def measure(
     """Measure a finished run against the recording it was played from, which is read once more.
 
     Args:
-        on_picture: called with each frame's number and its rectified left picture, as it is published.
+        on_picture: called with each frame's number and its rectified left image, as it is published.
 
     Raises:
         SagsError: nothing was processed, or the recording cannot be read again.

@@ -18,7 +18,7 @@ class TrackErrors:
     """The tracking errors of the visible points of one frame."""
 
     errors_mm: F64  # [F] of the points that were followed
-    errors_px: F64  # [F] the same, in the left picture
+    errors_px: F64  # [F] the same, in the left image
     lost: int  # visible, but no neighbour is left, or none was ever near enough
 
 

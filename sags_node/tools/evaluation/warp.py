@@ -1,4 +1,4 @@
-"""A drawn right view, and what it is compared with: the left picture, warped by depth."""
+"""A drawn right view, and what it is compared with: the left image, warped by depth."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,19 +20,19 @@ LARGEST_STEP = 1.0  # px of disparity between neighbours of one surface: steeper
 
 
 def warp_to_right(left: F32, depth: F32, focal_px: float, baseline: float) -> tuple[F32, Bool]:
-    """The left picture as the right eye would see it, and where that is known.
+    """The left image as the right eye would see it, and where that is known.
 
     Neighbouring left pixels of nearly one disparity span the surface between them; the nearest surface hides
     the others. What no surface covers stays unknown.
 
     Args:
         left: [H, W, 3] rectified.
-        depth: [H, W] m, of the left picture, 0 unknown.
+        depth: [H, W] m, of the left image, 0 unknown.
         focal_px: of the rectified pair.
         baseline: m.
 
     Returns:
-        The picture [H, W, 3] (0 where unknown) and the mask [H, W].
+        The image [H, W, 3] (0 where unknown) and the mask [H, W].
     """
     disparity = np.divide(np.float32(focal_px * baseline), depth, out=np.zeros_like(depth), where=depth > 0)
     columns = _left_columns(disparity)
@@ -45,18 +45,18 @@ def warp_to_right(left: F32, depth: F32, focal_px: float, baseline: float) -> tu
 def right_figures(
     shown: MappedFrame, pair: RectifiedPair, usable: Bool, rasterizer: Rasterizer, before: U8 | None = None
 ) -> dict[str, dict[str, float]]:
-    """PSNR of the right eye's picture, each after a fit of gain and offset.
+    """PSNR of the right eye's image, each after a fit of gain and offset.
 
     Args:
         shown: what the run made of the frame.
         pair: the frame, with its right eye.
         usable: [H, W] of `right_pixels`.
-        before: [H, W, 3] the right picture of the frame before.
+        before: [H, W, 3] the right image of the frame before.
 
     Returns:
         `novel`: of the model alone; the mapper never saw that eye. `right`, where the warp is known: `psnr`
-        of the right view, if it was shown; `warp_psnr` of the left picture, warped by the stereo stage's
-        depth; `model_psnr`; `copy_psnr` of the picture before; `coverage`, the share of `novel`'s pixels.
+        of the right view, if it was shown; `warp_psnr` of the left image, warped by the stereo stage's
+        depth; `model_psnr`; `copy_psnr` of the image before; `coverage`, the share of `novel`'s pixels.
     """
     assert pair.right is not None
     camera, focal_px = shown.snapshot.camera, float(shown.snapshot.camera.K[0, 0])
@@ -79,7 +79,7 @@ def right_figures(
 
 
 def right_pixels(rectifier: Rectifier, frame: StereoFrame, exclude: Sequence[Box]) -> Bool:
-    """A mask [H, W] of rectified right pixels that show the raw picture outside the boxes of `exclude`."""
+    """A mask [H, W] of rectified right pixels that show the raw image outside the boxes of `exclude`."""
     white = np.full_like(frame.left, 255)
     for x, y, width, height in exclude:
         white[y : y + height, x : x + width] = 0

@@ -58,7 +58,7 @@ def export(scene: Scene, targets: Mapping[str, Path], orbit: Orbit, advance: Adv
     """Write the files that `check_targets` accepted.
 
     Returns:
-        For each: `file`, `kind`, `holds` (Gaussians, points, triangles or pictures) and `bytes`.
+        For each: `file`, `kind`, `holds` (Gaussians, points, triangles or images) and `bytes`.
 
     Raises:
         SagsError: the model shows nothing there, or a file cannot be written.

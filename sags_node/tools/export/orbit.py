@@ -16,7 +16,7 @@ from sags_node.media.video_file import VideoFile
 from sags_node.tools.export.scene import Advance, Scene
 from sags_node.types import F32, U8, Camera, Gaussians
 
-RATE = 30.0  # pictures per second
+RATE = 30.0  # images per second
 BACKGROUND = 0.12  # grey, where the model says nothing
 
 
@@ -40,7 +40,7 @@ def picture_of(rasterizer: Rasterizer, gaussians: Gaussians, eye: Camera) -> tup
 
 
 def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advance: Advance) -> int:
-    """Write a video that can be played in a loop; returns the number of pictures.
+    """Write a video that can be played in a loop; returns the number of images.
 
     Raises:
         SagsError: the camera sees nothing of the model, or the video cannot be written.

@@ -1,4 +1,4 @@
-"""What the node knows of every frame of a recording, as files: depth, tracks, drawn pictures, a data set."""
+"""What the node knows of every frame of a recording, as files: depth, tracks, drawn images, a data set."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -103,7 +103,7 @@ def _played(session: Session) -> Iterator[tuple[int, FrameResult, AnchorStates]]
 
 
 def _pin(pipeline: Pipeline, result: FrameResult) -> None:
-    """Pin points on a grid over the picture, but none where there is no tissue or no depth."""
+    """Pin points on a grid over the image, but none where there is no tissue or no depth."""
     view = result.views["left"]
     height, width = view.depth.shape
     side = round(TRACKS**0.5)

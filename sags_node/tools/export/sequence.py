@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 ABOUT = "sequence.json"
 LOOP = "loop.mp4"
 FRAME = "frame_{:05d}.ply"
-QUALITY = 98  # of the pictures kept for the way back, JPEG
+QUALITY = 98  # of the images kept for the way back, JPEG
 
 
 def state_of(session: Session, fit: Path | None) -> dict[str, str | None]:
@@ -87,17 +87,17 @@ def write_sequence(
     and back.
 
     Args:
-        rate: pictures per second, used where stamps start again from an earlier time.
+        rate: images per second, used where stamps start again from an earlier time.
         count: how many scenes there will be, where that is known.
 
     Returns:
-        As `export.export`; `holds` counts frames and pictures.
+        As `export.export`; `holds` counts frames and images.
 
     Raises:
         SagsError: nothing is shown, or a file cannot be written; what was written stays.
     """
     written = kept = size = 0
-    stamps: list[int] = []  # ns, of the pictures
+    stamps: list[int] = []  # ns, of the images
     held: list[str] = []
     with writing(folder), tempfile.TemporaryDirectory(prefix=".sags-", dir=folder) as passing:
         rasterizer, camera = None, None
@@ -142,7 +142,7 @@ def write_sequence(
             for done, (number, stamp_ns) in enumerate(shown):
                 read = cv2.imread(str(Path(passing) / f"{number}.jpg"))
                 if read is None:
-                    raise SagsError(f"a picture in {passing} was removed; export again")
+                    raise SagsError(f"an image in {passing} was removed; export again")
                 video.add(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), stamp_ns)
                 advance(done + 1, len(shown), "writing the video")
             video.finish()

@@ -26,7 +26,7 @@ SAME: dict[str, tuple[str, float]] = {
     "clip.times": ("times", 1e-4),  # s
     "clip.K": ("camera matrix", 1e-2),  # px
     "clip.poses": ("camera poses", 1e-5),  # m, and parts of a rotation matrix
-    "clip.tissue": ("tissue masks", 2e-3),  # share of the picture
+    "clip.tissue": ("tissue masks", 2e-3),  # share of the image
     "clip.depth": ("depth", 1e-2),  # share of it
 }
 

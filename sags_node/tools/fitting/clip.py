@@ -1,4 +1,4 @@
-"""A whole recording in memory, as the fit sees it: rectified pictures, tissue and depth of every frame."""
+"""A whole recording in memory, as the fit sees it: rectified images, tissue and depth of every frame."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def _split(parents: F32, rng: np.random.Generator) -> tuple[F32, F32]:
 
 
 def quarter(model: DeformableModel) -> None:
-    """Replace each Gaussian by four, side by side and half as large in its plane, for pictures of twice the
+    """Replace each Gaussian by four, side by side and half as large in its plane, for images of twice the
     size. The colour of each is that of the old one at the new centre."""
     every, parents = np.arange(len(model)), model.table.copy()
     scales = np.exp(parents[:, columns.LOG_SCALE])

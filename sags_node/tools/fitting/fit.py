@@ -60,14 +60,14 @@ class Fit:
         Args:
             clip: what it learns from.
             settings: of the fit.
-            device: where Warp draws, and where torch keeps the model and the pictures; not for
+            device: where Warp draws, and where torch keeps the model and the images; not for
                 schedule = online. None: the kernels of the CPU.
         """
         seen = np.any([frame.tissue for frame in clip.train], axis=0)
         self.clip = clip
         self.settings = settings = settings.of_clip(int(np.count_nonzero(seen)), len(clip.train))
         self._on_device = device
-        # A core for each picture of an iteration: two that share one wait for each other all the time
+        # A core for each image of an iteration: two that share one wait for each other all the time
         cores = 1 if device else min(self._batch, thread_count())
         self._cores = ThreadPoolExecutor(cores, initializer=_take_one_core) if cores > 1 else None
         self._device = torch.device(device or "cpu")
@@ -86,7 +86,7 @@ class Fit:
         self._look()
 
     def _look(self) -> None:
-        """Prepare the pictures and the learning rates of the current stage."""
+        """Prepare the images and the learning rates of the current stage."""
         settings, frames = self.settings, list(self._learnt)
         self._cap = settings.max_gaussians
         if self.is_coarse:
@@ -137,13 +137,13 @@ class Fit:
 
     @property
     def coarse(self) -> int:
-        """The number of iterations with deformation on pictures of half the size."""
+        """The number of iterations with deformation on images of half the size."""
         share = self.settings.coarse if self.settings.schedule == "paper" else 0.0
         return round(share * self.settings.iterations)
 
     @property
     def is_coarse(self) -> bool:
-        """Tell whether the current stage uses pictures of half the size."""
+        """Tell whether the current stage uses images of half the size."""
         return self.coarse > 0 and self.iteration < self.warm_up + self.coarse
 
     @property

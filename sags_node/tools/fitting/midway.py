@@ -1,4 +1,4 @@
-"""Pictures half way between training frames, by optical flow: they teach the model what moves in between."""
+"""Images half way between training frames, by optical flow: they teach the model what moves in between."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,7 +35,7 @@ def _midway(before: ClipFrame, after: ClipFrame, flow: cv2.DISOpticalFlow) -> Cl
     grays = [cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (before, after)]
     images, tissue, depths = [], np.ones((height, width), np.bool_), []
     for near, grey, other in zip((before, after), grays, grays[::-1], strict=True):
-        # The flow to this picture is defined in the other one's pixels, so half of it lies a little beside.
+        # The flow to this image is defined in the other one's pixels, so half of it lies a little beside.
         there = here + cv2.GaussianBlur(flow.calc(other, grey, None), (0, 0), SMOOTH) / 2
         images.append(cv2.remap(near.image, there, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
         tissue &= cv2.remap(near.tissue.view(np.uint8), there, None, cv2.INTER_NEAREST) > 0

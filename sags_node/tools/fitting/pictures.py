@@ -19,7 +19,7 @@ class Pictures:
 
     Attributes:
         frames: all that are learnt; the first training frame comes first.
-        drawers: rasterizers of their size, one for each picture of an iteration.
+        drawers: rasterizers of their size, one for each image of an iteration.
         pixel: width of a pixel at the tissue's median depth in the first frame, m.
     """
 

@@ -92,7 +92,7 @@ class Residuals:
             t_ns: the time.
             v_rows: [N, 14] gradient of half the squared colour residuals by the deltas at that time.
             v_colors: [N, 3] the same by the colours as drawn.
-            contribution: [N] px, the weight of each Gaussian in the picture.
+            contribution: [N] px, the weight of each Gaussian in the image.
             steps: their lengths.
         """
         seen = np.flatnonzero(contribution > LEAST_CONTRIBUTION)

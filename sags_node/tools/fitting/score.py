@@ -21,7 +21,7 @@ from sags_node.types import F32
 Segments = dict[str, tuple[int, int]]  # first and last frame
 
 # EndoNeRF's two public clips: how many frames they have, and what was published for the held-out ones.
-# Pictures of 640x512 are multiplied by the tissue mask, which has no margin, and averaged over all pixels
+# Images of 640x512 are multiplied by the tissue mask, which has no margin, and averaged over all pixels
 # (`paper_psnr`, dB); every eighth is held out.
 CLIPS: dict[str, tuple[int, dict[str, float]]] = {
     "pulling": (63, {"SAGS": 38.3, "EndoGaussian": 37.2}),
@@ -37,7 +37,7 @@ def published(folder: Path | None, frames: int, hold_out: int, size: tuple[int, 
         folder: of the recording in EndoNeRF's layout; None: it has another one.
         frames: how many were read of it.
         hold_out: every how many frames one is held out.
-        size: width and height of the pictures that are compared, px.
+        size: width and height of the images that are compared, px.
     """
     if folder is None or (hold_out, size) != PUBLISHED_WAY:
         return {}
@@ -62,7 +62,7 @@ def score(
         frames: what to measure on.
         segments: named stretches, whose means are given too.
         lpips: measures LPIPS; None: it is left out.
-        pictures: an existing folder that takes the drawn frames, PNG.
+        images: an existing folder that takes the drawn frames, PNG.
         progress: called with the frames done.
 
     Returns:
@@ -71,7 +71,7 @@ def score(
         number.
 
     Raises:
-        SagsError: a picture cannot be written.
+        SagsError: an image cannot be written.
     """
     rows = []
     for done, frame in enumerate(frames):
@@ -87,7 +87,7 @@ def score(
 def score_between(
     fit: Fit, frames: Iterable[ClipFrame], segments: Segments, lpips: Lpips | None = None
 ) -> dict[str, Any] | None:
-    """Compare frames with what the two training pictures around each of them predict.
+    """Compare frames with what the two training images around each of them predict.
 
     Args:
         fit: started.
@@ -96,7 +96,7 @@ def score_between(
         lpips: measures LPIPS; None: it is left out.
 
     Returns:
-        `carried`: both pictures carried along the model's motion, and their mean; `mean`: the mean of both as
+        `carried`: both images carried along the model's motion, and their mean; `mean`: the mean of both as
         they are, the baseline of everything that is shown between two frames. Each as `score` has it. None:
         no frame lies between two.
     """

@@ -23,7 +23,7 @@ Part = Literal["means", "log_scales", "quats", "colors", "logits"]  # of a Gauss
 PARTS: tuple[Part, ...] = ("means", "log_scales", "quats", "colors", "logits")
 
 
-LEAST = 60_000  # Gaussians at least: small pictures gain from more per pixel, and are drawn quickly
+LEAST = 60_000  # Gaussians at least: small images gain from more per pixel, and are drawn quickly
 PATH_EVERY = 3  # training frames from one time of the paths to the next
 STEREO = LossWeights(coverage=0.1)
 MONOCULAR = {"inverse_depth": 0.0, "correlation": 1e-3}  # weights for depth up to scale and shift
@@ -93,8 +93,8 @@ class FitSettings:
     schedule: Schedule = "online"  # how it starts: see `fitting.start`
     warm_up: int = 1000  # iterations on the first frame without deformation; only with schedule = paper
     iterations: int = 2000  # on all training frames, with deformation
-    # Iterations before these on pictures of half the size, as a multiple of `iterations`, with a quarter of
-    # the Gaussians; the warm-up then uses such a picture, too. Only with schedule = paper; 0: none.
+    # Iterations before these on images of half the size, as a multiple of `iterations`, with a quarter of
+    # the Gaussians; the warm-up then uses such an image, too. Only with schedule = paper; 0: none.
     coarse: float = 0.0
     tokens: Tokens = "nodes"
     block: Block = "adaptive"  # what stands before the decoder's heads
@@ -114,7 +114,7 @@ class FitSettings:
     # section 4); None: they fall exponentially from the start.
     stable: float | None = None
     growth: Growth = Growth()
-    midway: bool = False  # also learn pictures half way between training frames, see `fitting.midway`
+    midway: bool = False  # also learn images half way between training frames, see `fitting.midway`
     batch_size: int = 1  # frames of an iteration, whose losses are added; only with schedule = paper
     weights: LossWeights = STEREO  # only with schedule = paper
     color_softness: float = 0.0  # of RGB 0..1, see `field.losses.compare`; only with schedule = paper

@@ -209,7 +209,7 @@ def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, pr
     """Train the field on the paths: minimise mean absolute errors of positions, at random times."""
     rng = np.random.default_rng(settings.seed)
     field.follow(rows[:, columns.MEAN])
-    for step in range(PATH_STEPS if len(paths.times_ns) > 1 else 0):  # one picture shows no motion
+    for step in range(PATH_STEPS if len(paths.times_ns) > 1 else 0):  # one image shows no motion
         slot = int(rng.integers(len(paths.times_ns)))
         known = np.flatnonzero(paths.known[slot])
         picked = rng.choice(known, min(PATH_POINTS, len(known)), replace=False)

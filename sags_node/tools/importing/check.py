@@ -120,13 +120,13 @@ def once(found: list[Finding]) -> list[Finding]:
 
 
 def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
-    """Findings on some of the pictures, before anything plays them."""
+    """Findings on some of the images, before anything plays them."""
     if contents.right is None and contents.config is None:
-        return _tried("pictures", lambda: _in_one_folder(left_folder))
+        return _tried("images", lambda: _in_one_folder(left_folder))
 
     def look() -> list[Finding]:
         counts = {len(list_pictures(each)) for each in (left_folder, contents.right) if each is not None}
-        found = [Finding("ok", f"{' and '.join(map(str, sorted(counts)))} pictures each")]
+        found = [Finding("ok", f"{' and '.join(map(str, sorted(counts)))} images each")]
         left = _some(left_folder)
         right = [] if contents.right is None else _some(contents.right)
         found += pictures.check_both(left, right) if right else pictures.check_eye("left", left)
@@ -139,14 +139,14 @@ def _pictures(contents: Contents, left_folder: Path) -> list[Finding]:
             found += as_warnings(pictures.check_depth(contents.depth, size, unit, stated))
         return found
 
-    return _tried("pictures", look)
+    return _tried("images", look)
 
 
 def _in_one_folder(folder: Path) -> list[Finding]:
-    """Findings on one folder: on both eyes, if file names tell them apart, else on all pictures as one."""
+    """Findings on one folder: on both eyes, if file names tell them apart, else on all images as one."""
     apart = both_eyes(folder)
     if not apart:
-        return pictures.check_eye("pictures", _some(folder))
+        return pictures.check_eye("images", _some(folder))
     left, right = (pictures.read_some([pair[eye] for pair in apart]).values() for eye in (0, 1))
     return pictures.check_both(left, right)
 
@@ -207,7 +207,7 @@ def _fits(config: LaunchConfig) -> list[Finding]:
 
 
 def calibrated(config: LaunchConfig, path: Path) -> list[Finding]:
-    """Compare the calibration that is used with the recording's pictures, which lie in or at `path`."""
+    """Compare the calibration that is used with the recording's images, which lie in or at `path`."""
 
     def compare() -> list[Finding]:
         source = config.source
@@ -229,7 +229,7 @@ def calibrated(config: LaunchConfig, path: Path) -> list[Finding]:
 
 def _none_used(folder: Path) -> Finding:
     if not (there := seem_calibrations(folder)):
-        return Finding("warning", "no calibration lies beside the pictures", MAKE_ONE)
+        return Finding("warning", "no calibration lies beside the images", MAKE_ONE)
     named, first = ", ".join(str(file.relative_to(folder)) for file in there[:MOST_NAMED]), _quoted(there[0])
     fix = f"set {override('rig', first)} if sags calib check {first} takes it, else docs/calibration.md"
     return Finding("warning", f"no calibration is used, though {named} lies there", fix)

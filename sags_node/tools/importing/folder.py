@@ -42,13 +42,13 @@ class Contents:
     what: str
     instead: str = ""  # what to do where it is not played as it is
     level: Literal["ok", "error"] = "ok"  # error: nothing can be made of it as it is
-    left: Path | None = None  # folders of pictures
+    left: Path | None = None  # folders of images
     right: Path | None = None
     masks: Path | None = None
     depth: Path | None = None
     config: LaunchConfig | None = None  # where it is played as it is
     videos: tuple[Path, ...] = ()  # of both eyes, or one that may show both
-    launch: tuple[str, ...] = ()  # `key:=value` that play two folders of pictures
+    launch: tuple[str, ...] = ()  # `key:=value` that play two folders of images
 
 
 def recognise(folder: Path) -> Contents:
@@ -101,7 +101,7 @@ def _plain(folder: Path) -> Contents:
         launch = ("source.kind:=folders", override("source.left", left), override("source.right", right))
         tools = () if masks is None else (override("source.tools", masks),)
         return Contents(
-            "two folders of pictures", "", "ok", left, right, masks, depth, launch=(*launch, *tools)
+            "two folders of images", "", "ok", left, right, masks, depth, launch=(*launch, *tools)
         )
     videos = sorted(file for file in folder.glob(SHOWN) if is_video(file))
     if videos:
@@ -115,12 +115,12 @@ def _plain(folder: Path) -> Contents:
     if has_pictures(folder):
         apart = both_eyes(folder)
         both = f" of both eyes, {len(apart)} pairs," if apart else ""
-        instead = "put the pictures of each eye in a folder of its own, left/ and right/, and check again"
-        return Contents(f"pictures{both} in one folder", instead, "error", left=folder)
+        instead = "put the images of each eye in a folder of its own, left/ and right/, and check again"
+        return Contents(f"images{both} in one folder", instead, "error", left=folder)
     below = sorted(each.name for each in folder.iterdir() if each.is_dir())
     if not below:
         what = (
-            "a folder without pictures, videos or a recording" if any(folder.iterdir()) else "an empty folder"
+            "a folder without images, videos or a recording" if any(folder.iterdir()) else "an empty folder"
         )
         return Contents(what, "give the folder that holds the recording", "error")
     instead = f"check one of the folders in it: {', '.join(below[:8])}"
@@ -150,7 +150,7 @@ def _eye_videos(videos: list[Path]) -> tuple[Path, ...]:
 
 
 def both_eyes(folder: Path) -> list[tuple[Path, Path]]:
-    """Pictures of left and right eye in one folder, as `left_001.png` and `right_001.png`; no masks."""
+    """Images of left and right eye in one folder, as `left_001.png` and `right_001.png`; no masks."""
     by_name = {
         file.name: file
         for file in sorted(folder.glob(SHOWN))
@@ -170,7 +170,7 @@ def _pairs(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def calibration_of(folder: Path) -> Path | None:
-    """Find the calibration beside the pictures, in a folder of a usual name or with them."""
+    """Find the calibration beside the images, in a folder of a usual name or with them."""
     places = [place for name in CALIBRATIONS if (place := folder / name).is_dir()]
     known = next((place for place in places if find_form(place) is not None), None)
     files = [file for place in places for file in place.glob(SHOWN) if is_opencv(file)]

@@ -1,4 +1,4 @@
-"""What is odd about the pictures of a recording: sizes, gaps, borders, interlacing, masks and depth."""
+"""What is odd about the images of a recording: sizes, gaps, borders, interlacing, masks and depth."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from sags_node.sources.truth import UNKNOWN
 from sags_node.tools.calibration.matches import match_eyes
 from sags_node.types import U8, Bool
 
-LOOKED_AT = 8  # pictures, spread over the folder
+LOOKED_AT = 8  # images, spread over the folder
 COMB_STEP = 12  # grey levels that a row must differ from both neighbours, alike
 COMB_SHARE = 0.02  # least share of the pixels that show combs, and
 COMB_RATIO = 3.0  # times as many as in columns: texture has no favourite direction
@@ -28,7 +28,7 @@ Box = tuple[int, int, int, int]  # x, y, width, height, px
 
 
 def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path, U8]:
-    """Read pictures spread over the files. Also try the last and the smallest one: there copies break off.
+    """Read images spread over the files. Also try the last and the smallest one: there copies break off.
 
     Raises:
         SagsError: one cannot be read.
@@ -43,7 +43,7 @@ def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path
 
 
 def check_eye(what: str, pictures: Collection[U8], keep: Box | None = None) -> list[Finding]:
-    """Look at one eye's pictures [H, W, 3] RGB: sizes, black borders, interlacing.
+    """Look at one eye's images [H, W, 3] RGB: sizes, black borders, interlacing.
 
     Args:
         keep: the box to keep where there are borders; None: what is lit of this eye.
@@ -51,17 +51,17 @@ def check_eye(what: str, pictures: Collection[U8], keep: Box | None = None) -> l
     sizes = {picture.shape[1::-1] for picture in pictures}
     if len(sizes) > 1:
         said = " and ".join(size_text(*size) for size in sorted(sizes))
-        return [Finding("error", f"{what}: pictures of {said} px", "all pictures must have one size")]
+        return [Finding("error", f"{what}: images of {said} px", "all images must have one size")]
     gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
     found = []
     x, y, width, height = lit_box(np.max(gray, axis=0))
     if (width, height) != gray[0].shape[::-1]:
         crop = CROP + str([*(keep or (x, y, width, height))]).replace(" ", "")
         fix = (
-            f"set {crop} (videos, cameras) or cut both eyes alike, and calibrate such pictures; a "
+            f"set {crop} (videos, cameras) or cut both eyes alike, and calibrate such images; a "
             "calibration of whole ones needs the borders"
         )
-        what_is = f"{what}: black borders; the picture is {size_text(width, height)} px at {x},{y}"
+        what_is = f"{what}: black borders; the image is {size_text(width, height)} px at {x},{y}"
         said = f"{what_is}, of {size_text(*gray[0].shape[::-1])}"
         found.append(Finding("warning", said, fix, launch=(crop,)))
     combs = [(combing(each), combing(np.ascontiguousarray(each.T))) for each in gray]
@@ -83,8 +83,8 @@ def combing(gray: U8) -> float:
 
 
 def lit_in_both(left: Collection[U8], right: Collection[U8], geometry: GeometryConfig | None) -> Box | None:
-    """The box without black borders of either eye, in each eye's picture before `geometry` cuts and flips it.
-    None: the pictures' sizes differ, or there is none."""
+    """The box without black borders of either eye, in each eye's image before `geometry` cuts and flips it.
+    None: the images' sizes differ, or there is none."""
     if len({picture.shape for picture in (*left, *right)}) != 1:
         return None
     boxes = [
@@ -108,7 +108,7 @@ def lit_in_both(left: Collection[U8], right: Collection[U8], geometry: GeometryC
 
 
 def lit_box(brightest: U8) -> Box:
-    """The box within the black borders; the whole picture where all is dark."""
+    """The box within the black borders; the whole image where all is dark."""
     columns, rows = (np.flatnonzero(np.percentile(brightest, 99, axis=axis) > DARK) for axis in (0, 1))
     height, width = brightest.shape
     if not len(columns) or not len(rows):
@@ -122,17 +122,17 @@ def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
     """Check both eyes without a calibration: are they in order, and are rows aligned?"""
     pairs = [(a, b) for a, b in zip(left, right, strict=False) if a.shape == b.shape]
     if not pairs:
-        return [Finding("error", "the eyes' pictures have not one size", "resize both eyes alike")]
+        return [Finding("error", "the eyes' images have not one size", "resize both eyes alike")]
     matches = np.concatenate([match_eyes(a, b) for a, b in pairs])
     if len(matches) < FEWEST_MATCHES:
-        fix = "are they of one moment and of one scope? Sharper pictures with more texture tell more"
+        fix = "are they of one moment and of one scope? Sharper images with more texture tell more"
         return [Finding("warning", f"only {len(matches)} points are found in both eyes", fix)]
     across, down = (float(np.median(matches[:, k] - matches[:, k + 2])) for k in (0, 1))
     rows = float(np.median(np.abs(matches[:, 1] - matches[:, 3])))
     figures = {"disparity_px": round(across, 2), "rows_px": round(rows, 2)}
     if np.mean(matches[:, 0] < matches[:, 2]) > 0.8:
         fix = (
-            "exchange left and right, unless each picture was cut out elsewhere (then calibrate as they are)"
+            "exchange left and right, unless each image was cut out elsewhere (then calibrate as they are)"
         )
         what = "points lie farther to the right in the right eye: eyes exchanged?"
         return [Finding("warning", what, fix, figures, launch=(RIGHT_FIRST,))]
@@ -145,7 +145,7 @@ def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
 def check_both(
     left: Collection[U8], right: Collection[U8], *, geometry: GeometryConfig | None = None
 ) -> list[Finding]:
-    """Look at each eye, and at how they belong together; `geometry`: how the pictures were cut."""
+    """Look at each eye, and at how they belong together; `geometry`: how the images were cut."""
     keep = lit_in_both(left, right, geometry)
     return [*check_eye("left", left, keep), *check_eye("right", right, keep), *check_eyes(left, right)]
 
@@ -154,13 +154,13 @@ def check_shares(shares: Sequence[float]) -> list[Finding]:
     """A finding on masks, from the share of each frame that is instrument."""
     if not any(shares):  # the source reports masks that mark nothing
         return []
-    return [Finding("ok", f"masks: {np.median(shares):.0%} of the picture is instrument")]
+    return [Finding("ok", f"masks: {np.median(shares):.0%} of the image is instrument")]
 
 
 def check_depth(
     folder: Path, size: tuple[int, int], unit: float | None = None, stated: bool = False
 ) -> list[Finding]:
-    """Check kind, size and unit (m per count) of depth pictures; `stated`: their author states that unit."""
+    """Check kind, size and unit (m per count) of depth images; `stated`: their author states that unit."""
     medians = []
     for file, depth in read_some(list_pictures(folder), cv2.IMREAD_UNCHANGED).items():
         if (wrong := _no_depth(file, depth, size)) is not None:
@@ -170,7 +170,7 @@ def check_depth(
             medians.append(float(np.median(depth[known])))
             coarse = depth.dtype == np.uint8
     if not medians:
-        return [Finding("error", "depth: no picture knows a pixel", "export it again")]
+        return [Finding("error", "depth: no image knows a pixel", "export it again")]
     median = float(np.median(medians))
     fitting = fitting_units(median)
     ask = "the files do not say it: ask who made them"
@@ -198,7 +198,7 @@ def check_depth(
 
 
 def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
-    """Why a picture cannot be depth; None: it can."""
+    """Why an image cannot be depth; None: it can."""
     export = "export depth as grey PNG of 16 bit, e.g. in 1e-5 m"
     if depth.ndim != 2:
         what = f"depth: {file.name} has {depth.shape[2]} channels: it is coloured for people"
@@ -206,6 +206,6 @@ def _no_depth(file: Path, depth: U8, size: tuple[int, int]) -> Finding | None:
     if depth.dtype.kind == "f":
         return Finding("error", f"depth: {file.name} holds floating numbers, which are not read", export)
     if depth.shape[::-1] != size:
-        what = f"depth: {file.name} is {size_text(*depth.shape[::-1])} px, the pictures {size_text(*size)}"
+        what = f"depth: {file.name} is {size_text(*depth.shape[::-1])} px, the images {size_text(*size)}"
         return Finding("error", what, "resize depth with nearest neighbour, never a mean")
     return None

@@ -1,4 +1,4 @@
-"""`sags new`: how a recording or a camera is best played, by what its pictures show."""
+"""`sags new`: how a recording or a camera is best played, by what its images show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ DEVICES = Path("/dev")
 EYES = ("left", "right")
 EACH_EYE = (("source.left", "source.right"), ("source.geometry.crop", "source.geometry.crop_right"))
 SECONDS = 2.0  # that a camera is watched
-WHOLE = "source.geometry.layout:=over_under"  # takes any picture apart so that it can be put together again
+WHOLE = "source.geometry.layout:=over_under"  # takes any image apart so that it can be put together again
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
 
     Raises:
         UsageError: what is named is not there or cannot be played, or it has a launch file already.
-        SagsError: it cannot be opened, or gives no pictures.
+        SagsError: it cannot be opened, or gives no images.
     """
     launch = [*_launch_of(named, overrides), *overrides]
     config = load_launch(named[0], launch)
@@ -77,7 +77,7 @@ def _launch_of(named: Sequence[Path], overrides: Sequence[str]) -> list[str]:
             if all(fits(path) for path in named):
                 left, right = (override(f"source.{eye}", path) for eye, path in zip(EYES, named, strict=True))
                 return [f"source.kind:={kind}", left, right]
-        raise UsageError(f"{named[0]} and {named[1]} are neither two videos nor two folders of pictures")
+        raise UsageError(f"{named[0]} and {named[1]} are neither two videos nor two folders of images")
     known = known_recording(named[0])
     launch = overrides_of(named[0]) if known is None else [override(*each) for each in leaves(known)]
     if not launch:
@@ -110,7 +110,7 @@ def _opened(config: LaunchConfig) -> list[Finding]:
 
 
 def _looked_at(config: LaunchConfig) -> list[Finding]:
-    """Findings on some pictures, spread over the recording."""
+    """Findings on some images, spread over the recording."""
     pairs, _ = pairs_of_session(config)
     left, right = zip(*pairs, strict=True)
     geometry: GeometryConfig | None = getattr(config.source, "geometry", None)
@@ -120,14 +120,14 @@ def _looked_at(config: LaunchConfig) -> list[Finding]:
 
 
 def _needs_borders(config: LaunchConfig, geometry: GeometryConfig | None, size: tuple[int, int]) -> str:
-    """Why black borders of pictures of this size must stay; "": they need not."""
+    """Why black borders of images of this size must stay; "": they need not."""
     if geometry is not None and geometry.crop_right is not None:
         return "each eye has a box of its own"
     if lacks_rig(config):
         return ""
     rig = recorded_rig(config.source, judged=False) if config.rig is None else read_rig(config.rig, size)
     fits = rig is not None and (rig.left.width, rig.left.height) == size
-    return "the calibration is of whole pictures" if fits else ""
+    return "the calibration is of whole images" if fits else ""
 
 
 def _with_borders(finding: Finding, why: str) -> Finding:

@@ -1,6 +1,6 @@
-"""Whether both eyes' pictures are of one time.
+"""Whether both eyes' images are of one time.
 
-What moves or flickers changes rows of both eyes' pictures at the same time, wherever along them it is. So the
+What moves or flickers changes rows of both eyes' images at the same time, wherever along them it is. So the
 changes from frame to frame of one eye's rows are those of the other eye's, some frames later where one is
 late. On D4D, a beating heart and the phantom the right delay correlates with 0.60 to 0.97, one that is off by
 a frame or more with 0.57 at most, and always with 0.4 less than the right one.
@@ -24,7 +24,7 @@ class Timing:
     """Takes pairs one after the other; of each it keeps a few numbers.
 
     Args:
-        longer: by how many pictures one eye has more than the other: it may have been begun so much sooner.
+        longer: by how many images one eye has more than the other: it may have been begun so much sooner.
     """
 
     def __init__(self, longer: int = 0) -> None:

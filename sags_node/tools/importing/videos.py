@@ -1,4 +1,4 @@
-"""What is odd about the videos of a recording, and how the pictures of one show both eyes."""
+"""What is odd about the videos of a recording, and how the images of one show both eyes."""
 
 import shlex
 from collections.abc import Callable, Sequence
@@ -22,12 +22,12 @@ from sags_node.tools.importing import pictures, timing
 from sags_node.tools.importing.folder import override
 from sags_node.types import U8
 
-LOOKED_AT = 4  # pictures, spread over the video
-MOST_LATE = 900  # pictures: the largest delay of an eye's start that is tried
+LOOKED_AT = 4  # images, spread over the video
+MOST_LATE = 900  # images: the largest delay of an eye's start that is tried
 LEAST_ALONG = 0.8  # share of the matches whose rows agree, of two eyes
 ROWS = 1 / 40  # of the width: as far as rows of eyes that are not rectified differ
 ONE_EYE = "one eye is shown, or both in a way that was not recognised"
-APART = 1.0  # px: eyes see the tissue in different columns; fields of one picture do not
+APART = 1.0  # px: eyes see the tissue in different columns; fields of one image do not
 
 
 LAYOUT = "source.geometry.layout:="
@@ -35,7 +35,7 @@ PACKED = {1080: 45, 720: 30}  # rows of an eye, and blank ones below the first: 
 
 
 class Way(NamedTuple):
-    """How a picture may show both eyes."""
+    """How an image may show both eyes."""
 
     what: str
     layout: str
@@ -59,7 +59,7 @@ def _fields(picture: U8) -> tuple[U8, U8]:
     return np.ascontiguousarray(picture[0:rows:2]), np.ascontiguousarray(picture[1:rows:2])
 
 
-_WAYS = (  # parts before wholes: pictures of two of four panes also match as side by side
+_WAYS = (  # parts before wholes: images of two of four panes also match as side by side
     Way("in the upper two of four panes", "panes", lambda picture: _quarters(picture)[0]),
     Way("side by side", "side_by_side", _halves),
     Way("one above the other", "over_under", lambda picture: _halves(picture, 0)),
@@ -68,7 +68,7 @@ _WAYS = (  # parts before wholes: pictures of two of four panes also match as si
 
 
 def _packed(start: int, rows: int) -> Way:
-    """The way of frame packing: the right eye's picture, `rows` rows high, begins in row `start`."""
+    """The way of frame packing: the right eye's image, `rows` rows high, begins in row `start`."""
 
     def eyes(picture: U8) -> tuple[U8, U8]:
         return picture[:rows], picture[start : start + rows]
@@ -77,7 +77,7 @@ def _packed(start: int, rows: int) -> Way:
 
 
 def look(files: tuple[Path, ...]) -> list[Finding]:
-    """Look at some pictures of the videos of the left and the right eye, or of one video of both. They are
+    """Look at some images of the videos of the left and the right eye, or of one video of both. They are
     played as `launch_of` says.
 
     Raises:
@@ -116,7 +116,7 @@ def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
 
 
 def way_of(shown: Sequence[U8]) -> Way | None:
-    """How pictures [H, W, 3] RGB show both eyes; None: in no way that is known."""
+    """How images [H, W, 3] RGB show both eyes; None: in no way that is known."""
     height, width = shown[0].shape[:2]
     for rows, blank in PACKED.items():
         if abs(height - 2 * rows - blank) <= 1:  # some codecs take even heights only
@@ -130,7 +130,7 @@ def way_of(shown: Sequence[U8]) -> Way | None:
 
 
 def layout_of(way: Way, shown: Sequence[U8]) -> tuple[str, ...]:
-    """The overrides `key:=value` that take these pictures apart, the left eye first."""
+    """The overrides `key:=value` that take these images apart, the left eye first."""
     eyes = zip(*map(way.eyes, shown), strict=True)
     fixes = [fix for finding in pictures.check_eyes(*eyes) for fix in finding.launch]
     if way.right is None:
@@ -150,7 +150,7 @@ def _file(file: Path) -> list[Finding]:
 
 
 def _some(file: Path) -> list[U8]:
-    """Pictures spread over a video, RGB."""
+    """Images spread over a video, RGB."""
     with closing(Video(file)) as video:
         found = []
         for number in _spread(video.count):
@@ -201,7 +201,7 @@ def _one(file: Path, shown: list[U8]) -> list[Finding]:
     if way.layout == "row_interleaved":  # an eye's rows lie two rows apart, which looks like a comb
         looked = [each for each in looked if "interlaced, " not in each.what]
     # `layout_of` exchanges them.
-    said = "points lie farther to the right in the second picture, which is taken for the left eye's"
+    said = "points lie farther to the right in the second image, which is taken for the left eye's"
     looked = [Finding("ok", said) if pictures.RIGHT_FIRST in each.launch else each for each in looked]
     return [Finding("ok", f"{size} px show both eyes: {way.what}"), *looked]
 
@@ -219,7 +219,7 @@ def _both_needed(file: Path) -> str:
 
 
 def _are_eyes(pairs: Sequence[tuple[U8, U8]]) -> bool:
-    """Tell whether pictures match as two eyes do: in the same rows, and in other columns."""
+    """Tell whether images match as two eyes do: in the same rows, and in other columns."""
     matches = np.concatenate([match_eyes(*pair) for pair in pairs])
     if len(matches) < pictures.FEWEST_MATCHES:
         return False

@@ -11,10 +11,10 @@ from sags_node.types import F32, Finding, GrayPyramid
 from sags_node.vision.pyramid import inner
 from sags_node.vision.watch.standing import watched_ns
 
-WIDTH = 160  # px, at most, of the picture in which contrast is measured, with its border
+WIDTH = 160  # px, at most, of the image in which contrast is measured, with its border
 LOCAL = 15  # px of it: shading wider than that is no structure
 
-# Octaves. Contrast and detail of a heart's two pictures differ by half an octave and one, on other tissue by
+# Octaves. Contrast and detail of a heart's two images differ by half an octave and one, on other tissue by
 # 0.1, and change by 0.2 while it moves. A fogged lens takes one and a half, and all of the detail.
 USUAL_DIFFERENCE = 0.6  # by which eyes may differ permanently
 LOST_CONTRAST = 0.8  # of one eye against the other, beyond their usual difference
@@ -26,7 +26,7 @@ LASTING_S = 10.0  # s: what has been unclear for so long is how the scene looks 
 
 LENS = "clean the lens, and check focus and cable"
 SMOKE = Finding(
-    "picture_smoke", "smoke or a fogged lens veils the picture, and it is not learnt: clear the view"
+    "picture_smoke", "smoke or a fogged lens veils the image, and it is not learnt: clear the view"
 )
 
 
@@ -47,7 +47,7 @@ class Clarity:
         self._contrasts = self._details = 0.0  # octaves, of the right eye over the left
 
     def __call__(self, stamp_ns: int, eyes: Sequence[GrayPyramid], structures: Sequence[F32]) -> Unclear:
-        """Take one frame: its picture, or the left and the right one, and the `structure` of each."""
+        """Take one frame: its image, or the left and the right one, and the `structure` of each."""
         contrasts, details = list(map(_contrast, eyes, structures)), list(map(_detail, eyes))
         contrast, detail = max(contrasts), max(details)
         apart = contrasts[-1] - contrasts[0], details[-1] - details[0]
@@ -76,13 +76,13 @@ class Clarity:
 
 
 def structure(pyramid: GrayPyramid) -> F32:
-    """Return a small picture [h, w] without its shading."""
+    """Return a small image [h, w] without its shading."""
     small = _small_level(pyramid)
     return np.ascontiguousarray(inner(small - cv2.blur(small, (LOCAL, LOCAL))))
 
 
 def mean_difference(a: F32, b: F32) -> float:
-    """Return the mean absolute difference of two small pictures."""
+    """Return the mean absolute difference of two small images."""
     return cv2.norm(a, b, cv2.NORM_L1) / a.size
 
 

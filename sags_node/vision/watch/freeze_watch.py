@@ -1,9 +1,9 @@
-"""Whether a live feed has frozen: one picture again and again, under new stamps.
+"""Whether a live feed has frozen: one image again and again, under new stamps.
 
-A camera never gives the same picture twice: its noise differs. A capture card or a scope's processor that
+A camera never gives the same image twice: its noise differs. A capture card or a scope's processor that
 lost its input repeats the last one, often under a caption that goes on: a clock, a dot. A codec on the way
 sends it anew with each key frame, equal up to quantisation. If both eyes freeze so, comparing them shows
-nothing (`vision.watch.pair_watch`). Recordings may repeat pictures: nobody takes them for the present.
+nothing (`vision.watch.pair_watch`). Recordings may repeat images: nobody takes them for the present.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,12 @@ import numpy as np
 from sags_node.types import F32, U8, Bool, Finding
 from sags_node.vision.watch.judgement import Evidence, Judgement
 
-LONGEST_NS = 300_000_000  # a converter of frame rates repeats a picture for 0.1 s at most (10 Hz given as 30)
+LONGEST_NS = 300_000_000  # a converter of frame rates repeats an image for 0.1 s at most (10 Hz given as 30)
 LONGEST_STILL_NS = 2_000_000_000  # living tissue moves within a heartbeat, or a breath
-GROUP_NS = 190_000_000  # least time between key frames of a frozen picture; at 5 Hz pictures change sooner
+GROUP_NS = 190_000_000  # least time between key frames of a frozen image; at 5 Hz images change sooner
 EVERY = 2  # px between the pixels that are compared
-CELLS = 40  # across the picture
-CAPTIONS = 0.04  # of the cells, all outside the middle half of the picture, may change
+CELLS = 40  # across the image
+CAPTIONS = 0.04  # of the cells, all outside the middle half of the image, may change
 RECODED = 4.0  # grey levels, rms in a cell: codecs at common rates differ by less from key frame to key frame
 RECODED_CELLS = 0.15  # of the cells may differ more
 STILL_CELLS = 0.05  # of the cells may do so while nothing moves; in D4D at rest a tenth do within a second
@@ -33,12 +33,12 @@ Eyes = tuple[U8, ...]
 
 _FROZEN = Finding(
     "picture_frozen",
-    "the same picture comes again and again, under new stamps: check the camera, the scope's processor and "
+    "the same image comes again and again, under new stamps: check the camera, the scope's processor and "
     "the capture card",
 )
 _STILL = Finding(
     "picture_still",
-    "hardly anything in the picture has changed for two seconds: does the scope rest, or has it frozen?",
+    "hardly anything in the image has changed for two seconds: does the scope rest, or has it frozen?",
 )
 
 
@@ -49,13 +49,13 @@ class _Change(Enum):
 
 
 class FreezeWatch:
-    """Compares every live frame, as it came, with the first that showed the same picture.
+    """Compares every live frame, as it came, with the first that showed the same image.
 
     Attributes:
         findings: what is wrong, and how to fix it. May be read from any thread.
 
     Args:
-        captions: x, y, width and height of boxes that are ignored, px of the raw left picture.
+        captions: x, y, width and height of boxes that are ignored, px of the raw left image.
     """
 
     def __init__(self, captions: Sequence[Box] = ()) -> None:
@@ -65,13 +65,13 @@ class FreezeWatch:
         self._shown: Eyes = ()  # the frame that has been repeated since
         self._changed: list[Bool] = []  # cells of each eye that captions have changed since
         self._group_ns = 0  # for how long that has been shown, by the stamps
-        self._unchanged_ns = 0  # the same, with the groups of pictures before that differ only in coding
+        self._unchanged_ns = 0  # the same, with the groups of images before that differ only in coding
         self._first: Eyes = ()  # the frame since which hardly anything has changed
         self._is_quiet = False  # the newest frame has no sensor noise
         self._still_ns = 0  # for how long hardly anything has changed, without noise
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Hold a picture that has come for too long."""
+        """Hold an image that has come for too long."""
         frame = evidence.frame
         passed_ns = max(0, frame.t_capture_ns - self._last_ns)  # clocks may be set back
         self._last_ns = frame.t_capture_ns
@@ -97,7 +97,7 @@ class FreezeWatch:
         return judged
 
     def _change(self, eyes: Eyes) -> _Change:
-        """How the picture differs from `_shown`."""
+        """How the image differs from `_shown`."""
         if [eye.shape for eye in eyes] != [eye.shape for eye in self._shown]:
             return _Change.NEW
         if any(map(self._is_plainly_new, eyes, self._shown)):
@@ -124,7 +124,7 @@ class FreezeWatch:
         return found
 
     def _is_plainly_new(self, picture: U8, other: U8) -> bool:
-        """Whether a few rows show that a picture is new; most new ones are found so."""
+        """Whether a few rows show that an image is new; most new ones are found so."""
         return max(cv2.mean(self._apart(picture, other, max(1, len(picture) // GLANCED_ROWS)))) > GLANCED
 
     def _apart(self, picture: U8, other: U8, rows: int) -> U8:

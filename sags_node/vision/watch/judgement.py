@@ -26,10 +26,10 @@ class Judgement:
     no_stereo: str = ""  # why its eyes are not matched; empty: they are
     learn: bool = True  # False: it is followed, but not learnt
     is_new_scene: bool = False  # it shows another scene for good: begin a new model
-    covered: Bool | None = None  # [h, w] in a small picture: what is not tissue now
+    covered: Bool | None = None  # [h, w] in a small image: what is not tissue now
     covered_left: Bool | None = None  # [rows, columns] cells that the left eye does not see
     covered_right: Bool | None = None  # and the right one
-    gain: F32 | None = None  # [3] exposure to be taken out of the pictures
+    gain: F32 | None = None  # [3] exposure to be taken out of the images
     guess: F32 | None = None  # [rows, columns, 2] px of square cells, where the motion search is to begin
 
 

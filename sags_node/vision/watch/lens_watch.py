@@ -1,7 +1,7 @@
 """Where something sits on one lens: a drop, a splash, dirt.
 
 It hides fine detail from one eye, and stays where it is while the tissue moves. The other eye sees the same
-tissue through another part of its lens. So each cell of the left picture is compared with the place in the
+tissue through another part of its lens. So each cell of the left image is compared with the place in the
 right one at which the model's depth says the same tissue is. What moves, is smooth or out of focus is so in
 both eyes.
 """
@@ -19,7 +19,7 @@ from sags_node.vision.watch.judgement import Evidence, Judgement
 from sags_node.vision.watch.picture_fit import middle_of
 from sags_node.vision.watch.standing import Debounced, watched_ns
 
-CELLS = 40  # across the picture
+CELLS = 40  # across the image
 SMALLEST = 8  # px of the first half, the side of a cell: of fewer, the detail is chance
 EVERY = 2  # rows from one that is read to the next
 NOISE = 0.5  # grey levels: detail below it is a camera's noise
@@ -44,7 +44,7 @@ class LensWatch(Debounced):
         self._hidden: I8 = np.zeros((1, 1), np.int8)  # -1: from the left eye, 1: from the right one
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Find what the lenses hide. The frame mapped last tells where tissue is in the right picture."""
+        """Find what the lenses hide. The frame mapped last tells where tissue is in the right image."""
         pair, last = evidence.pair, evidence.last
         if last is None or evidence.is_repeat:
             return judged

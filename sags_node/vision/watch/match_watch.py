@@ -1,7 +1,7 @@
 """Whether both eyes show one moment and still stand as calibrated: what the rows of matches tell of it.
 
 Where tissue moves up or down, an eye that is late shows it on another row than the other eye does. Row errors
-that grow with the vertical motion mean that an eye is late; a jump all over the picture means that the scope
+that grow with the vertical motion mean that an eye is late; a jump all over the image means that the scope
 was knocked. In both cases disparities are off by as much.
 """
 
@@ -23,7 +23,7 @@ WINDOW_NS = 200_000_000  # ns of motion that are compared with row errors
 FEWEST_FIELDS, LONGEST_WINDOW_NS = 3, 1_000_000_000  # with fewer fields the window is longer (ns)
 FEWEST_LATE = 2  # fields that show it, each by itself: one alone was tissue that slips or a match gone wrong
 SHORTEST_STEP_NS = 50_000_000  # between two frames: in less time tissue moves less than the flow's error
-LONGEST_STEP_NS = 200_000_000  # between two frames: longer motion is not followed in so small pictures
+LONGEST_STEP_NS = 200_000_000  # between two frames: longer motion is not followed in so small images
 LATE_ERROR = 0.2  # px of the working size, explained by motion: 1 % of the depth where disparities are 20 px
 LEAST_SLOPE = 0.1  # row error over motion: less is chance
 KNOCKED = 1.0  # px of the working size from the usual row error; clear pairs stay within 0.1
@@ -69,7 +69,7 @@ class MatchWatch(Debounced):
         self.is_late = False
         super().__init__()
         self._flow = OpticalFlow(STRIDE)
-        self._seen: deque[tuple[int, GrayPyramid]] = deque()  # stamps and left pictures of the last frames
+        self._seen: deque[tuple[int, GrayPyramid]] = deque()  # stamps and left images of the last frames
         self._sums: deque[_Sums] = deque()
         self._median: float | None = None  # px, usual
         self._errors: F32 | None = None  # px, usual at each place: a calibration that fits badly leaves some
@@ -77,7 +77,7 @@ class MatchWatch(Debounced):
         self._stamp_ns: int | None = None
 
     def see(self, stamp_ns: int, left: GrayPyramid) -> None:
-        """Take the left picture of a frame, whether it is matched or not."""
+        """Take the left image of a frame, whether it is matched or not."""
         while self._seen and not 0 <= stamp_ns - self._seen[0][0] <= LONGEST_STEP_NS:
             self._seen.popleft()
         self._seen.append((stamp_ns, narrowed(left)))

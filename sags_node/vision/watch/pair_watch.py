@@ -1,6 +1,6 @@
 """Whether both eyes show what they should: faults that no stage notices, because it fails quietly.
 
-They are looked for in small pictures of every frame, whatever else is skipped. An eye is compared with the
+They are looked for in small images of every frame, whatever else is skipped. An eye is compared with the
 other one and with what it showed a moment ago: a scene that gets smooth or stands still does so in both.
 """
 
@@ -21,15 +21,15 @@ from sags_node.vision.watch.standing import Debounced
 
 BLOCK = 8  # px, of JPEG and similar codecs
 EVERY = 16  # rows from one that is read to the next
-# By how much steps across block borders exceed those beside them, over the picture's mean step. Recorded
+# By how much steps across block borders exceed those beside them, over the image's mean step. Recorded
 # endoscopies have 0.1 to 0.3; JPEG of quality 50 to 30 has 0.3 to 1.3, of quality 10, which keeps 28 to
 # 30 dB, 1.3 to 2.4.
 BLOCKY = 1.0
 
-WIDTH = 80  # px of the small pictures
+WIDTH = 80  # px of the small images
 BLACK = 20.0  # grey levels; video that keeps its black at 16 too
 WHITE = 235.0  # and its white at 235
-ONE_COLOR = 6.0  # grey levels between the darkest and the brightest of a picture of one colour
+ONE_COLOR = 6.0  # grey levels between the darkest and the brightest of an image of one colour
 OUTLIERS = 0.01  # of the pixels at either end: a caption, dead pixels
 EQUAL = 0.5  # of the difference that a shift by one small pixel makes; true pairs have 1 to 5
 LEAST_MATCH = 0.35  # correlation; nothing matches below
@@ -40,30 +40,30 @@ MOVED = 1.0  # grey levels, mean: the other eye has moved for sure
 UNMOVED = 1 / 8  # of the other eye's change; clear pairs have 1/2 or more, with fog 1/4
 
 _TEXTS = {
-    "black": "the {eye} picture is black: check the light, the lens cap and the cable",
-    "white": "the {eye} picture is white: lower the light or the exposure",
-    "plain": "the {eye} picture is of one colour: check the lens, the cable and the capture card",
-    "fogged": f"the {{eye}} picture is fogged or out of focus beside the other: {LENS}",
-    "frozen": "the {eye} picture stands still while the other moves: check its cable and capture card",
+    "black": "the {eye} image is black: check the light, the lens cap and the cable",
+    "white": "the {eye} image is white: lower the light or the exposure",
+    "plain": "the {eye} image is of one colour: check the lens, the cable and the capture card",
+    "fogged": f"the {{eye}} image is fogged or out of focus beside the other: {LENS}",
+    "frozen": "the {eye} image stands still while the other moves: check its cable and capture card",
 }
-_EQUAL = Finding("eyes_equal", "both eyes show the same picture, so there is no depth: connect the other eye")
+_EQUAL = Finding("eyes_equal", "both eyes show the same image, so there is no depth: connect the other eye")
 _EXCHANGED = Finding(
     "eyes_exchanged",
     "left and right seem to be exchanged: exchange source.left and source.right or set source.geometry.first",
 )
 _UNCLEAR = {
     "": [],
-    "blurred": [Finding("picture_blurred", f"the picture is blurred, and is not learnt: {LENS}")],
+    "blurred": [Finding("picture_blurred", f"the image is blurred, and is not learnt: {LENS}")],
     "veiled": [SMOKE],
 }
 _COMPRESSED = Finding(
     "picture_compressed",
-    "the picture is compressed so hard that blocks show: raise the bit rate or the quality of the capture",
+    "the image is compressed so hard that blocks show: raise the bit rate or the quality of the capture",
 )
 
 
 class Small(NamedTuple):
-    """One picture, shrunk."""
+    """One image, shrunk."""
 
     rgb: U8  # [h, w, 3]
     gray: F32  # [h, w]
@@ -78,7 +78,7 @@ class PairWatch(Debounced):
         self._history: deque[tuple[F32, F32]] = deque(maxlen=HISTORY)
 
     def judge(self, evidence: Evidence, judged: Judgement) -> Judgement:
-        """Hold a frame with a bad left picture or exchanged eyes; do not match eyes of which one is bad."""
+        """Hold a frame with a bad left image or exchanged eyes; do not match eyes of which one is bad."""
         frame = evidence.frame
         found = self._look(frame, evidence.pair)
         learn = not any(code.startswith("picture") for code, _ in found)
@@ -176,13 +176,13 @@ def _ends(rgb: U8, outliers: int) -> I64:
 
 
 def _are_equal(left: F32, right: F32) -> bool:
-    """Whether both are captures of one picture: these differ far less than after a small shift."""
+    """Whether both are captures of one image: these differ far less than after a small shift."""
     apart = mean_difference(left, right * np.float32(cv2.mean(left)[0] / cv2.mean(right)[0]))
     return apart < EQUAL * mean_difference(left[:, 1:], left[:, :-1])
 
 
 def _are_exchanged(left: F32, right: F32) -> bool:
-    """Whether the eyes are exchanged: then everything lies farther right in the right picture, not farther
+    """Whether the eyes are exchanged: then everything lies farther right in the right image, not farther
     left (unless the eyes converge so much that the calibration shifts it back)."""
     match = row_correlation(left, right)
     reach = len(match) // 2
@@ -228,14 +228,14 @@ def _correlate(a: F32, b: F32, width: int, correlation: F32) -> None:
 
 
 def is_blocky(picture: U8) -> bool:
-    """Tell whether blocks show in a picture [H, W, 3] as it came. Resizing and rectifying hide them."""
+    """Tell whether blocks show in an image [H, W, 3] as it came. Resizing and rectifying hide them."""
     return bool(_excess(picture) > BLOCKY)
 
 
 @kernel
 def _excess(picture: U8) -> Any:
     """By how much steps across the borders of blocks, wherever these begin, exceed those beside them, over
-    the mean step. A picture that was enlarged by repeating pixels has such steps at other places too."""
+    the mean step. An image that was enlarged by repeating pixels has such steps at other places too."""
     height, width, _ = picture.shape
     blocks = (width - 3) // BLOCK
     sums = np.zeros(BLOCK + 2, np.float32)  # of the steps at each place in a block, and in the next two

@@ -17,7 +17,7 @@ REMEMBERED_S = 3.0  # s over which the usual colours follow
 
 
 class Colors:
-    """The channels of a picture [h, w, 3], and which of its pixels tell a colour.
+    """The channels of an image [h, w, 3], and which of its pixels tell a colour.
 
     Attributes:
         light: [h, w] their sum.
@@ -48,7 +48,7 @@ class Palette:
         self._stamp_ns = 0
 
     def new(self, picture: U8, tissue: Bool, now: int) -> Bool:
-        """Find where [h, w] a small picture [h, w, 3] has colours that the tissue has far more of than
+        """Find where [h, w] a small image [h, w, 3] has colours that the tissue has far more of than
         usual."""
         colors = Colors(cv2.blur(picture, (FINE, FINE)), DARK)
         self._bins, self._counted = colors.bins(), tissue & colors.fair
@@ -67,7 +67,7 @@ class Palette:
         return self._is_new
 
     def take(self, except_new: bool) -> None:
-        """Learn the colours of the picture that `new` took last; `except_new`: but for its new colours."""
+        """Learn the colours of the image that `new` took last; `except_new`: but for its new colours."""
         found = self._shares(self._counted & ~self._is_new if except_new else self._counted)
         if found.any():
             before = found if self._usual is None else self._usual

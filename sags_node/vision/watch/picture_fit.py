@@ -1,4 +1,4 @@
-"""How well a small picture agrees with the model as it was drawn: in exposure, colours and structure."""
+"""How well a small image agrees with the model as it was drawn: in exposure, colours and structure."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 from sags_node.kernels.jit import kernel
 from sags_node.types import F32, I64, Bool
 
-FEWEST = 50  # small px of the model in the picture, to judge it by
+FEWEST = 50  # small px of the model in the image, to judge it by
 DARK, BRIGHT = 0.03, 0.95  # beyond, a channel shows only noise or saturation
 MISFIT = 0.1  # of the range of colours, mean over the channels: above it a pixel does not agree
 COVERED = 0.15  # of the px misfit: something covers them, or it is another scene; a beating heart stays below
@@ -19,14 +19,14 @@ GREEN = 1  # the channel with most of the structure, and seldom saturated
 
 
 class Fit:
-    """How well small pictures [h, w, 3] agree where something is known [h, w].
+    """How well small images [h, w, 3] agree where something is known [h, w].
 
     Attributes:
         usable: share of the channels that can be compared.
         gain: [3] of the exposure.
         wrong: [h, w] where they do not agree.
         misfit: share of the known pixels that do not agree.
-        contrast: that of the seen picture over that of the model, after the gain.
+        contrast: that of the seen image over that of the model, after the gain.
         match: correlation of their structure.
     """
 
@@ -51,13 +51,13 @@ class Fit:
 
 
 def structure(gray: F32) -> F32:
-    """Return the structure of a small picture [h, w]: neither noise nor shading."""
+    """Return the structure of a small image [h, w]: neither noise nor shading."""
     found: F32 = cv2.blur(gray, (FINE, FINE)) - cv2.blur(gray, (LOCAL, LOCAL))
     return found
 
 
 def _misfit(seen: F32, drawn: F32, known: Bool, fair: Bool, gain: F32) -> tuple[Bool, float]:
-    """Find where pictures do not agree [h, w], and the share of the known pixels where they do not."""
+    """Find where images do not agree [h, w], and the share of the known pixels where they do not."""
     difference, wrong = np.empty(seen.shape, np.float32), np.empty(known.shape, np.bool_)
     _subtract(seen, drawn, fair, np.reciprocal(gain), difference)
     count, misfit = _judge(cv2.blur(difference, (FINE, FINE)), known, fair, wrong)

@@ -1,8 +1,8 @@
-"""Whether a picture shows the model's scene: what is too dark, too bright, veiled, covered or another scene
+"""Whether an image shows the model's scene: what is too dark, too bright, veiled, covered or another scene
 is not to be learnt, and is no reason for a new model.
 
-Small pictures are compared, before anything else is done with a frame. The exposure is one gain for each
-channel. A veil, as smoke is, takes contrast away all over. Blood and other cover changes some of the picture.
+Small images are compared, before anything else is done with a frame. The exposure is one gain for each
+channel. A veil, as smoke is, takes contrast away all over. Blood and other cover changes some of the image.
 Another scene changes most of it, and no motion explains it.
 """
 
@@ -23,39 +23,39 @@ from sags_node.vision.watch.palette import Palette
 from sags_node.vision.watch.picture_fit import COVERED, FEWEST, GREEN, LEAST_MATCH, Fit
 from sags_node.vision.watch.standing import Debounced, watched_ns
 
-WIDTH = 80  # px of the small pictures
+WIDTH = 80  # px of the small images
 SEEN_ALPHA = 0.5  # of the model: a pixel with more is known
-LEAST_USABLE = 0.5  # of the model's channels can be compared: with less the picture is overexposed or dark
-WHOLE = 0.98  # of them: with more, a picture may be learnt in another exposure than the model's
+LEAST_USABLE = 0.5  # of the model's channels can be compared: with less the image is overexposed or dark
+WHOLE = 0.98  # of them: with more, an image may be learnt in another exposure than the model's
 STARTLING = 0.08  # of the px misfit: then motion is looked for that explains it
-VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear pictures have 0.9 and more
+VEILED, HIDDEN = 0.6, 0.15  # of the model's contrast; clear images have 0.9 and more
 RIM = 5  # small px: what lies over the tissue has a soft edge, and grows
 LEAST_KEPT = 0.3  # of what is known must be in view after motion
-LARGEST_GAIN = 1.5  # over the model's exposure; a picture with more is brought to that exposure
+LARGEST_GAIN = 1.5  # over the model's exposure; an image with more is brought to that exposure
 STEADY = 1.2  # factor to the gain before: if it stays smaller, the exposure has changed for good
 FOLLOWED = 0.9  # of the gain's logarithm that the frame before took out is taken out after that
-STRANGE = 0.02  # of the tissue has new colours: clear pictures have 0.001, a bleeding 0.04 in its first frame
+STRANGE = 0.02  # of the tissue has new colours: clear images have 0.001, a bleeding 0.04 in its first frame
 LONGEST_NS = {"cover": 3_000_000_000, "veil": 10_000_000_000, "gain": 1_000_000_000}  # what lasts is usual
 NEW_SCENE_NS = 3_000_000_000  # ns: an unknown scene that lasts begins a new model
 
 _FLOW = OpticalFlow(stride=4)
 
-_DARK = Finding("picture_dark", "the picture is too dark, and is not learnt: check the light")
+_DARK = Finding("picture_dark", "the image is too dark, and is not learnt: check the light")
 _BRIGHT = Finding(
-    "picture_bright", "the picture is overexposed, and is not learnt: lower the light or the exposure"
+    "picture_bright", "the image is overexposed, and is not learnt: lower the light or the exposure"
 )
 _COVERED = Finding(
     "picture_covered", "blood or something else covers some of the tissue, and is not learnt: clear the view"
 )
 _UNKNOWN = Finding(
     "picture_unknown_scene",
-    "the picture does not show the model's scene: go back to it, or wait; what lasts three seconds begins a "
+    "the image does not show the model's scene: go back to it, or wait; what lasts three seconds begins a "
     "new model",
 )
 
 
 class Look(NamedTuple):
-    """How one picture compares with the model as it was drawn last."""
+    """How one image compares with the model as it was drawn last."""
 
     wrong: Finding | None = None  # why it cannot be followed
     veiled: bool = False  # its colours and contrast are not the scene's
@@ -63,16 +63,16 @@ class Look(NamedTuple):
     gain: F32 = np.ones(3, np.float32)  # [3] its exposure over the model's
     whole: bool = True  # next to nothing of it is clipped
     guess: F32 | None = None  # [rows, columns, 2] px: roughly the motion to where the scene is found again
-    clear: bool = True  # the picture itself is good
+    clear: bool = True  # the image itself is good
 
 
 class SceneWatch(Debounced):
-    """Compares every picture with the frame mapped last."""
+    """Compares every image with the frame mapped last."""
 
     def __init__(self, moving: bool = False) -> None:
         """
         Args:
-            moving: the camera's pose is estimated, which also deals with pictures of another scene.
+            moving: the camera's pose is estimated, which also deals with images of another scene.
         """
         self._moving = moving
         super().__init__()
@@ -145,7 +145,7 @@ class SceneWatch(Debounced):
         return grown.view(np.bool_)
 
     def _exposure(self, gain: F32, now: int) -> F32 | None:
-        """Return the gain [3] to take out of the pictures; None: the model follows their exposure itself."""
+        """Return the gain [3] to take out of the images; None: the model follows their exposure itself."""
         steady = _strength(gain / self._gain) < STEADY
         self._gain = gain
         if _strength(gain) <= LARGEST_GAIN:
@@ -194,16 +194,16 @@ def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
 
 
 def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
-    """Enlarge a small picture's mask to `shape`."""
+    """Enlarge a small image's mask to `shape`."""
     large: U8 = cv2.resize(small.view(np.uint8), shape[1::-1], interpolation=cv2.INTER_NEAREST)
     return large.view(np.bool_)
 
 
 def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> Look:
-    """Compare a picture with the frame mapped last.
+    """Compare an image with the frame mapped last.
 
     Args:
-        picture: [h, w, 3] the left one, small.
+        image: [h, w, 3] the left one, small.
         tissue: [h, w] small, where that frame would have shown tissue but for what covers it.
     """
     step = max(1, pair.camera.width // WIDTH)
@@ -226,7 +226,7 @@ def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> L
 def _closer_look(
     pair: RectifiedPair, last: FrameResult, step: int, seen: F32, drawn: F32, known: Bool, fit: Fit
 ) -> Look:
-    """Why picture and model differ: the tissue has moved, something covers it, or it is other tissue."""
+    """Why image and model differ: the tissue has moved, something covers it, or it is other tissue."""
     now = pyramids(exposed(pair, fit.gain) if _strength(fit.gain) > LARGEST_GAIN else pair)[0]
     before = pyramid_of(last.observation)
     fit = _after_motion(now, before, None, step, seen, drawn, known, fit)
@@ -248,10 +248,10 @@ def _after_motion(
     now: GrayPyramid, before: GrayPyramid, guess: F32 | None, step: int, seen: F32, drawn: F32, known: Bool,
     fit: Fit,
 ) -> Fit:  # fmt: skip
-    """The fit after the motion between the pictures is taken out; `fit` if that is no better. The motion is
+    """The fit after the motion between the images is taken out; `fit` if that is no better. The motion is
     searched from a guess [rows, columns, 2] px of the way back."""
     few = narrowed(now)
-    px = np.float32(now.full.shape[1] / (2 * inner(few.halves[0]).shape[1]))  # picture px per flow px
+    px = np.float32(now.full.shape[1] / (2 * inner(few.halves[0]).shape[1]))  # image px per flow px
     flow = _FLOW(few, narrowed(before), None if guess is None else guess / px)
     flow = cv2.resize(flow, known.shape[::-1], interpolation=cv2.INTER_AREA) * (px / np.float32(step))
     columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in known.shape[::-1]))
@@ -265,7 +265,7 @@ def _after_motion(
 
 
 def _around(landmarks: Landmarks, step: int, shape: tuple[int, ...]) -> Bool:
-    """True [h, w] where tissue was found again in a small picture: nothing covers it there."""
+    """True [h, w] where tissue was found again in a small image: nothing covers it there."""
     found = np.zeros(shape, np.uint8)
     columns, rows = np.rint(landmarks.after / step).astype(np.intp).T
     found[rows.clip(0, shape[0] - 1), columns.clip(0, shape[1] - 1)] = 1

@@ -65,7 +65,7 @@ def said_by(row: Recording) -> dict[str, Any]:
 
 
 def stamps_of(rng: random.Random, count: int) -> Any:
-    """Of pictures at about 30 Hz, with gaps, and some that came twice."""
+    """Of images at about 30 Hz, with gaps, and some that came twice."""
     steps = rng.choices((0, 33_333_333, 33_412_907, 5_000_000_000), (5, 60, 34, 1), k=count - 1)
     left = 1_700_000_000_123_456_789 + np.cumsum([0, *steps])
     return np.stack([left, left], axis=1)

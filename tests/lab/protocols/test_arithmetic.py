@@ -159,7 +159,7 @@ def test_depth_errors_have_a_sign() -> None:
 
 
 def test_stereomis_tracks_by_hand() -> None:
-    """Pictures of 512x1024 px: 2 px across and 4 px down are one of 256x256. The first point is right, then 6
+    """Images of 512x1024 px: 2 px across and 4 px down are one of 256x256. The first point is right, then 6
     px off across (3 of theirs), then 40 (20: lost), then not seen. The second is 8 px off downwards (2) once
     it is measured, and hidden in the third frame, where it is far off."""
     truth = np.full((2, 4, 2), 200.0)

@@ -23,7 +23,7 @@ FRAMES = 9  # the first and the last of them have depth
 THEIRS = 1e-3  # m that the data set's own stereo is too far
 SCANNER = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
 HIDDEN = np.s_[100:150, 120:180]  # that masks call instrument, and the scan tissue
-ON_SCANNER = np.s_[225:235, 310:330]  # that the mask over the scanner's picture calls instrument
+ON_SCANNER = np.s_[225:235, 310:330]  # that the mask over the scanner's image calls instrument
 
 
 def scanner_pose() -> F64:
@@ -158,7 +158,7 @@ def test_clips_of_d4d(d4d: Path, rig: StereoRig) -> None:
 
 
 def test_principal_points_that_differ_are_brought_together(d4d: Path, tmp_path: Path) -> None:
-    """What lies 2 px farther to the right in the right picture, because its principal point does, lies at the
+    """What lies 2 px farther to the right in the right image, because its principal point does, lies at the
     same depth."""
     folder = copied(d4d, tmp_path / "apart")
     rig = d4d_clips(folder)[0].rig

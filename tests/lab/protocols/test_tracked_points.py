@@ -32,8 +32,8 @@ def frames(played: list[StereoFrame]) -> list[StereoFrame]:
 
 
 def truth(frames: list[StereoFrame], rig: StereoRig) -> tuple[F64, Bool]:
-    """Pixels [P, T, 2] in the rectified left picture and whether they are seen [P, T]: of points in the
-    middle of the first picture."""
+    """Pixels [P, T, 2] in the rectified left image and whether they are seen [P, T]: of points in the
+    middle of the first image."""
     camera = Rectifier(rig, rig.left.width, rig.left.height).camera
     said = [frame.reference for frame in frames if frame.reference is not None]
     pixels = np.stack([project(camera, each.points)[0] for each in said if each.points is not None], 1)
@@ -54,7 +54,7 @@ def tracker(rig: StereoRig) -> PointTracker:
 def test_points_lie_in_space_in_the_frame_that_they_are_pinned_in(
     frames: list[StereoFrame], rig: StereoRig
 ) -> None:
-    """They stay there, and go on as the same points. A point outside the picture is not found."""
+    """They stay there, and go on as the same points. A point outside the image is not found."""
     pixels, _ = truth(frames, rig)
     places = np.concatenate([raw(rig, pixels[:6, 0]), [[-5.0, -5.0]]])
     follower = tracker(rig)
@@ -183,7 +183,7 @@ def test_what_is_missing_is_said(tracked: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"not whole: \{'poses': 2\}, of 8"):
         tracked_sequence(folder)
     (folder / "video_frames/000003r.png").unlink()
-    with pytest.raises(UsageError, match="lacks pictures"):
+    with pytest.raises(UsageError, match="lacks images"):
         tracked_sequence(folder)
     (folder / "P3_1.yaml").unlink()
     with pytest.raises(UsageError, match=r"configs/StereoMIS/P3_1\.yaml"):

@@ -1,7 +1,7 @@
-// A node's pictures and anchors in a web page, through `sags bridge web`: see docs/bridges.md for what comes.
+// A node's images and anchors in a web page, through `sags bridge web`: see docs/bridges.md for what comes.
 //
 //     const sags = new Sags();                                          // ws://HOST/ws of this page
-//     sags.show("sags/thin/half/left/render/image/jpeg", canvas);       // any picture topic
+//     sags.show("sags/thin/half/left/render/image/jpeg", canvas);       // any image topic
 //     sags.anchors("sags/anchors", (rows) => ...);                      // [] when they are not new any more
 //
 // `sags.units[topic]` is "relative" where nobody has calibrated the eyes: lengths have no unit then.
