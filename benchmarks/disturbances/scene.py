@@ -62,7 +62,7 @@ class Scene:
 
     @property
     def mirrors(self) -> tuple[F32, F32]:
-        """For either eye, the raw pixel [H, W, 2] that shows what each pixel would see if the world stood
+        """The raw pixel [H, W, 2] of either eye that shows what each pixel would see if the world stood
         upside down before the same rig."""
         if self._mirrors is None:
             eyes = zip((self.rig.left, self.rig.right), self.rays, strict=True)

@@ -108,7 +108,7 @@ class Splats:
 def project(
     camera: Camera, inputs: Sequence[Tensor], smoothing: Tensor | None = None, antialias: bool = True
 ) -> Splats:
-    """EWA projection (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
+    """Project Gaussians by EWA (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
 
     Args:
         camera: OpenCV's; here the first pixel has its centre at (0.5, 0.5).

@@ -327,7 +327,7 @@ def sort_into_tiles(
     tile_starts: I32,  # [tiles + 1] written
     next_part: I64,  # [1] shared counter of the workers
 ) -> None:
-    """Stable counting sort: the result does not depend on the number of parts."""
+    """Sort the pairs by tile. A stable counting sort: the result does not depend on the number of parts."""
     parts, tiles = histogram.shape
     total = np.int32(0)
     for tile in range(tiles):

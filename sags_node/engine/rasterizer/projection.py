@@ -80,7 +80,7 @@ def unpack(view: F32) -> Row:
 
 @inlined
 def rotation(w: Any, x: Any, y: Any, z: Any) -> Row:
-    """Rows of the rotation matrix of a unit quaternion."""
+    """Return the rotation matrix of a unit quaternion, row by row."""
     return (
         ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
         TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
@@ -90,7 +90,7 @@ def rotation(w: Any, x: Any, y: Any, z: Any) -> Row:
 
 @inlined
 def screen_axes(R: Row, j00: Any, j02: Any, j11: Any, j12: Any) -> Row:
-    """J R_cam [2, 3]: how a small step in the world moves the picture."""
+    """Return J R_cam [2, 3]: how a small step in the world moves a point in the picture."""
     return (
         j00 * R[0] + j02 * R[6], j00 * R[1] + j02 * R[7], j00 * R[2] + j02 * R[8],
         j11 * R[3] + j12 * R[6], j11 * R[4] + j12 * R[7], j11 * R[5] + j12 * R[8],
@@ -99,7 +99,7 @@ def screen_axes(R: Row, j00: Any, j02: Any, j11: Any, j12: Any) -> Row:
 
 @inlined
 def times_rotation(A: Row, Q: Row) -> Row:
-    """A [2, 3] Q [3, 3]."""
+    """Return A [2, 3] Q [3, 3]."""
     return (
         A[0] * Q[0] + A[1] * Q[3] + A[2] * Q[6],
         A[0] * Q[1] + A[1] * Q[4] + A[2] * Q[7],
@@ -174,7 +174,7 @@ def ellipse(a: Any, b: Any, c: Any, extent: Any) -> Row:
 
 @inlined
 def times_axes(V: Row, ax: Any, ay: Any, az: Any) -> Row:
-    """V [2, 3] a [3]."""
+    """Return V [2, 3] a [3]."""
     return V[0] * ax + V[1] * ay + V[2] * az, V[3] * ax + V[4] * ay + V[5] * az
 
 

@@ -100,8 +100,8 @@ def smooth_backward(
     v_opacities: F32,  # [N] likewise
     v_slopes: F32,  # [N, 3] likewise
 ) -> None:
-    """With r = scale / scale': d scale' / d scale = r, and d opacity' / d scale = opacity f / scale'^3 times
-    the other large r, which stays finite for a scale of 0; it is 0 for the smallest axis."""
+    """Differentiate `smooth`. With r = scale / scale': d scale' / d scale = r, d opacity' / d scale = opacity
+    f / scale'^3 times the other large r. This is finite for a scale of 0, and 0 for the smallest axis."""
     for i in numba.prange(opacities.size):
         j = u8(i)
         f = smoothing[j]
