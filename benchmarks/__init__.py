@@ -1,4 +1,4 @@
-"""How fast and how good the node is, measured; see README.md here. Not part of the installed package."""
+"""Measures how fast and how good the node is; see README.md here. Not part of the installed package."""
 
 from collections.abc import Callable
 

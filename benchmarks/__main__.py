@@ -1,4 +1,4 @@
-"""`python -m benchmarks`, in a checkout: measure how fast and how good this machine is at it."""
+"""`python -m benchmarks`, in a checkout: measure run time and error on this machine."""
 
 from benchmarks.commands import engine, node, quality
 from sags_node.cli.main import begin, sags_group
@@ -8,7 +8,7 @@ from sags_node.cli.main import begin, sags_group
 def main(verbose: bool, form: str) -> None:
     """Measure run time and error, on this machine.
 
-    Figures that are kept stand in benchmarks/results, each with its command in benchmarks/README.md.
+    Kept figures are in benchmarks/results; benchmarks/README.md has the command that made each.
     """
     begin(verbose, form)
 

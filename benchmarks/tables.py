@@ -10,7 +10,7 @@ Row = Mapping[str, Any]
 
 
 class _Cell(Formatter):
-    """`str.format` for figures of which some are not known: None, missing, or in a group that is None."""
+    """`str.format` for figures that may be unknown: None, missing, or in a group that is None."""
 
     def __init__(self, unknown: str) -> None:
         self._unknown = unknown
@@ -26,7 +26,7 @@ class _Cell(Formatter):
 
 
 def filled(made: Table, rows: Iterable[Row], *cells: str, unknown: str = "-") -> Table:
-    """The table with a line for each row; cells are as `str.format` takes them: "{depth[p90_mm]:.2f}"."""
+    """Add a line for each row to a table; `cells` are format strings: "{depth[p90_mm]:.2f}"."""
     cell = _Cell(unknown)
     for row in rows:
         made.add_row(*(cell.vformat(each, (), row) for each in cells))
@@ -34,7 +34,7 @@ def filled(made: Table, rows: Iterable[Row], *cells: str, unknown: str = "-") ->
 
 
 def plain_table(first: str, *others: str, title: str | None = None) -> Table:
-    """An empty table without lines, its columns of figures flush right."""
+    """Make an empty table without rules; columns of figures are right-aligned."""
     made = Table(box=None, padding=(0, 3, 0, 0), pad_edge=False, title=title, title_justify="left")
     made.add_column(first)
     for heading in others:

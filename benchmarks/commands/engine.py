@@ -1,4 +1,4 @@
-"""Of the engine and the offline model."""
+"""Benchmark commands of the engine and the offline model."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -53,14 +53,14 @@ def bench_kernels(
 ) -> None:
     """Time every kernel of the engine beside the machine's peak.
 
-    --out leaves a plot of the same name beside the figures, .svg.
+    --out also writes a plot of the same name, .svg, beside the figures.
 
     Milliseconds per stage, pixel-Gaussian pairs per second, the share of the machine's peak (multiply-adds or
     memory, whichever binds; both measured in the same run), the gain over the plain torch twin, how it scales
     with threads, and what idle pauses cost. Takes two minutes, in which the machine should do nothing else.
 
     --check is the guard against kernels that became slow without an error. It compares each kernel's time in
-    units of the machine's own peak, so a table from another machine serves too, less sharply. Exit code 1 and
+    units of the machine's own peak, so a table from another machine works, too, less exactly. Exit code 1 and
     the kernel's name if one is slower than the tolerance.
 
     \b
@@ -108,7 +108,7 @@ def bench_kernels(
 @force_option
 @as_json
 def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool, json_out: bool) -> None:
-    """What both filters are worth at other sizes and distances.
+    """What both anti-aliasing filters gain at other sizes and distances.
 
     Four models of one instant of the phantom, with each choice of filters, are drawn at 1/4 to 4 times the
     size and from 1/2 to 4 times the distance, and compared with the ray-cast truth: PSNR, the brightness of
@@ -136,7 +136,7 @@ def bench_alias(quick: bool, out: Path | None, picture: Path | None, force: bool
 @shown("--rung", type=click.IntRange(0), default=7, help="Of the ladder, as well.")
 @measures
 def bench_methods(launch: tuple[str, ...], iterations: int, rung: int) -> Measured:
-    """Control nodes or the paper's field: mapping.method nodes and sags on a recording, at two sizes.
+    """Compare control nodes and the paper's field (mapping.method nodes, sags) on a recording, at two sizes.
 
     Live: rate, latency and PSNR. Step by step: PSNR of the newest frame, the next and held-out ones, depth,
     tracks, and of all frames of the last two seconds when the stream has ended. Takes some minutes.
@@ -202,7 +202,7 @@ def bench_ablation(
 @shown("--seconds", type=click.FloatRange(min=1), default=420.0, help="After which no part begins.")
 @measures
 def bench_gpu(small: bool, fit: bool, seconds: float) -> Measured:
-    """All that a GPU should do: parity, times, live runs. `make gpu-check` calls it.
+    """Check all that a GPU should do: parity, times, live runs. `make gpu-check` calls it.
 
     \b
     python -m benchmarks gpu --fit --out benchmarks/results/gpu.json

@@ -1,4 +1,4 @@
-"""What commands of benchmarks have in common."""
+"""What the benchmark commands have in common."""
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
@@ -38,18 +38,18 @@ def measures(command: Callable[..., Measured]) -> Callable[..., None]:
 
 
 def split(launch: Sequence[str], name: str, needs: str = RECORDINGS) -> tuple[str | None, list[str]]:
-    """Path and overrides of a recording for the benchmark of that name."""
+    """Return path and overrides of a recording for the benchmark `name`."""
     return split_recording(launch, f"benchmarks {name} {needs}")
 
 
 def step_by_step(launch: Sequence[str], name: str) -> Session:
-    """A recording that is played once, each frame in turn."""
+    """Open a recording that is played once, frame by frame."""
     path, overrides = split(launch, name)
     return open_launched(path, [*overrides, *STEP])
 
 
 def each_recording(launch: Sequence[str], name: str) -> tuple[list[str | None], list[str]]:
-    """Paths, by default that of the built-in phantom, and overrides of all of them."""
+    """Return the recordings' paths, by default that of the built-in phantom, and the overrides for all."""
     overrides = [argument for argument in launch if ":=" in argument]
     alone = [[path, *overrides] for path in launch if ":=" not in path] or [overrides]
     return [split(arguments, name)[0] for arguments in alone], overrides

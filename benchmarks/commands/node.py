@@ -1,4 +1,4 @@
-"""Of the running node: time against error, endurance, tracking, subscribers."""
+"""Benchmark commands of the running node: time against error, endurance, tracking, subscribers."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ def bench_pareto(
     A smaller working size is measured at that size, and once more at the launch file's, for which its
     Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
 
-    The part rungs is each rung of the ladder of quality, with one step a frame: its price, and what it gives.
+    The part rungs plays each rung of the ladder of quality, with one step a frame: its time and its quality.
     The part hosts plays live, sockets included: with the machine for itself; on one of its cores; beside a
-    busy process, the overlay, a reader of everything and the viewer (with a browser, where there is one). How
-    many frames it shows after the first second, in which time and how well.
+    busy process, the overlay, a reader of everything and the viewer (with a browser, where there is one). It
+    tells how many frames are shown after the first second, how fast and how well.
 
     \b
     python -m benchmarks pareto launch/d4d_pull.yaml launch/phantom.yaml source.start:=2 --frames 50 \\
@@ -247,12 +247,12 @@ def bench_recall(launch: tuple[str, ...], seconds: float) -> Measured:
 @shown("--seconds", type=positive, default=120.0, help="Of each motion.")
 @measures
 def bench_scope(launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: float) -> Measured:
-    """How true the pose of a moving scope stays.
+    """How accurate the pose of a moving scope stays.
 
     The phantom's scope sways, zooms and orbits over breathing, pulled tissue, at 10 Hz. Its pose is given,
     estimated from the pictures, given by a robot that is off by some mm and a degree, and refined from that;
-    beside them a camera that takes the scene for rigid, and what fits the true surface points best. Errors of
-    the way, drift over whole breaths, pictures and depth. Takes some minutes for each motion.
+    beside them a camera that takes the scene for rigid, and the pose that fits true points best. Errors of
+    the path, drift over whole breaths, pictures and depth. Takes some minutes for each motion.
 
     \b
     python -m benchmarks scope --motion orbit source.width:=320 source.height:=256

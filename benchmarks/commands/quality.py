@@ -1,4 +1,4 @@
-"""How right depth and masks are, and how exactly is measured, registered and placed by them."""
+"""Benchmark commands of accuracy: depth, masks, lengths, registration, instruments; and disturbances."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def bench_depth(
     force: bool,
     json_out: bool,
 ) -> None:
-    """How right the depth is, and how much there is of it.
+    """How accurate the depth is, and how complete.
 
     The stereo stage at every scale, beside OpenCV's SGBM in its place and as its own sample sets it up, and a
     network where one is given.
@@ -111,7 +111,7 @@ def bench_depth(
 @click.argument("launch", nargs=-1, metavar="[LAUNCH.yaml | SESSION]... [key:=value ...]")
 @measures
 def bench_masks(launch: tuple[str, ...]) -> Measured:
-    """How right masks are that were found, and what they bring.
+    """How accurate the masks are that the node finds, and what they gain.
 
     Plays recordings that have masks of their own, by default the built-in phantom, once with these, once with
     those found without them (classical), once with none, and with a network's where vision.tissue.path is
@@ -141,7 +141,7 @@ def bench_masks(launch: tuple[str, ...]) -> Measured:
 @launch_argument
 @measures
 def bench_lengths(launch: tuple[str, ...]) -> Measured:
-    """How exactly lengths and areas between anchors are measured, and whether the errors told are true.
+    """How accurate lengths and areas between anchors are, and whether their stated errors are true.
 
     Anchors are pinned at points of the phantom that its first frame shows. Every fifth frame distances, paths
     of four and triangles between them are compared with the true ones; beside it the first frame's value,
@@ -161,10 +161,10 @@ def bench_lengths(launch: tuple[str, ...]) -> Measured:
 @shown("--seeds", type=click.IntRange(1), default=3, help="Phantoms, each pulled once.")
 @measures
 def bench_strain(seeds: int) -> Measured:
-    """How exactly the columns `strain_max` and `strain_min` of `points` tell how tissue is stretched.
+    """How accurate the strain of the tissue is, in the columns `strain_max` and `strain_min` of `points`.
 
-    The phantom is pulled. Truth is its grid, by central differences; beside it 0, which is known without
-    measuring.
+    The phantom is pulled. Truth is its grid, by central differences; beside it the value 0, which
+    needs no measurement.
 
     \b
     python -m benchmarks strain --out benchmarks/results/strain.json
@@ -181,12 +181,12 @@ def bench_strain(seeds: int) -> Measured:
 @shown("--seeds", type=click.IntRange(1), default=20, help="Phantoms, and errors of the picked points.")
 @measures
 def bench_registration(ct: Path | None, seeds: int) -> Measured:
-    """How exactly a model is placed on tissue, and whether the errors told are true.
+    """How accurately a model is placed on tissue, and whether the stated errors are true.
 
     A part of the phantom's surface, moved, is registered to what the node measures of it in a second, from
     five pairs of points that are 1 mm off along each axis. Errors of five targets 20 mm below the surface:
     by the pairs alone, after the fit to the surface, by Open3D's ICP from the same start; and how many are
-    within what was told. What must be refused is counted with its remedy.
+    within the stated error. Cases that must be refused are counted with their remedy.
 
     \b
     python -m benchmarks registration --ct $SAGS_DATA/tmi_ct_pair --out benchmarks/results/registration.json
@@ -206,8 +206,8 @@ def bench_deform(seeds: int) -> Measured:
 
     A part of the phantom's surface, and the same 5, 10 and 20 mm below it, is held by anchors while the
     surface is pulled by 10 mm and more: rigid, and bent with it (`deform: true`). Errors of its vertices to
-    the truth; below the surface that is an elastic half space, by definition. What the check of the residual
-    says of both.
+    the truth; below the surface that is an elastic half space, by definition. What the residual check says
+    of both.
 
     \b
     python -m benchmarks deform --out benchmarks/results/deform.json
@@ -223,10 +223,10 @@ def bench_deform(seeds: int) -> Measured:
 @shown("--seeds", type=click.IntRange(1), default=4, help="Phantoms, each with other instruments before it.")
 @measures
 def bench_instruments(seeds: int) -> Measured:
-    """How exactly the topic `instruments` tells tips, axes and distances, and whether its confidence is true.
+    """How accurate the tips, axes, distances and confidence of the topic `instruments` are.
 
     Instruments are put before the phantom, 5 to 40 mm from the tissue: one, two, crossing, and leaving the
-    picture. Beside them is the far end of the mask, at the depth of the tissue there, and at the depth that
+    picture. They are compared with the mask's far end, at the tissue's depth there, and at the depth that
     the node's stereo finds on the instrument.
 
     \b
@@ -286,7 +286,7 @@ def bench_disturbances(
     frame with one step of the mapper: undisturbed, disturbed for a second, undisturbed again. The picture is
     compared with what the tissue really looked like at that time; published depth with the recording's
     reference; anchors, pinned before, with true surface points, or with where the undisturbed run has them.
-    When the node warns, when it stops, how soon the picture is as before, how many models were made anew.
+    Tells when the node warns and stops, how soon the picture is as before, how many models were made anew.
     Instruments are found, not given (vision.tissue.method:=session gives them).
 
     \b

@@ -1,4 +1,4 @@
-"""All disturbances by name, how long each lasts, and a stream of frames of which a stretch has one."""
+"""All disturbances by name, how long each lasts, and a stream of frames with one of them for some time."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from sags_node.types import StereoFrame
 
 @dataclass(frozen=True, slots=True)
 class Disturbance:
-    """One thing that goes wrong."""
+    """A kind of disturbance."""
 
     name: str
-    change: Callable[[Moment], StereoFrame | None]  # the frame as it comes; None: it does not
-    seconds: float | None = None  # that it lasts; None: all the time that is given
-    frames: int | None = None  # likewise, whatever the rate
+    change: Callable[[Moment], StereoFrame | None]  # the frame as it arrives; None: it is lost
+    seconds: float | None = None  # how long it lasts; None: all the time that is given
+    frames: int | None = None  # how many frames it lasts, at any rate; None: see `seconds`
 
     @property
     def says(self) -> str:
-        """What it is, in words."""
+        """The disturbance in words: the first sentence of the docstring of `change`."""
         return (self.change.__doc__ or "").split(". ")[0].rstrip(".").replace("\n    ", " ")
 
     def length(self, whole: int, rate: float) -> int:
-        """How many of the `whole` frames that are given it lasts, at `rate` frames per second."""
+        """Return how many of `whole` given frames it lasts, at `rate` frames per second."""
         if self.frames is not None:
             return min(self.frames, whole)
         return whole if self.seconds is None else min(max(1, round(self.seconds * rate)), whole)
@@ -62,13 +62,13 @@ class Taken(NamedTuple):
     """One frame of a disturbed stream."""
 
     clean: StereoFrame  # as it was taken: the true picture of that time
-    given: StereoFrame | None  # as it comes; None: it is lost
+    given: StereoFrame | None  # as it arrives; None: it is lost
 
 
 def disturbed(
     disturbance: Disturbance, frames: Iterable[StereoFrame], during: range, rate: float, scene: Scene
 ) -> Iterator[Taken]:
-    """The frames with one disturbance. Numbers, stamps, poses, and what is true of them stay as they are.
+    """Yield the frames with one disturbance. Numbers, stamps, poses and ground truth stay as they are.
 
     Args:
         frames: of a source, both eyes.

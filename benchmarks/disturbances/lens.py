@@ -76,8 +76,8 @@ def _through_drops(picture: U8, eye: int) -> U8:
 
 @cache
 def _lenses(shape: tuple[int, int], eye: int) -> tuple[F32, F32, F32]:
-    """Where the picture is seen through the drops on a lens, x and y [H, W], and how much of what is there
-    comes through a drop [H, W] 0..1. A drop is a thick lens that shrinks and turns what is behind it."""
+    """The place x, y [H, W] in the picture that each pixel shows through the drops on a lens, and the drops'
+    share of the pixel [H, W] 0..1. A drop is a thick lens: it shrinks the scene and turns it upside down."""
     height, width = shape
     random = np.random.default_rng([SEED, eye])
     y, x = np.indices(shape, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""What changes the light: exposure, lamp, flash. In linear light, as it is in the camera."""
+"""Disturbances of the light: exposure, lamp, flash. They act on linear light, as in the camera."""
 
 import cv2
 import numpy as np
@@ -8,21 +8,21 @@ from sags_node.types import F32, U8, StereoFrame
 
 GAMMA = 2.2
 GRAIN = 1.5  # grey levels, noise of a camera (standard deviation)
-DARK = 0.003  # of the light: the lamp is off, something glows
-FLICKER = 3.0  # times and one over so many times the light
-FLASH = 8.0  # times the light
-FLASH_GLOW = np.array([0.20, 0.22, 0.28], np.float32)  # of a spark, beside the light on the tissue
+DARK = 0.003  # share of the light that is left when the lamp is off
+FLICKER = 3.0  # the light is multiplied and divided by this in turn
+FLASH = 8.0  # the light is multiplied by this
+FLASH_GLOW = np.array([0.20, 0.22, 0.28], np.float32)  # linear light of a spark, added to that of the tissue
 _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(GAMMA)
 
 
 def to_linear(picture: U8) -> F32:
-    """Linear light [H, W, 3] 0..1 of a picture."""
+    """Return the linear light [H, W, 3] 0..1 of a picture."""
     return np.asarray(cv2.LUT(picture, _LINEAR), np.float32)
 
 
 def to_display(linear: F32, random: np.random.Generator | None = None) -> U8:
-    """The picture [H, W, 3] of linear light; what is brighter than 1 is white. With a camera's grain where
-    `random` is given: what veils a scene does not take it away."""
+    """Return the picture [H, W, 3] of linear light; what is brighter than 1 is white. `random` adds the grain
+    of a camera, which stays where something veils the scene."""
     shown = np.asarray(cv2.pow(np.clip(linear, 0, 1), 1 / GAMMA)) * np.float32(255)
     if random is not None:
         shown += np.float32(GRAIN) * random.standard_normal(shown.shape, np.float32)

@@ -1,4 +1,4 @@
-"""What a disturbance may know of one frame: everything it does is a function of this."""
+"""What a disturbance knows of one frame; what it does depends on nothing else."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ class Moment:
 
     @property
     def frame(self) -> StereoFrame:
-        """As it was taken."""
+        """The frame as it was taken."""
         return self.history[-1]
 
     @property
@@ -33,25 +33,25 @@ class Moment:
         return right_of(self.frame)
 
     def earlier(self, frames: int) -> StereoFrame:
-        """As it was taken so many frames before, or the oldest there is."""
+        """Return the frame that was taken `frames` frames before, or the oldest that is kept."""
         return self.history[max(0, len(self.history) - 1 - frames)]
 
     def swell(self) -> float:
-        """0..1: of what comes, stays, and goes again before it is over. Never 0."""
+        """Return the strength 0..1 of what rises, stays and falls again while it lasts. Never 0."""
         rising = (self.index + 1) / (RISES * self.count)
         falling = (self.count - self.index) / (FALLS * self.count)
         return float(min(1.0, rising, falling))
 
     def random(self, eye: int) -> np.random.Generator:
-        """Of this frame and eye (0 left, 1 right)."""
+        """Return the random generator of this frame and eye (0 left, 1 right)."""
         return np.random.default_rng([SEED, self.frame.frame_id, eye])
 
     def both(self, change: Callable[[U8, int], U8]) -> StereoFrame:
-        """The frame with both pictures changed; `change` is given the picture and its eye, 0 or 1."""
+        """Return the frame with both pictures changed; `change` is given the picture and its eye, 0 or 1."""
         return replace(self.frame, left=change(self.frame.left, 0), right=change(self.right, 1))
 
 
 def right_of(frame: StereoFrame) -> U8:
-    """The right picture. Who disturbs a stream has made sure that there is one."""
+    """Return the right picture; a stream is only disturbed if it has one."""
     assert frame.right is not None
     return frame.right

@@ -1,4 +1,4 @@
-"""How far away everything is that the eyes see: for smoke in front of it, and blood on it."""
+"""The depth of all that the eyes see, for smoke in front of it and blood on it."""
 
 from collections.abc import Mapping
 
@@ -10,7 +10,7 @@ from sags_node.phantom.rig import raw_rays
 from sags_node.types import F32, Eye, StereoRig
 
 NOMINAL_DEPTH = 0.08  # m, a usual working distance: where no depth is known
-SEARCHES = 8  # of the depth that the right eye sees; each halves what is left of the error or better
+SEARCHES = 8  # iterations that find the right eye's depth; each at least halves the error
 
 
 class Scene:
@@ -37,8 +37,8 @@ class Scene:
         self._newest: tuple[int, tuple[F32, F32]] | None = None
 
     def depths(self, frame_id: int) -> tuple[F32, F32]:
-        """Depth [H, W] (m) of every raw pixel of the left and the right eye. Instruments, whose depth is not
-        known, are as far as the tissue beside them."""
+        """Return the depth [H, W] (m) of every raw pixel of the left and the right eye. Instruments, whose
+        depth is not known, are as far as the tissue beside them."""
         if self._newest is None or self._newest[0] != frame_id:
             rectified = self._rectified(frame_id)
             left = self._look_up(rectified, self.rays[0])
@@ -46,14 +46,14 @@ class Scene:
         return self._newest[1]
 
     def in_left(self, eye: int, frame_id: int) -> F32:
-        """Where the left eye sees what an eye (0 left, 1 right) sees: [H, W, 2], as `rays`."""
+        """Return the left eye's rays [H, W, 2] to what each pixel of an eye (0 left, 1 right) sees."""
         seen = self.rays[eye].copy()
         if eye:
             seen[..., 0] += np.float32(self.rig.baseline) / self.depths(frame_id)[1]
         return seen
 
     def rectified_left(self, picture: F32) -> F32:
-        """A raw left picture [H, W], rectified at the calibration's size; 0 beyond its edges."""
+        """Rectify a raw left picture [H, W] at the calibration's size; 0 beyond its edges."""
         eye = self.rig.left
         x, y = cv2.initUndistortRectifyMap(
             eye.K, eye.distortion, eye.R, eye.P[:, :3], (eye.width, eye.height), cv2.CV_32FC1
@@ -62,8 +62,8 @@ class Scene:
 
     @property
     def mirrors(self) -> tuple[F32, F32]:
-        """Raw pixel [H, W, 2] of either eye that shows what would be at each pixel if the world stood upside
-        down before the same rig."""
+        """The raw pixel [H, W, 2] of either eye that shows what each pixel would see if the world stood
+        upside down before the same rig."""
         if self._mirrors is None:
             eyes = zip((self.rig.left, self.rig.right), self.rays, strict=True)
             left, right = (_raw_pixels(eye, rays * np.array([1, -1], np.float32)) for eye, rays in eyes)
@@ -89,8 +89,8 @@ class Scene:
         return np.asarray(cv2.remap(rectified, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))
 
     def _right(self, rectified: F32) -> F32:
-        """A point at depth z is seen B / z farther left by the right eye: z such that the left eye has it
-        there."""
+        """The right eye's depth. It sees a point at depth z farther left by B / z; the z is found that the
+        left eye has there."""
         rays = self.rays[1].copy()
         depth = np.full(rays.shape[:2], np.median(rectified))
         for _ in range(SEARCHES):
@@ -113,6 +113,6 @@ def _raw_pixels(eye: Eye, rays: F32) -> F32:
 
 
 def _filled(depth: F32, size: tuple[int, int]) -> F32:
-    """At the calibration's size; what is unknown is as far as what is known nearest in the picture."""
+    """The depth at the calibration's size; unknown pixels get that of the nearest known pixel."""
     depth = np.asarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST_EXACT))
     return filled(depth, depth > 0)

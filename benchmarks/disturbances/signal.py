@@ -12,7 +12,7 @@ LATE = 3  # frames
 LOST = 0.2  # share of the frames
 JPEG_QUALITY = 6
 KNOCKED_DEGREES = 0.5
-KNOCKED_ROWS = 4 / 640  # of the width, px
+KNOCKED_ROWS = 4 / 640  # vertical shift, share of the width
 
 
 def clean(moment: Moment) -> StereoFrame:

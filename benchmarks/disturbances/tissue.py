@@ -1,5 +1,5 @@
-"""What comes between the eyes and the tissue: smoke, and blood on it. Both have a depth, so that the eyes
-see it as they see the scene: with disparity."""
+"""What comes between the eyes and the tissue: smoke, and blood on the tissue. Both have a depth, so that the
+eyes see them with disparity, as they see the scene."""
 
 from functools import cache
 
@@ -26,8 +26,8 @@ _PATTERN = 512  # texels of the noises
 
 
 def smoke(moment: Moment) -> StereoFrame:
-    """Smoke of cautery fills the space, drifts, and is sucked off. It veils the more the farther away the
-    tissue is, up to `SMOKE_VEIL`; its clouds hang half way."""
+    """Smoke of cautery fills the space, drifts, and is sucked off. The farther away the tissue is,
+    the more it is veiled, up to `SMOKE_VEIL`; the clouds hang half way to it."""
     frame_id = moment.frame.frame_id
     depths = moment.scene.depths(frame_id)
     density = -np.log(1 - SMOKE_VEIL) * moment.swell() / np.percentile(depths[0][::4, ::4], FARTHEST)
@@ -49,8 +49,8 @@ def smoke(moment: Moment) -> StereoFrame:
 
 def blood(moment: Moment) -> StereoFrame:
     """Blood comes from below until it covers half the picture, and is sucked off. It lies on the surface of
-    the tissue, hides its texture, and lets red light through where it is thin. Instruments that the session
-    has masks for stand out of it."""
+    the tissue, hides its texture, and lets red light through where it is thin. It does not cover instruments
+    that the session has masks for."""
     frame = moment.frame
     P, height, width = moment.scene.rig.left.P, *frame.left.shape[:2]
     front = np.float32(1 - BLOOD_COVERS * moment.swell())

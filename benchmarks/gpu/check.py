@@ -1,6 +1,6 @@
-"""`make gpu-check`: all that a GPU should do, once, on the machine that has it.
+"""`make gpu-check`: checks all that a GPU should do, once, on a machine that has one.
 
-A part that fails is noted and the others go on. None begins after the time is up.
+A part that fails is noted, and the others go on. No part begins after the time is up.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from sags_node.types import F32, Observation
 STILL = LearningRates().scaled(1e-6)  # so small that every step sees the same scene
 NODE_STEP = 1e-12  # m, likewise
 OPACITY = 0.8
-DARKER = 0.9  # what is to be shown, against what is drawn
-STEPS = 4  # that are timed together: a GPU is waited for at their end
+DARKER = 0.9  # brightness of the frame, as a share of what is drawn
+STEPS = 4  # that are timed together: only at their end the GPU is waited for
 
 Row = dict[str, Any]
-SECONDS = 420.0  # after which nothing new begins
+SECONDS = 420.0  # s after which no new part begins
 COMMAND = 300.0  # s that one of our commands may take
 COUNTS = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 SIZES = ((640, 512), (1280, 1024))
@@ -60,10 +60,10 @@ FIT_FIGURES = ("seconds", "gaussians", "heldout", "train", "depth", "device", "s
 
 @dataclass
 class GpuCheck:
-    """Runs parts and keeps what each gave.
+    """Runs the parts of the check and keeps their results.
 
     Attributes:
-        figures: by the name of each part; of one that failed, `error`.
+        figures: the results by the name of the part; for one that failed, only `error`.
     """
 
     seconds: float = SECONDS
@@ -82,7 +82,7 @@ class GpuCheck:
 
 
 def gpu_check(small: bool, fit: bool, say: Callable[[str], None], seconds: float = SECONDS) -> dict[str, Any]:
-    """Everything, by the name of its part.
+    """Run all parts and return their results by name.
 
     Args:
         small: tiny sizes and no live runs, for Warp's CPU device.
@@ -112,7 +112,7 @@ def gpu_check(small: bool, fit: bool, say: Callable[[str], None], seconds: float
 
 
 def environment() -> Row:
-    """The card, its driver, and what compiling our kernels takes."""
+    """Return the GPU, its driver, and how long compiling our kernels takes."""
     import warp as wp
 
     chosen = device.gpu()
@@ -130,19 +130,19 @@ def environment() -> Row:
 
 
 def live(arguments: list[str], kind: str) -> Row:
-    """What a subscriber got of a node that plays a recording."""
+    """Return the figures of what a subscriber gets from a node that plays a recording."""
     found = _sags("eval", *arguments, f"device:={kind}")
     return found if "error" in found else {key: found[key] for key in LIVE_FIGURES}
 
 
 def paper_fit() -> Row:
-    """The schedule of SAGS on the GPU, from start to figures."""
+    """Run the schedule of SAGS on the GPU and return its figures."""
     found = _sags("fit", "launch/d4d_pull.yaml", "--schedule", "paper", "device:=cuda", out="fit")
     return found if "error" in found else {key: found[key] for key in FIT_FIGURES}
 
 
 def _sags(*arguments: str, out: str = "figures.json") -> Row:
-    """What one of our commands writes: a file, or a folder with figures in it."""
+    """Run one of our commands and read the figures that it writes, to a file or into a folder."""
     with tempfile.TemporaryDirectory() as folder:
         written = Path(folder) / out
         command = [sys.executable, "-m", "sags_node", *arguments, "--out", str(written)]
@@ -157,7 +157,7 @@ def _sags(*arguments: str, out: str = "figures.json") -> Row:
 def measure_case(
     count: int, width: int, height: int, runs: int, cpu_runs: int | None = None
 ) -> dict[str, Any]:
-    """Times, and how far both are apart. `cpu_runs`: fewer, of the CPU.
+    """Time a frame and a step on CPU and GPU, and compare the results. `cpu_runs`: runs on the CPU, if fewer.
 
     Raises:
         SagsError: the GPU failed.
@@ -202,7 +202,7 @@ class Refining:
         )
 
     def frame(self) -> F32:
-        """What a frame with one step costs: the model there and back, two drawings. Returns the first."""
+        """Process a frame with one step: upload, two drawings, download. Return the first one's planes."""
         refiner = self.refiner
         refiner.begin(self.model, self._deformation, self._observation, NODE_STEP)
         refiner.draw()
@@ -214,7 +214,7 @@ class Refining:
         return planes
 
     def steps(self) -> None:
-        """More steps in that frame."""
+        """Do `STEPS` more steps in that frame."""
         for _ in range(STEPS):
             self.refiner.draw()
             self.refiner.refine(STILL)

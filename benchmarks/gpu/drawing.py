@@ -22,7 +22,7 @@ Row = dict[str, Any]
 
 
 def parity(count: int, width: int, height: int) -> Row:
-    """How far the GPU's planes and gradients are from the CPU's, and whether they repeat to the bit."""
+    """Compare the GPU's planes and gradients with the CPU's, and check that they repeat to the bit."""
     gaussians, camera = surface(count, width, height)
     v_planes, weight = make_cotangents(RasterCase(count, width, height, 1))
     drawn = []
@@ -49,7 +49,7 @@ def parity(count: int, width: int, height: int) -> Row:
 
 
 def measure_drawing(count: int, width: int, height: int, runs: int) -> Row:
-    """Milliseconds of a drawing and of its gradients, arrays already there: ours, and gsplat's where it is
+    """Time a drawing and its gradients (ms), with all arrays on the device: ours, and gsplat's where it is
     installed."""
     gaussians, camera = surface(count, width, height)
     chosen = device.gpu()
@@ -76,14 +76,14 @@ def measure_drawing(count: int, width: int, height: int, runs: int) -> Row:
 
 
 def _gsplat(gaussians: Gaussians, camera: Camera, runs: int) -> Row:
-    """The same by gsplat (V. Ye et al., JMLR 2025): its antialiased mode draws what ours does."""
+    """The same times of gsplat (V. Ye et al., JMLR 2025), whose antialiased mode draws the same picture."""
     import gsplat
     import torch
 
     names = ("means", "quats", "scales", "opacities", "colors")
     leaves = [torch.tensor(getattr(gaussians, name), device="cuda").requires_grad_() for name in names]
     shifted = camera.K.copy()
-    shifted[:2, 2] += 0.5  # its first pixel has its middle at 0.5
+    shifted[:2, 2] += 0.5  # the centre of gsplat's first pixel is at 0.5
     view, K = (torch.tensor(each, dtype=torch.float32, device="cuda") for each in (camera.viewmat, shifted))
     drawn: list[Any] = []
 

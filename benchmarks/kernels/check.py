@@ -30,7 +30,7 @@ class Compared:
 
 
 def read_table(file: Path) -> Table:
-    """A table that `python -m benchmarks kernels --out` wrote.
+    """Read a table that `python -m benchmarks kernels --out` wrote.
 
     Raises:
         UsageError: it cannot be read or is something else.
@@ -61,7 +61,7 @@ def check(measure: Callable[[], Table], kept: Table, tolerance: float) -> list[C
 
 
 def compare(now: Table, kept: Table) -> list[Compared]:
-    """Every kernel that both tables hold, the slowest first.
+    """Compare every kernel that both tables hold; return the slowest first.
 
     Raises:
         UsageError: they have none in common.
@@ -80,7 +80,7 @@ def compare(now: Table, kept: Table) -> list[Compared]:
 
 
 def _kernels(table: Table) -> Iterator[tuple[Kernel, Mapping[str, Any]]]:
-    """What names each kernel, and its record."""
+    """Each kernel's section, settings and stage, with its record."""
     for section in SECTIONS:
         for row in table.get(section, []):
             settings = tuple((key, row[key]) for key in SETTINGS if key in row)
@@ -89,7 +89,7 @@ def _kernels(table: Table) -> Iterator[tuple[Kernel, Mapping[str, Any]]]:
 
 
 def _peak(table: Table, threads: int, bound: str) -> float:
-    """Of memory that over few bytes: few kernels leave the caches, and what lies beyond is shared."""
+    """The peak rate. For memory, that over few bytes: few kernels leave the caches, and memory is shared."""
     (peak,) = (peak for peak in table["peaks"] if peak["threads"] == threads)
     if bound == "arithmetic":
         return float(peak["operations_per_s"])

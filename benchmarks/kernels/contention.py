@@ -1,4 +1,4 @@
-"""What the rasteriser's time becomes when the cores were idle before, or are not ours alone."""
+"""The rasteriser's time after idle pauses, and beside another process on the same cores."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ CAMERA_PERIOD_S = 1 / 30
 
 
 def measure_rhythm(case: RasterCase, runs: int) -> dict[str, Any]:
-    """Back to back, and once per camera frame with a pause between, as the node calls it."""
+    """Time calls back to back, and once per camera frame with a pause between, as the node calls it."""
     function = Drawing(case).forward_backward
     return {
         **_named(case),
@@ -26,7 +26,7 @@ def measure_rhythm(case: RasterCase, runs: int) -> dict[str, Any]:
 
 
 def measure_contention(case: RasterCase, runs: int) -> dict[str, Any]:
-    """Alone, and beside another process that burns one core."""
+    """Time calls alone, and beside another process that keeps one core busy."""
     function = Drawing(case).forward_backward
     alone = _spread(times_ms(function, runs))
     with burning_core():

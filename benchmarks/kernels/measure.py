@@ -22,7 +22,7 @@ from sags_node.tools.evaluation.provenance import machine_name
 
 DEPTH_WEIGHT, DEPTH_SCALE = 2e-3, 1e-3  # as the mapper's
 
-# per value: it and its two momenta are read and written, its gradient is read
+# per value: it and its two moments are read and written, its gradient is read
 ADAM_FLOATS, ADAM_OPERATIONS = 7, 14
 
 MILLION = 1_000_000
@@ -46,7 +46,7 @@ QUICK = Settings(counts=(500,), sizes=((64, 64),), runs=3)
 
 
 def measure_kernels(settings: Settings, advance: Advance) -> dict[str, Any]:
-    """Everything that `settings` ask for; keys as benchmarks/README.md lists them.
+    """Measure everything that `settings` ask for; keys as benchmarks/README.md lists them.
 
     Uses all cores of the process, and leaves the calling thread set to them.
     """
@@ -83,7 +83,7 @@ def _jobs(settings: Settings, peaks: Mapping[int, Peak]) -> Iterator[_Job]:
     twin_runs = 1 if settings.twin else 0
     for case in raster_cases(settings, sorted(peaks)):
         plain = case == RasterCase(few, case.width, case.height, every)
-        # of more Gaussians the twin would take tens of GB
+        # with more Gaussians the twin would take tens of GB
         measure = partial(measure_rasterizer, case, runs, peaks[case.threads], twin_runs if plain else 0)
         yield _Job("rasterize", f"rasteriser, {case.count} Gaussians", case.threads, measure)
     for width, height in settings.sizes:
@@ -101,7 +101,7 @@ def _jobs(settings: Settings, peaks: Mapping[int, Peak]) -> Iterator[_Job]:
 
 
 def raster_cases(settings: Settings, thread_counts: list[int]) -> Iterator[RasterCase]:
-    """Every count at every size; then, of the second count at the first size, everything that can differ."""
+    """Yield every count at every size; then the second count at the first size with one change at a time."""
     every = thread_counts[-1]
     for width, height in settings.sizes:
         for count in settings.counts:
@@ -117,8 +117,8 @@ def raster_cases(settings: Settings, thread_counts: list[int]) -> Iterator[Raste
 
 
 def measure_adam(count: int, of: int, columns: int, threads: int, runs: int, peak: Peak) -> dict[str, Any]:
-    """One row of the table: Adam on `count` rows, spread at random, of a table [of, columns]. The calling
-    thread must be set to `threads`, and `peak` be that of them."""
+    """Measure one row of the table: Adam on `count` rows, spread at random, of a table [of, columns]. The
+    calling thread must be set to `threads`, the threads of `peak`."""
     rng = np.random.default_rng(0)
     values, gradients = (rng.normal(size=(of, columns)).astype(np.float32) for _ in range(2))
     state, rates = AdamState.new(of, columns), np.full(columns, 1e-3, np.float32)
@@ -139,8 +139,8 @@ def measure_adam(count: int, of: int, columns: int, threads: int, runs: int, pea
 def measure_losses(
     count: int, width: int, height: int, threads: int, runs: int, peak: Peak
 ) -> dict[str, Any]:
-    """One row of the table: of a drawn surface against a darker picture of itself. The calling thread must be
-    set to `threads`, and `peak` be that of them."""
+    """Measure one row of the table: losses of a drawn surface against a darker picture of itself. The calling
+    thread must be set to `threads`, the threads of `peak`."""
     gaussians, camera = surface(count, width, height)
     planes = make_rasterizer("numba", width, height).forward(gaussians, camera)
     view = views.to_view(planes, camera, 0, 0)

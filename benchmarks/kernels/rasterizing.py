@@ -41,9 +41,9 @@ STAGES: Stages = {
     (projection_backward, "project_backward"): "project backward",
     (spherical_harmonics, "color_backward"): "color backward",
 }
-# On one pixel of one pair, with everything out of the loop that is the same along a row of pixels: a
-# multiply-add, a rounding, a shift, a division count as one each. The AVX-512 machine code of the innermost
-# loops holds as many vector instructions beside its loads and stores.
+# Operations on one pixel of one pair; what is the same along a row of pixels is out of the loop. A
+# multiply-add, a rounding, a shift and a division count as one each. The innermost loops have as many vector
+# instructions in AVX-512 machine code, besides loads and stores.
 OPERATIONS_PER_PAIR = {"composite": 18, "composite backward": 36}
 
 
@@ -61,7 +61,7 @@ class RasterCase:
 
 
 def measure_rasterizer(case: RasterCase, runs: int, peak: Peak, twin_runs: int = 0) -> dict[str, Any]:
-    """One row of the table. The calling thread must be set to `case.threads`, and `peak` be that of them.
+    """Measure one row of the table. The calling thread must be set to `case.threads`, the threads of `peak`.
 
     Args:
         twin_runs: how often to draw with the slow torch twin, too; 0: not at all.
@@ -103,7 +103,7 @@ def _time_twin(case: RasterCase, runs: int) -> float:
 
 
 class Drawing:
-    """One case on the host's arrays."""
+    """Draws one case with arrays of the host."""
 
     def __init__(self, case: RasterCase, rasterizer: Rasterizer | None = None) -> None:
         self.gaussians, self._camera = make_scene(case)
@@ -120,7 +120,7 @@ class Drawing:
 
 
 def make_scene(case: RasterCase) -> tuple[Gaussians, Camera]:
-    """What is drawn, and for whom."""
+    """Return the Gaussians and the camera of a case."""
     gaussians, camera = SCENES[case.scene](case.count, case.width, case.height)
     if case.sh_degree > 0:
         gaussians = with_harmonics(gaussians, case.sh_degree)
@@ -128,7 +128,7 @@ def make_scene(case: RasterCase) -> tuple[Gaussians, Camera]:
 
 
 def make_cotangents(case: RasterCase) -> tuple[F32, F32]:
-    """Random ones of the planes [5, H, W], and the pixels' weights [H, W]."""
+    """Return random cotangents of the planes [5, H, W], and the pixels' weights [H, W]."""
     size = (case.height, case.width)
     v_planes = np.random.default_rng(0).normal(size=(5, *size))
     return v_planes.astype(np.float32), np.ones(size, np.float32)
@@ -144,8 +144,8 @@ def _active_tiles(case: RasterCase) -> Bool | None:
 
 
 def evaluated_pairs(arguments: Mapping[str, Any]) -> int:
-    """Pixel-Gaussian pairs that `composite` evaluated: all that a splat touches of a tile's columns, until
-    the tile was finished.
+    """Count the pixel-Gaussian pairs that `composite` evaluated: all pixels in the rows that a splat touches
+    of a tile's columns, until the tile was finished.
 
     Args:
         arguments: `pairs`, `tile_starts`, `tile_ends` and `drawn` as `composite` left them.
@@ -157,7 +157,7 @@ def evaluated_pairs(arguments: Mapping[str, Any]) -> int:
     return int((rows_before[ends] - rows_before[starts[drawn]]).sum()) * BLOCK_WIDTH
 
 
-_PER_PAIR = {"emitted": 1, "pairs": 1, "v_pairs": RECORD}  # items, in buffers larger than what is used
+_PER_PAIR = {"emitted": 1, "pairs": 1, "v_pairs": RECORD}  # items; these buffers are larger than needed
 _PICTURES = {"planes", "v_planes", "weight"}  # only read and written where drawn
 _IN_CACHE = {"scratch"}
 

@@ -80,7 +80,7 @@ class ReferenceRasterizer:
 
 
 def _drawn_pixels(tiles: Bool | None, width: int, height: int) -> Bool:
-    """[H, W]"""
+    """Which pixels [H, W] are drawn."""
     if tiles is None:
         return np.ones((height, width), bool)
     return tiles.repeat(TILE_HEIGHT, 0).repeat(TILE_WIDTH, 1)[:height, :width]
@@ -108,7 +108,7 @@ class Splats:
 def project(
     camera: Camera, inputs: Sequence[Tensor], smoothing: Tensor | None = None, antialias: bool = True
 ) -> Splats:
-    """EWA projection (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
+    """Project Gaussians by EWA (Zwicker et al. 2001) with both filters of Mip-Splatting (Yu et al. 2024).
 
     Args:
         camera: OpenCV's; here the first pixel has its centre at (0.5, 0.5).
@@ -188,7 +188,7 @@ def _view_dependent(offsets: Tensor, sh_rest: Tensor) -> Tensor:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3]."""
+    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4]."""
     import torch
 
     w, x, y, z = torch.nn.functional.normalize(quats, dim=1, eps=0).unbind(1)
@@ -201,7 +201,7 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def blend(splats: Splats, width: int, height: int) -> Tensor:
-    """Planes [5, H, W]."""
+    """Blend splats into planes [5, H, W]."""
     import torch
 
     def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
@@ -217,8 +217,8 @@ def blend(splats: Splats, width: int, height: int) -> Tensor:
 
 
 def median(splats: Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Depth (m) and row of the first Gaussian behind which no more than half of the light is left, [H, W]
-    each; 0 and -1 where there is none."""
+    """Return the depth (m) and row, [H, W] each, of the first Gaussian behind which no more than half of the
+    light is left; 0 and -1 where there is none."""
     import torch
 
     def tile(left: int, top: int, right: int, bottom: int) -> Tensor:
@@ -250,8 +250,8 @@ def _tile_by_tile(tile: Callable[[int, int, int, int], Tensor], width: int, heig
 def alphas(
     splats: Splats, left: int, top: int, right: int, bottom: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Of one tile with P pixels: alpha [P, S'] and the transmittance before each splat [P, S'], which splats
-    these are [S'], and how far the pixels are from them [P, S', 2] px."""
+    """Return, for one tile with P pixels, alpha [P, S'], the transmittance before each splat [P, S'], which
+    splats these are [S'], and the offsets of the pixels from them [P, S', 2] px."""
     import torch
 
     # the box around the ellipse on which alpha is 1/255
@@ -274,8 +274,8 @@ def alphas(
 
 
 def contributions(splats: Splats, weight: Tensor, count: int) -> Tensor:
-    """Sums over pixels of (blending weight of a Gaussian) * (weight of the pixel [H, W]), and of that times
-    the squared distance in standard deviations, [2, count]."""
+    """Return the sums over pixels of (blending weight of a Gaussian) * (weight of the pixel [H, W]), and of
+    that times the squared distance in standard deviations, [2, count]."""
     import torch
 
     height, width = weight.shape

@@ -16,7 +16,7 @@ Row = Mapping[str, Any]
 
 
 def tables(measured: Row) -> Iterator[Table]:
-    """`measured` as `measure_kernels` returns it."""
+    """Make the tables; `measured` as `measure_kernels` returns it."""
     yield _peaks(measured)
     yield _drawings(measured["rasterize"])
     yield _stages(measured)
@@ -24,15 +24,15 @@ def tables(measured: Row) -> Iterator[Table]:
 
 
 def check_table(compared: Sequence[Compared], tolerance: float) -> Table:
-    """The slowest kernel first."""
+    """Make the table of a comparison, the slowest kernel first."""
     rows = [asdict(each) | {"verdict": "slower" * (each.ratio > tolerance)} for each in compared]
     made = plain_table("kernel", "ms", "kept ms", "ratio", "")
     return filled(made, rows, "{kernel}", "{ms:.2f}", "{kept_ms:.2f}", "{ratio:.2f}", "{verdict}")
 
 
 def plot(measured: Row) -> str:
-    """Where the time goes, as SVG: of each drawing a bar that is divided into its stages and ends with its
-    total."""
+    """Draw where the time goes, as SVG: for each drawing a bar that is divided into stages, with the total at
+    its end."""
     bars = {
         f"{_count(row['n'])}, {row['width']}x{row['height']}": {
             each["stage"]: each["ms"] for each in row["stages"]
@@ -97,7 +97,7 @@ def _stages(measured: Row) -> Table:
 
 
 def _contention(measured: Row) -> Iterator[Table]:
-    """Rows whose timings are maps from p50 and p90 to ms."""
+    """Tables of the rows whose timings have p50 and p90, ms."""
     for section in ("rhythm", "contention"):
         for row in measured.get(section, []):
             what = f"forward and backward, {_count(row['n'])} at {row['width']}x{row['height']}"
@@ -110,7 +110,7 @@ def _contention(measured: Row) -> Iterator[Table]:
 
 
 def _plain(measured: Row) -> list[Row]:
-    """The drawings of which nothing is special."""
+    """The drawings with default settings."""
     special = {"sh_degree": 0, "active_tiles": 1, "scene": "surface", "threads": measured["threads"]}
     return [row for row in measured["rasterize"] if special.items() <= row.items()]
 

@@ -1,4 +1,4 @@
-"""What the kernels are timed on: tissue-like surfaces of any number of Gaussians."""
+"""The scenes that kernels are timed on: tissue-like surfaces of any number of Gaussians."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -11,7 +11,7 @@ from sags_node.types import Camera, Gaussians
 
 
 def surface(count: int, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """About `count` Gaussians on a regular pixel grid of a wavy depth picture, 40 to 90 mm away: each pixel
+    """Make about `count` Gaussians on a regular grid of a wavy depth picture, 40 to 90 mm away: each pixel
     sees about twenty, whatever their number."""
     rng = np.random.default_rng(0)
     stride = math.sqrt(width * height / count)
@@ -74,6 +74,6 @@ SCENES: Mapping[str, Callable[[int, int, int], tuple[Gaussians, Camera]]] = {
 
 
 def with_harmonics(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The same with colours that change with the view: random spherical harmonics up to `degree`."""
+    """Return the Gaussians with view-dependent colours: random spherical harmonics up to `degree`."""
     shape = (len(gaussians), (degree + 1) ** 2 - 1, 3)
     return replace(gaussians, sh_rest=np.random.default_rng(0).normal(0, 0.05, shape).astype(np.float32))

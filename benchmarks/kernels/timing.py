@@ -21,7 +21,7 @@ Stages = Mapping[tuple[ModuleType | type, str], str]  # (module or class, name o
 def times_ms(
     function: Callable[[], object], runs: int, warm_up: int = WARM_UP_CALLS, period_s: float = 0.0
 ) -> list[float]:
-    """Times of `runs` calls, after `warm_up` calls that do not count.
+    """Return the times (ms) of `runs` calls, after `warm_up` calls that do not count.
 
     Args:
         period_s: sleep after each call until so much time has passed since it began: the rhythm of a camera.
@@ -43,14 +43,14 @@ def median_ms(function: Callable[[], object], runs: int, warm_up: int = WARM_UP_
 
 
 class StageTimes:
-    """What `stage_clock` has seen."""
+    """The times and arguments that `stage_clock` has noted."""
 
     def __init__(self) -> None:
         self._spent: dict[str, float] = {}  # stage -> ms in it, since it was emptied last
         self.arguments: dict[str, dict[str, Any]] = {}  # function -> arguments of its last call, by name
 
     def watched(self, function: Any, name: str, stage: str) -> Any:
-        """`function`, with its times and its arguments noted here."""
+        """Wrap `function` so that its times and its arguments are noted here."""
         signature = inspect.signature(getattr(function, "py_func", function))
 
         def timed(*args: Any, **kwargs: Any) -> Any:  # a function: it may take the place of a method
@@ -63,7 +63,7 @@ class StageTimes:
         return timed
 
     def medians_ms(self, function: Callable[[], object], runs: int) -> dict[str, float]:
-        """Stage -> median time in it over `runs` calls of `function`, after some that do not count."""
+        """Return stage -> median ms in it over `runs` calls of `function`, after some that do not count."""
         found: dict[str, list[float]] = {}
         for run in range(-WARM_UP_CALLS, runs):
             self._spent.clear()
@@ -76,10 +76,10 @@ class StageTimes:
 
 @contextmanager
 def stage_clock(stages: Stages) -> Iterator[StageTimes]:
-    """Time functions where their callers look them up, in their modules or classes, until the block ends.
+    """Time functions by replacing them in their modules or classes until the block ends.
 
-    So stages are timed inside the whole, one after the other with the caches as they are there, and what is
-    timed carries no stop watch of its own. Several functions may be one stage.
+    So stages are timed inside a whole call, with the caches as they are there, and the timed code needs no
+    clock of its own. Several functions may be one stage.
     """
     times = StageTimes()
     originals = {(module, name): getattr(module, name) for module, name in stages}
@@ -94,7 +94,7 @@ def stage_clock(stages: Stages) -> Iterator[StageTimes]:
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """A kernel that reached the machine's peak would take the longer of its two times."""
+    """The work of a kernel. At the machine's peak, it takes the longer of two times: memory or arithmetic."""
 
     bytes: float  # of all arrays that it reads or writes, each once
     operations: float = 0.0  # on float32, a multiply-add counted once; 0: not counted, few for each byte
@@ -104,7 +104,7 @@ class Work:
         return 1e3 * max(self._memory_s(peak), self._arithmetic_s(peak))
 
     def bound(self, peak: Peak) -> str:
-        """Which of the two it is."""
+        """Return which of the two times is the longer."""
         return "arithmetic" if self._arithmetic_s(peak) > self._memory_s(peak) else "memory"
 
     def _memory_s(self, peak: Peak) -> float:
@@ -119,7 +119,7 @@ def bytes_of(*arrays: NDArray[Any]) -> int:
 
 
 def stage_rows(times_ms: Mapping[str, float], work: Mapping[str, Work], peak: Peak) -> list[dict[str, Any]]:
-    """One record per stage: its time beside the machine's peak."""
+    """Return one record per stage: its time beside the machine's peak."""
     rows = []
     for stage, ms in times_ms.items():
         todo = work[stage]
@@ -131,5 +131,5 @@ def stage_rows(times_ms: Mapping[str, float], work: Mapping[str, Work], peak: Pe
 
 
 def share_of_peak(ms: float, work: Mapping[str, Work], peak: Peak) -> float:
-    """Of stages one after the other that took `ms` together."""
+    """Return the share of the peak of successive stages that took `ms` together."""
     return sum(todo.least_ms(peak) for todo in work.values()) / ms

@@ -45,7 +45,7 @@ THIN = tuple(f"{picture}/h264" for picture in PICTURES)
 
 @dataclass(slots=True)
 class Heard:
-    """What a peer got, by device or channel."""
+    """What a peer got; ages by device or channel."""
 
     ages_ms: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     count: int = 0
@@ -57,7 +57,7 @@ class Heard:
         self.size += size
 
 
-Said = dict[str, Any]  # by a bridge: where its peers find it
+Said = dict[str, Any]  # what a bridge prints: where its peers find it
 Listen = Callable[[Said, Heard, threading.Event], None]
 
 
@@ -72,7 +72,7 @@ class Case:
 
 
 def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> list[dict[str, Any]]:
-    """One row for the node alone, and one for each bridge.
+    """Measure one row for the node alone, and one for each bridge.
 
     Raises:
         SagsError: a node or a bridge does not run, or a peer gets nothing.
@@ -106,7 +106,7 @@ def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> 
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """For people; `rows` as `measure_bridges` returns them."""
+    """Make the table; `rows` as `measure_bridges` returns them."""
     made = Table(
         "bridge", "pictures, Hz", "MB/s", "age p50, p90, ms", "CPU ms a frame", "node: Hz", "p50, p99, ms"
     )

@@ -38,13 +38,13 @@ STOPPING = 30.0  # s for it to end
 SLOW = 0.2  # s that the slow subscriber takes for each frame
 PHASE = *OWN_PORTS, "source.loop:=true"
 
-Task = Callable[[Path, float, Event, Connection], None]  # of a subscriber
-Work = tuple[Task, float]  # with its argument
+Task = Callable[[Path, float, Event, Connection], None]  # what a subscriber does
+Work = tuple[Task, float]  # a task and its argument
 
 
 def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int, advance: Advance) -> Any:
-    """One node in its own process: with one quiet observer, with a reader of everything, with a crowd, and
-    alone again. What the reader costs is that all is computed and sent; what the crowd costs beyond, itself.
+    """Measure a node in its own process: with a quiet observer alone, with a reader of everything, with a
+    crowd, and alone again. The reader makes the node compute and send all; the rest is the crowd's cost.
 
     The crowd: a fast subscriber that takes every picture and depth; a slow one that takes `SLOW` seconds for
     each; a dead one that is connected to everything and never reads; and `many` more that listen to `SMALL`.
@@ -75,7 +75,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
 
 @contextmanager
 def node_beside(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A node in its own process, with its files in `folder`."""
+    """Run a node in its own process, with its files in `folder`."""
     command = [sys.executable, "-m", "sags_node", "run", *launch, *PHASE, f"publish.run_dir:={folder}"]
     with tempfile.TemporaryFile("w+", errors="replace") as errors:  # a pipe that is full would stop the node
         node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
@@ -96,7 +96,7 @@ def node_beside(launch: Sequence[str], folder: Path) -> Iterator[subprocess.Pope
 def watched(
     observer: Subscriber, seconds: float, node: subprocess.Popen[bytes], advance: Advance, what: str
 ) -> list[dict[str, Any]]:
-    """The node's own status, once a second, without that of the first seconds."""
+    """Return the node's own status once a second, without that of the first `WARM_UP` seconds."""
     seen: list[dict[str, Any]] = []
     begun = time.monotonic()
     newest: ReceivedText | None = None
@@ -119,7 +119,7 @@ def _crowd(many: int) -> dict[str, Work]:
 
 @contextmanager
 def peers_of(folder: Path, work: Mapping[str, Work]) -> Iterator[Callable[[], dict[str, Any]]]:
-    """Subscribers that run, in processes of their own; what is given ends them and returns what they saw."""
+    """Run subscribers in processes of their own. The function given ends them and returns what they saw."""
     spawn = multiprocessing.get_context("spawn")
     ending = spawn.Event()
     members: dict[str, Connection] = {}
@@ -147,12 +147,12 @@ def _with_what_is_left(work: Task, folder: Path, argument: float, ending: Event,
 
 
 def is_over(ending: Event) -> bool:
-    """Also when the benchmark was killed."""
+    """Tell whether the phase has ended or the benchmark was killed."""
     return ending.is_set() or not parent_lives()
 
 
 def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> None:
-    """Take pictures and depth of the newest frame, and `seconds` for each."""
+    """Take picture and depth of the newest frame again and again, and sleep for `seconds` after each."""
     since_capture, since_sent = [], []
     with Subscriber(PICTURES, run_dir=folder) as subscriber:
         newest = subscriber.wait(PICTURES[0], timeout=STARTING)
@@ -220,7 +220,7 @@ def _figures(seen: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def table(measured: dict[str, Any]) -> Table:
-    """For people; `measured` as `measure_crowd` returns it."""
+    """Make the table; `measured` as `measure_crowd` returns it."""
     made = Table("phase", "rate, Hz", "latency p50, p99, ms", "RSS, MB", "MB per minute", "others saw")
     latency, memory = "{latency_p50_ms:.0f}, {latency_p99_ms:.0f}", "{rss_mb[start]:.0f} - {rss_mb[end]:.0f}"
     rows = [

@@ -47,7 +47,7 @@ class _Taken:
     cpu_ms: float
     psnr: float  # dB over tissue, against the frame itself
     still: bool
-    hurried: bool  # no time for depth
+    hurried: bool  # depth was left out for lack of time
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Window:
 
 
 class _Run:
-    """A pipeline in step mode, with numbers and stamps that go on for ever."""
+    """A pipeline in step mode; frame numbers and stamps go on when the recording repeats."""
 
     def __init__(self, session: Session) -> None:
         configure_threads(session.config.engine.threads)
@@ -162,8 +162,8 @@ def measure_endurance(
 
 
 def slope(windows: Sequence[Any], figure: str) -> dict[str, float] | None:
-    """How a figure changes in 1000 frames, by least squares over the windows after the first, in which the
-    model is still made; with its standard error. None of fewer than three: two always lie on a line."""
+    """Return how a figure changes in 1000 frames, with its standard error: least squares over all windows but
+    the first, in which the model is still made. None of fewer than three: two always lie on a line."""
     counted = [window for window in windows[1:] if math.isfinite(getattr(window, figure))]
     if len(counted) < 3:
         return None
@@ -198,7 +198,7 @@ def _kept(session: Session) -> list[StereoFrame]:
 
 
 def visits(count: int, order: Order, seed: int) -> Iterator[int]:
-    """Which frame comes next, for ever."""
+    """Yield the index of the next frame, without end."""
     if order == "wrap":
         yield from itertools.cycle(range(count))
     elif order == "there-and-back":
@@ -208,7 +208,7 @@ def visits(count: int, order: Order, seed: int) -> Iterator[int]:
 
 
 def _walk(count: int, rng: np.random.Generator) -> Iterator[int]:
-    """To the next or last frame; at the ends, and now and then between them, it turns round."""
+    """A walk to the next or the previous frame. It turns round at the ends, and now and then between them."""
     at, step = 0, 1
     while True:
         yield at
@@ -233,7 +233,7 @@ def _photographed(frame: StereoFrame, times: int, seed: int) -> Iterator[StereoF
 
 
 def _stillness(moving: Iterable[_Taken], still: Sequence[_Taken]) -> dict[str, Any] | None:
-    """What frames cost in which nothing moves, once the model has settled, against those before."""
+    """What frames cost in which nothing moves, once the model has settled, against moving ones before."""
     settled = [each for each in still[SETTLED + 1 :] if each.still]
     before = [each for each in moving if not each.still]
     if not settled or not before:
@@ -259,7 +259,7 @@ HEADINGS = (
 
 
 def table(measured: Mapping[str, Any]) -> Table:
-    """For people; `measured` as `measure_endurance` returns it."""
+    """Make the table; `measured` as `measure_endurance` returns it."""
     made = Table(*HEADINGS, title=f"{measured['session']}, {measured['order'].replace('-', ' ')}")
     times, sizes = ("{ms_p50:.1f}", "{ms_p99:.1f}"), ("{gaussians}", "{nodes}", "{rss_mb:.0f}")
     counts = "{still}", "{hurried}", "{restarts}"
@@ -267,7 +267,7 @@ def table(measured: Mapping[str, Any]) -> Table:
 
 
 def statement(measured: Mapping[str, Any]) -> str:
-    """What the table says, in words, and no more than it can say."""
+    """Say in words what the table shows, and no more."""
     lines = ["stopped early"] if measured["interrupted"] else []
     lines += trends(measured["per_1000_frames"], dict(zip(FIGURES, HEADINGS[1:], strict=False)))
     still = measured["still"]
@@ -281,7 +281,7 @@ def statement(measured: Mapping[str, Any]) -> str:
 
 
 def trends(slopes: Mapping[str, Mapping[str, float] | None], names: Mapping[str, str]) -> list[str]:
-    """A line for each slope, and whether it is more than scatter."""
+    """Return a line for each slope, which says whether it is more than scatter."""
     lines = []
     for figure, found in slopes.items():
         if found is None:

@@ -1,8 +1,8 @@
-"""The node live on hosts that have less to give: one core, or neighbours that want the same cores.
+"""Runs the node live on hosts with less to give: one core, or neighbours that want the same cores.
 
 Every host is this machine. The node is run as users run it, on the recording's clock, and measured from
-outside: what a subscriber gets, enlarged to the full working size. Who reads stands for another machine and
-takes only what the node leaves of the cores.
+outside: what a subscriber gets, enlarged to the full working size. The subscriber stands for another machine
+and takes only what the node leaves of the cores.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ Beside = Callable[[Path], AbstractContextManager[Any]]  # a neighbour of the nod
 
 
 def measure_hosts(launch: str | None, overrides: Sequence[str], progress: Callable[[str], None]) -> list[Row]:
-    """One row for each host, keys as benchmarks/README.md lists them.
+    """Measure one row for each host, keys as benchmarks/README.md lists them.
 
     Raises:
         SagsError: a node or a neighbour does not run.
@@ -40,7 +40,7 @@ def measure_hosts(launch: str | None, overrides: Sequence[str], progress: Callab
         with own_run_dir() as run_dir, nullcontext() if beside is None else beside(run_dir):
             cores = 1 if name == "one core" else None
             row = {"name": name, "part": "hosts", **_played(launch, overrides, run_dir, cores)}
-        if name == "alone":  # what reading costs
+        if name == "alone":  # played again without a reader, to see what reading costs
             with own_run_dir() as run_dir:
                 row["unread"] = _played(launch, overrides, run_dir, cores, read=False)
         rows.append(row)
@@ -48,7 +48,7 @@ def measure_hosts(launch: str | None, overrides: Sequence[str], progress: Callab
 
 
 def neighbours() -> dict[str, Beside | None]:
-    """By the host's name. Without a browser a viewer takes nothing, so that host is left out."""
+    """Return the node's neighbour on each host, by name. Without a browser the viewer's host is left out."""
     hosts: dict[str, Beside | None] = {
         "alone": None,
         "one core": None,
@@ -66,7 +66,7 @@ def _played(
 ) -> Row:
     """One run, seen from outside; pictures are compared at the full working size."""
     played = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
-    alone = "publish.detail:=false"  # what is looked at is the model, not the camera's pictures
+    alone = "publish.detail:=false"  # the model is looked at, not the camera's pictures
     forced = [*OWN_PORTS, *played, alone, f"publish.run_dir:={run_dir}"]
     session = open_session(launch, [*overrides, *forced])
     warm_up(session.config)

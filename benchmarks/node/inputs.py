@@ -33,7 +33,7 @@ Send = Callable[[U8, int], object]  # a picture as both eyes', and its stamp (ns
 
 
 def _camera(height: int) -> str:
-    """Black is made at once; a moving picture of this size takes 18 ms of a core, and falls behind."""
+    """A black test picture, which costs nothing; a moving one takes 18 ms of a core: too slow."""
     return (
         "videotestsrc is-live=true pattern=black "
         f"! video/x-raw,format=UYVY,width={WIDTH},height={height},framerate={RATE}/1"
@@ -80,7 +80,7 @@ def _publishing(domain: int, *names: str) -> None:
 
 
 def _send_always(send: Send) -> None:
-    """The same picture at the camera's rate, stamped just before it is sent; also a parent's end ends it."""
+    """Send the same picture at the camera's rate, stamped just before, until the parent process ends."""
     picture: U8 = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     due = time.monotonic()
     while parent_lives():
@@ -103,14 +103,14 @@ WAYS: dict[str, Opener] = {
 def measure_inputs(
     seconds: float, only: str | None, progress: Callable[[int, int], None]
 ) -> list[dict[str, Any]]:
-    """A row for each way: `way`, `pairs`, `unequal` (pairs of unequal stamps), `dropped` (pictures that were
-    lost, or without a partner); `node_ms`, the CPU time of a pair in the node's process; `sender_ms`, that of
+    """Measure a row for each way: `way`, `pairs`, `unequal` (pairs of unequal stamps), `dropped` (pictures
+    lost or without a partner); `node_ms`, the CPU time of a pair in the node's process; `sender_ms`, that of
     the process that makes, converts and sends the pictures; `latency_ms_p50` and `_p99` from the stamp until
     the pair is there.
 
     Args:
-        seconds: to measure, each.
-        only: ways whose names begin so.
+        seconds: to measure each way.
+        only: measure the ways whose names begin with this; None: all.
         progress: called with ways done and in all.
 
     Raises:

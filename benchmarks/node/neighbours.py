@@ -1,6 +1,6 @@
-"""What stands beside a node: the overlay, the viewer, and who reads. Each is a process of its own.
+"""What runs beside a node: the overlay, the viewer, and readers. Each is a process of its own.
 
-Who reads stands for another machine, and takes only what the node leaves of the cores.
+A reader stands for another machine, and takes only what the node leaves of the cores.
 """
 
 import json
@@ -33,7 +33,7 @@ BROWSERS = "chromium", "chromium-browser", "google-chrome"
 
 @contextmanager
 def everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
-    """A socket that is sent all topics."""
+    """Open a socket that gets all topics."""
     context = zmq.Context()
     socket = context.socket(zmq.SUB)
     socket.subscribe("")
@@ -46,7 +46,7 @@ def everything(folder: Path) -> Iterator[zmq.Socket[bytes]]:
 
 @contextmanager
 def overlay(run_dir: Path) -> Iterator[int]:
-    """The overlay with its mark; its process id."""
+    """Run the overlay with its mark; gives its process id."""
     command = [sys.executable, "-m", "sags_node", "overlay", "--run-dir", str(run_dir), "--repin"]
     process = Popen(command, stdout=DEVNULL, stderr=DEVNULL)
     try:
@@ -63,7 +63,7 @@ def overlay(run_dir: Path) -> Iterator[int]:
 
 @contextmanager
 def viewer(run_dir: Path) -> Iterator[int]:
-    """The viewer and a browser on its page, which stands for one on another machine; its process id."""
+    """Run the viewer, and a browser on its page as if on another machine; gives the viewer's process id."""
     browser = find_browser()
     assert browser is not None
     environment = os.environ | {"XDG_RUNTIME_DIR": str(run_dir.parent)}
@@ -90,18 +90,18 @@ def viewer(run_dir: Path) -> Iterator[int]:
 
 
 def _still_runs(process: Popen[Any], name: str) -> None:
-    """A neighbour that has ended costs nothing, and its row would say so."""
+    """Raise if a neighbour has ended: its row would say that it costs nothing."""
     if process.poll() is not None:
         raise SagsError(f"the {name} ended before its time, exit code {process.returncode}")
 
 
 def reader(run_dir: Path) -> AbstractContextManager[None]:
-    """Who takes everything, as fast as it comes."""
+    """Run a reader that takes everything, as fast as it comes."""
     return program(_read, run_dir)
 
 
 def _read(run_dir: Path) -> None:
-    """Take everything that a node sends that may start later in this run directory."""
+    """Take everything that the node of this run directory sends; the node may start later."""
     give_way()
     while parent_lives() and not connection_path(run_dir, NS).exists():
         time.sleep(0.05)
@@ -109,7 +109,7 @@ def _read(run_dir: Path) -> None:
 
 
 def read_everything(run_dir: Path, goes_on: Callable[[], bool]) -> int:
-    """Take all that a node sends, as fast as it comes; how many messages that were."""
+    """Take all that a node sends, as fast as it comes; return the number of messages."""
     taken = 0
     with everything(run_dir) as socket:
         while goes_on():

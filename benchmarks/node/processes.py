@@ -1,4 +1,4 @@
-"""What processes cost, which this one has started, and work in one that ends with us."""
+"""Processes: what they cost, which this one has started, and how to run work in another."""
 
 import multiprocessing
 import os
@@ -9,11 +9,11 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 STOPPING = 5.0  # s for a process to end
-TICKS = os.sysconf("SC_CLK_TCK")  # of CPU time in a second
+TICKS = os.sysconf("SC_CLK_TCK")  # clock ticks per second of CPU time
 
 
 def children(named: str = "") -> list[int]:
-    """The processes that this one has started, and whose command holds `named`."""
+    """Return the processes that this one has started and whose command line contains `named`."""
     found = []
     for task in Path("/proc/self/task").iterdir():
         with suppress(OSError):  # a thread or a process that ends meanwhile
@@ -24,7 +24,7 @@ def children(named: str = "") -> list[int]:
 
 
 def cpu_seconds(process: int) -> float:
-    """Of a process and its threads.
+    """Return the CPU time (s) of a process and its threads.
 
     Raises:
         OSError: it has ended.
@@ -34,7 +34,7 @@ def cpu_seconds(process: int) -> float:
 
 
 def listed(process: int, what: Literal["fd", "task"]) -> int:
-    """How many files, sockets and pipes it holds open, or how many threads it has.
+    """Count the files, sockets and pipes that a process has open ("fd"), or its threads ("task").
 
     Raises:
         OSError: it has ended, or is another user's.
@@ -43,14 +43,14 @@ def listed(process: int, what: Literal["fd", "task"]) -> int:
 
 
 def parent_lives() -> bool:
-    """Whether the process that started this one with `program` still runs."""
+    """Tell whether the process that started this one with `program` still runs."""
     parent = multiprocessing.parent_process()
     return parent is not None and parent.is_alive()
 
 
 @contextmanager
 def own_run_dir() -> Iterator[Path]:
-    """An empty run directory; a process whose XDG_RUNTIME_DIR is its parent looks there."""
+    """Make an empty run directory; a process whose XDG_RUNTIME_DIR is its parent folder uses it."""
     with TemporaryDirectory(prefix="sags-benchmarks-") as folder:
         run_dir = Path(folder) / "sags"
         run_dir.mkdir(mode=0o700)
@@ -59,7 +59,7 @@ def own_run_dir() -> Iterator[Path]:
 
 @contextmanager
 def program(work: Callable[..., None], *arguments: Any) -> Iterator[None]:
-    """Work in another process, which ends when this is left, and with us."""
+    """Run `work` in another process, which ends when the block ends or this process does."""
     process = multiprocessing.get_context("spawn").Process(target=work, args=arguments, daemon=True)
     process.start()
     try:

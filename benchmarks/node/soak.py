@@ -1,4 +1,4 @@
-"""`benchmarks soak`: whether a live node lasts, with all beside it that a theatre puts there.
+"""`benchmarks soak`: whether a live node lasts beside all that runs with it in an operating room.
 
 The node, the overlay, the viewer with a browser, a recorder and three subscribers, each a process of its own.
 The recorder and the subscribers come and go. Every frame is timed by its own stamps; sizes are the system's.
@@ -40,7 +40,7 @@ from sags_node.quality.metrics import psnr
 from sags_node.tools.evaluation.provenance import machine_name
 
 EACH_FRAME = "tf"  # the smallest topic that is sent with every frame
-HIGH_WATER = 1000  # frames may wait while a picture is compared
+HIGH_WATER = 1000  # frames that may wait while a picture is compared
 SHOWN = TopicName("left/render/image", ReceivedImage)
 TRUTH = TopicName("left/image_rect_color", ReceivedImage)
 TISSUE = TopicName("left/tissue_mask", ReceivedImage)
@@ -50,7 +50,7 @@ WARM_UP = 10.0  # s before frames count
 COMPARED = 3  # pictures of each window
 SUBSCRIBERS = 3
 NO_VISITS = {"visits": 0, "pictures": 0}
-STAY, AWAY = (2.0, 20.0), (1.0, 5.0)  # s, of a subscriber, from and to
+STAY, AWAY = (2.0, 20.0), (1.0, 5.0)  # s that a subscriber stays and is away: least and most
 RECORDING = 60.0  # s of one recording
 SILENCE = 30.0  # s without a frame: the node hangs
 NODE = ("frames_per_s", "latency_p50_ms", "latency_p99_ms", "psnr", "rss_mb", "descriptors", "threads")
@@ -63,7 +63,7 @@ HEADINGS = (
 
 WORSE_WHEN_LESS = ("frames_per_s", "psnr")  # of `FIGURES`; the others are worse when they grow
 AN_HOUR = 108_000  # frames of the camera
-TOLERATED = 0.1  # of a figure's mean, in an hour
+TOLERATED = 0.1  # change per hour, as a share of a figure's mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,11 +84,11 @@ class Window:
 
 @dataclass
 class _Heard:
-    """What each frame said of itself."""
+    """The figures that came with each frame."""
 
     latency_ms: list[float] = field(default_factory=list)
     published: list[float] = field(default_factory=list)  # s
-    missed: int = 0  # messages on their way here
+    missed: int = 0  # messages lost on their way here
     dropped: int = 0  # frames that the node left out
     freezes: Freezes = field(default_factory=Freezes)
     _first: Meta | None = None
@@ -112,7 +112,7 @@ class _Heard:
 
 
 def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: Advance) -> dict[str, Any]:
-    """Run a node live for so many frames of its camera. Ctrl-C ends it with what is known by then.
+    """Run a node live for `frames` frames of its camera. Ctrl-C ends it with what is known by then.
 
     Args:
         launch: launch file and overrides of the node.
@@ -167,7 +167,7 @@ def measure_soak(launch: Sequence[str], frames: int, per_window: int, advance: A
 
 
 def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iterator[None]:
-    """Each published frame after the first seconds is added to `heard`."""
+    """Add each published frame after the first seconds to `heard`."""
     begun = last = time.monotonic()
     messages = listen_to(NodeAddress(neighbours.NS, run_dir=run_dir), (EACH_FRAME,), None, HIGH_WATER)
     with closing(messages):
@@ -187,7 +187,7 @@ def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iter
 
 
 def _compared(run_dir: Path) -> float:
-    """PSNR (dB) over tissue of a picture that is being shown; NaN when none came whole."""
+    """PSNR (dB) over tissue of the picture now shown; NaN if no complete frame came."""
     names = (SHOWN, TRUTH, TISSUE)
     with Subscriber(names, run_dir=run_dir) as subscriber:
         newest = subscriber.wait(SHOWN, timeout=1.0)
@@ -202,7 +202,7 @@ def _compared(run_dir: Path) -> float:
 def _window(
     heard: _Heard, since: int, quality: Sequence[float], node: int, overlay: int, viewer: int | None
 ) -> Window:
-    """Of the frames that were published after the first `since`."""
+    """The window of the frames that were published after the first `since`."""
     p50, p99 = np.percentile(heard.latency_ms[since:], [50, 99])
     known = [each for each in quality if not np.isnan(each)]
     moments = heard.published[max(0, since - 1) :]
@@ -239,7 +239,7 @@ def _overall(heard: _Heard) -> dict[str, Any]:
 
 
 def _visit(run_dir: Path, _: float, ending: Event, there: Connection) -> None:
-    """Subscribers that come, take pictures for a while, and leave; it counts both."""
+    """Run subscribers that come, take pictures for a while, and leave; count visits and pictures."""
     counted = [NO_VISITS.copy() for _ in range(SUBSCRIBERS)]
     working = [
         threading.Thread(target=_come_and_go, args=(run_dir, ending, random.Random(seed), counts))
@@ -267,7 +267,7 @@ def _come_and_go(run_dir: Path, ending: Event, chance: random.Random, counts: di
 
 @contextmanager
 def _recordings(run_dir: Path) -> Iterator[Callable[[], dict[str, int]]]:
-    """One recording after the other, each removed when it is closed; what is given ends that and counts."""
+    """Make one recording after another, each removed once closed. The function given ends and counts them."""
     counts = {"recordings": 0, "failed": 0, "messages": 0, "dropped": 0, "lost": 0}
     ending = threading.Event()
     thread = threading.Thread(target=_record, args=(run_dir, ending, counts), daemon=True)
@@ -313,7 +313,7 @@ def _record(run_dir: Path, ending: threading.Event, counts: dict[str, int]) -> N
 
 
 def _said(recorder: subprocess.Popen[str], ending: threading.Event) -> str:
-    """All it prints; it is asked to end, once, when `ending` is set."""
+    """Return all that the recorder prints. When `ending` is set, it is asked once to end."""
     deadline = time.monotonic() + neighbours.STARTING + RECORDING
     asked = False
     while time.monotonic() < deadline:
@@ -328,7 +328,7 @@ def _said(recorder: subprocess.Popen[str], ending: threading.Event) -> str:
 
 
 def worsening(measured: Mapping[str, Any]) -> list[str]:
-    """The figures that get worse beyond their scatter, by more than `TOLERATED` an hour.
+    """Return the figures that get worse beyond their scatter, by more than `TOLERATED`.
 
     Args:
         measured: as `measure_soak` returns it.
@@ -354,7 +354,7 @@ def worsening(measured: Mapping[str, Any]) -> list[str]:
 
 
 def table(measured: Mapping[str, Any]) -> Table:
-    """For people; `measured` as `measure_soak` returns it."""
+    """Make the table; `measured` as `measure_soak` returns it."""
     title = (
         f"{measured['frames']} frames of the camera in {measured['seconds']:.0f} s, "
         f"{measured['published']} published"
@@ -370,7 +370,7 @@ def _figure(value: float | None) -> str:
 
 
 def statement(measured: Mapping[str, Any]) -> str:
-    """What the table says, in words, and no more than it can say."""
+    """Say in words what the table shows, and no more."""
     lines = ["stopped early"] if measured["interrupted"] else []
     latency, freezes = measured["latency_ms"], measured["freezes"]
     lines.append(

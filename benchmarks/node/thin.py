@@ -14,8 +14,8 @@ from sags_node.messaging.topics import thin_picture
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import Session
 
-WARM_UP = 30  # frames: the model has grown to what the picture asks for
-RATE = 30.0  # Hz, of the rate on a link
+WARM_UP = 30  # frames, after which the model has its full size
+RATE = 30.0  # Hz, for the data rate on a link
 NAMES = tuple(
     f"thin/{size}/left/{form}"
     for size in ("full", "half", "quarter")
@@ -29,7 +29,7 @@ NAMES = tuple(
 def measure_thin(
     session: Session, frames: int, advance: Callable[[int, int | None, str], None]
 ) -> list[dict[str, Any]]:
-    """One row for each thin picture: CPU time to make and to decode it, and its size, mean of `frames`.
+    """Measure a row for each thin picture: CPU time to make and to decode it, and its size, mean of `frames`.
 
     Raises:
         SagsError: the recording is too short.

@@ -25,7 +25,7 @@ STARTING, ARRIVING = 60.0, 10.0  # s, at most
 
 
 def measure_transport(frames: int) -> list[dict[str, Any]]:
-    """Milliseconds from the send call to the arrival of a 4 MB frame, for each way a node offers.
+    """Measure the milliseconds from the send call to the arrival of a 4 MB frame, for each way a node offers.
 
     Sender and receiver are two processes of this machine.
 

@@ -32,7 +32,7 @@ Row = dict[str, Any]  # with the keys of `sags eval` that apply
 def measured_baselines(
     session: Session, run: Run, size: tuple[int, int], options: MeasureOptions, progress: Progress
 ) -> list[Row]:
-    """Baselines that need the recording, over the frames of a run and with its masks.
+    """Measure the baselines that need the recording, over the frames of a run and with its masks.
 
     Args:
         session: what was run.
@@ -105,7 +105,7 @@ def measured_baselines(
 
 
 def baselines_of_run(run: Row) -> list[Row]:
-    """What the figures of a run say of the picture before and of its own stereo stage."""
+    """Return the baselines that a run's figures contain: the picture before, and its own stereo stage."""
     rows = []
     if run["predict"] is not None:
         predict = dict(run["predict"])
@@ -121,7 +121,7 @@ def baselines_of_run(run: Row) -> list[Row]:
 
 
 def read_fits(files: Sequence[Path]) -> list[Row]:
-    """Offline fits, with the session they were made of: rows from the figures that `sags fit` wrote.
+    """Read offline fits: rows from the figures that `sags fit` wrote, each with the session it was made of.
 
     Raises:
         UsageError: a file cannot be read or holds something else.

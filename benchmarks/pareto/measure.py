@@ -35,7 +35,7 @@ from sags_node.tools.evaluation.summary import summarise
 from sags_node.vision.rectify import Rectifier
 from sags_node.vision.tissue import TissueMask
 
-SHORTEST = 3  # frames: the first one, in which the model is made, has times of its own
+SHORTEST = 3  # frames; the first one, in which the model is made, takes another time
 KEPT = (
     "frame_ms", "cpu_ms", "stage_ms", "rate_hz", "iterations_per_frame", "online", "predict", "heldout",
     "between", "novel", "depth", "measured_depth", "track", "gaussians", "skipped",
@@ -80,7 +80,7 @@ def measure_pareto(
 
 
 def non_dominated(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Which (time, quality) no other point beats: none is as good in both and better in one."""
+    """Tell which (time, quality) points are Pareto-optimal: no other is as good in both and better in one."""
     return [
         not any(ms <= time and quality >= good and (ms, quality) != (time, good) for ms, quality in points)
         for time, good in points
@@ -88,7 +88,7 @@ def non_dominated(points: Sequence[tuple[float, float]]) -> list[bool]:
 
 
 def why_default(rows: Sequence[Row], period_ms: float) -> str:
-    """What speaks for the default among rows of `time_settings`, or against it, in one sentence."""
+    """Say in one sentence what speaks for or against the default among rows of `time_settings`."""
     default = rows[0]
     ms, psnr = _place(default)
     camera = f"the camera's {period_ms:.3g} ms"
@@ -234,8 +234,8 @@ def _effect(on: Row, off: Row) -> Row:
 def online_at(
     size: tuple[int, int], session: Session, run: Run, options: MeasureOptions, progress: Progress
 ) -> dict[str, Any]:
-    """The figures `online` of a finished run, with its Gaussians drawn at `size` (width, height, px) and
-    compared with pictures of that size.
+    """Return the figures `online` of a finished run, with its Gaussians drawn at `size` (width, height, px)
+    and compared with pictures of that size.
 
     Raises:
         SagsError: the recording cannot be read again.

@@ -1,4 +1,4 @@
-"""What a frame's time buys as a PNG: the picture, depth and points of each recording."""
+"""Draws what a frame's time buys, as a PNG: picture, depth and points of each recording."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawn
 
-WIDTH, HEIGHT, SMALL = 1100, 520, 260  # px of a panel; of those below the pictures'
-BESIDE, LETTER, LINE = 11, 6, 12  # px: of a name to its point, of a letter, of a line
+WIDTH, HEIGHT, SMALL = 1100, 520, 260  # px: a panel's width and height; height of panels without pictures
+BESIDE, LETTER, LINE = 11, 6, 12  # px: from a point to its name; width of a letter; height of a line
 COLOURS = {
     "default": "#1e1e1e",
     "budgets": "#2166ac",
@@ -27,7 +27,7 @@ Row = Mapping[str, Any]
 
 
 class Figure(NamedTuple):
-    """One that is drawn over the time of a frame."""
+    """A figure that is drawn over the time of a frame."""
 
     name: str
     unit: str
@@ -45,7 +45,7 @@ FIGURES = (PICTURE, DEPTH, POINTS)
 
 
 def picture(measured: Row) -> bytes:
-    """PNG of `measured` as `measure_pareto` returns it."""
+    """Draw `measured`, as `measure_pareto` returns it, as a PNG."""
     panels = [
         (session, figure, _rows(session, figure))
         for session in measured["sessions"]
@@ -119,6 +119,6 @@ def _label(drawn: Drawn, axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _difference(name: str, default: str) -> str:
-    """Of a name "budget, size, N": what is not as in the default's."""
+    """The parts of a name "budget, size, N" that differ from the default's."""
     usual = default.split(", ")
     return ", ".join(said for said in name.split(", ") if said not in usual) or name

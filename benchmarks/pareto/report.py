@@ -23,7 +23,7 @@ TIMES = "{frame_ms[p50]:.1f}", "{frame_ms[p99]:.1f}", "{latency_ms[p50]:.1f}", "
 
 
 def tables(measured: Row) -> Iterator[Table]:
-    """`measured` as `measure_pareto` returns it."""
+    """Make the tables; `measured` as `measure_pareto` returns it."""
     for session in measured["sessions"]:
         yield _settings(session)
         if session["skips"]:

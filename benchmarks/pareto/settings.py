@@ -10,14 +10,14 @@ from sags_node.mapping.ladder import RUNGS
 from sags_node.tools.evaluation.measure import MeasureOptions
 
 PARTS = ("budgets", "resolutions", "gaussians", "skips")
-# Parts for those who ask: each rung of the ladder, one step a frame; and live on hosts with less to give.
+# Parts that run only on request: each rung of the ladder, one step a frame; and live on weaker hosts.
 RUNG_PART, HOSTS = "rungs", "hosts"
 BUDGETS_MS = (25.0, 33.0, 50.0, 100.0, 200.0)
 SIZES = (0.75, 0.5)  # of the launch file's working size
 COUNTS = (10_000, 20_000, 30_000, 50_000, 70_000)
 COUNT_BUDGETS_MS = (33.0, 100.0)
 SKIP_STEPS = 2  # per frame, where rules that leave work out are compared
-HURRIED_RULES = ("depth",)  # that act on rungs of the ladder where time is short
+HURRIED_RULES = ("depth",)  # rules that act on rungs of the ladder for when time is short
 
 BUDGET, COUNT = "mapping.budget_ms", "mapping.max_gaussians"
 WIDTH, HEIGHT = "vision.width", "vision.height"
@@ -55,7 +55,7 @@ class Sweep:
 
 
 def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[str]) -> list[Setting]:
-    """The settings with a budget of time, each once, the default (the launch file as it is) first.
+    """Return the settings with a time budget, each once, the default (the launch file as it is) first.
 
     `size`: the default's working size, width and height, px.
     """
@@ -78,13 +78,13 @@ def time_settings(config: LaunchConfig, size: tuple[int, int], parts: Sequence[s
 
 
 def rung_settings() -> list[Setting]:
-    """Each rung of the ladder, one step a frame."""
+    """Return a setting for each rung of the ladder, one step a frame."""
     step = "mapping.iterations:=1"
     return [Setting(RUNG_PART, f"rung {i}", (step, f"mapping.rung:={i}")) for i in range(len(RUNGS))]
 
 
 def skip_settings() -> dict[str, tuple[Setting, Setting]]:
-    """For each rule of `Skips`: all rules, and all but this one.
+    """Return, for each rule of `Skips`, two settings: all rules, and all but this one.
 
     Both at a fixed number of steps. A rule for when time is short is compared on the highest rung of the
     ladder on which it acts.
@@ -101,6 +101,6 @@ def skip_settings() -> dict[str, tuple[Setting, Setting]]:
 
 
 def _name(values: Mapping[str, float]) -> str:
-    """Without a number of Gaussians it is the one that follows from the budget."""
+    """A setting's name. If it has no number of Gaussians, that number follows from the budget."""
     count = f", {values[COUNT] / 1e3:g}k" if COUNT in values else ""
     return f"{values[BUDGET]:g} ms, {values[WIDTH]}x{values[HEIGHT]}{count}"

@@ -1,1 +1,1 @@
-"""How right pictures, depth, masks and poses are, whatever the time."""
+"""How accurate pictures, depth, masks and poses are, regardless of time."""

@@ -1,9 +1,9 @@
 """What does each part of the SAGS model bring? The ablation of the paper, and of what goes beyond it.
 
 Every variant is fitted to the same training frames with as many iterations, from several seeds, and
-measured on the same frames that it never saw: every eighth, and the last ones of the recording, which ask it
-to look ahead. Training frames are measured too, which tells what is over-fitted from what is not learnt; and
-pictures of a half and a quarter of the size, which is what the filters are for.
+measured on the same frames that it never saw: every eighth, and the last ones of the recording, for which it
+must look ahead. Training frames are measured, too: they tell overfitting from what was not learnt. So are
+pictures of half and a quarter of the size, for which the filters are made.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,7 +34,7 @@ from sags_node.tools.fitting.score import score, score_between, score_depth, sco
 from sags_node.tools.fitting.settings import ONLINE, PAPER, FitSettings, with_changes
 from sags_node.types import Bool
 
-AHEAD = 3  # last frames that nothing is learnt from
+AHEAD = 3  # last frames, not used for training
 SMALLER = {"half": 2, "quarter": 4}  # what a picture's sides are divided by
 
 _PAPER = replace(PAPER, max_gaussians=30_000)
@@ -52,7 +52,7 @@ VARIANTS: Mapping[str, FitSettings] = {
     "online_self": replace(_ONLINE, tokens="self"),
 }
 
-# What a part brings: with it, without it, and dB by the paper's table (its rows, EndoNeRF "pulling").
+# What a part brings: variant with it, variant without it, gain in the paper's table (dB, EndoNeRF "pulling").
 PARTS: Mapping[str, tuple[str, str, float | None]] = {
     "self-adaptive block, beside an MLP of its size": ("full", "no_adaptive", 0.26),
     "self-adaptive block, beside none": ("full", "no_block", None),
@@ -168,8 +168,8 @@ def _measured(
 
 
 def _smaller(fit: Fit, frames: Iterable[ClipFrame], factor: int) -> float:
-    """Mean PSNR, dB, over tissue of pictures with sides divided by `factor`; the truth is the mean of the
-    pixels that one stands for."""
+    """Mean PSNR, dB, over tissue of pictures with sides divided by `factor`. A pixel's truth is the mean of
+    the pixels that it stands for."""
     found = []
     for frame in frames:
         height, width = (side // factor for side in frame.tissue.shape)
@@ -200,7 +200,7 @@ FIGURES: Mapping[str, Callable[[Row], float]] = {
 
 
 def _gain(whole: Sequence[Row], without: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """What the whole has beyond the other with the same seed, dB: mean, lowest and highest."""
+    """The gain of the whole over the variant without the part, same seed, dB: mean, lowest and highest."""
     found = {}
     for name, figure in FIGURES.items():
         gains = [figure(a) - figure(b) for a, b in zip(whole, without, strict=True)]
@@ -217,7 +217,7 @@ def _by_time(clip: Clip) -> list[ClipFrame]:
 
 
 def _split(clip: Clip) -> tuple[Clip, list[ClipFrame]]:
-    """The clip without its last frames, and those."""
+    """The clip without its last `AHEAD` frames, and those frames."""
     frames = _by_time(clip)
     ahead = {frame.frame_id for frame in frames[-AHEAD:]}
     known = Clip(
@@ -234,7 +234,7 @@ def _split(clip: Clip) -> tuple[Clip, list[ClipFrame]]:
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """A row for each variant, mean and half of the range over its seeds; and one for each part."""
+    """Make two tables: a row for each variant, mean and half the range over seeds; and one for each part."""
     headings = (
         "", "PSNR* held-out", "train", "half size", "quarter", "SSIM", "ahead", "track mm", "N", "ms/it",
     )  # fmt: skip

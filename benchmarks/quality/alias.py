@@ -1,6 +1,6 @@
 """Does the picture stay right at another size, or from another distance, than it was trained at?
 
-That is what both filters of Mip-Splatting (Yu et al., CVPR 2024) are for; at the trained size they show
+That is what both filters of Mip-Splatting (Yu et al., CVPR 2024) are for; at the trained size they bring
 nothing. Four models of one instant of the phantom are trained by the mapper, each with its own choice of
 filters, and drawn where nothing was trained, against the ray-cast truth.
 """
@@ -44,7 +44,7 @@ STEPS_PER_ROUND = 50  # between two looks for holes
 class Settings:
     """What is measured."""
 
-    width: int = 640  # px that are trained at
+    width: int = 640  # px, size of the training picture
     height: int = 512
     max_gaussians: int = 30_000
     rounds: int = 6  # of STEPS_PER_ROUND
@@ -56,7 +56,7 @@ QUICK = Settings(width=160, height=128, max_gaussians=3000, rounds=1, frames=4)
 
 @dataclass(frozen=True, slots=True)
 class Filters:
-    """Which of the two are on."""
+    """Which of the two filters are on."""
 
     screen: bool  # 2D; off: the fixed dilation of 3D Gaussian Splatting
     world: bool  # 3D
@@ -78,13 +78,13 @@ class Trained:
     antialias: bool
 
     def draw(self, camera: Camera) -> F32:
-        """[H, W, 3]"""
+        """Draw the picture [H, W, 3]."""
         rasterizer = make_rasterizer("numba", camera.width, camera.height, self.antialias)
         return colours_of(rasterizer.forward(self.gaussians, camera))
 
 
 def train(observation: Observation, filters: Filters, settings: Settings) -> Trained:
-    """A model of one still picture, by the node's own mapper."""
+    """Train a model on one still picture with the node's own mapper."""
     refiner = CpuRefiner(partial(make_rasterizer, "numba", antialias=filters.screen))
     mapper = Mapper(refiner, TissueMap(settings.max_gaussians), filters.world, focus=1.0)
     mapped = mapper.update(observation, None, StepBudget(STEPS_PER_ROUND))  # places the Gaussians
@@ -105,7 +105,7 @@ class Measured:
 
 
 def measure_alias(settings: Settings, advance: Advance) -> Measured:
-    """Train, draw and compare."""
+    """Train all variants, draw them and compare them with the truth."""
     total = len(VARIANTS) + 2
     advance(0, total, "the truth")
     truth = AliasTruth(PhantomSource(width=settings.width, height=settings.height))
@@ -146,13 +146,13 @@ def _psnrs(models: Mapping[str, Trained], shot: Shot) -> dict[str, float]:
 
 
 def _gain(rows: list[dict[str, float]], factor: float) -> float:
-    """Of both filters over none, dB."""
+    """The gain of both filters over none, dB."""
     (row,) = (row for row in rows if row["factor"] == factor)
     return row["both"] - row["none"]
 
 
 def _brightness_changes(models: Mapping[str, Trained], truth: AliasTruth, factor: float) -> dict[str, float]:
-    """Mean brightness of thin vessels against the truth's, as a share of it."""
+    """The change of the thin vessels' mean brightness, as a share of the truth's."""
     shot, vessel = truth.at_size(factor), truth.thin_vessels(factor)
     true = _brightness(shot.image, vessel)
     return {name: _brightness(model.draw(shot.camera), vessel) / true - 1 for name, model in models.items()}
@@ -163,8 +163,8 @@ def _brightness(image: F32, weight: F32) -> float:
 
 
 def _flicker(models: Mapping[str, Trained], truth: AliasTruth, frames: int) -> dict[str, Any]:
-    """Energy of the pixels' second differences in time over a slow motion, as multiples of the truth's: of
-    the picture (1 is right, less is blurred, more flickers), and of its error (0 is right)."""
+    """Energy of the pixels' second differences in time over a slow motion, as multiples of the truth's. Of
+    the picture 1 is right, less is blurred and more flickers; of its error 0 is right."""
     shots = list(truth.drift(DRIFT_SIZE, DRIFT_STEP, frames))
     counted = np.logical_and.reduce([shot.counted for shot in shots])
     true = np.stack([shot.image[counted] for shot in shots])
@@ -184,8 +184,8 @@ def _restlessness(pixels: F32) -> float:
 
 
 def _requested_view(model: Trained, truth: AliasTruth) -> list[dict[str, Any]]:
-    """From nearer by: should the camera that only looks at the result take part in the 3D filter's sampling
-    rate? PSNR both ways."""
+    """PSNR from nearer by, with and without the camera that only looks at the result in the 3D filter's
+    sampling rate."""
     rows = []
     for view, shot in (("size 4", truth.at_size(4.0)), ("distance 0.5", truth.at_distance(0.5))):
         variances = smoothing_variances(model.gaussians.means, [truth.camera, shot.camera])
@@ -196,7 +196,7 @@ def _requested_view(model: Trained, truth: AliasTruth) -> list[dict[str, Any]]:
 
 
 def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
-    """`measured` as `measure_alias` returns it."""
+    """Make the tables; `measured` as `measure_alias` returns it."""
     yield _by_factor("PSNR, dB, at a picture size of", measured["psnr_at_size"], ".2f")
     yield _by_factor("PSNR, dB, from a distance of", measured["psnr_at_distance"], ".2f")
     changes = measured["thin_vessel_brightness_change"]
@@ -215,7 +215,7 @@ def _by_factor(title: str, rows: list[dict[str, Any]], shown: str) -> Table:
 
 
 def picture(truth: AliasTruth, models: Mapping[str, Trained]) -> bytes:
-    """Pieces of tissue at a quarter and at four times the trained size, as PNG: truth, both filters, none."""
+    """Draw pieces of tissue at 1/4 and 4 times the trained size, as a PNG: truth, both filters, none."""
     rows = []
     for factor, crop in CROPS.items():
         shot = truth.at_size(factor)
@@ -228,7 +228,7 @@ def picture(truth: AliasTruth, models: Mapping[str, Trained]) -> bytes:
 
 
 def _panel(image: F32, crop: tuple[float, float, float], title: str) -> U8:
-    """`crop`: left, top and side as shares of the picture."""
+    """A titled piece of a picture; `crop`: left, top and side as shares of the picture."""
     height, width = image.shape[:2]
     left, top = round(crop[0] * width), round(crop[1] * height)
     piece = image[top : top + round(crop[2] * height), left : left + round(crop[2] * width)]

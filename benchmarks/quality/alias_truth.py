@@ -12,12 +12,12 @@ from sags_node.phantom.scene import Phantom
 from sags_node.types import F32, F64, Bool, Camera, Observation
 
 PHASE = 0.5  # of the phantom's session: the fold is held up
-FINEST = 4  # times the size that is trained at
+FINEST = 4  # size of the finest picture, in multiples of the trained size
 SAMPLES = 4  # x 4 rays per pixel of the trained size; pictures of other sizes average as densely
-HIDDEN = 0.02  # of the depth: what lies so far behind what the trained camera sees was never seen
+HIDDEN = 0.02  # share of the depth: what is this far off what the trained camera sees, it never saw
 BORDER = 2  # px left out around what the trained camera did not see
 THIN = 5  # px of the trained size: vessels thinner than this
-DARK = 0.03  # how much darker than what is around it, 0..1
+DARK = 0.03  # how much darker a vessel is than its surroundings, 0..1
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Shot:
 
 
 class AliasTruth:
-    """One instant of the phantom, ray-cast without noise; what trains is its rectified left camera."""
+    """One instant of the phantom, ray-cast without noise. Training uses its rectified left camera."""
 
     def __init__(self, config: PhantomSource) -> None:
         phantom = Phantom(config)
@@ -44,7 +44,7 @@ class AliasTruth:
         self._depth = _shrunk(depth, self.camera)
 
     def observation(self) -> Observation:
-        """What there is to train with: the picture and its exact depth."""
+        """Return the training data: the picture and its exact depth."""
         shape = self._depth.shape
         picture = np.rint(self._image * 255).astype(np.uint8)
         return Observation(
@@ -59,18 +59,18 @@ class AliasTruth:
         )
 
     def at_size(self, factor: float) -> Shot:
-        """The trained camera with `factor` times as many pixels along each side, FINEST at most: means over
-        the finest picture's pixels."""
+        """Return the trained camera's view with `factor` times as many pixels along each side (up to FINEST),
+        as means over the finest picture's pixels."""
         camera = resized(self.camera, factor)
         return Shot(camera, _shrunk(self._finest, camera), np.ones((camera.height, camera.width), np.bool_))
 
     def at_distance(self, factor: float) -> Shot:
-        """From `factor` times the median depth away, along the optical axis, at the trained size."""
+        """Return the view from `factor` times the median depth on the optical axis, at the trained size."""
         back = (factor - 1) * float(np.median(self._depth))
         return self._shot(moved(self.camera, np.array([0, 0, -back])), SAMPLES)
 
     def drift(self, factor: float, step: float, frames: int) -> Iterator[Shot]:
-        """The trained camera at `factor` of its size, moving right by `step` of its pixels per frame."""
+        """Yield views of the camera at `factor` of its size, moving right by `step` of its pixels a frame."""
         camera = resized(self.camera, factor)
         pixel = float(np.median(self._depth)) / camera.K[0, 0]
         for frame in range(frames):
@@ -78,7 +78,7 @@ class AliasTruth:
             yield self._shot(at, round(SAMPLES / factor))
 
     def thin_vessels(self, factor: float) -> F32:
-        """How much of each pixel [H, W] of `at_size(factor)` is thin vessel, 0..1."""
+        """Return how much of each pixel [H, W] of `at_size(factor)` is thin vessel, 0..1."""
         luminance = self._image.mean(-1)
         around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (THIN, THIN))
         thin = cv2.morphologyEx(luminance, cv2.MORPH_BLACKHAT, around) > DARK
@@ -103,13 +103,13 @@ class AliasTruth:
 
 
 def resized(camera: Camera, factor: float) -> Camera:
-    """The same view with `factor` times as many pixels along each side."""
+    """Return the camera with `factor` times as many pixels along each side."""
     size = round(camera.width * factor), round(camera.height * factor)
     return Camera(*size, scale_intrinsics(camera.K, (camera.width, camera.height), size), camera.T_world_cam)
 
 
 def moved(camera: Camera, by: F64) -> Camera:
-    """The camera shifted by [3] m along its own axes."""
+    """Return the camera shifted by [3] m along its own axes."""
     T = camera.T_world_cam.copy()
     T[:3, 3] += T[:3, :3] @ by
     return replace(camera, T_world_cam=T)

@@ -1,9 +1,9 @@
 """How well a registered model follows tissue that is pulled: on the phantom, rigid and bent with it.
 
-Where the phantom's surface goes is known exactly. It has nothing below: there the truth is that of an
-incompressible elastic half space with this surface, by definition. Its solution is that of Stokes' equations
-below a plane whose motion is given, wave by wave: a wave of k rad/m has faded to (1 + k z) exp(-k z) in depth
-z, upwards, and sooner sideways. Nothing of it is in the overlay, which fades every motion alike.
+The motion of the phantom's surface is known exactly. The phantom has nothing below it: there the truth is by
+definition an incompressible elastic half space with this surface. Its solution is that of Stokes' equations
+below a plane with a given motion, wave by wave: at depth z a wave of k rad/m has faded to (1 + k z) exp(-k z)
+upwards, and to less sideways. The overlay does not know this solution: it fades every motion alike.
 """
 
 from collections.abc import Iterator
@@ -37,9 +37,9 @@ from sags_node.types import F64, I32, FrameResult
 
 RATE, SECONDS, STEPS = 15, 4.0, 2  # Hz; s, one pull; steps of the mapper, each frame
 PINNED, LAST = 4, 39  # frames: before the pull, and when it lets go
-PULLED, MOVED = 0.010, 0.005  # m, of the grip; of the surface: what lies under it is counted apart
+PULLED, MOVED = 0.010, 0.005  # m: pull of the grip; motion of surface that is counted apart
 BELOW = (0.0, 0.005, 0.010, 0.020)  # m
-STATED = 0.45  # mm: what `register` finds of the phantom, nine of ten
+STATED = 0.45  # mm: 90th percentile of the residual that `register` finds on the phantom
 CHECKED = "residual_mm", "residual_limit_mm", "unsure"
 MODES: dict[str, dict[str, Any]] = {"rigid": {}, "bent": {"deform": True}}
 
@@ -60,7 +60,7 @@ class Own(Pinner):
 
 
 def measure_deform(seeds: int, advance: Advance) -> dict[str, Any]:
-    """All of it, of each seed's phantom."""
+    """Measure how the model follows, on each seed's phantom."""
     scene = PhantomScene(seconds=SECONDS, width=SIZE[0], height=SIZE[1])
     config = LaunchConfig(source=scene)
     prepare(config)
@@ -81,8 +81,8 @@ def measure_deform(seeds: int, advance: Advance) -> dict[str, Any]:
 def _pulled(
     pipeline: Pipeline, phantom: Phantom, seed: int, receipt: Receipt
 ) -> Iterator[tuple[F64, F64, dict[str, Any]]]:
-    """Of each frame in which the grip is pulled so far: errors [modes, layers, N] (m) of the vertices, how
-    far [N] those of the surface have gone, and what the last check said."""
+    """For each frame in which the grip is pulled by `PULLED` or more: errors [modes, layers, N] (m) of the
+    vertices, how far those of the surface have moved [N] (m), and the results of the last check."""
     count = round(SECONDS * RATE)
     with ThreadPoolExecutor(1) as worker:
         for number in range(LAST):
@@ -98,7 +98,7 @@ def _pulled(
                 layers = start.reshape(-1, 3)[used] + np.array([[[0, 0, below]] for below in BELOW])
                 objects = _objects(layers, triangles, Own(pipeline), worker)
             placed = [each.placed(frame) for each in objects]
-            worker.submit(int).result()  # what was begun is done, so a run repeats
+            worker.submit(int).result()  # wait for all work, so that runs are repeatable
             if phantom.tissue.lift(number / count) * float(np.linalg.norm(LIFT)) >= PULLED:
                 gone = _half_space(now - start)[:, used]
                 worlds = [put.shape(put.T_world_body) for put in placed if put is not None]
@@ -119,7 +119,7 @@ def _objects(layers: F64, triangles: I32, pinner: Pinner, worker: ThreadPoolExec
 
 
 def _rows(errors: F64, moved: Any) -> list[dict[str, Any]]:
-    """Of each layer, all vertices and those under what has moved far."""
+    """A row for each layer: all vertices, and those under surface that has moved by more than `MOVED`."""
     rows = []
     for layer, below in enumerate(BELOW):
         row: dict[str, Any] = {"below_mm": 1e3 * below}
@@ -133,7 +133,7 @@ def _rows(errors: F64, moved: Any) -> list[dict[str, Any]]:
 
 
 def seen(result: FrameResult) -> TissueFrame:
-    """What the overlay would receive of a frame."""
+    """Return what the overlay would receive of a frame."""
     view, states, pair = result.views["left"], result.anchors, result.pair
     rows = zip(
         states.ids, states.points, states.visibility, states.confidence, states.depth_confidence, strict=True
@@ -144,9 +144,9 @@ def seen(result: FrameResult) -> TissueFrame:
 
 
 def _half_space(ways: F64) -> F64:
-    """How far [layers, N, 3] all goes at each depth below a surface that goes [rows, cols, 3] (m)."""
+    """The motion [layers, N, 3] (m) at the depths `BELOW`, given that of the surface [rows, cols, 3] (m)."""
     rows, cols = ways.shape[:2]
-    padded = np.pad(ways, ((0, rows), (0, cols), (0, 0)), mode="symmetric")  # what wraps round is even
+    padded = np.pad(ways, ((0, rows), (0, cols), (0, 0)), mode="symmetric")  # no jump where it wraps
     waves = np.fft.fft2(padded, axes=(0, 1))
     ky, kx = np.meshgrid(*(2 * np.pi * np.fft.fftfreq(2 * n, SPACING) for n in (rows, cols)), indexing="ij")
     k = np.hypot(kx, ky)
@@ -160,7 +160,7 @@ def _half_space(ways: F64) -> F64:
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """For people."""
+    """Make the tables for people."""
     columns = [f"{which}_{name}" for which in ("all", "moved") for name in MODES]
     errors = Table("below, mm", *columns, "worse, mm", title="median, nine of ten, mm")
     cells = [f"{{{name}[median_mm]}}, {{{name}[p90_mm]}}" for name in columns]

@@ -1,4 +1,4 @@
-"""Depth from stereo against what is known to be true: the node's stage at every scale, and SGBM."""
+"""Depth from stereo against a known truth: the node's stage at every scale, and SGBM."""
 
 import statistics
 import time
@@ -32,7 +32,7 @@ from sags_node.vision.stereo import StereoDepth
 
 STEP = 2.0  # px of disparity over `AROUND`: an edge of the depth, or a slope that is hard to match
 AROUND = 21  # px, a window's side
-BESIDE = 30 / 640  # of the width, from an instrument or what else is no tissue
+BESIDE = 30 / 640  # share of the width: distance from instruments and all else that is no tissue
 
 SCALES = (1, 2, 4)
 PLAIN_SCALES = (1, 2)
@@ -40,7 +40,7 @@ MODEL = "the model, drawn"
 CONFIDENCES = (0.0, 0.25, 0.5, 0.75, 1.0)  # edges of the table's groups
 EVERY = 10  # frames of a recording
 WHITE = 230  # of 255, in every channel: a highlight
-FAULTS: dict[str, tuple[float, ...]] = {  # what `PhantomScene` calls it -> levels
+FAULTS: dict[str, tuple[float, ...]] = {  # name in `PhantomScene` -> levels
     "noise": (0.0, 0.01, 0.03, 0.06),
     "blur": (0.0, 1.0, 2.0, 4.0),
     "smoke": (0.0, 0.3, 0.6, 0.9),
@@ -51,7 +51,7 @@ Matcher = Callable[[RectifiedPair, Bool], tuple[F32, F32]]  # depth (m, 0 unknow
 
 
 def network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: float) -> Matcher:
-    """The stage with a network, as `vision.onnx` sets it up. Nothing is matched where it fails.
+    """Return the stage with a network, as `vision.onnx` sets it up, without its fallback.
 
     Raises:
         UsageError: the file is no depth network.
@@ -71,7 +71,7 @@ def network_matcher(file: Path, config: StereoConfig, camera: Camera, baseline: 
 def make_matchers(
     config: StereoConfig, camera: Camera, baseline: float, network: Path | None = None
 ) -> dict[str, Matcher]:
-    """By name; the first is the stage as `config` sets it up, which the others are compared with.
+    """Return the matchers by name. The first, to which the others are compared, is as `config` says.
 
     Args:
         network: an ONNX file to compare as well.
@@ -94,7 +94,7 @@ def make_matchers(
 
 @dataclass
 class Tally:
-    """What one matcher gave, over all frames so far."""
+    """The results of one matcher over all frames so far."""
 
     errors_mm: list[F64] = field(default_factory=list)  # measured minus true
     confidences: list[F32] = field(default_factory=list)
@@ -103,7 +103,7 @@ class Tally:
     wanted: int = 0  # px that have a true depth
 
     def add(self, depth: F32, confidence: F32, truth: F32, mask: Bool, shared: Bool) -> None:
-        """One frame: pictures [H, W], `mask` where it counts, `shared` where others know the depth too."""
+        """Add a frame: pictures [H, W]; `mask`: pixels that count; `shared`: the first matcher has depth."""
         comparable = mask & (truth > 0)
         given = comparable & (depth > 0)
         self.wanted += int(comparable.sum())
@@ -125,7 +125,7 @@ class Tally:
 
 
 def by_confidence(errors_mm: F64, confidences: F32) -> list[dict[str, Any]]:
-    """Whether the confidence orders the errors: one row for each group of it."""
+    """Show whether confidence orders the errors: return one row for each group of confidence."""
     rows = []
     for low, high in pairwise(CONFIDENCES):
         group = (confidences > low) & (confidences <= high)
@@ -135,7 +135,7 @@ def by_confidence(errors_mm: F64, confidences: F32) -> list[dict[str, Any]]:
 
 
 def error_figures(errors_mm: F64) -> dict[str, float | None]:
-    """Of signed errors; None of nothing. A negative bias means too near."""
+    """Return figures of signed errors; None if there are none. A negative bias means too near."""
     if len(errors_mm) == 0:
         return dict.fromkeys(("median_mm", "p90_mm", "bias_mm"))
     size = np.abs(errors_mm)
@@ -148,7 +148,7 @@ def rounded(value: float | np.floating[Any]) -> float:
 
 
 def spread(values: Sequence[float] | NDArray[np.floating[Any]]) -> dict[str, float]:
-    """What half of them are below, and nine of ten."""
+    """Return the median and the 90th percentile of values."""
     return {"median": rounded(np.median(values)), "p90": rounded(np.quantile(values, 0.9))}
 
 
@@ -164,10 +164,10 @@ class Comparison:
         """Match one pair with each matcher and compare with `truth` [H, W] (m) on tissue.
 
         Args:
-            extra: depths that are there already, by name.
+            extra: depths that need no matching, by name.
 
         Returns:
-            What the first matcher gave, [H, W] m.
+            The first matcher's depth, [H, W] m.
         """
         configured: F32 | None = None
         for name, matcher in self._matchers.items():
@@ -191,7 +191,7 @@ class Comparison:
 
 
 class Regions:
-    """Errors by `regions_of` the picture, of the stage as configured and of the drawn model."""
+    """Errors by region of the picture (`regions_of`), of the stage as configured and of the drawn model."""
 
     def __init__(self) -> None:
         self._tallies: dict[str, tuple[Tally, Tally]] = {}
@@ -216,10 +216,10 @@ def _without_time(tally: Tally) -> dict[str, Any]:
 def measure_recording(
     session: Session, advance: Advance, every: int = EVERY, network: Path | None = None
 ) -> dict[str, Any]:
-    """Frames of a recording that have a reference depth, at most one in `every`, against it, on tissue.
+    """Compare depth on tissue with a recording's reference depth, in at most one of `every` frames.
 
     The whole recording is played with one step of the mapper a frame, so that the depth of the drawn model is
-    measured beside.
+    measured, too.
 
     Raises:
         SagsError: no frame has a reference depth, or the recording cannot be used.
@@ -270,7 +270,7 @@ def measure_faults(
     advance: Advance,
     network: Path | None = None,
 ) -> dict[str, Any]:
-    """The phantom, whose depth is known exactly, with one fault of its pictures rising at a time.
+    """Measure the phantom, whose depth is known exactly, with one fault of its pictures rising at a time.
 
     Args:
         size: width and height of the pictures, px.
@@ -313,7 +313,7 @@ def measure_faults(
 
 
 def frame_of(number: int, rate: float, truth: PhantomFrame) -> StereoFrame:
-    """What a camera of so many frames a second gives of a phantom, with its true mask."""
+    """Return a phantom's frame as a camera of `rate` frames per second gives it, with its true mask."""
     stamp = round((1 + number / rate) * 1e9)
     return StereoFrame(number, stamp, stamp, truth.left, truth.right, tissue=~truth.tool)
 
@@ -325,10 +325,10 @@ def _phantom_frames(phantom: Phantom, count: int) -> Iterable[tuple[StereoFrame,
 
 
 def regions_of(truth: F32, tissue: Bool, focal_baseline: float) -> dict[str, Bool]:
-    """Masks [H, W] of pixels that are tissue and have a true depth, by name.
+    """Return masks [H, W] of pixels that are tissue and have a true depth, by the name of the region.
 
-    "near" and "far" are the thirds of them with the least and the greatest depth. The next three may overlap,
-    "elsewhere" is what is in none of them.
+    "near" and "far" are the thirds of them with the least and the greatest depth. The next three may overlap;
+    "elsewhere" is what is in none of these three.
 
     Args:
         truth: [H, W] m, 0 unknown.

@@ -28,7 +28,7 @@ from sags_node.vision.stereo import StereoDepth
 MILLIMETRE = 1e-3
 SURFACE, EVALUATED = "*_CT_cut.xyz", "*_MASK_eval.png"
 LARGEST_FILE = 2**24  # bytes, of the surface
-HIDES_WITHIN = 13  # px: the points of the surface are up to so far apart, from one another
+HIDES_WITHIN = 13  # px: neighbouring points of the surface are at most this far apart
 HIDDEN = 2e-3  # m behind a nearer point: the organ folds over itself
 RUNS = 11  # of each matcher, for its time
 MARGIN = 30  # px around the region, in the picture
@@ -49,8 +49,8 @@ class CTPair:
 
 
 def read_ct_pair(folder: Path) -> CTPair:
-    """left.png, right.png, a calibration of text matrices, the CT surface `*_CT_cut.xyz` (mm, left raw
-    camera) and the region to evaluate, 0 in `*_MASK_eval.png`.
+    """Read left.png, right.png, a calibration of text matrices, the CT surface `*_CT_cut.xyz` (mm, left raw
+    camera) and the region to evaluate, which is 0 in `*_MASK_eval.png`.
 
     Raises:
         UsageError: a file is missing or of another form.
@@ -72,7 +72,7 @@ def read_ct_pair(folder: Path) -> CTPair:
 
 
 def _largest_piece(mask: Bool) -> Bool:
-    """Without the echoes of the region: so strong a distortion folds the corners over the middle."""
+    """The largest piece of a mask: so strong a distortion folds the corners, and repeats the region there."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8))
     return np.asarray(labels == 1 + np.argmax(stats[1:, cv2.CC_STAT_AREA]), np.bool_)
 
@@ -111,7 +111,7 @@ def _seen(rectifier: Rectifier, points: F64, evaluated: Bool) -> tuple[F64, Bool
 
 
 def errors_along_z(ct: CTPair, depth: F32) -> tuple[F64, Bool]:
-    """Measured minus true depth (mm) of the points whose pixel has a depth, and which those are [P]."""
+    """Return measured minus true depth (mm) of points whose pixel has a depth, and which those are [P]."""
     x, y = np.rint(ct.pixels).astype(int).T
     measured = depth[y, x]
     given = measured > 0
@@ -120,7 +120,7 @@ def errors_along_z(ct: CTPair, depth: F32) -> tuple[F64, Bool]:
 
 
 def distances_to_surface(ct: CTPair, depth: F32) -> F64:
-    """From each point with a measured pixel to the nearest measured point of the region, mm.
+    """Return the distance (mm) of each point with a measured pixel to the region's nearest measured point.
 
     Measured points are a tenth of a millimetre apart, so the nearest one stands for the surface.
     """
@@ -135,8 +135,8 @@ def distances_to_surface(ct: CTPair, depth: F32) -> F64:
 
 
 def measure_ct(ct: CTPair, advance: Advance, network: Path | None = None) -> dict[str, Any]:
-    """Errors of every setting along z, as everywhere else, and to the nearest surface; share of the region
-    that has a depth.
+    """Measure the errors of every setting along z, as everywhere else, and to the nearest surface, and the
+    share of the region that has a depth.
 
     `median_abs_mm`, `p90_abs_mm` and `coverage` are those of the stage as a launch file has it by default.
 
@@ -171,7 +171,7 @@ def measure_ct(ct: CTPair, advance: Advance, network: Path | None = None) -> dic
 
 
 def configured_depth(ct: CTPair) -> tuple[F32, F32]:
-    """Depth (m) and confidence [H, W] of the stage as a launch file has it by default."""
+    """Return depth (m) and confidence [H, W] of the stage as a launch file has it by default."""
     return StereoDepth(StereoConfig(), ct.pair.camera, ct.pair.baseline)(ct.pair, np.ones_like(ct.evaluated))
 
 
@@ -190,7 +190,7 @@ def _measured(ct: CTPair, matcher: Matcher) -> dict[str, Any]:
 
 
 def picture(ct: CTPair) -> bytes:
-    """Left picture, measured depth and its error against the CT surface, side by side, as JPEG."""
+    """Draw left picture, measured depth and its error against the CT surface side by side, as JPEG."""
     depth, _ = configured_depth(ct)
     errors, given = errors_along_z(ct, depth)
     rows, columns = np.nonzero(ct.evaluated)

@@ -12,7 +12,7 @@ ERRORS = "{median_mm:.2f}", "{p90_mm:.2f}", "{bias_mm:+.2f}"
 
 
 def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
-    """`measured` as `measure_recording`, `measure_faults` or `measure_ct` returns it."""
+    """Make the tables; `measured` as `measure_recording`, `measure_faults` or `measure_ct` returns it."""
     if "faults" in measured:
         yield from _fault_tables(measured["faults"])
         return

@@ -1,4 +1,4 @@
-"""What the node makes of pictures that something is wrong with, for a second in the middle of a recording."""
+"""What the node makes of disturbed pictures, for a second in the middle of a recording."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, F64, I64, U8, AnchorStates, Bool, FrameResult, RenderedView, StereoFrame
 from sags_node.vision.tissue import TissueMask
 
-LEAD = 10  # frames: how long before it begins the anchors are pinned
-RECOVERY = 10  # frames after its end, within which all should be as before
-AFTER_SECONDS = 2.0  # that are played after it
+LEAD = 10  # frames from pinning the anchors to the beginning of the disturbance
+RECOVERY = 10  # frames after the disturbance, within which all should be as before
+AFTER_SECONDS = 2.0  # played after the disturbance
 BEGINS_AT = 0.4  # of the recording, where the launch file names no segment
-WITHIN_DB = 1.0  # of what it was: recovered
-STEADY = 3  # frames in a row that must be so good
+WITHIN_DB = 1.0  # a PSNR this close to what it was has recovered
+STEADY = 3  # frames in a row that must have recovered
 CONFIDENT = 0.5
 SUPPORTED_SECONDS = 0.5  # a depth that was measured in this time is not borrowed
 ANCHORS = 24
-ANCHOR_WRONG = 2e-3  # m: an instrument led to such a target misses it
+ANCHOR_WRONG = 2e-3  # m: an instrument guided to an anchor that is farther off misses its target
 ANCHOR_WRONG_PX = 8 / 640  # of the width, where depth has no truth: 1.1 mm sideways at 80 mm
 
 Row = dict[str, Any]
@@ -63,8 +63,8 @@ class _Shown:
     """What one frame of a run showed."""
 
     psnr: float  # dB over the true tissue, against the true picture
-    borrowed: float  # share of the published depth
-    confident_borrowed: float  # share of that which is published as confident
+    borrowed: float  # share of the published depth, see `_Run._borrowed`
+    confident_borrowed: float  # share of the depth that is published as confident
     depth: _Depth | None  # None: there is no reference
     warnings: frozenset[str]
     restarts: int  # of the model, since the first frame
@@ -86,7 +86,7 @@ def measure_disturbances(
     Args:
         names: of `DISTURBANCES`.
         start: the frame in which each begins; None: that of the launch file's first segment, or `BEGINS_AT`.
-        seconds: that those last which have no length of their own.
+        seconds: length of the disturbances that have no length of their own.
         look: called after each run with a frame before, in the middle, and after the disturbance.
 
     Returns:
@@ -156,7 +156,7 @@ def _stretch(session: Session, start: int | None, seconds: float) -> tuple[float
 
 
 def _references(session: Session, during: range) -> dict[int, F32]:
-    """Depths from the last frame before the stretch that has one to the first after it."""
+    """Reference depths by frame, from the last one before the stretch to the first one after it."""
     found: dict[int, F32] = {}
     with open_source(session.config.source) as source:
         for frame in source:
@@ -194,7 +194,7 @@ class _Run:
         self._shoot_at = [during.start - 1, during.start + len(during) // 2, during.stop]
 
     def take(self, taken: Taken) -> None:
-        """Play one frame and measure it. Where it is lost, nothing new is shown, and nothing measured."""
+        """Play one frame and measure it. If it is lost, nothing new is shown and nothing is measured."""
         if taken.given is None:
             return
         result = self._pipeline.process(taken.given, self._budget)
@@ -222,8 +222,8 @@ class _Run:
             self.shots.append(Shot(result.pair.left, result.pair.right, view, tissue))
 
     def _borrowed(self, frame_id: int, result: FrameResult) -> Bool:
-        """Where stereo has not measured a depth for `SUPPORTED_SECONDS`, [H, W]: what is published there is
-        carried on, or taken from elsewhere. A wrong measurement counts as one."""
+        """Where [H, W] stereo has not measured a depth for `SUPPORTED_SECONDS`: depth that is published there
+        is carried over, or taken from elsewhere. A wrong measurement counts as a measurement."""
         measured = result.observation.depth > 0
         if self._measured_in is None:
             self._measured_in = np.full(measured.shape, np.iinfo(np.int64).min // 2)
@@ -231,7 +231,7 @@ class _Run:
         return np.asarray(frame_id - self._measured_in >= SUPPORTED_SECONDS * self._rate)
 
     def row(self) -> Row:
-        """The figures of the run; None where one does not apply."""
+        """Return the figures of the run; None where one does not apply."""
         first, stop = self.during.start, self.during.stop
         before = [shown for frame, shown in self._shown.items() if first - self._rate <= frame < first]
         within = [shown for frame, shown in self._shown.items() if frame in self.during]
@@ -273,8 +273,8 @@ class _Run:
 def frames_to_recover(
     psnr: Mapping[int, float], clean: Mapping[int, float], stop: int, before: float | None
 ) -> int | None:
-    """Frames from the end of a disturbance until `STEADY` frames in a row are within `WITHIN_DB` of what it
-    was before, or of the undisturbed run's same frames, where those are worse; None: never.
+    """Count the frames from the end of a disturbance until `STEADY` frames in a row are within `WITHIN_DB` of
+    the PSNR before it, or of the undisturbed run's same frames, where those are worse; None: never.
 
     Args:
         psnr: frame_id -> dB, of the run; lost frames are not in it.
@@ -293,8 +293,8 @@ def frames_to_recover(
 def warning_times(
     warnings: Mapping[int, frozenset[str]], during: range, rate: float
 ) -> tuple[float | None, float | None]:
-    """Seconds from the begin of a disturbance to the first warning, and from its end until there is none;
-    None: never.
+    """Return the seconds from the beginning of a disturbance to the first warning, and from its end until
+    there is none; None: never.
 
     Args:
         warnings: frame_id -> the codes of the warnings, without those that warned before.
@@ -311,7 +311,7 @@ def warning_times(
 
 
 class _PinnedAnchors:
-    """Anchors of one run, and where they were in each frame after."""
+    """The anchors of one run, and where they were in each frame after they were pinned."""
 
     def __init__(self, pipeline: Pipeline) -> None:
         self.pinned = False
@@ -321,7 +321,7 @@ class _PinnedAnchors:
         self._truth: dict[int, F64] = {}  # frame_id -> points [A, 3] (m, world), where the recording has any
 
     def pin(self, frame: StereoFrame, result: FrameResult) -> None:
-        """On visible true surface points, where the recording has them, else on a grid.
+        """Pin anchors on visible true surface points, where the recording has them, else on a grid.
 
         Raises:
             SagsError: nothing can be pinned.
@@ -351,16 +351,16 @@ class _PinnedAnchors:
             self._tracks.append(track)
 
     def follow(self, frame: StereoFrame, result: FrameResult) -> None:
-        """Note where they are said to be, and where they are."""
+        """Note where the node says the anchors are, and where they truly are."""
         self._states[frame.frame_id] = result.anchors
         points = true_points(frame, result)
         if points is not None:
             self._truth[frame.frame_id] = points[self._tracks]
 
     def judge(self, frame_id: int, clean: _PinnedAnchors) -> Row:
-        """Shares 0..1 of the anchors in a frame, or the first after it that came: those confident and within
-        `ANCHOR_WRONG` of the truth, and those confident and farther away. The rest say that they are unsure,
-        or are lost. Without true points the truth is where the undisturbed run has them in the picture."""
+        """Return shares 0..1 of the anchors in a frame, or in the first after it that came: confident and
+        within `ANCHOR_WRONG` of the truth, and confident and farther away. The rest are unsure or lost.
+        Without true points, the truth is where the undisturbed run has the anchors in the picture."""
         frame_id = min(frame for frame in self._states if frame >= frame_id)
         states = self._states[frame_id]
         if frame_id in self._truth:
@@ -369,7 +369,7 @@ class _PinnedAnchors:
             offsets, most = states.pixels - clean._states[frame_id].pixels, ANCHOR_WRONG_PX * self._width
         sure = (states.confidence >= CONFIDENT) & np.isfinite(offsets).all(1)
         if frame_id in self._truth:
-            sure &= states.depth_confidence >= CONFIDENT  # it says that it may be 3 mm off along the ray
+            sure &= states.depth_confidence >= CONFIDENT  # below, it may be 3 mm off along the ray
         right = np.linalg.norm(offsets, axis=1) <= most  # NaN: not
         return {
             "anchors": len(states),
@@ -379,7 +379,7 @@ class _PinnedAnchors:
 
 
 def _is_confident(view: RenderedView) -> Bool:
-    """[H, W]; all of it, where the view does not say."""
+    """Where [H, W] a view is confident; everywhere, if it has no confidence."""
     if view.confidence is None:
         return np.ones(view.depth.shape, np.bool_)
     return np.asarray(view.confidence >= CONFIDENT)
@@ -400,7 +400,7 @@ def _share(part: Bool, whole: Bool) -> float:
 
 
 def _over(values: Iterable[float], figure: Callable[..., Any] = np.mean) -> float | None:
-    """Of those that are known: their mean, or another figure."""
+    """The mean, or another figure, of the values that are known; None if none is."""
     known = [value for value in values if np.isfinite(value)]
     return _round(float(figure(known))) if known else None
 

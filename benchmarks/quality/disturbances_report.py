@@ -22,15 +22,15 @@ _COLUMNS = {
 
 
 def table(measured: Mapping[str, Any]) -> Table:
-    """`measured` as `measure_disturbances` returns it."""
+    """Make the table; `measured` as `measure_disturbances` returns it."""
     title = f"from frame {measured['settings']['from']}"
     made = plain_table(measured["session"], *_COLUMNS, title=title)
     return filled(made, measured["rows"], "{name}", *_COLUMNS.values())
 
 
 def strip(shots: Sequence[Shot]) -> bytes:
-    """A PNG: a line each of before, middle and after; what came to the left and the right eye, the model's
-    picture, and its depth, grey where none is published on tissue."""
+    """Draw a PNG with a row each for before, middle and after: the left and right pictures as they came, the
+    model's picture and its depth, which is grey on tissue where none is published."""
     shown = [Picture(shot.view.frame_id, 0.0, shot.left, shot.view.rgb, shot.view.depth, shot.tissue)
              for shot in shots]  # fmt: skip
     near, far = depth_range(shown[::2])  # those that nothing is wrong with

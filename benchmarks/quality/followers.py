@@ -1,6 +1,6 @@
-"""Points followed in the pictures of one eye by common methods that know no model: what anchors stand beside.
+"""Points followed in one eye's pictures by common methods without a model, for comparison with anchors.
 
-Each gets the points' pixels in the first picture, and then shown the pictures in turn.
+Each gets the points' pixels in the first picture, and is then shown the pictures in turn.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,10 @@ import numpy as np
 
 from sags_node.types import F32, F64, U8, Bool
 
-CONSISTENT = 1.0  # px between a point and where the way there and back takes it
-WINDOW = (21, 21)  # px, of Lucas-Kanade: what an anchor's patch has
+CONSISTENT = 1.0  # px: largest forward-backward error
+WINDOW = (21, 21)  # px, of Lucas-Kanade: the size of an anchor's patch
 LEVELS = 3  # of its pyramid, beside the picture itself
-BOX = 33  # px: side of what CSRT is shown of a point
+BOX = 33  # px: side of the box around a point that CSRT tracks
 HALF_BOX = (BOX - 1) / 2
 AT_ONCE = 1 << 14  # places: OpenCV takes no picture of more than 32,766 rows
 
@@ -25,12 +25,12 @@ class Follower(Protocol):
     """Follows points."""
 
     def follow(self, picture: U8) -> tuple[F64, Bool]:
-        """Where the points are in the next picture [H, W, 3] RGB, px [P, 2], and which are not lost [P]."""
+        """Return the points' pixels [P, 2] in the next picture [H, W, 3] RGB, and which are not lost [P]."""
 
 
 class Chained:
-    """From each picture to the next. A point whose way back misses where it came from is lost for good:
-    nothing is left that knows it (forward-backward error; Kalal et al., ICPR 2010)."""
+    """Follows from each picture to the next. A point with too large a forward-backward error (Kalal et al.,
+    ICPR 2010) is lost for good, because nothing is kept by which it could be found again."""
 
     def __init__(self, step: Step, picture: U8, pixels: F64) -> None:
         self._step, self._gray = step, _gray(picture)
@@ -49,7 +49,7 @@ class Chained:
 
 
 class Csrt:
-    """One correlation filter for each point (Lukezic et al., CVPR 2017); OpenCV's, as it comes."""
+    """One correlation filter for each point (Lukezic et al., CVPR 2017); OpenCV's, with its defaults."""
 
     def __init__(self, picture: U8, pixels: F64) -> None:
         self._pixels = pixels.copy()
@@ -70,7 +70,7 @@ class Csrt:
 
 
 class Unmoved:
-    """Points that stay where they were: how much there is to follow."""
+    """Leaves points where they were: its error says how much there is to follow."""
 
     def __init__(self, picture: U8, pixels: F64) -> None:
         self._pixels = pixels
@@ -80,12 +80,12 @@ class Unmoved:
 
 
 def lucas_kanade(picture: U8, pixels: F64) -> Follower:
-    """Pyramidal Lucas-Kanade (Bouguet, 2001) from picture to picture."""
+    """Make a follower by pyramidal Lucas-Kanade (Bouguet, 2001) from picture to picture."""
     return Chained(_lucas_kanade_step, picture, pixels)
 
 
 def dense_flow(picture: U8, pixels: F64) -> Follower:
-    """Dense inverse search (Kroeger et al., ECCV 2016) from picture to picture."""
+    """Make a follower by dense inverse search (Kroeger et al., ECCV 2016) from picture to picture."""
     flow = dis_flow()
 
     def step(before: U8, after: U8, pixels: F64) -> tuple[F64, Bool]:
@@ -108,7 +108,7 @@ def dis_flow() -> cv2.DISOpticalFlow:
 
 
 def sample(flow: F32, places: F64) -> F64:
-    """A flow [H, W, 2] at places [M, 2] px."""
+    """Sample a flow [H, W, 2] at places [M, 2] px."""
     taken = [
         cv2.remap(flow, some[:, None], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
         for some in np.array_split(places.astype(np.float32), len(places) // AT_ONCE + 1)

@@ -1,4 +1,4 @@
-"""How exactly instruments are placed: before the phantom, where their tips are known."""
+"""How accurately instruments are placed: in front of the phantom, where their tips are known."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,21 +26,21 @@ from sags_node.types import F32, F64, Bool, Camera, FrameResult, InstrumentState
 from sags_node.vision.stereo import StereoDepth
 
 SIZE = (640, 512)
-FIRST = 8  # seed: constants were chosen on those before it
+FIRST = 8  # first seed; the seeds before it were used to choose constants
 BEFORE, RATE, STEPS = 3, 5.0, 2  # frames without instruments; a second; steps of the mapper, each frame
 DISTANCES = (0.005, 0.010, 0.020, 0.040)  # m, along the axis
 SIDES = {"one": ("left",), "two": ("left", "right"), "crossing": ("left", "right"), "leaving": ("right",)}
 TROCARS = {"left": np.array([-0.105, 0.125, -0.010]), "right": np.array([0.125, 0.105, 0.0])}  # m
-WHERE = {  # of the tip, in parts of the picture's size: from, to
+WHERE = {  # column of the tip, as a share of the picture's width: from, to
     "one": (0.25, 0.70), "two left": (0.20, 0.45), "two right": (0.55, 0.80), "crossing left": (0.55, 0.75),
     "crossing right": (0.25, 0.45), "leaving": (-0.30, -0.05),
 }  # fmt: skip
 DEPTHS = (0.035, 0.085)  # m, of a tip
-NEAR = 0.15  # of the distance
+NEAR = 0.15  # tolerance, share of the distance
 SPREAD = 0.015  # m, of a trocar along each axis
 FREE = np.arange(0.0, 0.15, 0.0015)  # m from the tip: no tissue hides the instrument
-JAW_END = 0.001  # m, of a jaw
-AROUND = 8  # px around a far end, whose depth is its depth
+JAW_END = 0.001  # m: length of the end of a jaw
+AROUND = 8  # px around a far end whose median depth it gets
 SAID = ("tip_mm", "distance_mm", "clearance_mm", "axis_deg")
 BESIDE = ("far_end_on_tissue_mm", "far_end_by_stereo_mm")  # the baselines' tips
 KINDS = ("grasper", "open grasper", "hook")
@@ -58,7 +58,7 @@ class Tool:
 
 
 class Scene:
-    """A phantom at rest, and instruments put before it."""
+    """A phantom at rest, with instruments in front of it."""
 
     def __init__(self, seed: int) -> None:
         self.phantom = Phantom(
@@ -71,7 +71,7 @@ class Scene:
         self._bodies = Bodies(self.phantom.tissue, self._vertices, NOTHING)
 
     def tool(self, setting: str, side: str, distance: float) -> Tool:
-        """Its tip so far from the tissue along its axis, seen by the left eye but where it is leaving."""
+        """Make a tool whose tip is `distance` m from the tissue along its axis; in view unless "leaving"."""
         low, high = WHERE.get(f"{setting} {side}") or WHERE[setting]
         while True:
             pixel = self._rng.uniform([low, 0.25], [high, 0.65]) * SIZE
@@ -86,7 +86,7 @@ class Scene:
                 return tool
 
     def moving(self, kind: str, trocar: F64, pixel: F64, t: float) -> Tool:
-        """Its tip at a pixel [2], 8 to 16 mm before the tissue there."""
+        """Make a tool with its tip at a pixel [2], 8 to 16 mm in front of the tissue there."""
         u, v = np.clip(pixel, 0, np.array(SIZE) - 1).astype(int)
         depth = float(self.bare.depth[v, u]) - 0.012 - 0.004 * np.sin(1.7 * t)
         tip = np.asarray(unproject(self.camera, pixel, np.array(depth)), np.float64)
@@ -111,7 +111,7 @@ class Scene:
 
 
 def _jaws(mesh: Mesh, axis: F64) -> F64:
-    """Where [2, 3] both jaws end."""
+    """The ends [2, 3] of both jaws."""
     along = mesh.vertices @ axis
     end = mesh.vertices[along > along.max() - JAW_END]
     aside = end - (end @ axis)[:, None] * axis
@@ -120,14 +120,14 @@ def _jaws(mesh: Mesh, axis: F64) -> F64:
 
 
 def off(tool: Tool, place: F64) -> float:
-    """From a place [3] to the tip, mm."""
+    """Return the distance from a place [3] to the tip, mm."""
     way = tool.ends[1] - tool.ends[0]
     share = np.clip((place - tool.ends[0]) @ way / max(way @ way, 1e-12), 0, 1)
     return 1e3 * float(np.linalg.norm(tool.ends[0] + share * way - place))
 
 
 def measure_instruments(seeds: int, advance: Advance) -> dict[str, Any]:
-    """Of every setting and distance, `seeds` times."""
+    """Measure every setting and distance, `seeds` times."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     prepare(config)
     rows: list[dict[str, Any]] = []
@@ -161,7 +161,7 @@ def measure_instruments(seeds: int, advance: Advance) -> dict[str, Any]:
 
 
 def _compared(tools: list[Tool], result: FrameResult, shown: Bool) -> list[dict[str, Any]]:
-    """A row for each instrument: what is true, what is said, and what the far end of the mask says."""
+    """A row for each instrument: the truth, and the errors of the node and of the mask's far end."""
     states = result.instruments
     assert states is not None  # they are asked for
     known = np.nonzero(np.isfinite(states.tips[:, 0]))[0]
@@ -190,7 +190,7 @@ def _compared(tools: list[Tool], result: FrameResult, shown: Bool) -> list[dict[
 
 
 def placed(tool: Tool, states: InstrumentStates, at: int) -> dict[str, Any]:
-    """How far off a tip is, as it is and as it is told, and the axis."""
+    """Return a tip's error and its stated error (mm), whether it is sure, and its axis' error."""
     row = {
         "tip_mm": off(tool, states.tips[at].astype(np.float64)),
         "told_mm": 1e3 * float(error_of(states.confidence[at])),
@@ -202,8 +202,8 @@ def placed(tool: Tool, states: InstrumentStates, at: int) -> dict[str, Any]:
 
 
 def _far_ends(shown: Bool, result: FrameResult) -> dict[str, F64]:
-    """Where [K, 3] the far end of each region of the mask is: at the tissue's depth there, and at that which
-    the node's stereo finds on the instruments."""
+    """The far end [K, 3] (m) of each region of the mask, once at the tissue's depth there and once at the
+    depth that the node's stereo finds on the instruments."""
     pair, view = result.pair, result.views["left"]
     camera = result.observation.camera
     matched, _ = StereoDepth(LaunchConfig().vision.stereo, camera, pair.baseline)(pair, np.ones_like(shown))
@@ -233,7 +233,7 @@ def _around(depth: F32, pixel: F64) -> float:
 
 
 def tally(what: str, rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The rows that have a place, and how many they are, of so many `what`."""
+    """Return the rows with a placed tip, and counts: all rows (`what`), placed, sure, within stated error."""
     there = [row for row in rows if "tip_mm" in row]
     said: dict[str, Any] = {what: len(rows), "placed": len(there), "sure": sum(row["sure"] for row in there)}
     if there:
@@ -242,7 +242,7 @@ def tally(what: str, rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], 
 
 
 def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians and nine of ten, of those of which there is something."""
+    """Counts, and the median and 90th percentile of each figure that is there."""
     there, said = tally("instruments", rows)
     met = [row for row in there if "distance_mm" in row]
     if met:
@@ -258,7 +258,7 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """For people."""
+    """Make the tables for people."""
     names = ("sure_tip_mm", *SAID, *BESIDE)
     table = Table("", "placed", "sure", "within told", *names, title="errors: median, nine of ten")
     for part in ("settings", "distances_mm", "kinds"):
@@ -268,7 +268,7 @@ def tables(measured: dict[str, Any]) -> list[Table]:
 
 
 def add(table: Table, row: dict[str, Any], what: str, names: Sequence[str], *head: str) -> None:
-    """What `tally` counted, and the median and nine of ten of each figure that there is."""
+    """Add a row to a table: the counts of `tally`, and each figure's median and 90th percentile."""
     figures = [f"{row[n]['median']}, {row[n]['p90']}" if n in row else "" for n in names]
     cells = f"{{placed}} of {{{what}}}", "{sure}", "{within_told}"
     filled(table, [row], *head, *cells, *figures, unknown="")

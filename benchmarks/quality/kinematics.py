@@ -1,4 +1,4 @@
-"""How exactly tips are placed by a robot's kinematics, with and without the picture: before the phantom."""
+"""How accurately tips are placed by a robot's kinematics, with and without the picture, on the phantom."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,11 +21,11 @@ from sags_node.types import F64, InstrumentStates, ToolPose
 from sags_node.vision.pyramid import pyramids
 
 RATE, SECONDS, LEAVES = 5.0, 8.0, 6.0  # a second; s; s after which the tip leaves the picture
-SETTLED = 2.0  # s, after which corrections are counted apart
-SHIFT, TURN = 0.005, np.radians(5.0)  # m, and about MIDDLE: how far kinematics are off
+SETTLED = 2.0  # s, after which corrected poses are counted apart
+SHIFT, TURN = 0.005, np.radians(5.0)  # m; rad about MIDDLE: the error of the kinematics
 MIDDLE = np.array([0.0, 0.0, 0.06])  # m, of where instruments work
 FIGURES = ("tip_mm", "axis_deg")
-ERROR = 0.010  # m, as robot.tools says unless it is told better
+ERROR = 0.010  # m, the default in robot.tools
 CASES = {  # whether the picture is used, and whether the robot's kinematics are: exact, or off
     "picture": (True, None), "exact": (False, "exact"), "off": (False, "off"),
     "exact_corrected": (True, "exact"), "off_corrected": (True, "off"),
@@ -39,7 +39,7 @@ class _Case:
 
 
 def measure_kinematics(seeds: int, advance: Advance) -> dict[str, Any]:
-    """Of one moving tool, before `seeds` phantoms."""
+    """Measure one moving tool in front of each of `seeds` phantoms."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in CASES}
     for seed in range(FIRST, FIRST + seeds):
@@ -82,14 +82,14 @@ def measure_kinematics(seeds: int, advance: Advance) -> dict[str, Any]:
 
 
 def _pixel(t: float) -> F64:
-    """Where [2] px the tip is: about in the picture, then out of it."""
+    """The tip's pixel [2]: it moves about in the picture, and leaves it after `LEAVES` s."""
     u, v = 0.45 + 0.18 * np.sin(1.3 * t), 0.45 + 0.15 * np.sin(2.1 * t + 1)
     u -= 0.8 * max(0.0, t - LEAVES) ** 0.5 * (t > LEAVES)
     return np.array([u, v]) * SIZE
 
 
 def _error(rng: np.random.Generator, tool: F64) -> F64:
-    """By which [4, 4] kinematics are off: turned about an axis across the tool [3]: all of it shows."""
+    """The error [4, 4] of the kinematics; it turns about an axis across the tool [3], so all of it shows."""
     way, turn = rng.normal(size=(2, 3))
     turn = np.cross(tool, turn)
     way, turn = way / np.linalg.norm(way), turn / np.linalg.norm(turn)
@@ -98,14 +98,14 @@ def _error(rng: np.random.Generator, tool: F64) -> F64:
 
 
 def _pose(tool: Tool) -> F64:
-    """What exact kinematics say [4, 4]: the tip, out of which z points."""
+    """The pose [4, 4] by exact kinematics: its origin is the tip, and z points out of the tip."""
     x = np.cross(tool.axis, [0.0, 1.0, 0.0])
     x /= np.linalg.norm(x)
     return rigid(np.stack([x, np.cross(tool.axis, x), tool.axis], -1), tool.tip)
 
 
 def _compared(tool: Tool, states: InstrumentStates) -> dict[str, Any]:
-    """What is said of the tip that is the nearest to the true one."""
+    """The errors of the reported tip that is nearest to the true one."""
     known = np.nonzero(np.isfinite(states.tips[:, 0]))[0]
     row: dict[str, Any] = {"rows": len(states)}
     if len(known):
@@ -133,7 +133,7 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def table(measured: dict[str, Any]) -> Table:
-    """For people."""
+    """Make the table for people."""
     shown = Table("", "", "placed", "sure", "within told", *FIGURES, title="kinematics: median, nine of ten")
     for case in CASES:
         for part, row in measured[case].items():

@@ -1,4 +1,4 @@
-"""How right masks are that were not given, and what each source of masks is worth to the mapper."""
+"""How accurate masks are that were not given, and what each source of masks is worth to the mapper."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,7 +28,7 @@ def measure_masks(session: Session, advance: Advance) -> Row:
     mapper a frame.
 
     Masks are compared with the recording's own without dilation. Pictures and depth are measured under the
-    recording's own mask, whatever the mapper was given: figures of different sources compare.
+    recording's own mask, whatever the mapper was given, so figures of different sources are comparable.
 
     Raises:
         SagsError: the recording has no masks.
@@ -102,7 +102,7 @@ class _Run:
             self._depth.append(metrics.depth_errors(view.depth, truth, tissue))
 
     def figures(self) -> Row:
-        """Of the whole pass; shares are 0..1."""
+        """Return the figures of the whole pass; shares are 0..1."""
         usable, given, found, both, flickering = self._pixels.tolist()
         return {
             "iou": _ratio(both, given + found - both),
@@ -127,6 +127,6 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """For people; each row as `measure_masks` returns it."""
+    """Make the table; each row as `measure_masks` returns it."""
     columns = [key for key in rows[0] if key != "receipt"]
     return filled(Table(*columns), rows, *(f"{{{key}}}" for key in columns))

@@ -1,4 +1,4 @@
-"""How exactly lengths and areas between anchors are measured, and whether the errors told are true.
+"""How accurately lengths and areas between anchors are measured, and whether the stated errors are true.
 
 The phantom's tissue is pulled. Anchors are pinned at pixels of true points that its first frame shows.
 """
@@ -32,19 +32,19 @@ EVERY = 5  # frames between two that are measured
 STEPS = 2  # of the mapper, each frame
 CORNERS = {"distance": 2, "path": 4, "area": 3}
 SHAPES = 60  # of each kind, between anchors drawn at random
-CHANGED = 0.05  # of the first true value
+CHANGED = 0.05  # change as a share of the first true value
 
 
 @dataclass(frozen=True, slots=True)
 class _Tally:
-    """Of one kind of value, in all frames that were measured. mm, or mm2 of an area."""
+    """All values of one kind, in all frames that were measured; mm, or mm2 for an area."""
 
-    errors: list[float] = field(default_factory=list)  # of what was sure
-    told: list[float] = field(default_factory=list)  # the same, as it was told
-    kept: list[float] = field(default_factory=list)  # errors of what was measured first, kept
+    errors: list[float] = field(default_factory=list)  # of values that were sure
+    told: list[float] = field(default_factory=list)  # their stated errors
+    kept: list[float] = field(default_factory=list)  # errors if the first measured value is kept
     changed: list[bool] = field(default_factory=list)  # the true value has changed by more than `CHANGED`
-    stretch: list[tuple[float, float]] = field(default_factory=list)  # its error, and as it was told
-    unsure: list[float] = field(default_factory=list)  # errors of what was not sure
+    stretch: list[tuple[float, float]] = field(default_factory=list)  # its error and its stated error
+    unsure: list[float] = field(default_factory=list)  # errors of values that were not sure
 
 
 def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[str, Any]:
@@ -85,14 +85,14 @@ def measure_lengths(session: Session, advance: Advance, seed: int = 0) -> dict[s
 
 
 def _shapes(anchors: int, seed: int) -> list[tuple[str, list[int]]]:
-    """Kinds of values, and the numbers of their anchors, which begin with 1."""
+    """Random shapes: the kind of value, and the numbers of its anchors, which begin with 1."""
     rng = np.random.default_rng(seed)
     draws = ((kind, corners) for kind, corners in CORNERS.items() for _ in range(SHAPES))
     return [(kind, (1 + rng.choice(anchors, corners, replace=False)).tolist()) for kind, corners in draws]
 
 
 def _values(result: FrameResult, shapes: list[tuple[str, list[int]]]) -> list[Measured]:
-    """As a client reads them from the messages of a frame."""
+    """The values of all shapes, as a client reads them from the messages of a frame."""
     frame = Frame()
     for name in MEASURING:
         body = FRAME_CONTENT[name](result)
@@ -110,7 +110,7 @@ def _exact(kind: str, points: F64, corners: list[int]) -> float:
 
 
 def _add(tally: _Tally, unit: float, found: Measured, exact: float, first: Measured, before: float) -> None:
-    """One value and the true one, and both as they were in the first frame that was measured."""
+    """Add a value and the true one, given both as they were in the first frame that was measured."""
     if found.value is None:
         return
     off = unit * abs(found.value - exact)
@@ -128,7 +128,7 @@ def _add(tally: _Tally, unit: float, found: Measured, exact: float, first: Measu
 
 
 def _figures(tally: _Tally) -> dict[str, Any]:
-    """Of values that were sure, of those of them that have changed, and of those that were not sure."""
+    """Figures of values that were sure, of those of them that have changed, and of unsure ones."""
     changed = np.array(tally.changed, np.bool_)
     return {
         "all": _compared(tally, np.ones(len(changed), np.bool_)),
@@ -158,7 +158,7 @@ def _spread(values: F64) -> dict[str, float] | None:
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """For people."""
+    """Make the tables for people."""
     made = Table(
         "mm, mm2", "", "values", "off by p50, p90", "told", "within told", "the first kept", "stretch off by",
         "within told",

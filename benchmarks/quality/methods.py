@@ -1,8 +1,8 @@
 """Control nodes or the paper's field, `mapping.method`: what each shows of the same recordings.
 
 Live, on the recording's clock, for the rate; then frame by frame with a fixed number of steps, for the
-error. At the end of that the model is asked for all frames of the last two seconds. A field knows of each
-time; nodes only have what they are now.
+error. At the end of that the model is asked for all frames of the last two seconds. A field has a state for
+each time; nodes have only their present state.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ SHOWN = {"online": "psnr", "predict": "psnr", "heldout": "psnr", "depth": "media
 def measure_methods(
     launch: Path | str | None, overrides: Sequence[str], iterations: int, rung: int, advance: Advance
 ) -> list[dict[str, Any]]:
-    """A row for each size and method.
+    """Measure a row for each size and method.
 
     Args:
         iterations, rung: of the run frame by frame.
@@ -85,8 +85,8 @@ def _step_by_step(launch: Path | str | None, overrides: Sequence[str]) -> dict[s
 
 
 def _window_psnr(pipeline: Pipeline, run: Run, pictures: dict[int, U8]) -> float:
-    """dB over tissue, mean over the frames of the last two seconds: the model as it is at the end, asked for
-    the time of each."""
+    """Mean PSNR, dB over tissue, of the frames of the last two seconds: the model at the end of the run is
+    drawn for the time of each."""
     mapper, camera, found = pipeline.mapper, pipeline.rectifier.camera, []
     rasterizer = make_rasterizer("numba", camera.width, camera.height)
     last_ns = 0
@@ -103,7 +103,7 @@ def _window_psnr(pipeline: Pipeline, run: Run, pictures: dict[int, U8]) -> float
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """For people."""
+    """Make the table for people."""
     columns = (
         "size", "method", "rate Hz", "p50 / p99 ms", "live dB", "step: online", "next frame", "held out",
         "window", "depth mm", "track px", "ms",

@@ -41,17 +41,17 @@ STEPS = 2  # of the mapper, each frame
 BORDER = 30  # px: what is nearer to the picture's edge is not pinned
 COVERED = (0.25, 0.85)  # of the width: what a cloth hides
 CLOTH = (190, 230)  # grey levels
-DISPARITY = 0.05  # of the width: the cloth lies nearer than the tissue
-TURN = 45.0  # degrees: nothing that was seen is in the picture then
+DISPARITY = 0.05  # of the width; the cloth is nearer than the tissue
+TURN = 45.0  # degrees, so far that nothing seen before is in the picture
 TURNING = 1.5  # s, there and back
 MOVED = np.array([0.006, -0.004, 0.004])  # m, in the dark
 ROLLED = 8.0  # degrees, in the dark
-WRONG = 6.0 / 640  # of the width: one that is farther, and sure, is wrong
+WRONG = 6.0 / 640  # of the width; a sure anchor that is farther off is wrong
 
 
 @dataclass(frozen=True, slots=True)
 class _Moment:
-    """What is true of one frame."""
+    """The truth of one frame."""
 
     frame: PhantomFrame
     T_world_cam: F64
@@ -59,17 +59,17 @@ class _Moment:
 
 
 def measure_recall(session: Session, away: float, advance: Advance) -> dict[str, Any]:
-    """Each scenario once. An anchor is found within `RIGHT` of its point.
+    """Play each scenario once. An anchor is found if it is within `RIGHT` of its point.
 
     Args:
         session: of the phantom; its size and seed are used.
         away: s out of sight.
 
     Returns:
-        `rows`, by scenario: anchors, and shares of those whose points are in sight. `found` and `wrong`:
-        sure, and right or not, 2.4 s after they are back, and `before` they went; `unmoved`: right where
-        they were. `reliability_mm`, `reliability_px`: of all anchors in all frames that were taken in, in
-        pixels of those whose points are in the picture or hidden there.
+        `rows`, by scenario: anchors, and shares of those whose points are in sight. `found`: sure and right,
+        `wrong`: sure and farther off than `WRONG`, 2.4 s after they are back, and `before` they went;
+        `unmoved`: right if they had not moved. `reliability_mm`, `reliability_px`: of all anchors in all
+        frames that were not held; in px only of those whose points are in the picture or hidden there.
 
     Raises:
         UsageError: the session is not the phantom's.
@@ -97,8 +97,8 @@ class _Said:
     inside: list[Bool] = field(default_factory=list)  # the point is in the picture, seen or hidden
 
     def add(self, result: FrameResult, pinned: dict[int, int], truth: F64, points: F64) -> None:
-        """`truth` [P, 2] px and `points` [P, 3] m of all the phantom's points. Of a frame that was not taken
-        in nobody knows where anchors are."""
+        """Add a frame, given `truth` [P, 2] px and `points` [P, 3] m of all the phantom's points. A held
+        frame is left out: the positions of its anchors are not known."""
         if result.held:
             return
         anchors, camera = result.anchors, result.pair.camera
@@ -159,7 +159,7 @@ def _played(
 def _scored(
     anchors: AnchorStates, pinned: dict[int, int], truth: F64, visible: Bool, width: int
 ) -> dict[str, float]:
-    """Of the anchors whose points are in sight: those that are sure and right, and sure and wrong."""
+    """Shares of the anchors whose points are in sight: sure and right, and sure and wrong."""
     points = np.array([pinned[int(anchor)] for anchor in anchors.ids])
     there = visible[points]
     errors = np.linalg.norm(anchors.pixels - truth[points], axis=1)[there] / width
@@ -172,7 +172,7 @@ def _scored(
 
 @dataclass(frozen=True, slots=True)
 class _Film:
-    """The phantom's frames; those of a scope that stays are rendered once for all scenarios."""
+    """The phantom's frames; those with the scope at rest are rendered once for all scenarios."""
 
     phantom: Phantom
     count: int
@@ -203,7 +203,7 @@ def _moments(film: _Film, scenario: Scenario, counts: list[int]) -> Iterator[_Mo
 
 
 def _place(scenario: Scenario, since: int, away: int) -> F64:
-    """Pose of the scope so many frames after the tissue went out of sight."""
+    """Pose of the scope `since` frames after the tissue went out of sight."""
     T_world_cam = np.eye(4)
     if scenario == "turned away":
         share = np.clip(min(since, away - since) / (TURNING * RATE), 0, 1)
@@ -246,7 +246,7 @@ def _inside(pixels: F64, camera: Camera) -> Bool:
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """For people; `measured` as `measure_recall` returns it."""
+    """Make the tables; `measured` as `measure_recall` returns it."""
     made = Table(
         "out of sight", "anchors", "right before", "wrong", "found again", "wrong", "had they not moved",
         title=f"{measured['away_s']:g} s out of sight",

@@ -1,4 +1,4 @@
-"""How exactly a model is placed on tissue: on the phantom, whose surface is the model, and on a real organ.
+"""How accurately a model is placed on tissue: on the phantom, whose surface is the model, and a real organ.
 
 Each seed is another phantom, another part of its surface, and other errors of the picked points.
 """
@@ -35,9 +35,9 @@ BELOW = 0.020  # m under the surface, along the line of sight
 FRAMES, RATE, STEPS = 5, 5.0, 2  # a second of the node; steps of the mapper, each frame
 SIZE = (640, 512)
 PART = (0.35, 0.36)  # half axes of the part that is cut out, of width and height
-REACH = 0.010  # m, of Open3D's ICP
-EVEN = 0.03  # m, half a side of the shapes without a hold
-ERRORS = 5  # of the picked points, on each of these
+REACH = 0.010  # m, largest distance of a correspondence in Open3D's ICP
+EVEN = 0.03  # m, half a side of the shapes that do not fix a pose
+ERRORS = 5  # random errors of the picked points on each of these shapes
 RADIUS = 0.05  # m, of the ball
 
 
@@ -45,7 +45,7 @@ class Case:
     """A model that lies somewhere in its own coordinates, and where it truly is.
 
     Args:
-        rng: turns it, and errs as it picks.
+        rng: for the model's pose and the errors of the picked points.
         vertices: [V, 3] m, world, that the eye at the world's origin sees.
     """
 
@@ -62,28 +62,28 @@ class Case:
         self.model = Shape(lying, triangles)
 
     def errors(self, T: F64) -> F64:
-        """Of the targets (m) under a pose."""
+        """Return the errors (m) of the targets under a pose."""
         return np.asarray(np.linalg.norm(transform(T, self.targets) - self.deep, axis=1), np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Placing:
-    """What came of one case. Its errors are by pose: by_pairs, open3d, and fitted where it came to that."""
+    """The result of one case. Errors are by pose: by_pairs, open3d, and fitted unless it was refused."""
 
     verdict: Verdict
     reason: str
     share: float  # as `Registration.share`
     errors_mm: dict[str, list[float]]  # of each target
-    told_mm: dict[str, list[float]]  # the same, as it was told; Open3D tells none
+    told_mm: dict[str, list[float]]  # stated errors of each target; Open3D states none
 
     def as_json(self, seed: int) -> dict[str, Any]:
-        """What is kept of it."""
+        """Return what is kept of the result."""
         said = {"seed": seed, "verdict": self.verdict, "reason": self.reason, "share": self.share}
         return {**said, "fitted_mm": self.errors_mm.get("fitted", [])}
 
 
 def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[str, Any]:
-    """All of it.
+    """Register on each seed's phantom and, with `ct`, on the CT surface, and count the refusals.
 
     Args:
         ct: folder of the pair with a CT surface; None: the phantom only.
@@ -124,13 +124,13 @@ def measure_registration(ct: Path | None, seeds: int, advance: Advance) -> dict[
 
 
 def shown_to_node(phantom: Phantom, number: int, count: int, rate: float) -> StereoFrame:
-    """Frame `number` of `count`, with its true masks and pose."""
+    """Return frame `number` of `count`, with its true masks and pose."""
     truth = phantom.frame(number, count)
     return replace(frame_of(number, rate, truth), T_world_cam=truth.T_world_cam)
 
 
 def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tuple[Camera, Surface]:
-    """What `sags register` gets of a second of the node."""
+    """The camera and the surface that `sags register` gets from a second of the node."""
     pipeline, parts = Pipeline(config, phantom.rig, rate=RATE), []
     for number in range(FRAMES):
         frame = shown_to_node(phantom, number, FRAMES, RATE)
@@ -143,7 +143,7 @@ def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tupl
 
 
 def part(rng: np.random.Generator, phantom: Phantom, camera: Camera, phase: float = 0.0) -> tuple[I64, I32]:
-    """Numbers of the vertices of the tissue within an ellipse of the picture, and triangles of these."""
+    """Return the tissue's vertices (indices) within an ellipse of the picture, and triangles of these."""
     vertices = phantom.tissue.vertices(phase).reshape(-1, 3).astype(np.float64)
     triangles = phantom.tissue.faces.astype(np.int32)
     size = np.array([camera.width, camera.height])
@@ -155,7 +155,7 @@ def part(rng: np.random.Generator, phantom: Phantom, camera: Camera, phase: floa
 
 
 def _far_apart(rng: np.random.Generator, vertices: F64) -> F64:
-    """As people pick landmarks: each of some that are at hand, the farthest from those before."""
+    """Landmarks as people pick them: each time, of 12 random vertices, the farthest from those before."""
     chosen = [vertices[rng.integers(len(vertices))]]
     while len(chosen) < PAIRS:
         at_hand = vertices[rng.choice(len(vertices), 12)]
@@ -177,7 +177,7 @@ def _registered(case: Case, surface: Surface) -> Placing:
 
 
 def _open3d(model: Shape, surface: Surface, T: F64) -> F64:
-    """The pose [4, 4] by Open3D's ICP, point to plane, with nothing else set."""
+    """The pose [4, 4] by Open3D's point-to-plane ICP with default settings."""
     import open3d as o3d
 
     measured, corners = (
@@ -190,7 +190,7 @@ def _open3d(model: Shape, surface: Surface, T: F64) -> F64:
 
 
 def _spoilt(case: Case, surface: Surface) -> Iterable[tuple[str, Registration, str]]:
-    """What must be refused, and a word of the remedy."""
+    """Registrations that must be refused: name, result, and words that the remedy must contain."""
     model, at, places, targets = case.model, case.at, case.places, case.targets
     for name, factor, word in (
         ("mm read as m", 1000.0, "divide --scale by 1000"),
@@ -207,7 +207,7 @@ def _spoilt(case: Case, surface: Surface) -> Iterable[tuple[str, Registration, s
 
 
 def _even(rng: np.random.Generator) -> Iterable[tuple[str, Registration, str]]:
-    """A plane and a part of a ball that go on beyond the model, with the errors of a depth."""
+    """A plane and a part of a sphere, with errors like those of depth; both go on beyond the model."""
     K = np.array([[576.0, 0, 319.5], [0, 576.0, 255.5], [0, 0, 1]])
     camera = Camera(*SIZE, K, np.eye(4))
     x, y = np.meshgrid(np.linspace(-EVEN, EVEN, 61), np.linspace(-EVEN, EVEN, 61))
@@ -227,7 +227,7 @@ def _even(rng: np.random.Generator) -> Iterable[tuple[str, Registration, str]]:
 
 
 def _on_ct(pair: CTPair, seeds: int) -> Iterable[Placing]:
-    """Other errors of other picked points, each time; the set's own alignment is the truth."""
+    """Registrations on the CT surface, each with other picked points; truth is the set's own alignment."""
     depth, confidence = configured_depth(pair)
     surface = Surface.of_depth(depth, confidence, pair.evaluated, pair.pair.camera)
     triangles = _joined_in_picture(pair.pixels.astype(np.float32), pair.points)
@@ -256,7 +256,7 @@ def _mm(lengths: F64) -> list[float]:
 
 
 def _summary(placings: list[Placing]) -> dict[str, Any]:
-    """Of all targets of all seeds."""
+    """Figures of all targets of all seeds."""
     said: dict[str, Any] = {"seeds": len(placings)}
     verdicts = [each.verdict for each in placings]
     said["verdicts"] = {verdict: verdicts.count(verdict) for verdict in get_args(Verdict)}
@@ -289,7 +289,7 @@ def _counted(refusals: list[tuple[str, Registration, str]]) -> list[dict[str, An
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """For people."""
+    """Make the tables for people."""
     errors = Table(
         "", "pose by", "median, mm", "nine of ten, mm", "told, mm", "within told", title="targets' error"
     )

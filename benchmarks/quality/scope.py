@@ -1,8 +1,8 @@
-"""How true the pose of a moving scope stays over minutes: on the phantom, whose tissue moves too.
+"""How accurate the pose of a moving scope stays over minutes: on the phantom, whose tissue moves, too.
 
-The same pictures are played once for each way to know the pose. Beside the node's own ways stand a camera
-that takes the scene for rigid, and the pose that fits the true surface points best: it says how much of an
-error is a matter of definition, since the motion that all tissue shares cannot be told from the scope's.
+The same pictures are played once for each way to know the pose. The node's own ways are compared with rigid
+odometry, and with the pose that fits the true surface points best. That pose says how much of an error is a
+matter of definition, since a motion that all tissue shares cannot be told from the scope's.
 """
 
 from collections.abc import Sequence
@@ -36,23 +36,23 @@ RATE = 10.0  # frames per second, where the launch file says nothing
 STEPS = 1  # of the mapper, each frame
 
 # What is wrong with the poses that a robot gives.
-WANDERS = 120.0  # s, in which it goes so far:
+WANDERS = 120.0  # s, in which the robot's base drifts by WANDERED and TURNED
 WANDERED = np.array([0.002, -0.0015, 0.0017])  # m: 3 mm
 TURNED = np.radians([0.6, 0.5, -0.6])  # 1 degree
-HAND_EYE = np.radians([0.6, -0.6, 0.5])  # of the camera on the hand: 1 degree
+HAND_EYE = np.radians([0.6, -0.6, 0.5])  # error of the hand-eye calibration: 1 degree
 JITTER = 1e-4  # m, along each axis (standard deviation)
-JITTER_TURN = np.radians(0.03)  # about each
+JITTER_TURN = np.radians(0.03)  # rad about each axis (standard deviation)
 
 
 class Robot:
-    """The poses that a robot gives whose base gives way slowly, whose hand-eye calibration is wrong, and
-    whose joints tremble."""
+    """A robot that gives wrong poses: its base drifts slowly, its hand-eye calibration is wrong, and its
+    joints tremble."""
 
     def __init__(self) -> None:
         self._rng = np.random.default_rng(0)
 
     def gives(self, T_world_cam: F64, seconds: float) -> F64:
-        """[4, 4] for the true pose after so many seconds."""
+        """Return the robot's pose [4, 4] for the true pose after some seconds."""
         gone = seconds / WANDERS
         trembles = self._rng.normal(size=(2, 3))
         base = rigid(cv2.Rodrigues(gone * TURNED)[0], gone * WANDERED)
@@ -62,7 +62,7 @@ class Robot:
 
 @dataclass(slots=True)
 class _Played:
-    """What the node makes of the pictures with one way to know the pose."""
+    """What the node makes of the pictures with one way to know the scope's pose."""
 
     pipeline: Pipeline
     budget: StepBudget = field(default_factory=lambda: StepBudget(STEPS))
@@ -94,15 +94,15 @@ class _Played:
 def measure_scope(
     config: LaunchConfig, motions: Sequence[Motion], seconds: float, advance: Advance
 ) -> dict[str, Any]:
-    """Each motion of the scope once.
+    """Measure each motion of the scope once.
 
     Args:
-        config: of the phantom; its `source.rate` and what shapes its tissue are used.
+        config: of the phantom; `source.rate` and the settings of its tissue are used.
         seconds: of each.
 
     Returns:
         `rows`, by `motion` and `way`. `session`: the true poses are given; `estimate`: none; `robot`: those
-        of a `Robot`; `refine`: the same, put right; `rigid` and `points`: see the module. Errors are those of
+        of a `Robot`; `refine`: the same, corrected; `rigid` and `points`: see the module. Errors are those of
         `trajectory_errors` and `drift`, pictures and depth over frames that were not `held`.
 
     Raises:
@@ -136,7 +136,7 @@ def measure_scope(
 def _measured(
     config: LaunchConfig, phantom: Phantom, motion: Motion, seconds: float, rate: float, advance: Advance
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Its rows, and the receipt of what the ways to know the pose were shown."""
+    """The rows of one motion, and the receipt of what was shown to the ways to know the pose."""
     count, robot = round(seconds * rate), Robot()
     ways: dict[str, PoseWay] = {way: way for way in ("session", "estimate", "refine")} | {"robot": "session"}
     played = {name: _Played(Pipeline(_with_pose(config, way), phantom.rig)) for name, way in ways.items()}
@@ -188,8 +188,8 @@ class _Points:
         self._visible.append(truth.visible)
 
     def fitted(self, camera: Camera) -> list[F64]:
-        """The poses [4, 4] from which the points, where each is on average, are seen nearest to where they
-        are; `camera` says how it sees."""
+        """Return the poses [4, 4] that best explain the points in each frame if every point stayed at its
+        mean position; `camera` gives the intrinsics."""
         rest = np.mean(self._points, axis=0).astype(np.float32)
         fitted, focal_baseline = [], float(camera.K[0, 0]) * self._baseline
         for pose, points, visible in zip(self.poses, self._points, self._visible, strict=True):
@@ -202,7 +202,7 @@ class _Points:
 
 
 def table(measured: dict[str, Any]) -> Table:
-    """For people; `measured` as `measure_scope` returns it."""
+    """Make the table; `measured` as `measure_scope` returns it."""
     made = Table(
         "motion", "pose", "ATE / max, mm", "RPE, mm / deg", "at the end, mm / deg", "drift, mm / deg",
         "worst drift", "PSNR, dB", "depth, median / p90, mm", "held",
@@ -219,11 +219,11 @@ def table(measured: dict[str, Any]) -> Table:
 
 
 def drift(estimated: F64, known: F64, period: int) -> dict[str, float]:
-    """How the error of poses `T_world_cam` [T, 4, 4] grows with time.
+    """Return how the error of poses `T_world_cam` [T, 4, 4] grows with time.
 
     `end_...`: the error of the last pose, worlds aligned at the first frame. `drift_...`: the mean error over
-    the last `period` frames less that over the first ones; `worst_drift_...`: over any so many. Where the
-    scene repeats itself with that period, what its motion does to a pose is in all these means alike.
+    the last `period` frames less that over the first ones; `worst_drift_...`: the largest over any period. If
+    the scene repeats itself with that period, its motion changes the pose by the same in all these means.
     """
     ours = np.linalg.inv(estimated[0]) @ estimated
     true = np.linalg.inv(known[0]) @ known

@@ -16,7 +16,7 @@ COMMON = {"blockSize": BLOCK, "P1": 8 * BLOCK**2, "P2": 32 * BLOCK**2, "disp12Ma
 
 
 class PlainSGBM:
-    """As OpenCV's own sample `stereo_match.py` sets it up, and nothing around it."""
+    """SGBM as OpenCV's own sample `stereo_match.py` sets it up, without our checks."""
 
     def __init__(self, config: StereoConfig, camera: Camera, baseline: float, scale: int) -> None:
         self._size = round(camera.width / scale), round(camera.height / scale)
@@ -41,7 +41,7 @@ class PlainSGBM:
 
 
 class JudgedSGBM:
-    """In the place of the stage's own matcher: on its pictures, and trusted as far as it trusts a match."""
+    """SGBM in place of the stage's own matcher: on the stage's pictures, and the stage judges the matches."""
 
     def __init__(self, config: StereoConfig, camera: Camera, baseline: float, scale: int) -> None:
         self._stage = StereoDepth(config.model_copy(update={"scale": scale}), camera, baseline)

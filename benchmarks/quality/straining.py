@@ -1,4 +1,4 @@
-"""How exactly the strain of a surface that is pulled is told: before the phantom, whose strain is known."""
+"""How accurate the reported strain of a pulled surface is: on the phantom, whose strain is known."""
 
 from typing import Any
 
@@ -20,15 +20,15 @@ from sags_node.types import F32, F64, I64
 
 SIZE = (640, 512)
 SECONDS, RATE, STEPS = 4.0, 15.0, 2  # of one pull; frames a second; steps of the mapper, each frame
-SINCE, EVERY = 10, 3  # frames: the moment, before the pull; one of so many is measured
-STRAINED = 0.05  # of what is counted apart
-PULLED, BACK = 0.75, 0.8  # of the session: "all" ends, and the tissue is where it was
+SINCE, EVERY = 10, 3  # frame before the pull, to which strain refers; one of so many frames is measured
+STRAINED = 0.05  # strain from which on points are counted apart
+PULLED, BACK = 0.75, 0.8  # shares of the session: "all" ends; the tissue is back where it was
 ACROSS = 4  # vertices to each side of one, over which its true strain is taken: about 2 mm
-NEAR = 0.002  # m, from a point to the surface
+NEAR = 0.002  # m, largest distance from a point to the surface
 
 
 def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
-    """Of what each message of `points` says while the tissue is pulled, and once it is back."""
+    """Measure the strain in each message of `points` while the tissue is pulled, and once it is back."""
     config = LaunchConfig(source=PhantomScene(width=SIZE[0], height=SIZE[1]))
     prepare(config)
     told, true, back, count = [], [], [], round(SECONDS * RATE)
@@ -66,7 +66,7 @@ def measure_strain(seeds: int, advance: Advance) -> dict[str, Any]:
 
 
 def _nearest(vertices: F32, places: F32) -> tuple[I64, F32]:
-    """The vertex [N] that is the nearest to each place [N, 3], and how far it is [N] (m)."""
+    """The vertex [N] nearest to each place [N, 3], and its distance [N] (m)."""
     from open3d.core import Tensor
     from open3d.core.nns import NearestNeighborSearch
 
@@ -77,8 +77,8 @@ def _nearest(vertices: F32, places: F32) -> tuple[I64, F32]:
 
 
 def true_strain(before: F32, now: F32) -> F64:
-    """The largest and smallest principal strain [rows, cols, 2] at the vertices of a grid [rows, cols, 3],
-    by central differences along its rows and columns; NaN at its edges."""
+    """Return the largest and smallest principal strain [rows, cols, 2] at the vertices of a grid
+    [rows, cols, 3], by central differences along its rows and columns; NaN at its edges."""
     metrics, inner = [], slice(ACROSS, -ACROSS)
     for vertices in (before.astype(np.float64), now.astype(np.float64)):
         down = (vertices[2 * ACROSS :] - vertices[: -2 * ACROSS])[:, inner]
@@ -110,7 +110,7 @@ def _summary(found: F32, exact: F64) -> dict[str, Any]:
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """For people."""
+    """Make the tables for people."""
     table = Table("points", "strain", "known", "true, p90", "error", "0 is told", title="median, nine of ten")
     for part in ("all", "strained", "back"):
         for name, row in measured[part].items():

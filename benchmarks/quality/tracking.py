@@ -1,5 +1,5 @@
-"""How well points stay on the tissue of a recording: anchors and Gaussians, and beside anchors the common
-methods that know no model (`followers`)."""
+"""How well points stay on the tissue of a recording: anchors and Gaussians; anchors are compared with common
+methods without a model (`followers`)."""
 
 import time
 from collections.abc import Collection, Sequence
@@ -32,8 +32,8 @@ from sags_node.types import F32, F64, I64, AnchorStates, Bool, FrameResult, Ster
 SPACING = 34  # px between anchors
 BESIDE = 40  # points, at most, that all methods are compared on: CSRT is slow
 BORDER = 60  # px: what is nearer to the picture's edge soon leaves it
-RIGHT = 4.0 / 640  # of the width: so near to its point a confident anchor should be
-RIGHT_MM = 2.0  # the same in space
+RIGHT = 4.0 / 640  # of the width: a confident anchor should be this near to its point
+RIGHT_MM = 2.0  # mm, the same in space
 WRONG = 8.0 / 640  # of the width: what is farther, and said to be seen there, is wrong
 
 
@@ -49,10 +49,10 @@ class _Truth:
 
 @dataclass(frozen=True, slots=True)
 class _Said:
-    """What one method said of the points, in the frames that are measured."""
+    """The results of one method for the points, in the frames that are measured."""
 
     pixels: list[F64] = field(default_factory=list)  # [P, 2] of each
-    seen: list[Bool] = field(default_factory=list)  # [P] of each: it is sure that they are seen there
+    seen: list[Bool] = field(default_factory=list)  # [P] of each: the method is sure to see the point there
     times_s: list[float] = field(default_factory=list)  # of every frame
 
 
@@ -62,9 +62,9 @@ def measure_tracking(
     """Pin anchors in the first frame and follow them, one step of the mapper a frame.
 
     A recording that has true points (`source.reference.tracks`) is measured against those that the first
-    frame shows. Of any other the truth of a point in a later frame is where the flow from the first frame to
-    it (Kroeger et al., ECCV 2016) takes the point, if the flow back returns within `CONSISTENT` and ends on
-    tissue. It knows nothing of the frames between. Points that an instrument hides have no such truth.
+    frame shows. In any other recording, a point's truth in a later frame is where the flow from the first
+    frame to that one (Kroeger et al., ECCV 2016) takes it, if this is on tissue and the flow back returns
+    within `CONSISTENT`. The frames between are not used. Points behind an instrument have no such truth.
 
     Args:
         session: a recording.
@@ -130,7 +130,7 @@ class _Run:
         self._frame_s: list[float] = []
 
     def follow(self, result: FrameResult, measured: bool) -> None:
-        """Show a frame to all that follow."""
+        """Show a frame to all followers, and note the anchors."""
         self._frame_s.append(sum(result.timings_ms.values()) * 1e-3)
         self._said["anchors"].times_s.append(result.timings_ms.get("anchors", 0.0) * 1e-3)
         for name, follower in self._followers.items():
@@ -142,7 +142,7 @@ class _Run:
             self._said["anchors"].seen.append(surely_seen(states)[self._shared])
 
     def measured(self, number: int, frame: StereoFrame, result: FrameResult) -> dict[str, Any]:
-        """One frame; to be asked after it was followed."""
+        """Return the figures of one frame; call it after `follow`."""
         started = time.perf_counter()
         there = np.asarray(self._flow.calc(self._first.observation.gray, result.observation.gray, None))
         back = np.asarray(self._flow.calc(result.observation.gray, self._first.observation.gray, None))
@@ -177,7 +177,7 @@ class _Run:
         return _Truth(pixels, np.ones(len(points), np.bool_), _visible(frame)[self._rows], points)
 
     def figures(self) -> dict[str, Any]:
-        """All methods over all frames that were measured, and whether the anchors' confidence is right."""
+        """Return figures of all methods over all measured frames, and of the anchors' confidence."""
         confidence = np.concatenate([states.confidence for states in self._states]).astype(np.float64)
         in_sight = np.concatenate([states.visibility for states in self._states]) == 1
         known = np.concatenate([truth.known for truth in self._truths])
@@ -201,7 +201,7 @@ class _Run:
         visible = np.array([truth.visible[self._shared] for truth in self._truths])
         wanted = np.array([truth.pixels[self._shared] for truth in self._truths])
         seen, off = np.array(said.seen), np.linalg.norm(np.array(said.pixels) - wanted, axis=2)
-        off = np.where(np.isfinite(off), off, np.inf)  # it does not know at all
+        off = np.where(np.isfinite(off), off, np.inf)  # the method gives no position
         points = self.count if name in ("anchors", "direct_flow") else len(self._shared)
         return {
             "off_by_px": percentiles(off[visible & np.isfinite(off)]),
@@ -224,8 +224,8 @@ def _show(follower: Follower, said: _Said, result: FrameResult, measured: bool) 
 
 
 def reliability_rows(confidence: F64, right: Bool, in_sight: Bool) -> dict[str, Any]:
-    """For JSON: `bins`, each as `Bin`, and the mean distance between confidence and truth (`error`); the bins
-    of anchors that are wholly `in_sight`, whose patches are looked for, and of those `out_of_sight`."""
+    """Return for JSON `bins`, each as `Bin`, the mean distance between confidence and truth (`error`), and
+    the bins of anchors that are wholly `in_sight`, whose patches are searched for, and `out_of_sight`."""
     parts = {"bins": np.ones_like(in_sight), "in_sight": in_sight, "out_of_sight": ~in_sight}
     bins = {name: reliability(confidence[part], right[part]) for name, part in parts.items()}
     rows = {name: [asdict(each) for each in found] for name, found in bins.items()}
@@ -233,7 +233,7 @@ def reliability_rows(confidence: F64, right: Bool, in_sight: Bool) -> dict[str, 
 
 
 def true_points(frame: StereoFrame, result: FrameResult) -> F64 | None:
-    """The recording's true surface points [P, 3] in the world of the run; None where it has none."""
+    """Return the recording's true surface points [P, 3] in the world of the run; None if it has none."""
     if frame.reference is None or frame.reference.points is None:
         return None
     if frame.T_world_cam is None:
@@ -249,14 +249,14 @@ def _visible(frame: StereoFrame) -> Bool:
 
 
 def _grid(result: FrameResult) -> F64:
-    """Pixels [P, 2] all over the picture."""
+    """A regular grid of pixels [P, 2] over the picture."""
     height, width = result.observation.tissue.shape
     columns, rows = np.arange(BORDER, width - BORDER, SPACING), np.arange(BORDER, height - BORDER, SPACING)
     return np.stack(np.meshgrid(columns, rows), 2).reshape(-1, 2).astype(np.float64)
 
 
 def middle(places: F64, result: FrameResult) -> Bool:
-    """Which of some pixels [P, 2] are not near the picture's edge."""
+    """Tell which of some pixels [P, 2] are not near the picture's edge."""
     height, width = result.observation.tissue.shape
     inside = (places >= BORDER) & (places < [width - BORDER, height - BORDER])
     return np.asarray(inside.all(1))
@@ -268,10 +268,10 @@ NO_TISSUE = "no tissue with depth was found in the first frame; set source.start
 def pin(
     pipeline: Pipeline, result: FrameResult, places: F64, rows: I64, otherwise: str = NO_TISSUE
 ) -> dict[int, int]:
-    """Anchors at these rows of pixels [P, 2], where that can be: id -> row.
+    """Pin anchors at these rows of pixels [P, 2], where possible; return id -> row.
 
     Raises:
-        SagsError: `otherwise`, where none can.
+        SagsError: `otherwise`, if none can be pinned.
     """
     pinned, shown = dict[int, int](), (result.observation, result.snapshot, result.views["left"])
     for row in rows.tolist():
@@ -284,7 +284,7 @@ def pin(
 
 
 def _follow(places: F64, there: F32, back: F32, tissue: Bool) -> tuple[F64, Bool]:
-    """Where the flow takes places [M, 2] px, and whether to believe it [M]."""
+    """Where the flow takes places [M, 2] px, and whether the flow is reliable there [M]."""
     ends = places + sample(there, places)
     error = np.linalg.norm(ends + sample(back, ends) - places, axis=1)
     height, width = tissue.shape
@@ -295,8 +295,8 @@ def _follow(places: F64, there: F32, back: F32, tissue: Bool) -> tuple[F64, Bool
 
 
 def _common_gaussians(first: FrameResult, result: FrameResult) -> tuple[F64, F64]:
-    """Pixels [M, 2] of the Gaussians that lie on the surface seen in the first frame and still live, in both
-    frames."""
+    """Pixels [M, 2], in both frames, of the Gaussians on the surface seen in the first frame that still
+    exist."""
     before, after = first.snapshot.gaussians, result.snapshot.gaussians
     _, i, j = np.intersect1d(before.ids, after.ids, return_indices=True)
     started, z = project(first.snapshot.camera, before.means[i])

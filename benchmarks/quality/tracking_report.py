@@ -10,7 +10,7 @@ from sags_lab.protocols.point_tracks import Bin
 
 
 def tables(measured: dict[str, Any]) -> list[Table]:
-    """For people; `measured` as `measure_tracking` returns it."""
+    """Make the tables; `measured` as `measure_tracking` returns it."""
     return [_by_frame(measured), _by_method(measured), *reliability_tables(measured)]
 
 
@@ -40,7 +40,7 @@ def _by_method(measured: dict[str, Any]) -> Table:
 
 
 def reliability_tables(measured: dict[str, Any]) -> list[Table]:
-    """How often anchors of some confidence are right, in figures that say so."""
+    """Make the tables of how often anchors of each confidence are right, as far as `measured` has them."""
     limits = {"reliability_px": f"{RIGHT * 640:g} px of 640", "reliability_mm": f"{RIGHT_MM:g} mm"}
     return [_reliability(measured[key], limit) for key, limit in limits.items() if key in measured]
 

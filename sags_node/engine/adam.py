@@ -1,9 +1,9 @@
-"""Adam (Kingma & Ba, 2015) on rows of a table, fused, where a step takes some of the rows only.
+"""Fused Adam (Kingma & Ba, 2015) on the rows of a table, where a step may take only some of the rows.
 
 A row's moments move only in steps that take it, and so does its bias correction: each row behaves as if it
 had an optimiser of its own that never saw the other steps. (With one step count for all, a row that is taken
 for the first time late would step several times too far.) Instead of a count, a row keeps the moments of a
-gradient that is always 1: they are the corrections 1 - beta^t, without a power.
+gradient that is always 1. They equal the bias corrections 1 - beta^t, so no power is computed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _step_row(
     move_v: Any,
     eps: Any,
 ) -> bool:
-    """Returns whether the row was not finite."""
+    """Update one row. Return True if it is not finite: its values stay, and its state is reset."""
     size = ZERO
     for k in range(values.size):
         i = u8(k)
@@ -72,9 +72,9 @@ def _step(
 
 @dataclass(frozen=True, slots=True)
 class AdamState:
-    """What Adam remembers of a table of M rows and C columns. All zeros: a row was never touched."""
+    """The state of Adam for a table of M rows and C columns. All zeros: the row was never updated."""
 
-    moments: F32  # [M, C, 2] running means of the gradient and of its square: one stream to read, not two
+    moments: F32  # [M, C, 2] running means of the gradient and of its square, interleaved for fast reading
     shares: F32  # [M, 2] the same of a gradient that is always 1: 1 - beta^t after t steps of the row
 
     @classmethod
@@ -92,10 +92,10 @@ def adam_step(
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-15,
 ) -> int:
-    """Move the rows of a table against their gradients; the result does not depend on the number of threads.
+    """Take one Adam step on rows of a table. The result does not depend on the number of threads.
 
-    A row whose gradient or state is NaN or infinite (or whose squared gradient overflows) sits the step out,
-    with its state made anew.
+    A row whose gradient or state is NaN or infinite (or whose squared gradient overflows) is left out of the
+    step, and its state is reset.
 
     Args:
         values: [M, C] changed in place.
@@ -104,11 +104,11 @@ def adam_step(
         rates: [C] learning rate of each column.
         rows: [K] the rows to take, none of them twice, for example `np.flatnonzero(contribution > 1e-3)`;
             None: all.
-        betas: decay of the two momenta; they may not change while a state is in use.
+        betas: decay rates of the two moments; they must not change while a state is in use.
         eps: > 0.
 
     Returns:
-        How many rows sat out because they were not finite.
+        The number of rows that were left out because they were not finite.
 
     Raises:
         ValueError: shapes do not fit, or eps is not positive.

@@ -1,6 +1,6 @@
-"""Which processor the model is refined on: the CPU, or a GPU if Warp can use it.
+"""Choice of the processor that refines the model: the CPU, or a GPU if Warp can use it.
 
-Warp takes most of a second to start. What tells that there is no GPU costs nothing and is looked at first.
+Warp takes most of a second to start, so the cheap signs that there is no GPU are checked first.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """What was chosen; of the CPU, why it is not a GPU and how to fix that."""
+    """The chosen processor. Where the CPU stands in for a GPU: the reason, and how to fix it."""
 
     kind: Literal["cpu", "cuda"]
     name: str
@@ -31,7 +31,7 @@ class Device:
 
 
 def choose_device(wanted: DeviceName) -> Device:
-    """The device for a launch.
+    """Return the device for a launch.
 
     Raises:
         UsageError: a GPU is wanted and none can be used.
@@ -46,7 +46,7 @@ def choose_device(wanted: DeviceName) -> Device:
 
 @functools.cache
 def find_gpu() -> Device:
-    """The GPU, or the CPU and why."""
+    """Return the GPU, or the CPU with the reason why no GPU can be used."""
     missing = _missing_hardware() or _missing_software()
     if missing is not None:
         return Device("cpu", "the CPU", *missing)
@@ -56,7 +56,7 @@ def find_gpu() -> Device:
 
 
 def gpu() -> wp.Device:
-    """Warp's device that is drawn on.
+    """Return Warp's device of the GPU.
 
     Raises:
         UsageError: no GPU can be used.
@@ -69,12 +69,12 @@ def gpu() -> wp.Device:
 
 def has_gpu() -> bool:
     """Tell whether a GPU's driver seems to be here, usable or not."""
-    devices = [*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev").glob("dxg")]  # dxg: Windows' own Linux
+    devices = [*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev").glob("dxg")]  # dxg: WSL
     return bool(devices) or shutil.which("nvidia-smi") is not None
 
 
 def _missing_hardware() -> tuple[str, str] | None:
-    """The reason and its remedy."""
+    """Why the hardware cannot be used, and the remedy; None if it can."""
     if not has_gpu():
         return (
             "this machine has no NVIDIA GPU, or no driver for it",
@@ -86,7 +86,7 @@ def _missing_hardware() -> tuple[str, str] | None:
 
 
 def _missing_software() -> tuple[str, str] | None:
-    """The reason and its remedy."""
+    """Why Warp cannot use the GPU, and the remedy; None if it can."""
     if importlib.util.find_spec("warp") is None:
         return "NVIDIA Warp is not installed", "pip install warp-lang"
     from sags_node.engine.gpu import runtime

@@ -1,4 +1,4 @@
-"""What every rasteriser takes and gives."""
+"""The interface of all rasterisers: their arguments and results."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,23 +12,23 @@ DILATION_VARIANCE = 0.3  # px^2, in its place without antialiasing: 3D Gaussian 
 MIN_ALPHA = 1.0 / 255.0  # a Gaussian is cut off where its alpha falls below this
 MAX_OPACITY = 0.999  # keeps 1 - alpha away from zero
 MIN_QUAT_NORM = 1e-12  # shorter quaternions have no direction; such Gaussians are not drawn
-BEHIND_SURFACE = 0.035  # of the depth: what is this far behind the drawn surface is hidden by it
-FRUSTUM_MARGIN = 0.3  # x/z in the Jacobian is held within the frustum widened by this share of its half width
+BEHIND_SURFACE = 0.035  # share of the depth; what is farther than this behind the drawn surface is hidden
+FRUSTUM_MARGIN = 0.3  # the Jacobian clamps x/z, y/z to the frustum widened by this share of its half size
 
 
 @dataclass(frozen=True, slots=True)
 class Gradients:
-    """Derivatives with respect to what was drawn; rows of Gaussians that were not drawn are zero."""
+    """Derivatives with respect to the Gaussians' parameters; rows of Gaussians that were not drawn are 0."""
 
     means: F32  # [N, 3] per m
-    quats: F32  # [N, 4] of the given, not normalised, quaternion
+    quats: F32  # [N, 4] with respect to the quaternion as given, not normalised
     scales: F32  # [N, 3] per m, before the 3D filter
     opacities: F32  # [N] before the filters
     colors: F32  # [N, 3]
     slopes: F32  # [N, 3] before the 3D filter
     sh_rest: F32  # [N, K - 1, 3]; [N, 0, 3] without spherical harmonics
     contribution: F32  # [N] sum over pixels of (blending weight of this Gaussian) * (weight of the pixel)
-    spread: F32  # [N] the same, each pixel times its squared distance in the Gaussian's standard deviations
+    spread: F32  # [N] the same, each pixel times its squared distance from the mean in standard deviations
 
 
 class Rasterizer(Protocol):
@@ -46,8 +46,8 @@ class Rasterizer(Protocol):
 
         Returns:
             Planes [5, H, W]: sums over the Gaussians of w r, w g, w b, w z (m) and w, where
-            w = alpha * transmittance; not normalised. A view into own memory, overwritten by the next
-            `forward`.
+            w = alpha * transmittance; not normalised. A view into the rasteriser's memory, overwritten by
+            the next `forward`.
 
         Raises:
             UsageError: an array or a camera has the wrong shape or size.
@@ -56,19 +56,19 @@ class Rasterizer(Protocol):
         ...
 
     def backward(self, v_planes: F32, weight: F32) -> Gradients:
-        """Gradients of sum(v_planes * planes) for the last `forward`, whose arrays must be unchanged.
+        """Return gradients of sum(v_planes * planes) for the last `forward`; its arrays must be unchanged.
 
         Args:
             v_planes: [5, H, W] cotangent of the planes.
             weight: [H, W] pixel weights for `Gradients.contribution`.
 
         Returns:
-            Views into own memory, overwritten by the next `backward`.
+            Views into the rasteriser's memory, overwritten by the next `backward`.
         """
         ...
 
     def median(self) -> tuple[F32, I32]:
-        """Find where the transmittance of the last `forward` falls to one half: depth [H, W] m and row of
-        that Gaussian [H, W]. Where it stays above: 0 and -1. Tiles that were not drawn keep what was
-        there."""
+        """Return the depth [H, W] (m) at which the transmittance of the last `forward` falls to one half,
+        and the row of the Gaussian there [H, W]. Where it stays above: 0 and -1. Tiles that were not drawn
+        keep their earlier values."""
         ...

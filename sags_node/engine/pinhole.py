@@ -31,7 +31,7 @@ def pack(camera: Camera, first: float = 0.0) -> F32:
 
 @inlined
 def to_camera(cam: Any, x: Any, y: Any, z: Any) -> Any:
-    """Camera coordinates of a world point."""
+    """Return the camera coordinates of a world point."""
     return (
         cam[0] * x + cam[1] * y + cam[2] * z + cam[9],
         cam[3] * x + cam[4] * y + cam[5] * z + cam[10],
@@ -41,5 +41,5 @@ def to_camera(cam: Any, x: Any, y: Any, z: Any) -> Any:
 
 @kernel
 def to_pixel(cam: Any, x: Any, y: Any, z: Any) -> Any:
-    """Pixel of a point in camera coordinates, z > 0."""
+    """Return the pixel of a point in camera coordinates, z > 0."""
     return cam[12] * x / z + cam[14], cam[13] * y / z + cam[15]

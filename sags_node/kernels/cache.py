@@ -1,7 +1,7 @@
-"""Compiled kernels on disk, such that a stale one cannot be loaded.
+"""The disk cache of compiled kernels, which cannot load a stale one.
 
-A kernel's folder is named by everything its machine code depends on (`digest`), so a folder is never out of
-date: states of the sources and compile targets lie side by side. Those that were used last are kept.
+A kernel's folder is named by everything its machine code depends on (`digest`), so it is never out of date.
+Several states of the sources and several compile targets lie side by side; those used last are kept.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def is_cold(function: Callable[..., Any]) -> bool:
 
 @functools.cache
 def cache_root() -> Path | None:
-    """The first of these in which this user can write and nobody else: `$NUMBA_CACHE_DIR/sags`,
+    """Return the first of these that only this user can write to: `$NUMBA_CACHE_DIR/sags`,
     `$XDG_CACHE_HOME/sags/kernels` (default `~/.cache`), `/tmp/sags-kernels-<uid>`. None: no such place."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     parents = [f"{numba.config.CACHE_DIR}/sags"] if numba.config.CACHE_DIR else []
@@ -144,7 +144,7 @@ def _lock(root: Path) -> Iterator[None]:
 
 
 def clear_old(root: Path) -> None:
-    """Leave the `KEPT` folders that were used last. A process that misses one compiles again."""
+    """Delete all but the `KEPT` folders that were used last. A process that misses one compiles again."""
     used = {}
     for folder in root.glob("*-*"):
         with suppress(OSError):
@@ -155,5 +155,5 @@ def clear_old(root: Path) -> None:
 
 @functools.cache
 def _warn(message: str) -> None:
-    """Once."""
+    """Log a message, but only once in this process."""
     log.warning(message)

@@ -9,9 +9,9 @@ here changes with
 - the versions of Python, Numba and llvmlite;
 - the compile target: CPU, its features, and Numba's settings.
 
-What is read is text, not syntax: any mention of a module by its full name counts as an import, and that of a
-folder as an import of all its modules whose names stand in the text. So nothing is missed, and an edit
-changes the names of the files that stand on it and of few others.
+Sources are searched as text: any mention of a module by its full name counts as an import, and that of a
+folder as an import of all its modules whose names occur in the text. So no import is missed, and an edit
+changes the names of the files that depend on it and of few others.
 """
 
 import functools
@@ -31,7 +31,7 @@ _PACKAGE = Path(__file__).parents[1]
 _MENTION = re.compile(rf"\b{_PACKAGE.name}((?:\.\w+)*)")
 _WORD = re.compile(r"\w+")
 _STARTED = time.time()
-# These settings of Numba do not change machine code. Whatever is not listed counts.
+# Settings of Numba that do not change machine code. All others are part of the digest.
 _HARMLESS = {
     *("CACHE_DIR", "CACHE_LOCATOR_CLASSES", "DEBUG_CACHE", "COLOR_SCHEME", "CHROME_TRACE"),
     *("NUMBA_NUM_THREADS", "NUMBA_DEFAULT_NUM_THREADS", "THREADING_LAYER", "THREADING_LAYER_PRIORITY"),
@@ -39,11 +39,11 @@ _HARMLESS = {
 
 
 def kernel_name(function: Callable[..., Any]) -> str | None:
-    """Module and digest, as in `engine.rasterizer.binning-31b9...`, shared by the kernels of one file.
+    """Return module and digest, as in `engine.rasterizer.binning-31b9...`, shared by a file's kernels.
 
-    None: what the function stands on is not known. It stands outside the package (in a test, say), or it was
-    made around functions that were handed to its maker; or a source changed while this process ran, which
-    may still run the former text.
+    None: the function's dependencies are not known. It is outside the package (in a test, say), or it is a
+    closure over other functions; or a source changed while this process ran, which may still run the former
+    text.
     """
     if any(callable(cell.cell_contents) for cell in function.__closure__ or ()):
         return None
@@ -89,7 +89,7 @@ def _read(path: Path) -> tuple[bytes, set[Path]] | None:
 
 @functools.cache
 def _files(name: str) -> set[Path]:
-    """The files that a dotted name within the package may lead to; the rest of it is something in them."""
+    """The files that a dotted name within the package may refer to; its last parts may be names in a file."""
     place = _PACKAGE
     for part in name.split(".")[1:]:
         place /= part
@@ -102,7 +102,7 @@ def _files(name: str) -> set[Path]:
 
 @functools.cache
 def _surroundings() -> bytes:
-    """Everything beside the sources that machine code depends on."""
+    """Everything that machine code depends on besides the sources."""
     config = vars(numba.config)
     settings = sorted((key, str(config[key])) for key in config if key.isupper() and key not in _HARMLESS)
     target = cpu_target.target_context.codegen().magic_tuple()

@@ -86,7 +86,7 @@ def _compile(function: F, **options: bool) -> F:
 
 
 def aligned(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[Any]:
-    """Zeroed array that starts on a cache line."""
+    """Return a zeroed array that starts on a cache line (64 bytes)."""
     item = np.dtype(dtype)
     size = int(np.prod(shape)) * item.itemsize
     raw = np.zeros(size + 64, np.uint8)
@@ -95,7 +95,7 @@ def aligned(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[An
 
 
 def read_only(array: NDArray[T]) -> NDArray[T]:
-    """The same memory as a contiguous array that kernels only read.
+    """Return the array as a contiguous one that kernels only read; it is copied only if it must be.
 
     Whether an array may be written is part of its Numba type: without this, a caller's frozen array would
     compile every kernel a second time.
@@ -120,7 +120,7 @@ def _make_unary(name: str) -> Any:
     return unary
 
 
-# Of a float32: one instruction, also in vectors, where the functions of Python and NumPy are calls.
+# Functions of a float32: each is one instruction, also in vectors. Those of Python and NumPy would be calls.
 square_root = intrinsic(_make_unary("llvm.sqrt"))
 round_up = intrinsic(_make_unary("llvm.ceil"))
 round_down = intrinsic(_make_unary("llvm.floor"))
@@ -128,8 +128,8 @@ round_down = intrinsic(_make_unary("llvm.floor"))
 
 @intrinsic
 def take(typing_context: Any, counter: Any, amount: Any) -> Any:
-    """Add to the first element of an int64 array and return what it was before, in one step for all threads.
-    Free workers share out items with it: `item = take(counter, 1)` until all are taken."""
+    """Add to the first element of an int64 array and return its former value, as one atomic step. Workers
+    share items among them with it: `item = take(counter, 1)` until all are taken."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         data = context.make_array(signature.args[0])(context, builder, args[0]).data
@@ -141,8 +141,8 @@ def take(typing_context: Any, counter: Any, amount: Any) -> Any:
 
 @intrinsic
 def copy(typing_context: Any, to: Any, to_start: Any, source: Any, start: Any, count: Any) -> Any:
-    """to[to_start : to_start + count] = source[start : start + count] for contiguous arrays of one dimension
-    that do not overlap. A loop would have to expect that they do, and copy element by element."""
+    """Do to[to_start : to_start + count] = source[start : start + count] for contiguous 1D arrays that do not
+    overlap. A loop would have to allow for overlap and copy element by element."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pointers = []
@@ -158,8 +158,8 @@ def copy(typing_context: Any, to: Any, to_start: Any, source: Any, start: Any, c
 
 @intrinsic
 def add_lanes(typing_context: Any, to: Any, to_start: Any, weight: Any, source: Any, start: Any) -> Any:
-    """to[to_start : to_start + 16] += weight * source[start : start + 16] for flat arrays of float32 that do
-    not overlap: one vector, where a loop would be unrolled into sixteen steps."""
+    """Do to[to_start : to_start + 16] += weight * source[start : start + 16] for flat float32 arrays that do
+    not overlap. It works on one vector; a loop would be unrolled into sixteen steps."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         pointers = []
@@ -182,7 +182,7 @@ def add_lanes(typing_context: Any, to: Any, to_start: Any, weight: Any, source: 
 
 @intrinsic(prefer_literal=True)
 def stack_floats(typing_context: Any, size: Any) -> Any:
-    """An uninitialised float32 array on the stack, of a size that the source states. Call it outside loops.
+    """Make an uninitialised float32 array on the stack; its size must be a literal. Call it outside loops.
 
     Unlike any other array it cannot overlap those of the arguments: sums kept in it stay in vector registers.
     """
@@ -219,8 +219,8 @@ def _make_prefetch(write: int, closeness: int) -> Any:
     return prefetch
 
 
-# Each of (array, index of its first axis), into all caches; the last into all but the innermost, for what is
-# read so much later that it would only push other things out of it.
+# Each takes (array, index of its first axis) and prefetches into all caches. `prefetch_far` leaves out L1: it
+# is for what is read so much later that it would only displace other data there.
 prefetch_read = intrinsic(_make_prefetch(0, 3))
 prefetch_write = intrinsic(_make_prefetch(1, 3))
 prefetch_far = intrinsic(_make_prefetch(0, 2))

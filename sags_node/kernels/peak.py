@@ -29,20 +29,20 @@ REPEATS = 15
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """The best that was measured with so many threads."""
+    """The best rates that were measured with `threads` threads."""
 
     threads: int
     operations: float  # float32 lanes per s that a vector instruction finished, a multiply-add counted once
-    bandwidths: Mapping[int, float]  # bytes read and written per s, over so many bytes, ascending
+    bandwidths: Mapping[int, float]  # size of the arrays in bytes, ascending -> bytes read and written per s
 
     def bandwidth(self, touched: float) -> float:
-        """Bytes per s for a kernel that touches so many."""
+        """Return the bytes per s for a kernel that touches `touched` bytes."""
         sizes = list(self.bandwidths)
         return self.bandwidths[next((size for size in sizes if touched <= size), sizes[-1])]
 
 
 def peak_row(peak: Peak) -> dict[str, Any]:
-    """Return what a table says of it."""
+    """Return the peak as a row of a table."""
     return {
         "threads": peak.threads,
         "operations_per_s": peak.operations,
@@ -51,8 +51,8 @@ def peak_row(peak: Peak) -> dict[str, Any]:
 
 
 def measure_peak(threads: int) -> Peak:
-    """The best of several tries; half a second, and a few to compile the first time. Leaves the calling
-    thread's number of threads as it was."""
+    """Measure the best of several tries. Takes half a second, and a few more to compile the first time. The
+    calling thread's number of threads stays as it was."""
     before = numba.get_num_threads()
     configure_threads(threads)
     try:
@@ -64,7 +64,7 @@ def measure_peak(threads: int) -> Peak:
 
 @kernel
 def run_chains(first: Any, rounds: int) -> Any:
-    """Compute rounds of CHAINS chains x -> x / 2 + `first`, chain k from k on; the sum of one lane."""
+    """Run `rounds` steps x -> x / 2 + `first` of CHAINS chains, chain k from k on. Return one lane's sum."""
     half, addend = spread(f4(0.5)), spread(f4(first))
     a, b, c, d = spread(f4(0)), spread(f4(1)), spread(f4(2)), spread(f4(3))
     e, f, g, h = spread(f4(4)), spread(f4(5)), spread(f4(6)), spread(f4(7))
@@ -107,7 +107,7 @@ def _triad(workers: int, sums: F32, left: F32, right: F32, factor: Any, passes: 
 def _bytes_per_second(size: int, threads: int) -> float:
     sums, left, right = (aligned((size // 12,)) for _ in range(3))
     for array in (sums, left, right):
-        array.fill(1)  # pages of zeros that nothing was written to are all the same page
+        array.fill(1)  # pages of zeros that were never written share one page of memory
     passes = TRIAD_BYTES[-1] // size
     return size * passes / _shortest(lambda: _triad(threads, sums, left, right, f4(0.5), passes))
 

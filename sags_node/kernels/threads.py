@@ -7,15 +7,15 @@ fork: start other processes with the `spawn` method.
 
 Waiting: passive, unless the environment says otherwise. A worker that has nothing to do sleeps instead of
 spinning. On free cores that costs nothing measurable; when another process or thread wants a core, a spinning
-worker keeps it from the one everybody waits for, and a frame takes up to 2.5 times longer. OpenMP reads this
-when its library is loaded: import this module before torch.
+worker keeps it from the worker that all wait for, and a frame takes up to 2.5 times longer. OpenMP reads this
+setting when its library is loaded: import this module before torch.
 
 Place: left to the system. Some schedulers pack threads that were asleep onto one core, and a drawing right
 after a pause then takes twice as long. Pinning a thread and its workers to cores of their own fixes that for
 a kernel alone, but cost the whole node 5 to 25 % of its rate: its other threads want the same cores.
 
-Count: Numba keeps it per Python thread, and a new thread starts with all cores of the process. OpenCV's is
-one for the whole process, and its workers spin while they wait.
+Count: Numba keeps it per Python thread, and a new thread starts with all cores of the process. OpenCV has one
+count for the whole process, and its workers spin while they wait.
 """
 
 import os
@@ -28,7 +28,7 @@ numba.config.THREADING_LAYER = "omp"
 
 
 def configure_threads(threads: int | None) -> int:
-    """Set how many cores the kernels called from *this* Python thread use; returns that count.
+    """Set how many cores the kernels called from *this* Python thread use, and return that count.
 
     `None` means all cores this process may run on, which is also the upper bound: more threads than cores
     only wait for each other. Call it in every thread that computes. Results do not depend on the count.
@@ -40,12 +40,12 @@ def configure_threads(threads: int | None) -> int:
 
 
 def leave_a_core(threads: int | None) -> None:
-    """Do as `configure_threads` in a thread beside which others work: `None` leaves them one core, and OpenCV
-    gets as many as the kernels. Of two cores, one that is shared costs more than it gives."""
+    """Call `configure_threads` in a thread beside which others work: `None` leaves them one core. OpenCV gets
+    as many threads as the kernels. On two cores, sharing the second one costs more than it gives."""
     cores = int(numba.config.NUMBA_NUM_THREADS)
     cv2.setNumThreads(configure_threads(max(1, cores - 1) if threads is None else threads))
 
 
 def thread_count() -> int:
-    """How many threads a kernel called now from this Python thread uses."""
+    """Return how many threads a kernel called now from this Python thread uses."""
     return int(numba.get_num_threads())

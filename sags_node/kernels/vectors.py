@@ -1,16 +1,16 @@
 """Vectors: a type of variable for kernels that holds `LANES` float32, and the arithmetic on it.
 
-Where LLVM's own vectoriser does well, a kernel is better off with plain loops. Here it does not: a loop with
-a dozen sums leaves its registers, and a short loop costs more to enter than to run. In a vector's arithmetic
-every operation is one instruction:
+Where LLVM's own vectoriser does well, plain loops are better. Vectors are for loops where it does not: one
+with a dozen sums runs out of registers, and a short one costs more to enter than to run. In the arithmetic of
+vectors every operation is one instruction:
 
     weight = alpha * transmittance
     store(tile, at + RED, load(tile, at + RED) + weight * red)
 
-`+ - * /` work on two vectors, or on a vector and a float32 that then stands in every lane. Comparisons give a
-`Mask`, for `select`; masks know `&` and `|`. A product and a sum become one multiply-add where the processor
-has it; nothing else is rearranged (not even under `fastmath`), so that results are the same everywhere up to
-that.
+`+ - * /` work on two vectors, or on a vector and a float32 that is copied into every lane. Comparisons give a
+`Mask`, for `select`; masks support `&` and `|`. A product and a sum become one multiply-add where the
+processor has it. Nothing else is rearranged, not even under `fastmath`: apart from multiply-adds, results are
+the same on all processors.
 
 `LANES` is 16 where the compile target has AVX-512, else 8; a narrower processor takes a vector in pieces.
 
@@ -36,7 +36,7 @@ RECORD = 16  # float32 in a record
 
 
 def _fits_a_register(lanes: int) -> bool:
-    """Tell whether the compile target adds so many float32 with one instruction."""
+    """Tell whether the compile target adds `lanes` float32 with one instruction."""
     triple, cpu, features = cpu_target.target_context.codegen().magic_tuple()
     machine = llvm.Target.from_triple(triple).create_target_machine(cpu=cpu, features=features)
     vector = f"<{lanes} x float>"
@@ -62,7 +62,7 @@ class Vector(types.Type):  # type: ignore[misc]  # Numba has no types
 
 
 class Mask(types.Type):  # type: ignore[misc]  # Numba has no types
-    """LANES truths."""
+    """LANES booleans."""
 
     def __init__(self) -> None:
         super().__init__(f"Mask({LANES})")
@@ -120,7 +120,7 @@ def _arithmetic(name: str, **flags: Any) -> Generate:
 
 
 def _comparison(sign: str) -> Generate:
-    """False where one of the two is NaN; `!=` is true there."""
+    """A comparison that is false where an operand is NaN, except `!=`, which is true there."""
     ordered = "fcmp_unordered" if sign == "!=" else "fcmp_ordered"
     return lambda builder, values: getattr(builder, ordered)(sign, *values, flags=_FLAGS)
 
@@ -154,7 +154,7 @@ def spread(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def spread_bits(typing_context: Any, value: Any) -> Any:
-    """A vector with the bits of the same int32 in every lane, to be selected and stored, not to be added."""
+    """A vector with the bits of the same int32 in every lane: to select and store, not to compute with."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return _spread(builder, builder.bitcast(args[0], _F32))
@@ -164,7 +164,7 @@ def spread_bits(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def select(typing_context: Any, condition: Any, yes: Any, no: Any) -> Any:
-    """Lane by lane one or the other of two vectors or float32."""
+    """Return, lane by lane, `yes` where the mask is true and `no` elsewhere; each a vector or a float32."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.select(args[0], *_vectors(builder, sig.args[1:], args[1:]))
@@ -199,7 +199,7 @@ def any_of(typing_context: Any, condition: Any) -> Any:
 
 @intrinsic
 def times_power_of_two(typing_context: Any, x: Any, exponent: Any) -> Any:
-    """x * 2**n for x near 1, by its exponent bits; n is what stands in the lowest bits of `exponent`."""
+    """Return x * 2**n for x near 1, by adding to its exponent bits; n is in the lowest bits of `exponent`."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         power, shift = (builder.bitcast(value, _INTS) for value in args)
@@ -211,7 +211,7 @@ def times_power_of_two(typing_context: Any, x: Any, exponent: Any) -> Any:
 
 @intrinsic
 def split_powers(typing_context: Any, x: Any) -> Any:
-    """m and n with x = m 2**n and sqrt(1/2) <= m < sqrt(2), of positive numbers."""
+    """Return m and n with x = m 2**n and sqrt(1/2) <= m < sqrt(2), for positive x."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         def every(number: int) -> Any:
@@ -227,8 +227,8 @@ def split_powers(typing_context: Any, x: Any) -> Any:
 
 @intrinsic
 def multiply_add(typing_context: Any, x: Any, y: Any, z: Any) -> Any:
-    """x y + z of vectors or float32, for two kernels that must round alike: in a b + c d each may otherwise
-    round another of the two products."""
+    """Return x y + z of vectors or float32, for kernels that must round alike. In a b + c d the compiler may
+    fuse either product with the sum, and so round differently in each kernel."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(_FLOATS, [_FLOATS] * 3)
@@ -303,15 +303,15 @@ def _make_store(align: int) -> Any:
     return intrinsic(store)
 
 
-# The vector at array[index] of a flat float32 array, read and written; both aligned to a whole vector.
+# Read and write the vector at array[index] of a flat float32 array, which is aligned to a whole vector.
 load, store = _make_load(4 * LANES), _make_store(4 * LANES)
-# The vector that starts at array[index], counted through all dimensions, without regard to alignment.
+# The same at any alignment; the index counts through all dimensions of the array.
 load_anywhere, store_anywhere = _make_load(4), _make_store(4)
 
 
 @intrinsic
 def store_integers(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write a vector of whole numbers to array[index] and what follows, of a flat int32 array."""
+    """Write a vector of whole numbers to a flat int32 array, from array[index] on."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         integers = builder.fptosi(args[2], _INTS)
@@ -323,8 +323,8 @@ def store_integers(typing_context: Any, array: Any, index: Any, value: Any) -> A
 
 @intrinsic
 def load_records(typing_context: Any, array: Any, index: Any) -> Any:
-    """LANES records of 16 float32 from array[index] on, as 16 vectors, one for each field; aligned as for
-    `load`."""
+    """Read LANES records of 16 float32 from array[index] on, as 16 vectors, one for each field; aligned as
+    for `load`."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         start, fields = _address(context, builder, sig, args, 0, _FLOATS), []
@@ -355,7 +355,7 @@ def store_records(typing_context: Any, array: Any, index: Any, fields: Any) -> A
 
 @intrinsic
 def load_block(typing_context: Any, picture: Any, first: Any, width: Any) -> Any:
-    """A block of a flat picture whose rows have `width` px; `first` is its first pixel."""
+    """Read a block of a flat picture whose rows have `width` px; `first` is the block's first pixel."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         start = _address(context, builder, sig, args, 0)
@@ -398,11 +398,11 @@ def _make_constant(values: Sequence[float]) -> Any:
     return intrinsic(constant)
 
 
-# Where a lane's pixel lies in its block, px; and the number of a lane
+# Where a lane's pixel lies in its block, px; and the lane's number
 block_x = _make_constant([float(lane % BLOCK_WIDTH) for lane in range(LANES)])
 block_y = _make_constant([float(lane // BLOCK_WIDTH) for lane in range(LANES)])
 lane_numbers = _make_constant([float(lane) for lane in range(LANES)])
-# Two halves: a lane's number in its half, and 1 in the first, -1 in the second
+# Of a vector in two halves: the lane's number in its half; 1 in the first half and -1 in the second
 half_lanes = _make_constant([float(lane % (LANES // 2)) for lane in range(LANES)])
 half_signs = _make_constant([1.0 - 2.0 * (lane // (LANES // 2)) for lane in range(LANES)])
 
@@ -411,9 +411,9 @@ half_signs = _make_constant([1.0 - 2.0 * (lane // (LANES // 2)) for lane in rang
 
 
 def _fold_masks() -> list[tuple[list[int], list[int]]]:
-    """Find for each step of `_fold`: which lanes of two vectors, one behind the other, are added to which.
+    """For each step of `_fold`, which lanes of two concatenated vectors are added: (first ones, second ones).
 
-    First whole quarters of a register move (4 lanes), then lanes within them: those are single instructions.
+    Whole groups of 4 lanes move first, then lanes within them: each of these is a single instruction.
     """
     quarters = 2 * LANES // 4
     across = [[4 * quarter + k for quarter in range(odd, quarters, 2) for k in range(4)] for odd in (0, 1)]
@@ -439,14 +439,14 @@ def _fold(items: list[Any], zero: Any, add: Callable[[Any, Any, Sequence[int], S
 
 
 def _sum_lanes(count: int) -> list[int]:
-    """In which lane of `_fold`'s result the sum of each of `count` vectors stands."""
+    """The lane of `_fold`'s result that holds the sum of each of `count` vectors."""
     labels = [[k] * LANES for k in range(count)]
     found = _fold(labels, [-1] * LANES, lambda x, y, one, other: [(x + y)[lane] for lane in one])
     return [found.index(k) for k in range(count)]
 
 
 def _add_lanes(builder: Any, given: Sequence[Any]) -> tuple[Any, list[int]]:
-    """The sums over the lanes of up to LANES vectors, in one vector, and where in it they stand."""
+    """The sums over the lanes of up to LANES vectors, in one vector, and the lane that holds each sum."""
 
     def add(x: Any, y: Any, one: Sequence[int], other: Sequence[int]) -> Any:
         parts = [builder.shuffle_vector(x, y, ir.Constant(_INTS, lanes)) for lanes in (one, other)]
@@ -457,8 +457,8 @@ def _add_lanes(builder: Any, given: Sequence[Any]) -> tuple[Any, list[int]]:
 
 @intrinsic
 def lane_sums(typing_context: Any, vectors: Any) -> Any:
-    """The sums over the lanes of up to 8 vectors, given as a tuple: so many float32. Four hardly cost more
-    than one."""
+    """Return the sum over the lanes of each of up to 8 vectors, given as a tuple: one float32 for each. Four
+    hardly cost more than one."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         given = cgutils.unpack_tuple(builder, args[0], sig.args[0].count)
@@ -488,7 +488,7 @@ def smallest_lane(typing_context: Any, x: Any) -> Any:
 @intrinsic
 def store_sums(typing_context: Any, array: Any, index: Any, vectors: Any) -> Any:
     """Fill a record of 16 float32 at array[index] with the sums over the lanes of up to 16 vectors, given as
-    a tuple. What comes behind them in the record is left undefined. Aligned as for `load`."""
+    a tuple. The rest of the record is undefined. Aligned as for `load`."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         given = cgutils.unpack_tuple(builder, args[2], sig.args[2].count)

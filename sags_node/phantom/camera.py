@@ -1,4 +1,4 @@
-"""From bodies to a picture: one raw eye's view in linear light, smoke, then lens and sensor."""
+"""Renders the picture of one raw eye: its view in linear light, then smoke, then lens and sensor."""
 
 import cv2
 import numpy as np
@@ -12,13 +12,13 @@ from sags_node.phantom.vectors import normalized
 from sags_node.types import F32, F64, U8, Bool
 
 LENS_BLUR = 0.45  # px: no endoscope is sharper; it also softens the edges of single-sample rendering
-SMOKE_DISTANCE = 0.035  # m
+SMOKE_DISTANCE = 0.035  # m from the scope
 SMOKE_COLOR = np.array([0.42, 0.40, 0.40], np.float32)
 _NOTHING = 0.003  # linear light where a ray leaves the scene
 
 
 def world_rays(directions: F32, offset: float, T_world_cam: F64) -> F32:
-    """Rays [..., 6] in the world of an eye `offset` m to the right of the camera.
+    """Return the rays [..., 6], in the world, of an eye `offset` m to the right of the camera.
 
     `directions` [..., 3] are in the camera's axes with z = 1, so that a hit's distance is its depth.
     """
@@ -31,7 +31,7 @@ def world_rays(directions: F32, offset: float, T_world_cam: F64) -> F32:
 def look(
     directions: F32, offset: float, T_world_cam: F64, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp
 ) -> tuple[F32, Bool]:
-    """Linear-light picture [H, W, 3] along `directions` [H, W, 3], and where it shows instruments [H, W]."""
+    """Render linear light [H, W, 3] along `directions` [H, W, 3], and the mask of the instruments [H, W]."""
     rays = world_rays(directions, offset, T_world_cam)
     hits, towards = bodies.cast(rays), rays[..., 3:]
     distance = np.where(np.isfinite(hits.distance), hits.distance, np.float32(1))
@@ -55,7 +55,7 @@ def look(
 def shine(
     points: F32, view: F32, hits: Hits, bodies: Bodies, relief: Relief, skin: Skin, lamp: Lamp, lit: F32
 ) -> F32:
-    """Linear light [..., 3] of the tissue at the hits of rays; what hit none is nearly dark.
+    """Return the linear light [..., 3] of the tissue at the hits of rays; a ray without a hit is nearly dark.
 
     Args:
         points: [..., 3] where the rays hit, m, world.
@@ -84,7 +84,7 @@ def _lit(points: F32, bodies: Bodies, lamp: Lamp) -> F32:
 
 
 def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F64, density: float) -> F32:
-    """A veil [H, W, 3] over the picture: a lit cloud [S, S] that hangs in front of the tissue.
+    """Add smoke to a picture [H, W, 3]: a lit cloud [S, S] that hangs in front of the tissue.
 
     `drift` [2] moves the cloud, in its own pixels; `density` 0..1.
     """
@@ -97,7 +97,7 @@ def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F
 
 
 def expose(linear: F32, blur: float, noise: float, rng: np.random.Generator) -> U8:
-    """The recorded picture [H, W, 3]: lens blur (px, standard deviation), tone curve, noise (0..1)."""
+    """Return the recorded picture [H, W, 3]: lens blur (px, standard deviation), tone curve, noise (0..1)."""
     sharpness = float(np.hypot(LENS_BLUR, blur))
     shown = develop(cv2.GaussianBlur(linear, (0, 0), sharpness))
     if noise > 0:

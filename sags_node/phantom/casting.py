@@ -1,4 +1,4 @@
-"""The bodies of one moment, and what rays meet when they are cast at them."""
+"""The bodies in the scene at one moment, and ray casting at them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +22,7 @@ class Hits:
 
 
 class Bodies:
-    """Tissue and instruments, posed."""
+    """Tissue and instruments, posed for one moment."""
 
     def __init__(self, tissue: Tissue, vertices: F32, tools: Mesh) -> None:
         import open3d.core as o3c
@@ -40,7 +40,7 @@ class Bodies:
         )
 
     def cast(self, rays: F32) -> Hits:
-        """Nearest hits of rays [..., 6]: origin and direction (m, world)."""
+        """Return the nearest hits of rays [..., 6]: origin and direction (m, world)."""
         import open3d.core as o3c
 
         found = self._caster.cast_rays(o3c.Tensor.from_numpy(np.ascontiguousarray(rays)))
@@ -54,16 +54,16 @@ class Bodies:
         )
 
     def occluded(self, rays: F32) -> Bool:
-        """Tell whether rays [..., 6], whose directions end at the light, are stopped on their way, [...]."""
+        """Tell whether something blocks rays [..., 6] before the light, where their directions end; [...]."""
         import open3d.core as o3c
 
-        own_surface = 0.012  # of the way: not to be hidden by the place where the ray starts
+        own_surface = 0.012  # share of the way that is not tested: a surface must not shadow itself
         stopped = self._caster.test_occlusions(o3c.Tensor.from_numpy(rays), own_surface, 1.0)
         return np.asarray(stopped.numpy(), np.bool_)
 
 
 def grid_position(hits: Hits, cols: int) -> F32:
-    """Column and row [..., 2] on the tissue's vertex grid (`Tissue.faces`); 0, 0 where none was hit."""
+    """Return column and row [..., 2] on the tissue's vertex grid (`Tissue.faces`); 0, 0 without a hit."""
     face = np.where(hits.tissue, hits.face, 0)
     row, col = np.divmod(face // 2, cols - 1)
     lower = (face % 2).astype(np.float32)[..., None]

@@ -15,7 +15,7 @@ X, Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 JAW_LENGTH = 0.0145  # m, hinge to tip
 BITE = 0.0022  # m, how deep the closed jaws sit in the fold
 SHAFT_END = 0.16  # m
-SHAFT_RADIUS = 0.0034
+SHAFT_RADIUS = 0.0034  # m
 SEGMENTS = 32  # of a ring
 
 # Reflectance (RGB, linear) and share of mirror-like reflection.
@@ -25,7 +25,7 @@ _CERAMIC = (0.62, 0.60, 0.52, 0.12)
 _GOLD = (0.72, 0.50, 0.12, 0.60)
 _BLACK = (0.022, 0.022, 0.024, 0.06)
 
-# The instruments' work, over the phase of one action.
+# The instruments' work as (phase of one action, 0..1) keys: shares of RETREAT, of OPENING, of the way in.
 GRASPER_AWAY = ((0.0, 1.0), (0.12, 0.0), (0.86, 0.0), (1.0, 1.0))
 GRASPER_OPEN = ((0.0, 1.0), (0.12, 1.0), (0.18, 0.0), (0.82, 0.0), (0.88, 1.0), (1.0, 1.0))
 HOOK_IN = ((0.0, 0.0), (0.30, 0.75), (0.45, 1.0), (0.62, 0.85), (1.0, 0.0))
@@ -62,7 +62,7 @@ class Instruments:
         self._hook = _hook_parts()
 
     def mesh(self, action: float, grip: F64, view_at: F64) -> Mesh:
-        """Both instruments at phase `action` of their work.
+        """Return both instruments at phase `action` of their work.
 
         Args:
             grip: the gripped tissue point [3] (m, world).
@@ -79,12 +79,12 @@ class Instruments:
         return joined([grasper, self.hook(tip, HOOK_TROCAR)])
 
     def grasper(self, tip: F64, trocar: F64, opening: float = 0.0) -> Mesh:
-        """The grasper whose tip, when it is closed, is at `tip` [3] and that comes through `trocar` [3] (m,
-        world); `opening` of each jaw, radians."""
+        """Return the grasper that comes through `trocar` [3] (m, world) and whose tip, when it is closed, is
+        at `tip` [3]. `opening`: angle of each jaw, radians."""
         return _posed(self._grasper, _pose(tip, trocar, roll=np.radians(55.0)), opening)
 
     def hook(self, tip: F64, trocar: F64) -> Mesh:
-        """The hook, as `grasper`. Its end is 3 mm beside its axis, on which the tip is."""
+        """Return the hook, as `grasper`. `tip` is on its axis; the end of the hook is 3 mm beside it."""
         return _posed(self._hook, _pose(tip, trocar, roll=np.radians(20.0)), 0.0)
 
 
@@ -109,7 +109,7 @@ def _posed(parts: list[_Part], pose: F64, opening: float) -> Mesh:
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """One mesh of several."""
+    """Join several meshes into one."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
@@ -190,7 +190,7 @@ def _tube(
     plane_normal: F64,
     material: tuple[float, float, float, float],
 ) -> Mesh:
-    """Elliptic rings along a path [n, 3] in (about) one plane; half axes (m) in it and normal to it."""
+    """A tube of elliptic rings along a path [n, 3] in (about) a plane; half axes (m) in and normal to it."""
     count = len(path)
     tangent = np.gradient(path, axis=0)
     side = _unit(np.cross(plane_normal, tangent))

@@ -12,35 +12,35 @@ _HEARTBEAT = 0.8  # s
 _SCOPE = 7.0  # s: no multiple of a breath, so that all places are seen in all states of the tissue
 _ZOOM = 0.015  # m, in and out
 CENTRE = np.array([0.0, 0.0, 0.078])  # m: what the scope looks at when it stands still
-_ORBIT = 0.20, 0.15  # rad, sideways and upwards: 16 and 12 mm of way
+_ORBIT = 0.20, 0.15  # rad, sideways and upwards: arcs of 16 and 12 mm
 
 
 class Clock:
-    """Turns the phase of a session of `seconds` into the phases of its movements; all close at the end."""
+    """Turns the phase of a session of `seconds` into those of its movements, which all make whole cycles."""
 
     def __init__(self, seconds: float) -> None:
         self._cycles = {p: max(1, round(seconds / p)) for p in (_ACTION, BREATH, _HEARTBEAT, _SCOPE)}
 
     def action(self, phase: float) -> float:
-        """Phase 0..1 of the instruments' work."""
+        """Return the phase 0..1 of the instruments' work."""
         return (phase * self._cycles[_ACTION]) % 1.0
 
     def breath(self, phase: float) -> float:
-        """Angle of breathing, radians."""
+        """Return the phase angle of the breath, radians."""
         return 2 * np.pi * phase * self._cycles[BREATH]
 
     def heartbeat(self, phase: float) -> float:
-        """Outward push -1..1: a quick stroke and a slow return."""
+        """Return the outward push, about -1..1: a quick stroke and a slow return."""
         angle = 2 * np.pi * phase * self._cycles[_HEARTBEAT]
         return float(0.75 * np.sin(angle) + 0.35 * np.sin(2 * angle))
 
     def scope(self, phase: float) -> float:
-        """Phase 0..1 of a round of the scope."""
+        """Return the phase 0..1 of the scope's round."""
         return (phase * self._cycles[_SCOPE]) % 1.0
 
 
 def keyed(phase: float, keys: tuple[tuple[float, float], ...]) -> float:
-    """Value at `phase` between (phase, value) keys, at rest at every key; the first and last must agree."""
+    """Interpolate (phase, value) keys smoothly, at rest at every key; the first and last value must agree."""
     at, values = zip(*keys, strict=True)
     k = int(np.clip(np.searchsorted(at, phase, side="right") - 1, 0, len(keys) - 2))
     t = np.clip((phase - at[k]) / (at[k + 1] - at[k]), 0, 1)
@@ -48,8 +48,8 @@ def keyed(phase: float, keys: tuple[tuple[float, float], ...]) -> float:
 
 
 def scope_pose(phase: float, motion: CameraMotion) -> F64:
-    """`T_world_cam` [4, 4] of the left rectified camera at a phase 0..1 of a round, which starts and ends at
-    identity."""
+    """Return `T_world_cam` [4, 4] of the left rectified camera at a phase 0..1 of a round. A round starts and
+    ends at identity."""
     pose = np.eye(4)
     once, twice = 2 * np.pi * phase, 4 * np.pi * phase
     if motion == "sway":

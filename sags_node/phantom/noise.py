@@ -1,4 +1,4 @@
-"""Smooth random pictures: the raw material of shapes and colours."""
+"""Smooth random pictures, from which shapes and colours are made."""
 
 import cv2
 import numpy as np
@@ -7,7 +7,7 @@ from sags_node.types import F32
 
 
 def fractal_noise(rng: np.random.Generator, shape: tuple[int, int], cell: float, octaves: int) -> F32:
-    """Value noise [rows, cols], about zero mean and unit deviation.
+    """Return value noise [rows, cols] with about zero mean and unit standard deviation.
 
     `cell` is the size in pixels of the coarsest bumps; every further octave halves size and strength.
     """

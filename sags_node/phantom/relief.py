@@ -40,7 +40,7 @@ class Relief:
     y: F64  # [rows] m
     positions: F32  # [rows, cols, 3] m, world
     chart: F32  # [rows, cols, 2] m: coordinates of equal arc length, in which the texture is drawn
-    loop: F32  # [rows, cols] 0..1, how much this is bowel
+    loop: F32  # [rows, cols] 0..1, share of bowel
     liver: F32  # [rows, cols] 0..1
     tint: F32  # [rows, cols] -1..1, the loops differ in colour
     cavity: F32  # [rows, cols] 0..1, 1 = open to the light
@@ -49,7 +49,7 @@ class Relief:
 
 
 def make_relief(rng: np.random.Generator, half_view: tuple[float, float]) -> Relief:
-    """A seeded rest shape. `half_view` is the tangent of half the angle of view, horizontal and vertical."""
+    """Make a random rest shape. `half_view`: tangent of half the angle of view, horizontal and vertical."""
     half = np.array(half_view)
     x, y = (np.arange(-h, h + SPACING, SPACING) for h in half * FARTHEST + MARGIN)
     grid = np.stack(np.meshgrid(x, y), -1)  # [rows, cols, 2]
@@ -119,7 +119,7 @@ def _smooth_curve(control: F64) -> F64:
 def _loop_height(
     rng: np.random.Generator, grid: F64, curve: F64, radius: float, elevation: float
 ) -> tuple[F64, F64]:
-    """Height (m) of a tube over the bed, and what turns plan coordinates into arc length across the tube."""
+    """Height (m) of a tube over the bed; and the offset [..., 2] (m) from x, y to arc length across it."""
     offset, along = _nearest_on_curve(grid, curve)
     distance = np.hypot(offset[..., 0], offset[..., 1])
     waves = np.sin(2 * np.pi * along / rng.uniform(0.015, 0.020) + rng.uniform(0, 6))
@@ -162,7 +162,7 @@ def _liver_height(grid: F64, half: F64) -> F64:
 
 
 def _cavity(height: F32) -> F32:
-    """Less light reaches the bottom of a furrow: compare the height with its surroundings."""
+    """Share 0..1 of the light that arrives, less in a furrow: compares the height with its surroundings."""
     open_share = np.ones_like(height)
     for width, weight in ((1.6e-3, 0.55), (5e-3, 0.75)):
         around = cv2.GaussianBlur(height, (0, 0), width / SPACING, borderType=cv2.BORDER_REPLICATE)

@@ -6,7 +6,7 @@ import numpy as np
 from sags_node.rig import rectify_eyes
 from sags_node.types import F64, Eye, StereoRig
 
-FOCAL_PER_WIDTH = 0.9  # of the longer side: about 58 degrees, a usual endoscope
+FOCAL_PER_WIDTH = 0.9  # focal length over the longer side: about 58 degrees, usual for an endoscope
 BASELINE = 0.0043  # m
 _UNDISTORT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
@@ -16,7 +16,7 @@ _TOE_IN = np.radians([0.25, 0.6, -0.3])  # rotation vector, left axes to right a
 
 
 def phantom_rig(width: int, height: int) -> StereoRig:
-    """The rig for raw pictures of `width` x `height` px; rectified by `cv2.stereoRectify` at that size."""
+    """Return the rig for raw pictures of `width` x `height` px, rectified at that size."""
     focal = FOCAL_PER_WIDTH * max(width, height)
     K_left, K_right = np.eye(3), np.eye(3)
     K_left[0, 0], K_left[1, 1] = focal, focal
@@ -31,7 +31,7 @@ def phantom_rig(width: int, height: int) -> StereoRig:
 
 
 def raw_rays(eye: Eye) -> F64:
-    """Ray of every raw pixel in the rectified camera's axes, [H, W, 3], scaled to z = 1."""
+    """Return the ray of every raw pixel in the rectified camera's axes, [H, W, 3], scaled to z = 1."""
     u, v = np.meshgrid(np.arange(eye.width, dtype=np.float64), np.arange(eye.height, dtype=np.float64))
     pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
     normalized = cv2.undistortPoints(pixels, eye.K, eye.distortion, R=eye.R, criteria=_UNDISTORT)
@@ -41,7 +41,7 @@ def raw_rays(eye: Eye) -> F64:
 
 
 def rectified_rays(eye: Eye) -> F64:
-    """Ray of every rectified pixel in the rectified camera's axes, [H, W, 3], scaled to z = 1."""
+    """Return the ray of every rectified pixel in the rectified camera's axes, [H, W, 3], scaled to z = 1."""
     u, v = np.meshgrid(np.arange(eye.width, dtype=np.float64), np.arange(eye.height, dtype=np.float64))
     x, y = (u - eye.P[0, 2]) / eye.P[0, 0], (v - eye.P[1, 2]) / eye.P[1, 1]
     return np.stack([x, y, np.ones_like(x)], -1)

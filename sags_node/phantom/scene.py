@@ -1,4 +1,4 @@
-"""The phantom itself: one call gives both raw pictures of a frame and everything that is true of it."""
+"""The phantom itself: one call gives both raw pictures of a frame and its ground truth."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from sags_node.types import F32, F64, U8, Bool, Camera
 
 BAND = 1 << 19  # rays at a time
 
-TRACKS = 240
+TRACKS = 240  # tracked surface points
 HOOK_DEPTH = 0.055  # m
 HIDDEN = 5e-5  # m: a surface this much nearer hides a tracked point
 
 
 class PhantomScene(PhantomSource):
-    """The session of a launch file, and what tests, benchmarks and `sags phantom` change of it besides."""
+    """The session of a launch file, with further settings for tests, benchmarks and `sags phantom`."""
 
     smoke: float = Field(0.0, ge=0, le=1)  # density
     noise: float = Field(0.01, ge=0, le=0.2)  # of a pixel: standard deviation, in units of white
     blur: float = Field(0.0, ge=0, le=5)  # of the lens: standard deviation, px
     gloss: float = Field(1.0, ge=0, le=100)  # strength of the wet highlights
-    still_tissue: bool = False  # only the instruments move, and the scope if it is to
-    blackout: tuple[float, float] | None = None  # s: without light from, until
+    still_tissue: bool = False  # only the instruments move, and the scope if `camera_motion` says so
+    blackout: tuple[float, float] | None = None  # s: start and end of the time without light
 
     @classmethod
     def of(cls, config: PhantomSource) -> PhantomScene:
-        """The scene of `config`; of a launch file's, with nothing changed."""
+        """Return `config` as a scene; the source of a launch file gets the default further settings."""
         return config if isinstance(config, cls) else cls(**dict(config))
 
 
@@ -62,7 +62,7 @@ class PhantomFrame:
 
 @lru_cache(maxsize=1)
 def _material(seed: int, half_view: tuple[float, float], focal_px: float) -> tuple[Relief, Skin]:
-    """The tissue at rest and its texture: most of the time that a new scene takes, and many share them."""
+    """The tissue at rest and its texture: most of the work for a new scene, and shared by many scenes."""
     shape, paint = (np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(2))
     relief = make_relief(shape, half_view)
     return relief, paint_skin(relief, paint, footprint=0.8 * BED_DEPTH / focal_px)
@@ -72,8 +72,8 @@ class Phantom:
     """A seeded scene; a frame is a pure function of its place in the session.
 
     Attributes:
-        rig: that looks at it.
-        tissue: where its surface is at each moment.
+        rig: the stereo rig that looks at the tissue.
+        tissue: where the surface is at each moment.
     """
 
     def __init__(self, config: PhantomSource) -> None:
@@ -101,8 +101,8 @@ class Phantom:
     def frame(
         self, index: int, count: int, T_world_cam: F64 | None = None, tools: Mesh | None = None
     ) -> PhantomFrame:
-        """Frame `index` of a session of `count` frames; `T_world_cam` [4, 4]: where the scope is then, if not
-        on its path; `tools`: other instruments than those at work."""
+        """Render frame `index` of a session of `count` frames. `T_world_cam` [4, 4]: pose of the scope, None:
+        that of its path. `tools`: the instruments, None: those at work."""
         phase = index / count
         if T_world_cam is None:
             T_world_cam = self._scope(phase)
@@ -148,7 +148,7 @@ class Phantom:
         return first <= phase * self._scene.seconds < last
 
     def still(self, phase: float) -> Still:
-        """The tissue alone at a phase 0..1 of the session, as the left rectified camera there sees it."""
+        """Return the tissue alone at a phase 0..1 of the session, lit as for the scope's pose then."""
         T_world_cam = self._scope(phase)
         vertices = self.tissue.vertices(0.0 if self._scene.still_tissue else phase)
         bodies = Bodies(self.tissue, vertices, NOTHING)
@@ -156,7 +156,7 @@ class Phantom:
         return Still(bodies, self._relief, self._skin, lamp, eye=T_world_cam[:3, 3])
 
     def _visible(self, bodies: Bodies, points: F64, T_world_cam: F64) -> Bool:
-        """Inside the left rectified picture and not behind anything, [P]."""
+        """Which points [P] are inside the left rectified picture and not hidden."""
         eye = self.rig.left
         local = transform(invert(T_world_cam), points)
         pixels = local @ eye.P[:, :3].T
@@ -170,18 +170,18 @@ class Phantom:
 class Still:
     """The tissue at one instant, without instruments, noise or lens: exact truth for any pinhole camera.
 
-    Its light and its gleam stay as the first camera has them, so that a view from elsewhere differs by its
-    geometry alone. Nothing casts a shadow: the phantom softens shadows in the picture, by so many pixels."""
+    Light and highlights stay as the scope's camera sees them, so that a view from elsewhere differs only by
+    its geometry. Nothing casts a shadow: the phantom softens shadows in a picture, by a number of pixels."""
 
     bodies: Bodies
     relief: Relief
     skin: Skin
     lamp: Lamp
-    eye: F64  # [3] m, world: where the gleam is seen from
+    eye: F64  # [3] m, world: where the highlights are seen from
 
     def look(self, camera: Camera, samples: int) -> tuple[F32, F32]:
-        """Display values [H, W, 3] 0..1 and depth [H, W] (m): means over `samples` x `samples` rays per
-        pixel. Depth is 0 where a ray of the pixel met nothing."""
+        """Return display values [H, W, 3] 0..1 and depth [H, W] (m), each the mean of `samples` x `samples`
+        rays per pixel. Depth is 0 where any ray of the pixel meets nothing."""
         size = camera.width * samples, camera.height * samples
         K = scale_intrinsics(camera.K, (camera.width, camera.height), size)
         slopes_x = (np.arange(size[0]) - K[0, 2]) / K[0, 0]
@@ -202,7 +202,7 @@ class Still:
         return image, depth
 
     def _trace(self, rays: F32) -> tuple[F32, F32]:
-        """Display values [..., 3] and depths [...] of rays [..., 6]; 0 where they meet nothing."""
+        """Display values [..., 3] and depths [...] (m) of rays [..., 6]; depth 0 where they meet nothing."""
         hits = self.bodies.cast(rays)
         distances = np.asarray(np.where(hits.tissue, hits.distance, 0), np.float32)
         points = np.asarray(rays[..., :3] + distances[..., None] * rays[..., 3:], np.float32)

@@ -31,9 +31,9 @@ _COMPLETE = "launch.yaml"  # written last
 
 
 def cached_session(config: PhantomSource, progress: Progress | None = None) -> Path:
-    """Folder of the session for `config` under `$XDG_CACHE_HOME/sags` (default `~/.cache/sags`).
+    """Return the folder of the session for `config` under `$XDG_CACHE_HOME/sags` (default `~/.cache/sags`).
 
-    Rendered at 30 frames per second when it is not there yet; see `write_session`.
+    A session that is not there yet is rendered at 30 frames per second; see `write_session`.
     """
     scene = PhantomScene.of(config)
     shaping = {"version": VERSION, "rate": RATE} | {name: getattr(scene, name) for name in _SHAPING}
@@ -52,10 +52,10 @@ def cached_session(config: PhantomSource, progress: Progress | None = None) -> P
 def write_session(
     config: PhantomSource, folder: Path, rate: float = RATE, progress: Progress | None = None
 ) -> None:
-    """Render `frame_count` frames and all that is true of them into a new folder.
+    """Render `frame_count` frames and their ground truth into a new folder.
 
-    The folder appears only when it is complete. `launch_file.load_launch(folder)` reads the result. Same
-    config and rate, same files on one machine.
+    The folder appears only when it is complete. `launch_file.load_launch(folder)` reads the result. The same
+    config and rate give the same files on one machine.
 
     Raises:
         UsageError: the folder exists and is not empty.
@@ -72,7 +72,7 @@ def write_session(
 
 
 def frame_count(config: PhantomSource, rate: float = RATE) -> int:
-    """How many frames a session has."""
+    """Return how many frames a session has."""
     return max(1, round(config.seconds * rate))
 
 
@@ -136,5 +136,5 @@ def _write_pictures(frame: PhantomFrame, folder: Path, stem: str) -> None:
 
 
 def _write(file: Path, picture: np.ndarray, options: list[int]) -> None:
-    """`cv2.imwrite` only returns False on a full disk; a file written by Python raises."""
+    """Write a picture, and raise on a full disk, where `cv2.imwrite` would only return False."""
     file.write_bytes(cv2.imencode(file.suffix, picture, options)[1].tobytes())

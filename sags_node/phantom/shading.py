@@ -10,12 +10,10 @@ from sags_node.geometry import transform
 from sags_node.phantom.vectors import dot, normalized
 from sags_node.types import F32, F64
 
-LAMP_ABOVE = 0.006  # m, off the eyes' axis: what makes shadows
-LIGHT_POWER = 0.0052  # m^2: brightness 1 on a white wall at sqrt(LIGHT_POWER)
+LAMP_ABOVE = 0.006  # m above the eyes; this offset makes shadows visible
+LIGHT_POWER = 0.0052  # m^2: a white wall at sqrt(LIGHT_POWER) m has brightness 1
 LIGHT_SPREAD = 3.0  # exponent of the fall-off towards the rim
-_WRAP = np.array(
-    [0.34, 0.14, 0.12], np.float32
-)  # red light leaks round into the shade: under-surface scattering
+_WRAP = np.array([0.34, 0.14, 0.12], np.float32)  # subsurface scattering: red light leaks into the shade
 _AMBIENT = np.array([0.085, 0.050, 0.047], np.float32)  # light that has bounced off other tissue
 _CAVITY_GLOW = np.array([0.30, 0.085, 0.075], np.float32)  # what metal mirrors when it faces the tissue
 
@@ -29,12 +27,12 @@ class Lamp:
 
     @staticmethod
     def at_tip(T_world_cam: F64, baseline: float) -> Lamp:
-        """Above the eyes of a scope whose left eye has this pose."""
+        """Return the lamp above the eyes of a scope whose left eye has this pose."""
         place = transform(T_world_cam, np.array([0.5 * baseline, -LAMP_ABOVE, 0.0]))
         return Lamp(place.astype(np.float32), T_world_cam[:3, 2].astype(np.float32))
 
     def reach(self, points: F32) -> tuple[F32, F32]:
-        """Directions to the light [..., 3] and strength received [...] at points [..., 3]."""
+        """Return unit vectors to the light [..., 3] and the strength received [...] at points [..., 3]."""
         to_light = self.place - points
         squared = dot(to_light, to_light)
         to_light = normalized(to_light)
@@ -43,7 +41,7 @@ class Lamp:
 
 
 def shade_tissue(points: F32, normals: F32, view: F32, color: F32, surface: F32, lamp: Lamp, lit: F32) -> F32:
-    """Linear-light colour [..., 3] of wet tissue.
+    """Return the linear-light colour [..., 3] of wet tissue.
 
     Args:
         points, normals: [..., 3] m and unit vectors.
@@ -78,7 +76,7 @@ def _tilted(normals: F32, slope: F32) -> F32:
 
 
 def shade_metal(points: F32, normals: F32, view: F32, materials: F32, lamp: Lamp) -> F32:
-    """Linear-light colour [N, 3] of instrument parts; `materials` [N, 4] is reflectance and mirror share."""
+    """Return the linear-light colour [N, 3] of metal; `materials` [N, 4] is reflectance and mirror share."""
     to_light, strength = lamp.reach(points)
     color, mirror = materials[:, :3], materials[:, 3:]
     facing = dot(normals, view)[:, None]
@@ -97,6 +95,6 @@ def shade_metal(points: F32, normals: F32, view: F32, materials: F32, lamp: Lamp
 
 
 def develop(linear: F32) -> F32:
-    """Display values 0..1 of linear light: a soft shoulder, so that highlights bloom to white, and gamma."""
+    """Turn linear light into display values 0..1: a soft shoulder, so that highlights bloom, and gamma."""
     shoulder = np.where(linear < 0.6, linear, 1 - 0.4 * np.exp(-(linear - 0.6) / 0.4))
     return np.asarray(np.maximum(shoulder, 0) ** np.float32(1 / 2.2), np.float32)

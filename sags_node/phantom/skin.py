@@ -21,7 +21,7 @@ _SEROSA_DARK = np.array([0.46, 0.115, 0.115], np.float32)
 _MESENTERY = np.array([0.47, 0.165, 0.140], np.float32)
 _FAT = np.array([0.80, 0.50, 0.24], np.float32)
 _LIVER = np.array([0.200, 0.050, 0.042], np.float32)
-# Optical density of a full vessel: blood takes green and blue; a deep vein looks bluish.
+# Optical density of a full vessel: blood absorbs green and blue; a deep vein looks bluish.
 _ARTERY = np.array([0.55, 1.75, 1.55], np.float32)
 _VEIN = np.array([0.95, 1.15, 0.80], np.float32)
 _CAPILLARY = np.array([0.12, 0.45, 0.40], np.float32)
@@ -121,7 +121,7 @@ def _base_color(
 
 
 def _blood(rng: np.random.Generator, shape: Shape, perfused: F32, wrap: Wrap) -> F32:
-    """Optical density [H, W, 3] of the vessels; the number of trees goes with the area."""
+    """Optical density [H, W, 3] of the vessels; the number of trees is proportional to the area."""
     area = shape[0] * shape[1] / 1e6
     veins = grow_vessels(rng, shape, roots=int(7 * area), width=9.0, thinnest=2.0)
     arteries = grow_vessels(rng, shape, roots=int(24 * area), width=4.2, thinnest=0.5)
@@ -157,7 +157,7 @@ def _slopes(rng: np.random.Generator, shape: Shape, bed: F32, liver: F32, fat: F
 
 
 def _lobules(rng: np.random.Generator, shape: Shape, cell: float) -> F32:
-    """Rounded cells side by side, height in px: fat."""
+    """Height (px) of rounded cells side by side, as fat has them."""
     seeds = np.full(shape, 255, np.uint8)
     count = int(shape[0] * shape[1] / cell**2)
     seeds[rng.integers(0, shape[0], count), rng.integers(0, shape[1], count)] = 0
@@ -176,7 +176,7 @@ class _Sprout:
 def grow_vessels(
     rng: np.random.Generator, shape: tuple[int, int], roots: int, width: float, thinnest: float
 ) -> F32:
-    """Strength of blood [rows, cols] 0..1: `roots` trees of `width` px, down to twigs of `thinnest` px."""
+    """Draw `roots` trees of vessels, from `width` px down to `thinnest` px: strength [rows, cols] 0..1."""
     canvas = np.zeros(shape, np.uint8)
     rows, cols = shape
     growing = [
@@ -206,7 +206,7 @@ def grow_vessels(
 
 
 def _grow(rng: np.random.Generator, sprout: _Sprout, thinnest: float) -> tuple[F32, list[_Sprout]]:
-    """One winding stretch [n, 2] (x, y) up to a fork, and what leaves the fork."""
+    """One winding stretch [n, 2] (x, y) up to a fork, and the branches that leave the fork."""
     steps = int(rng.integers(8, 22))
     step = 1.2 + 1.5 * np.sqrt(sprout.width)
     bends = np.cumsum(rng.normal(0, 0.24, steps))

@@ -47,7 +47,7 @@ class Tissue:
         self._heart_push = near_heart[..., None] * np.array([0.0002, 0.0003, -1.0 * HEART_PUSH], np.float32)
 
     def vertices(self, phase: float) -> F32:
-        """Positions [rows, cols, 3] (m, world)."""
+        """Return the positions [rows, cols, 3] (m, world) at a phase 0..1 of the session."""
         breath = self._breath_gain * np.sin(self._clock.breath(phase) - self._breath_delay)
         positions = self.relief.positions + np.float32(self.lift(phase)) * self._lifted
         positions += np.float32(self._clock.heartbeat(phase)) * self._heart_push
@@ -56,15 +56,15 @@ class Tissue:
         return np.asarray(positions, np.float32)
 
     def lift(self, phase: float) -> float:
-        """How far the grip is pulled, 0..1."""
+        """Return how far the grip is pulled, 0..1."""
         return keyed(self._clock.action(phase), LIFT_KEYS)
 
     def grip(self, vertices: F32) -> F64:
-        """The gripped point [3] (m, world)."""
+        """Return the gripped point [3] (m, world)."""
         return np.asarray(vertices[self.relief.grip], np.float64)
 
     def track_indices(self, rng: np.random.Generator, half_view: tuple[float, float], count: int) -> I64:
-        """Flat indices [count] of vertices spread over the view: the tracked surface points."""
+        """Choose the tracked surface points: flat indices [count] of vertices spread over the view."""
         rest = self.relief.positions
         inside = np.abs(rest[..., :2] / rest[..., 2:]) < 0.92 * np.array(half_view)
         candidates = np.flatnonzero(inside.all(-1))
@@ -72,7 +72,7 @@ class Tissue:
 
 
 def vertex_normals(vertices: F32) -> F32:
-    """Unit normals [rows, cols, 3] of a grid surface, towards the camera (negative z)."""
+    """Return the unit normals [rows, cols, 3] of a grid surface, towards the camera (negative z)."""
     along_row = np.empty_like(vertices)
     along_row[:, 1:-1] = vertices[:, 2:] - vertices[:, :-2]
     along_row[:, 0], along_row[:, -1] = along_row[:, 1], along_row[:, -2]

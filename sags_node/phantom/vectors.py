@@ -6,10 +6,10 @@ from sags_node.types import F32
 
 
 def dot(a: F32, b: F32) -> F32:
-    """Dot products [...] of vectors [..., 3]."""
+    """Return the dot products [...] of vectors [..., 3]."""
     return np.asarray(np.einsum("...c,...c->...", a, b))
 
 
 def normalized(vectors: F32) -> F32:
-    """Unit vectors [..., 3] of vectors of any length but zero."""
+    """Return the unit vectors [..., 3] of vectors of any length but zero."""
     return np.asarray(vectors * (1 / np.sqrt(dot(vectors, vectors)))[..., None])

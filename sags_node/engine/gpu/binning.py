@@ -1,7 +1,7 @@
-"""Which splats reach which tiles: pairs of both, near to far within each tile.
+"""The pairs of a splat and a tile that it reaches, near to far within each tile.
 
-Splats are sorted by depth, their pairs by tile, both stably: equal depths keep the order of the rows. The
-pairs of one splat have neighbouring slots, where its gradients are summed without an atomic.
+Splats are sorted by depth, then their pairs by tile. Both sorts are stable: equal depths keep the order of
+the rows. The pairs of one splat have neighbouring slots, so its gradients are summed without atomics.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def tile_rows(s: wp.vec4, reach_y: float, height: int):
 
 @wp.func
 def tile_columns(s: wp.vec4, r: wp.vec4, row: int, width: int, height: int):
-    """The tiles of a row that the ellipse u^2 + v^2 = extent reaches, the first and one after the last."""
+    """The first tile of a row that the ellipse u^2 + v^2 = extent reaches, and one after the last."""
     a, b, c, extent = s[2], s[3], r[0], r[2]
     low = wp.max(float(row * TILE) + 0.5 - s[1], -wp.sqrt(extent) / c)
     high = wp.min(float(wp.min(row * TILE + TILE, height)) - 0.5 - s[1], wp.sqrt(extent) / c)
@@ -60,7 +60,7 @@ def count_pairs(
     splats: wp.array2d(dtype=wp.vec4), keys: wp.array(dtype=int), order: wp.array(dtype=int),
     width: int, height: int, active: wp.array(dtype=int), counts: wp.array(dtype=int),
 ):  # fmt: skip
-    """Count for each splat, in the order of depth, with the tiles that are active."""
+    """Count the active tiles that each splat reaches; `counts` is in the order of depth."""
     n = wp.tid()
     total = int(0)
     if keys[n] != FAR_KEY:
@@ -82,7 +82,7 @@ def emit_pairs(
     ends: wp.array(dtype=int), tiles: wp.array(dtype=int), slots: wp.array(dtype=int),
     slot_splats: wp.array(dtype=int), own_slots: wp.array(dtype=wp.vec2i),
 ):  # fmt: skip
-    """Pairs in the order of depth; `own_slots`: the first of each splat, and one after its last."""
+    """Write the pairs in the order of depth. `own_slots`: a splat's first slot, and one after its last."""
     n = wp.tid()
     i = order[n]
     at = ends[n] - counts[n]
@@ -108,8 +108,8 @@ def find_ranges(
     tiles: wp.array(dtype=int), slots: wp.array(dtype=int), slot_splats: wp.array(dtype=int), count: int,
     starts: wp.array(dtype=int), pairs: wp.array(dtype=int),
 ):  # fmt: skip
-    """From pairs sorted by tile: where each tile's begin [tiles + 1], and the splat of each pair. Launched
-    for one thread more than there are pairs."""
+    """Given pairs sorted by tile, write where each tile's pairs begin [tiles + 1] and the splat of each pair.
+    Launch one thread more than there are pairs."""
     p = wp.tid()
     before, here = int(-1), starts.shape[0] - 1
     if p > 0:

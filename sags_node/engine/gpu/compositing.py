@@ -1,7 +1,7 @@
 """Front-to-back blending of the splats of each tile, its derivative and the median depth.
 
-Formulas: `engine.rasterizer.compositing`. A block is a tile of 16x16 px, a thread a pixel. A pixel ends where
-its transmittance falls to `OPAQUE`.
+Formulas: `engine.rasterizer.compositing`. A block of threads draws a tile of 16x16 px, a thread one pixel,
+which is finished when its transmittance falls to `OPAQUE`.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from sags_node.engine.gpu.projection import LOG_MIN_ALPHA, vec16
 wp.set_module_options({"enable_backward": False})
 
 OPAQUE = 1e-4  # transmittance
-BATCH = 8  # pairs that a block takes at a time, when it goes back
+BATCH = 8  # pairs that a block takes at a time in the backward pass
 GROUP = LANES // BATCH  # threads that then sum one pair's moments
-VALUES = 14  # of a pair's moments
-# Rows of a block's shared memory: what is asked of each pixel; its weights of a batch, and dL/dlog alpha;
-# partial sums. An odd number of columns keeps the banks apart.
+VALUES = 14  # moments of a pair
+# Rows of a block's shared memory: six inputs of each pixel; its w for each pair of a batch; its dL/dlog alpha
+# for each; partial sums. An odd number of columns avoids bank conflicts.
 WEIGHTS, LOGS, PARTS = 6, 6 + BATCH, 6 + 2 * BATCH
 ROWS, COLUMNS = PARTS + VALUES + 2, LANES + 1
 shelf = wp.tile(dtype=float, shape=(ROWS, COLUMNS))
 
 
-# Elements of shared memory without the barrier that each write by Warp's own functions brings.
+# Access to single elements of shared memory. With Warp's own functions each write would bring a barrier.
 @wp.func_native("t.data(wp::tile_coord(i, j)) = value;")
 def put(t: shelf, i: int, j: int, value: float): ...
 
@@ -45,7 +45,7 @@ def composite(
     width: int, height: int, active: wp.array(dtype=int),
     planes: wp.array3d(dtype=float), tile_ends: wp.array(dtype=int),
 ):  # fmt: skip
-    """Planes [5, H, W] of the active tiles, and behind which pair no pixel of each looks further."""
+    """Write the planes [5, H, W] of active tiles. `tile_ends`: one after the last pair that a tile used."""
     tile, lane = wp.tid()
     tiles_x = (width + TILE - 1) // TILE
     x, y = tile % tiles_x * TILE + lane % TILE, tile // tiles_x * TILE + lane // TILE
@@ -82,7 +82,7 @@ def median(
     width: int, height: int, active: wp.array(dtype=int),
     depths: wp.array2d(dtype=float), rows: wp.array2d(dtype=int),
 ):  # fmt: skip
-    """Depth and Gaussian at which the transmittance falls to one half; 0 and -1 where it stays above."""
+    """Write the depth and Gaussian where the transmittance falls to one half; 0, -1 where it stays above."""
     tile, lane = wp.tid()
     tiles_x = (width + TILE - 1) // TILE
     x, y = tile % tiles_x * TILE + lane % TILE, tile // tiles_x * TILE + lane // TILE
@@ -109,7 +109,7 @@ def weight_and_log(
     s: wp.vec4, r: wp.vec4, c: wp.vec4, slope_v: float, place_x: float, place_y: float, cotangent: wp.vec4,
     luminance: float, v_coverage: float, T: float, remaining: float,
 ):  # fmt: skip
-    """w and dL/dlog alpha of a splat at a pixel, and the pixel's transmittance and rest after it."""
+    """Return w and dL/dlog alpha of a splat at a pixel, and the pixel's T and `remaining` (R) behind it."""
     u, v = whitened(s, r, place_x, place_y)
     exponent = r[1] - u * u - v * v
     w, g = float(0.0), float(0.0)
@@ -145,9 +145,9 @@ def composite_backward(
     planes: wp.array3d(dtype=float), v_planes: wp.array3d(dtype=float), weights: wp.array2d(dtype=float),
     slots: wp.array(dtype=int), sums: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """A thread is a pixel and finds w and dL/dlog alpha of a batch of pairs; then a group of threads sums the
-    moments of one of them over the pixels; then a thread sums one of its values. Each sum has its order, so
-    that results repeat to the bit. Needs blocks of 256 threads."""
+    """Sum each pair's moments over a tile's pixels. Each thread finds w and dL/dlog alpha of its pixel for a
+    batch of pairs. Then a group of threads sums the moments of one pair, and one thread adds up each moment.
+    The order of every sum is fixed, so results repeat to the bit. Needs blocks of 256 threads."""
     tile, lane = wp.tid()
     if active[tile] == 0:
         return

@@ -8,7 +8,7 @@ Formulas: `engine.rasterizer.projection` and `smoothing`. With W the triangular 
     red, green, blue, slope u
     slope v, reach x, reach y
 
-with u = a dx + b dy and v = c dy. `extent` is where u^2 + v^2 ends; 0: it is not drawn.
+with u = a dx + b dy and v = c dy. `extent` is the largest u^2 + v^2 that is drawn; 0: nothing is drawn.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FAR_KEY = 0x7FFFFFFF  # sorts what is not drawn behind all else
 NEAR_PLANE, MAX_OPACITY = interface.NEAR_PLANE, interface.MAX_OPACITY
 LOG_MIN_ALPHA = math.log(interface.MIN_ALPHA)
 LEAST_QUAT, MOST_QUAT = interface.MIN_QUAT_NORM**2, 1e36  # squared lengths
-LARGE, FAR, TINY = 1e18, 1e9, 1e-30  # squares are finite; px; above zero
+LARGE, FAR, TINY = 1e18, 1e9, 1e-30  # has a finite square; px; keeps quotients finite
 # Sums over pixels that `project_backward` takes, in this order.
 G, GU, GV, GUU, GUV, GVV, RED, GREEN, BLUE, DEPTH, SEEN, LIT_U, LIT_V, SPREAD = range(14)
 
@@ -49,7 +49,7 @@ def camera_rotation(view: wp.array(dtype=float)):
 
 @wp.func
 def smoothed(scale: float, variance: float):
-    """A scale after the 3D filter, and that before as a share of it."""
+    """Return a scale after the 3D filter, and the ratio of the scale before it to that."""
     root, share = float(scale), float(1.0)
     if not variance <= 0.0:
         root = wp.sqrt(scale * scale + variance)
@@ -59,7 +59,7 @@ def smoothed(scale: float, variance: float):
 
 @wp.func
 def filtered(scales: wp.vec3, variance: float):
-    """`smoothed` of all axes, and the share of the opacity that is left."""
+    """Return `smoothed` of all axes, and the share of the opacity that the 3D filter leaves."""
     x, share_x = smoothed(scales[0], variance)
     y, share_y = smoothed(scales[1], variance)
     z, share_z = smoothed(scales[2], variance)
@@ -69,7 +69,7 @@ def filtered(scales: wp.vec3, variance: float):
 
 @wp.func
 def whitening(xx: float, xy: float, yy: float, det0: float, variance: float, compensates: int):
-    """a, b, c of a splat, and the share of the opacity that the 2D filter leaves."""
+    """Return a, b, c of a splat, and the share of the opacity that the 2D filter leaves."""
     det = det0 + variance * (xx + yy) + variance * variance
     inverse_yy = 1.0 / (yy + variance)
     along = wp.sqrt(0.5 * (yy + variance) / det)
@@ -135,7 +135,7 @@ def project(
 
 @wp.func
 def by_scale(scale: float, variance: float, by_root: float, by_share: float):
-    """Derivative by a scale, given those by `smoothed`'s results."""
+    """Return the derivative with respect to a scale, given those with respect to `smoothed`'s results."""
     found = float(by_root)
     if variance > 0.0:
         root = wp.sqrt(scale * scale + variance)
@@ -153,7 +153,7 @@ def project_backward(
     v_opacities: wp.array(dtype=float), v_colors: wp.array(dtype=wp.vec3), v_slopes: wp.array(dtype=wp.vec3),
     contribution: wp.array(dtype=float), spreads: wp.array(dtype=float),
 ):  # fmt: skip
-    """From each splat's sums over pixels to the gradients by its Gaussian; 0 where it was not drawn."""
+    """Turn each splat's sums over pixels into the gradients of its Gaussian; 0 where it was not drawn."""
     i = wp.tid()
     slots = own_slots[i]
     m = vec16()
@@ -195,7 +195,7 @@ def project_backward(
     px, py = wp.dot(V0, a), wp.dot(V1, a)
     slope_u, slope_v = 2.0 * (along * px + across * py), 2.0 * down * py
 
-    # log alpha = log opacity' - u^2 - v^2; see `engine.rasterizer.projection_backward`, 2 for its 2 ln 2.
+    # log alpha = log opacity' - u^2 - v^2; see `engine.rasterizer.projection_backward`; its 2 ln 2 is 2 here.
     x_x, x_y = 2.0 * along * m[LIT_U], 2.0 * (across * m[LIT_U] + down * m[LIT_V])
     y_x, y_y = along * slope_u, across * slope_u + down * slope_v
     luminance = m[RED] + m[GREEN] + m[BLUE]
@@ -216,7 +216,7 @@ def project_backward(
     v0 = 2.0 * (c_xx * V0 + c_xy * V1) + s_xx * W0 + s_xy * W1 + x_x * a
     v1 = 2.0 * (c_xy * V0 + c_yy * V1) + s_xy * W0 + s_yy * W1 + x_y * a
 
-    # The 3D filter; the opacity knows the two larger of its shares.
+    # The 3D filter. The opacity depends on the two larger shares only.
     by_scales = wp.cw_mul(v0, U0) + wp.cw_mul(v1, U1)
     by_slopes = x_x * V0 + x_y * V1
     v_slopes[i] = wp.cw_mul(by_slopes, kept_share)
@@ -239,7 +239,7 @@ def project_backward(
     v_opacities[i] = v_log_opacity / wp.max(opacities[i], TINY)
 
     v0, v1 = wp.cw_mul(v0, scale), wp.cw_mul(v1, scale)
-    D = wp.outer(A0, v0) + wp.outer(A1, v1)  # by the rotation
+    D = wp.outer(A0, v0) + wp.outer(A1, v1)  # gradient of the rotation
     w, x, y, z = q[0], q[1], q[2], q[3]
     turned_x, turned_y, turned_z = D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]
     with_y, with_z, of_yz = D[0, 1] + D[1, 0], D[0, 2] + D[2, 0], D[1, 2] + D[2, 1]
@@ -250,7 +250,7 @@ def project_backward(
         w * turned_z + x * with_z + y * of_yz - 2.0 * z * (D[0, 0] + D[1, 1]),
     )
     v_quats[i] = n * (v_q - wp.dot(v_q, q) * q)
-    a0, a1 = Q * v0, Q * v1  # by A0 and A1
+    a0, a1 = Q * v0, Q * v1  # gradients of A0 and A1
     v_j02, v_j12 = wp.dot(a0, R[2]), wp.dot(a1, R[2])
     v_inverse_z = fx * (wp.dot(a0, R[0]) - held_x * v_j02) + fy * (wp.dot(a1, R[1]) - held_y * v_j12)
     v_slope_x, v_slope_y = fx * v_mean_x, fy * v_mean_y

@@ -1,4 +1,4 @@
-"""Gaussians to planes and back on one of Warp's devices; nothing leaves it but the number of pairs."""
+"""Rasterisers on a Warp device. `DeviceRasterizer` copies nothing to the host but the number of pairs."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.errors import SagsError
 from sags_node.types import F32, I32, Bool, Camera, Gaussians
 
-MAX_PAIRS = 1 << 25  # 3 GiB
-SPARE = 1.25  # what is asked for beyond the need when a buffer grows
+MAX_PAIRS = 1 << 25  # they take 3 GiB
+SPARE = 1.25  # a buffer that grows gets this many times the size it needs
 KINDS: dict[str, Any] = {
     "means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": float, "colors": wp.vec3,
     "slopes": wp.vec3, "smoothing": float,
-}  # of what is drawn, by its name in `types.Gaussians`  # fmt: skip
+}  # types of the inputs, by their names in `types.Gaussians`  # fmt: skip
 DERIVED: dict[str, Any] = {
     "means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": float, "colors": wp.vec3,
     "slopes": wp.vec3, "contribution": float, "spread": float,
-}  # of `interface.Gradients`  # fmt: skip
+}  # types of the results, by their names in `interface.Gradients`  # fmt: skip
 
 
 class DeviceRasterizer:
-    """Draws and differentiates arrays of a device. Not for use by two threads at once.
+    """Draws Gaussians in arrays of a device and differentiates the drawing. Not for two threads at once.
 
     Buffers grow with the numbers of Gaussians and pairs and are never given back.
 
@@ -99,7 +99,7 @@ class DeviceRasterizer:
         return self.planes
 
     def backward(self, v_planes: wp.array, weight: wp.array) -> dict[str, wp.array]:
-        """Gradients of sum(v_planes * planes) for the last `forward`, whose tables must be unchanged.
+        """Return gradients of sum(v_planes * planes) for the last `forward`; its tables must be unchanged.
 
         Args:
             v_planes: [5, H, W] cotangent of the planes.
@@ -127,8 +127,8 @@ class DeviceRasterizer:
         return found
 
     def median(self) -> tuple[wp.array, wp.array]:
-        """Depth [H, W] m and row [H, W] of where the transmittance of the last `forward` falls to one half;
-        as `interface.Rasterizer.median`."""
+        """Return the depth [H, W] (m) at which the transmittance of the last `forward` falls to one half, and
+        the row of the Gaussian there [H, W]; as `interface.Rasterizer.median`."""
         if self._medians is None:
             shape = self.planes.shape[1:]
             self._medians = self._new(shape), self._new(shape, int)
@@ -139,7 +139,7 @@ class DeviceRasterizer:
         return self._medians
 
     def _choose(self, tiles: Bool | None) -> None:
-        """Say which of our tiles are drawn, given those of the CPU's engine."""
+        """Set which of this engine's tiles are drawn, given those of the CPU's engine."""
         self._active = self._everywhere
         if tiles is not None:
             chosen = np.repeat(np.repeat(tiles, TILE_HEIGHT // TILE, 0), TILE_WIDTH // TILE, 1)
@@ -148,7 +148,7 @@ class DeviceRasterizer:
             self._active = wp.array(flat, dtype=int, device=self.device)
 
     def _sort_by_depth(self, tables: Mapping[str, wp.array]) -> int:
-        """Splats, near to far; returns how many pairs they make."""
+        """Project the Gaussians and sort the splats, near to far. Return how many pairs they make."""
         n, counts, ends = self._count, self._counts[: self._count], self._ends[: self._count]
         self._launch(projection.project, n, [
             *(tables[name] for name in KINDS), self._view, *self._filter, self._splats, self._keys,
@@ -176,10 +176,10 @@ class DeviceRasterizer:
         ])  # fmt: skip
 
     def _hold(self, room: int) -> None:
-        """Make room for so many Gaussians."""
+        """Make room for `room` Gaussians."""
         self._room = room
         self._splats = self._new((room, projection.RECORD), wp.vec4)
-        self._keys, self._order = self._new(2 * room, int), self._new(2 * room, int)  # a sort needs twice
+        self._keys, self._order = self._new(2 * room, int), self._new(2 * room, int)  # half is for sorting
         self._counts, self._ends = self._new(room, int), self._new(room, int)
         self._own_slots = self._new(room, wp.vec2i)
         self._found = {name: self._new(room, kind) for name, kind in DERIVED.items()}
@@ -201,7 +201,7 @@ class DeviceRasterizer:
 
 
 class WarpRasterizer:
-    """`interface.Rasterizer` on a device: arrays of the host in and out, copied on every call."""
+    """An `interface.Rasterizer` on a device. It takes and gives arrays of the host, copied on every call."""
 
     def __init__(self, width: int, height: int, antialias: bool, device: wp.Device) -> None:
         """See `rasterize.make_rasterizer`."""
@@ -214,7 +214,7 @@ class WarpRasterizer:
         check_size(self._width, self._height, camera, tiles)
         gaussians, view = checked(gaussians), view_of(camera)
         given, self._centre = gaussians, tuple(map(np.float32, camera.T_world_cam[:3, 3]))
-        if gaussians.sh_rest is not None:  # the one thing that the host's kernels do
+        if gaussians.sh_rest is not None:  # the only step that runs on the host
             seen = np.empty_like(gaussians.colors)
             spherical_harmonics.color(
                 gaussians.means, gaussians.colors, gaussians.sh_rest, self._centre, seen
@@ -244,7 +244,7 @@ class WarpRasterizer:
 
 
 def sent(gaussians: Gaussians, device: wp.Device) -> dict[str, wp.array]:
-    """Return what `DeviceRasterizer.forward` takes of Gaussians, copied to the device."""
+    """Copy Gaussians to the device, as the tables that `DeviceRasterizer.forward` takes."""
     count = len(gaussians)
     absent = {"slopes": np.zeros((count, 3), np.float32), "smoothing": np.zeros(count, np.float32)}
     given = {name: getattr(gaussians, name) for name in KINDS}

@@ -1,4 +1,4 @@
-"""Warp, started: without a word on stdout, its compiled kernels beside ours."""
+"""Starts Warp without output on stdout; its compiled kernels are cached beside ours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sags_node.kernels.cache import cache_root
 if TYPE_CHECKING:
     import warp as wp
 
-QUIET = 40  # of Warp's levels: errors
+QUIET = 40  # Warp's log level for errors
 
 
 @functools.cache
@@ -23,7 +23,7 @@ def start() -> None:
     wp.config.log_level = QUIET
     wp.config.enable_cpu_blocks = True  # the CPU device runs a block's threads as the GPU does
     root = cache_root()
-    if root is not None:  # machine code: only from a folder of this user's
+    if root is not None:  # load machine code only from a folder that belongs to this user
         wp.config.kernel_cache_dir = str(root / "warp" / wp.config.version)
         Path(wp.config.kernel_cache_dir).mkdir(mode=0o700, parents=True, exist_ok=True)
     wp.init()
@@ -37,7 +37,7 @@ def driver() -> str:
 
 
 def device_named(name: str) -> wp.Device:
-    """Warp's device: "cuda", the current GPU, or "cpu", which is for tests."""
+    """Return Warp's device: "cuda", the current GPU, or "cpu", which is for tests."""
     start()
     import warp as wp
 

@@ -1,1 +1,1 @@
-"""What a drawn picture lacks, and its derivative, for the CPU."""
+"""The loss of a drawn picture, and its derivative, for the CPU."""

@@ -1,4 +1,4 @@
-"""Moving runs of pixels between whole pictures and the small scratch array that a kernel computes in.
+"""Copies runs of pixels between whole pictures and the small scratch array that a kernel computes in.
 
 A loop over many arrays does not vectorise, because LLVM would have to prove that none overlap; a loop over
 planes of one scratch array does (see `jit`). Pictures are flat here, [P] with P pixels; a run starts at pixel
@@ -14,7 +14,7 @@ from sags_node.types import F32, U8, Bool
 
 u8 = np.uint64
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-LEVEL = np.float32(1 / 255)  # of a picture's bytes
+LEVEL = np.float32(1 / 255)  # one step of a picture's bytes, which stand for 0..1
 
 PIECE = 256  # pixels that a kernel takes at a time
 PLANE = PIECE + 16  # floats; 64 bytes of padding
@@ -32,7 +32,7 @@ def load(scratch: F32, plane: Any, picture: F32, start: Any, count: int) -> None
 
 @inlined
 def load_mask(scratch: F32, plane: Any, mask: Bool, start: Any, count: int) -> None:
-    """True as 1, False as 0."""
+    """Load a mask: True as 1, False as 0."""
     for k in range(count):
         scratch[plane + u8(k)] = ONE if mask[start + u8(k)] else ZERO
 
@@ -41,7 +41,7 @@ def load_mask(scratch: F32, plane: Any, mask: Bool, start: Any, count: int) -> N
 def load_frame(
     scratch: F32, planes: F32, image: U8, tissue: Bool, depth: F32, start: Any, count: int
 ) -> None:
-    """Return what was drawn, `planes` [5, P], and what was seen: `image` [3 P] interleaved, `depth`,
+    """Load what was drawn, `planes` [5, P], and what the camera saw: `image` [3 P] interleaved, `depth`,
     `tissue`."""
     for plane in range(5):
         load(scratch, u8(plane * PLANE), planes[plane], start, count)

@@ -1,4 +1,4 @@
-"""What a drawn picture should have been: one fused pass from planes to their cotangent."""
+"""The loss of drawn planes against a frame: one fused pass from the planes to their cotangents."""
 
 from typing import Any
 
@@ -33,11 +33,11 @@ ZERO, ONE, INFINITY = f4(0.0), f4(1.0), f4(np.inf)
 COVERED = f4(0.05)  # below this coverage the normalised colour means nothing
 DEPTH_COVERED = f4(0.3)  # the same for depth
 FULL = f4(0.9)  # coverage that tissue should reach
-COVERAGE_WEIGHT = 2e-3  # of the push towards it, against the colour term
+COVERAGE_WEIGHT = 2e-3  # of the push towards that coverage, relative to the colour term
 MAX_RESIDUAL = f4(1e3)  # also rejects NaN in the picture
 
 WEIGHT = u8(FREE * PLANE)  # planes beyond those of `pieces`
-RESIDUAL, USED = TRUE_RED, TISSUE  # results stand where the inputs stood
+RESIDUAL, USED = TRUE_RED, TISSUE  # results overwrite the inputs
 SCRATCH = (FREE + 1) * PLANE  # floats per worker
 
 
@@ -158,7 +158,7 @@ def tissue_loss(
 
     Args:
         planes: [5, H, W] of `Rasterizer.forward`.
-        image: [H, W, 3] RGB; above, its bytes over 255.
+        image: [H, W, 3] RGB bytes; the formula takes them over 255.
         tissue: [H, W] True where the pixel is to be explained.
         depth: [H, W] m, 0 unknown.
         v_planes: [5, H, W] written: the gradient with respect to `planes`.

@@ -1,1 +1,1 @@
-"""Gaussians to pictures and back, for the CPU; `rasterize.make_rasterizer` is the way in to all backends."""
+"""The rasteriser for the CPU, forward and backward; `rasterize.make_rasterizer` makes one of any backend."""

@@ -1,4 +1,4 @@
-"""What a rasteriser is given: checked, and as its kernels take it."""
+"""Checks the arguments of a rasteriser and converts them to what its kernels take."""
 
 import math
 
@@ -15,8 +15,8 @@ SH_TERMS = (0, 3, 8, 15)  # spherical harmonics of degree 0 to 3 without the con
 
 
 def view_of(camera: Camera) -> F32:
-    """The camera as the rasterisers see it, [20] as in `pinhole.pack`: their first pixel has its centre at
-    (0.5, 0.5), OpenCV's at (0, 0). UsageError: it has the wrong shape, or is no pinhole."""
+    """Return the camera as the rasterisers take it, [20] as in `pinhole.pack`: their first pixel has its
+    centre at (0.5, 0.5), OpenCV's at (0, 0). UsageError: wrong shape, no pinhole, or not finite."""
     K, T = camera.K, camera.T_world_cam
     if K.shape != (3, 3) or T.shape != (4, 4):
         raise UsageError(f"a camera needs K [3, 3] and T_world_cam [4, 4], got {K.shape} and {T.shape}")
@@ -47,20 +47,20 @@ def check_size(width: int, height: int, camera: Camera, tiles: Bool | None) -> N
 
 
 def drawn(last: Gaussians | None, call: str) -> Gaussians:
-    """Return what was drawn last, before this call. UsageError: nothing."""
+    """Return the Gaussians that were drawn last. UsageError: nothing was drawn before `call`."""
     if last is None:
         raise UsageError(f"nothing was drawn yet; call forward before {call}")
     return last
 
 
 def checked_cotangents(v_planes: F32, weight: F32, width: int, height: int) -> tuple[F32, F32]:
-    """Those of `Rasterizer.backward`. UsageError: a shape is wrong."""
+    """Return the arguments of `Rasterizer.backward` as kernels take them. UsageError: a shape is wrong."""
     size = height, width
     return _as_f32(v_planes, (5, *size), "v_planes"), _as_f32(weight, size, "weight")
 
 
 def checked(gaussians: Gaussians) -> Gaussians:
-    """The same with contiguous float32 arrays that are only read. UsageError: a shape is wrong."""
+    """Return the Gaussians with contiguous, read-only float32 arrays. UsageError: a shape is wrong."""
     n = len(gaussians.means)
     return Gaussians(
         means=_as_f32(gaussians.means, (n, 3), "means"),
@@ -76,7 +76,7 @@ def checked(gaussians: Gaussians) -> Gaussians:
 
 
 def _checked_harmonics(sh_rest: F32 | None, n: int) -> F32 | None:
-    """None where there is no view dependence."""
+    """The checked `sh_rest`; None if colours do not depend on the view."""
     if sh_rest is None or sh_rest.shape == (n, 0, 3):
         return None
     if sh_rest.ndim != 3 or sh_rest.shape[1] not in SH_TERMS:
@@ -87,7 +87,7 @@ def _checked_harmonics(sh_rest: F32 | None, n: int) -> F32 | None:
 
 
 def _as_f32(array: NDArray[np.floating], shape: tuple[int, ...], name: str) -> F32:
-    """The same memory where it is float32 and contiguous already."""
+    """The array as contiguous float32; it is not copied if it is that already."""
     if array.shape != shape:
         raise UsageError(f"{name} has shape {list(array.shape)}, expected {list(shape)}")
     return read_only(array.astype(np.float32, copy=False))

@@ -36,14 +36,14 @@ ROW_SLACK = f4(0.001)  # px: rounding must not lose a row
 BLOCK = 64  # splats that are looked at in one go
 AT_ONCE = LANES // 2  # 8 px wide columns of a splat that are looked at in one go
 CHUNK = 1024  # slots that a worker reserves at a time
-AHEAD = 12  # how far ahead records are prefetched
+AHEAD = 12  # splats between prefetch and use
 DIGIT_BITS = 12
 DIGITS = 1 << DIGIT_BITS
 
 
 @inlined
 def _up(value: Any, low: int, high: int) -> Any:
-    """Rounded up to an integer, held in a range first: a far-off float does not fit an integer."""
+    """Clamp to a range, then round up: a float far outside it would not fit an integer."""
     return np.int64(round_up(min(max(value, f4(low)), f4(high))))
 
 
@@ -61,8 +61,8 @@ def _pixels(mean: Any, radius: Any, size: int) -> Any:
 
 @inlined
 def _box(splat: Any, width: int, height: int, tile_width_bits: int) -> Any:
-    """Return what a splat's box touches: the columns of tiles, first and one after the last; the first and
-    last row of pixels. No column and no row where the box lies outside."""
+    """Return what a splat's bounding box touches: the first column of tiles and one after the last; the first
+    and last row of pixels. Both ranges are empty if the box lies outside the picture."""
     x_first, x_last = _pixels(splat.mean_x, splat.reach_x, width)
     y_first, y_last = _pixels(splat.mean_y, splat.reach_y, height)
     left, right = x_first >> tile_width_bits, (x_last >> tile_width_bits) + 1
@@ -98,7 +98,7 @@ def drop_untouched(
     tile_width_bits: int,  # tiles are 2**bits px
     tile_height_bits: int,
 ) -> None:
-    """Take out what meets no active tile, before it costs more than this look at its box."""
+    """Drop the splats whose bounding box touches no active tile, before they cost more time."""
     count = splats.size
     for n in numba.prange((count + BLOCK - 1) // BLOCK):
         _drop_block(
@@ -109,9 +109,9 @@ def drop_untouched(
 
 @kernel
 def sort_by_depth(depths: F32, slots: Any, order: I32, spare_order: I32, keys: I32, spare_keys: I32) -> int:
-    """Stable radix sort: `order` begins with the indices of the `depths` [N] above 0, from near to far.
-    Returns how many those are. Positive floats sort like their bits. The others' `slots` [N] SLOTS are
-    made empty."""
+    """Write the indices of the `depths` [N] above 0 to the beginning of `order`, near to far; return how many
+    they are. A stable radix sort; positive floats sort like their bits. The `slots` [N] SLOTS of the others
+    are made empty."""
     bits = depths.view(np.int32)
     kept = 0
     smallest, largest = np.int32(0x7FFFFFFF), np.int32(0)
@@ -153,13 +153,13 @@ def sort_by_depth(depths: F32, slots: Any, order: I32, spare_order: I32, keys: I
 
 @inlined
 def _find_rows(splat: Any, box: Any, height: int, tile_width_bits: int, rows: I32, n: int) -> Any:
-    """Find which rows of the picture a splat touches in each 8 px wide column of its box. Returns where those
-    of the next splat may stand.
+    """Find which rows of the picture a splat touches in each 8 px wide column of its box. Return the place in
+    `rows` for the next splat.
 
-    Turned by half a turn, the splat's upper end is its lower end. So one half of a vector's lanes look for
-    the lower ends in AT_ONCE columns, the other half for the upper ends in the same columns. From `n` on
-    `rows` holds for as many columns one after the last row of each, and then their first rows, with a minus
-    sign; their sum is the number of rows, or not above 0.
+    Rotated by 180 degrees, the splat's upper end is its lower end. So half of a vector's lanes find the lower
+    ends in AT_ONCE columns, and the other half the upper ends in the same columns. For each AT_ONCE columns,
+    `rows` holds one after the last row of each, then the first row of each, negated. The sum of the two is
+    the number of rows; there is none if it is not above 0.
     """
     left, right, y_first, y_last = box
     # The ellipse u^2 + v^2 = extent lies over any dx between dy = -shear dx +- chord sqrt(reach_x^2 - dx^2)
@@ -191,8 +191,8 @@ def _emit_parts(
     splats: Any, order: I32, active: Bool, width: int, height: int, tile_width_bits: int,
     tile_height_bits: int, emitted: Any, slots: Any, runs: Any, reserved: I64, histogram: I32, next_part: I64,
 ) -> None:  # fmt: skip
-    """First all of a block's rows, then its pairs: with both in one loop the processor would wait for every
-    square root before it knows where to go on."""
+    """Find the rows of all splats of a block first, then write their pairs. In a single loop the processor
+    would wait for every square root before it knows the next branch."""
     tile_height = 1 << tile_height_bits
     tiles_x = (width + (1 << tile_width_bits) - 1) >> tile_width_bits
     boxes = np.empty((BLOCK, 2), np.int32)
@@ -221,7 +221,7 @@ def _emit_parts(
                 boxes[position - begin, 1] = right
                 needed += (right - left) * ((y_last >> tile_height_bits) - (y_first >> tile_height_bits) + 1)
             if slot + needed > limit:
-                # where a worker's slots lie depends on who comes first; what becomes of them does not
+                # which slots a worker gets depends on the timing; the result does not
                 limit = needed if needed > CHUNK else CHUNK
                 slot = take(reserved, limit)
                 limit += slot
@@ -279,11 +279,11 @@ def emit_pairs(
     tile_height_bits: int,
     workers: int,
     emitted: Any,  # EMITTED, written, with gaps
-    slots: Any,  # [N] SLOTS, written for what is drawn: where a splat's pairs stand
-    runs: Any,  # [ceil(N / BLOCK)] SLOTS, written: where the pairs of a block of the order stand
-    reserved: I64,  # [1] written: how many of `emitted` are needed; if that is more than it has, call again
+    slots: Any,  # [N] SLOTS, written for what is drawn: the slots of a splat's pairs
+    runs: Any,  # [ceil(N / BLOCK)] SLOTS, written: the slots of the pairs of a block of the order
+    reserved: I64,  # [1] written: records needed in `emitted`; if it has fewer, call again with a larger one
     histogram: I32,  # [parts, tiles] pairs per tile of each part of the order, written
-    next_part: I64,  # [1] for the workers
+    next_part: I64,  # [1] shared counter of the workers
 ) -> None:
     """Find the tiles and rows that each splat touches."""
     reserved[0] = 0
@@ -322,12 +322,12 @@ def sort_into_tiles(
     size: int,  # of the order
     emitted: Any,  # EMITTED, of `emit_pairs`, as the next two
     runs: Any,
-    histogram: I32,  # used up
+    histogram: I32,  # overwritten
     pairs: Any,  # PAIR, written: tile after tile, near to far within each
     tile_starts: I32,  # [tiles + 1] written
-    next_part: I64,  # [1] for the workers
+    next_part: I64,  # [1] shared counter of the workers
 ) -> None:
-    """Stable counting sort: the result does not depend on the number of parts."""
+    """Sort the pairs by tile. A stable counting sort: the result does not depend on the number of parts."""
     parts, tiles = histogram.shape
     total = np.int32(0)
     for tile in range(tiles):

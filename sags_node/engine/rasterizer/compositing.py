@@ -11,9 +11,9 @@ T <= 1e-4.
 
 A tile is two columns of blocks (see `vectors`); a pair says which rows of each column its splat touches. With
 d = pixel - mean2d a block's u = a dx + b dy and v = c dy (see `layout`) follow from those of the block above
-by adding a constant. The scratch of a worker holds a tile block by block, and of each block its planes.
+by adding a constant. The scratch of a worker holds a tile block by block, and each block plane by plane.
 
-`median` uses the constants and helpers of this file. Tile sizes stand here only.
+`median` uses the constants and helpers of this file. Tile sizes are defined here only.
 """
 
 from typing import Any
@@ -60,8 +60,8 @@ BLOCKS = TILE_HEIGHT // BLOCK_HEIGHT  # in a column
 
 # Planes of a block in the scratch
 TRANSMITTANCE, RED, GREEN, BLUE, DEPTH, COVERAGE, REMAINING, WEIGHT, LUMINANCE = (k * LANES for k in range(9))
-DRAWN = 5 * LANES  # floats from one block to the next when drawing, which needs the first five,
-DERIVED = 9 * LANES  # and for the derivative; eight would be 512 bytes, which share few cache sets
+DRAWN = 5 * LANES  # floats from one block to the next in the forward pass, which needs the first five planes
+DERIVED = 9 * LANES  # the same in the backward pass; blocks 512 bytes apart would share few cache sets
 SCRATCH = COLUMNS * BLOCKS * DERIVED  # floats per worker
 
 ZERO, HALF, ONE = f4(0.0), f4(0.5), f4(1.0)
@@ -76,7 +76,7 @@ ROUNDING = f4(1.5 * 2**23)  # a float32 this large has no place for fractions: a
 
 @inlined
 def alpha_of(exponent: Any) -> Any:
-    """2**exponent, and 0 where that is below 1/255; of a vector."""
+    """Return 2**exponent of a vector; 0 where that is below 1/255."""
     rounded = exponent + ROUNDING
     x = exponent - (rounded - ROUNDING)
     power = times_power_of_two((((x * P4 + P3) * x + P2) * x + P1) * x + P0, rounded)
@@ -85,15 +85,15 @@ def alpha_of(exponent: Any) -> Any:
 
 @inlined
 def whitened(a: Any, b: Any, c: Any, dx: Any, dy: Any) -> Any:
-    """a dx, u and v; rounded alike in every kernel, or one would cut a splat at a pixel where another draws
-    it."""
+    """Return a dx, u and v. All kernels must round them alike, or one would cut off a splat at a pixel where
+    another draws it."""
     along = dx * a
     return along, multiply_add(dy, b, along), dy * c
 
 
 @inlined
 def place_of(t: int, width: int, height: int) -> Any:
-    """First pixel and size of a tile."""
+    """Return a tile's first column and row in the picture, and its numbers of columns and rows, px."""
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     x0, y0 = t % tiles_x * TILE_WIDTH, t // tiles_x * TILE_HEIGHT
     return x0, y0, min(TILE_WIDTH, width - x0), min(TILE_HEIGHT, height - y0)
@@ -107,14 +107,14 @@ def is_whole(columns: int, rows: int) -> bool:
 
 @inlined
 def place_in_scratch(x: int, y: int, stride: int) -> int:
-    """The place of a pixel of the tile, in the first plane."""
+    """The index of a tile's pixel in the first plane of the scratch."""
     block = x // BLOCK_WIDTH * BLOCKS + y // BLOCK_HEIGHT
     return block * stride + y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH
 
 
 @inlined
 def open_tile(tile: F32, stride: int, columns: int, rows: int) -> None:
-    """Transmittance 1 inside the picture, 0 outside: pixels outside neither draw nor keep a tile open."""
+    """Set the transmittance to 1 inside the picture, 0 outside: pixels outside do not keep a tile open."""
     for block in range(COLUMNS * BLOCKS):
         store(tile, block * stride + TRANSMITTANCE, spread(ONE))
     if not is_whole(columns, rows):
@@ -168,7 +168,7 @@ def _composite_tiles(
         p, end = tile_starts[t], tile_starts[t + 1]
         row_to_come, until_test = 0, TEST_EVERY
         while p < end:
-            if row_to_come < rows:  # what is written in the end, row by row
+            if row_to_come < rows:  # prefetch the rows that are written at the end
                 for k in range(5):
                     prefetch_write(planes, start + k * area + row_to_come * width)
                 row_to_come += 1
@@ -221,7 +221,7 @@ def composite(
     pairs: Any,  # PAIR
     tile_starts: I32,  # [tiles + 1]
     drawn: I32,  # the tiles to draw
-    next_tile: I64,  # [1] for the workers
+    next_tile: I64,  # [1] shared counter of the workers
     scratch: F32,  # [workers, SCRATCH]
     width: int,
     height: int,
@@ -240,8 +240,8 @@ def _read_tile(
     tile: F32, planes: F32, v_planes: F32, weight: F32, start: int, width: int, area: int, columns: int,
     rows: int,
 ) -> Any:  # fmt: skip
-    """Fill the scratch: cotangents, what remains to be seen of them, weights. Whether any of it is not 0; NaN
-    is not."""
+    """Fill the scratch with the cotangents, R before the first splat, and the weights. Return whether any
+    cotangent or weight is not 0; NaN counts as not 0."""
     if is_whole(columns, rows):
         asked = spread(ZERO) != ZERO
         for block in range(COLUMNS * BLOCKS):
@@ -282,7 +282,7 @@ def _read_tile(
 def _prefetch_row(
     planes: F32, v_planes: F32, weight: F32, place: Any, y: int, width: int, height: int
 ) -> None:
-    """One row of what `_read_tile` reads of a tile."""
+    """Prefetch one row of what `_read_tile` reads of a tile."""
     x0, y0, _, rows = place
     if y < rows:
         pixel = (y0 + y) * width + x0
@@ -360,7 +360,7 @@ def _composite_tiles_backward(
                     w_depth += w * v_depth
                     counted = w * load(tile, at + WEIGHT)
                     w_weight += counted
-                    # not counted (u u + v v): alpha would then be rounded otherwise than where it is drawn
+                    # not counted * (u * u + v * v): the compiler would then round alpha unlike `composite`
                     w_spread += counted * u * u
                     w_spread += counted * v * v
                     lit = w * v_luminance
@@ -388,7 +388,7 @@ def _composite_tiles_backward(
                     w_u, w_v, w_spread,
                 ),
             )  # fmt: skip
-        for p in range(end, tile_starts[t + 1]):  # hidden behind a finished tile, or nothing is asked of it
+        for p in range(end, tile_starts[t + 1]):  # hidden in a finished tile, or all cotangents are 0
             for part in range(0, RECORD, LANES):
                 store(v_pairs, pairs[p].slot * RECORD + part, spread(ZERO))
 

@@ -1,8 +1,8 @@
 """The confidence of a drawn depth, from the predicted errors of what was drawn.
 
 The errors are averaged on a coarse grid, weighted by what each Gaussian covers of the surface that is drawn.
-Where a frame measures another depth than is drawn, the difference is an error of at least that size: surfaces
-that were left behind can be drawn together with new ones.
+Where a frame measures another depth than is drawn, the error is at least the difference: outdated surfaces
+can be drawn together with new ones.
 """
 
 from dataclasses import replace
@@ -19,17 +19,17 @@ from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.types import F32, DepthGrid, Gaussians, RenderedView
 
 CELLS = 80  # across the picture
-SHARES = 4  # of the Gaussians, each added up by itself
-ENOUGH = 3  # Gaussians in a cell, on the average: of more not all are looked at
+SHARES = 4  # parts of the Gaussians that are summed in parallel
+ENOUGH = 3  # Gaussians per cell on average; with more, only every n-th is used
 
 
 def with_confidence(
     view: RenderedView, gaussians: Gaussians, measured: DepthGrid | None = None
 ) -> RenderedView:
-    """The view of these Gaussians with its confidence; a depth below `LEAST` is taken out, in place.
+    """Return the view of these Gaussians with its confidence. Depths below `LEAST` are set to 0, in place.
 
     Args:
-        measured: what is known of the depth in the same frame, in cells of the same size.
+        measured: the depth that was measured in the same frame, in cells of the same size.
     """
     if gaussians.depth_errors is None:
         return view
@@ -56,7 +56,7 @@ def with_confidence(
 
 
 def doubted(view: RenderedView, error: float) -> RenderedView:
-    """The view when its depth may be wrong by so much more, m; what falls below `LEAST` is taken out."""
+    """Lower the confidence as for a depth error `error` m larger; below `LEAST`, it and depth become 0."""
     if view.confidence is None:
         return view
     confidence = view.confidence * np.float32(2 ** (-error / HALVING))
@@ -85,8 +85,8 @@ def _add_up_rows(
     means: F32, scales: F32, opacities: F32, errors: F32, cam: Any, depth: F32, per_px: Any, every: int,
     sums: F32, first: Any, end: Any,
 ) -> None:  # fmt: skip
-    """Add up for each cell, what the Gaussians in it cover of the drawn surface, and that times the squared
-    error."""
+    """Add up, for each cell, the area of the drawn surface that its Gaussians cover, and that area times the
+    squared error."""
     height, width = depth.shape
     half = np.float32(0.5)
     for i in range(first, end, every):
@@ -109,8 +109,8 @@ def _add_up_rows(
 def _average(
     sums: F32, halving: Any, depth: F32, side: int, inverse: F32, error: F32, confidence: F32
 ) -> None:
-    """Over each cell and, by half, its neighbours; no less than what it differs from what is measured in it
-    (`inverse` and `error` of a `DepthGrid`, or empty)."""
+    """Average the error over each cell and its neighbours (1 2 1 along rows and columns). It is at least the
+    difference from the depth measured there (`inverse` and `error` of a `DepthGrid`, or empty)."""
     shares, _, rows, columns = sums.shape
     height, width = depth.shape[0] - 1, depth.shape[1] - 1
     half = np.float32(0.5)
@@ -139,7 +139,7 @@ def _average(
 
 @kernel
 def _difference(drawn: Any, inverse: Any, error: Any) -> Any:
-    """By how much a drawn depth differs from a measured one beyond the error of that, m."""
+    """The difference between a drawn and a measured depth, less the measured one's error, m."""
     if not (drawn > 0 and inverse > 0):
         return np.float32(0)
     measured = np.float32(1) / inverse
@@ -161,7 +161,7 @@ def _state(wide: F32, per_px: Any, least: Any, depth: F32, confidence: F32) -> N
 
 @kernel
 def _state_row(wide: F32, per_px: Any, least: Any, row: Any, depth: F32, confidence: F32) -> None:
-    """Confidence between two rows of cells, where it and a depth are stated; elsewhere both are 0."""
+    """Interpolate the confidence of a row of pixels. Below `least`, or without a depth, both become 0."""
     zero, half = np.float32(0), np.float32(0.5)
     v = min(max((np.float32(row) + half) * per_px - half, zero), np.float32(len(wide) - 1))
     before = int(v)

@@ -25,8 +25,8 @@ from sags_node.kernels.vectors import RECORD
 from sags_node.types import F32, I32, Bool, Camera, Gaussians
 
 MAX_PAIRS = 1 << 25  # 2 GiB of gradients
-PARTS = 4  # of the splats, for each worker
-SPARE = 1.25  # what is asked for beyond the need when a buffer grows
+PARTS = 4  # parts of the splats per worker
+SPARE = 1.25  # a buffer that grows gets this many times the size it needs
 Records = NDArray[Any]  # of a structured type of `layout`
 
 
@@ -100,7 +100,7 @@ class CpuRasterizer:
         return self._planes
 
     def _project(self, gaussians: Gaussians, splats: Records) -> None:
-        """The 3D filter, the colours for the camera's place, the projection."""
+        """Apply the 3D filter, compute the colours seen from the camera, and project."""
         n = len(gaussians)
         slopes = self._no_slopes[:n] if gaussians.slopes is None else gaussians.slopes
         self._unfiltered = self._filtered = gaussians.scales, gaussians.opacities, slopes
@@ -121,7 +121,7 @@ class CpuRasterizer:
         )  # fmt: skip
 
     def _bin(self, splats: Records, tiles: Bool | None) -> None:
-        """Lists of splats, near to far, for the tiles to draw."""
+        """Make the lists of splats, near to far, of the tiles to draw."""
         depths, slots = self._depths[: len(splats)], self._slots[: len(splats)]
         active, self._drawn = self._all_active, self._all_drawn
         if tiles is not None:
@@ -177,7 +177,7 @@ class CpuRasterizer:
         return self._project_backward(given)
 
     def _project_backward(self, given: Gaussians) -> Gradients:
-        """From gradients of pairs to those of Gaussians."""
+        """Turn the gradients of pairs into those of Gaussians."""
         n, terms = len(given), 0 if given.sh_rest is None else given.sh_rest.shape[1]
         if n > len(self._v_sh_rest) or terms != self._v_sh_rest.shape[1]:
             self._v_sh_rest = aligned((len(self._splats), terms, 3))
@@ -212,11 +212,11 @@ class CpuRasterizer:
 
     @property
     def _work(self) -> tuple[Any, Any, Any, Any, Any]:
-        """What the workers share that go from tile to tile."""
+        """The arguments common to all kernels whose workers take tile after tile."""
         return self._drawn, self._next, self._scratch, self._width, self._height
 
     def _blended(self, given: Gaussians) -> tuple[Any, Any, Any, Any]:
-        """What was blended of them, tile by tile."""
+        """The splats and pairs that the last `forward` blended, and where each tile's pairs begin and end."""
         return self._splats[: len(given)], self._pairs, self._tile_starts, self._tile_ends
 
 

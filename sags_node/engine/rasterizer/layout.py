@@ -1,4 +1,4 @@
-"""Records that the CPU kernels hand to each other. Each fills one or a quarter of a 64-byte cache line."""
+"""Records that the CPU kernels pass to each other. A splat or its gradient fills a 64-byte cache line."""
 
 import numpy as np
 
@@ -19,10 +19,10 @@ SPLAT = np.dtype(
             "green",
             "blue",
             "depth",  # m
-            # The ellipse on which u^2 + v^2 = extent reaches so far from the mean, px,
+            # Half the width and half the height of the ellipse u^2 + v^2 = extent, px
             "reach_x",
             "reach_y",
-            "lowest_x",  # and reaches the largest dy at this dx
+            "lowest_x",  # px; the ellipse has its largest dy at this dx
             "slope_u",  # luminance at a pixel: that of the colour + slope_u u + slope_v v
             "slope_v",
         ],
@@ -38,16 +38,16 @@ PAIR = np.dtype(
         "names": [
             "splat",
             "slot",  # where this pair's gradient goes: pairs of one splat are neighbours there
-            "begin",  # first row that the splat touches in each column, from the tile's first,
-            "end",  # and one after the last; not above the first: none
-            "rows",  # both at once, to be copied
+            "begin",  # first row that the splat touches in each column, counted from the tile's first
+            "end",  # one after the last row; not above `begin`: no row is touched
+            "rows",  # `begin` and `end` as one number, for fast copies
         ],
         "formats": ["i4", "i4", ("u1", COLUMNS), ("u1", COLUMNS), "i4"],
         "offsets": [0, 4, 8, 10, 8],
     }
 )
 
-# A pair before it is sorted into its tile; it stands at its slot.
+# A pair before it is sorted into its tile, stored at its slot.
 EMITTED = np.dtype(
     {
         "names": ["splat", "tile", "begin", "end", "rows"],
@@ -56,7 +56,7 @@ EMITTED = np.dtype(
     }
 )
 
-# The slots of one splat's pairs, or of those of a block of splats.
+# The slots of the pairs of one splat, or of a block of splats.
 SLOTS = np.dtype([("first", "i4"), ("count", "i4")])
 
 # Sums over pixels of g = dL/d(log alpha): moments in the whitened coordinates u, v of the Gaussian.

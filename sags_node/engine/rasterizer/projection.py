@@ -4,11 +4,11 @@
     opacity' = opacity sqrt(det cov0 / det cov)               (Mip-Splatting, Yu et al. 2024)
 
 or, for comparison, with the dilation of 3D Gaussian Splatting (Kerbl et al. 2023): cov = cov0 + 0.3 px^2 I
-and opacity' = opacity. `screen_filter` says which: the variance, and 1 where the opacity makes up for it,
+and opacity' = opacity. `screen_filter` says which: the variance, and 1 if the opacity is reduced as above,
 else 0.
 
 det cov0 is the sum of the squared 2x2 minors of V (Cauchy-Binet): no cancellation for flat Gaussians. J is
-taken at x/z, y/z held within the widened frustum, as Mip-Splatting and gsplat do.
+evaluated at x/z, y/z clamped to the widened frustum, as Mip-Splatting and gsplat do.
 
 The kernel takes Gaussians in blocks: it copies their parameters into planes of a small scratch array, works
 on LANES of them at a time, one in each lane of a vector, and copies the finished records out.
@@ -61,7 +61,7 @@ ZERO, HALF, ONE, TWO = f4(0.0), f4(0.5), f4(1.0), f4(2.0)
 MAX_COORDINATE = f4(1e9)  # px; a comparison with it also rejects NaN and infinity
 MAX_VALUE = f4(1e18)  # its square is still finite
 TWO_LN2 = f4(2.0 * math.log(2.0))
-WHITEN2 = f4(0.5 / math.log(2.0))  # exponents of base e and 1/2 to base 2
+WHITEN2 = f4(0.5 / math.log(2.0))  # exp(-q / 2) = 2**(-WHITEN2 q)
 # log2 m = 2 / ln 2 artanh s with s = (m - 1) / (m + 1); for |s| <= 0.172 these terms of its series suffice
 L1, L3, L5, L7, L9 = (f4(2.0 / math.log(2.0) / k) for k in (1, 3, 5, 7, 9))
 
@@ -70,7 +70,7 @@ Row = tuple[Any, ...]
 
 @inlined
 def unpack(view: F32) -> Row:
-    """Pose, intrinsics and limits of a camera of `pinhole.pack`: tuples travel in registers."""
+    """Return pose, intrinsics and limits of a camera of `pinhole.pack` as tuples, which stay in registers."""
     pose = (
         view[0], view[1], view[2], view[3], view[4], view[5], view[6], view[7], view[8],
         view[9], view[10], view[11],
@@ -80,7 +80,7 @@ def unpack(view: F32) -> Row:
 
 @inlined
 def rotation(w: Any, x: Any, y: Any, z: Any) -> Row:
-    """Rows of the rotation matrix of a unit quaternion."""
+    """Return the rotation matrix of a unit quaternion, row by row."""
     return (
         ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
         TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
@@ -90,7 +90,7 @@ def rotation(w: Any, x: Any, y: Any, z: Any) -> Row:
 
 @inlined
 def screen_axes(R: Row, j00: Any, j02: Any, j11: Any, j12: Any) -> Row:
-    """J R_cam [2, 3]: how a small step in the world moves the picture."""
+    """Return J R_cam [2, 3]: how a small step in the world moves a point in the picture."""
     return (
         j00 * R[0] + j02 * R[6], j00 * R[1] + j02 * R[7], j00 * R[2] + j02 * R[8],
         j11 * R[3] + j12 * R[6], j11 * R[4] + j12 * R[7], j11 * R[5] + j12 * R[8],
@@ -99,7 +99,7 @@ def screen_axes(R: Row, j00: Any, j02: Any, j11: Any, j12: Any) -> Row:
 
 @inlined
 def times_rotation(A: Row, Q: Row) -> Row:
-    """A [2, 3] Q [3, 3]."""
+    """Return A [2, 3] Q [3, 3]."""
     return (
         A[0] * Q[0] + A[1] * Q[3] + A[2] * Q[6],
         A[0] * Q[1] + A[1] * Q[4] + A[2] * Q[7],
@@ -117,7 +117,7 @@ def scale_axes(U: Row, sx: Any, sy: Any, sz: Any) -> Row:
 
 @inlined
 def covariance(V: Row) -> Row:
-    """xx, xy, yy of V V^T, its determinant, and the minors of V that give it."""
+    """Return xx, xy, yy of V V^T, its determinant, and the minors of V that give it."""
     xx = V[0] * V[0] + V[1] * V[1] + V[2] * V[2]
     xy = V[0] * V[3] + V[1] * V[4] + V[2] * V[5]
     yy = V[3] * V[3] + V[4] * V[4] + V[5] * V[5]
@@ -129,8 +129,8 @@ def covariance(V: Row) -> Row:
 
 @inlined
 def whitening(xx: Any, xy: Any, yy: Any, det0: Any, screen_filter: Row) -> Row:
-    """Triangular factor (xx, xy, yy) of the conic of the filtered covariance, for exponents of base 2; and
-    the share of the opacity that the filter leaves."""
+    """Return the triangular factor (xx, xy, yy) of the filtered covariance's conic, for exponents of base 2,
+    and the share of the opacity that the filter leaves."""
     variance, compensates = screen_filter
     det = det0 + variance * (xx + yy) + variance * variance
     filtered_yy = yy + variance
@@ -147,7 +147,7 @@ def clamp(value: Any, low: Any, high: Any) -> Any:
 
 @inlined
 def unit_quaternion(w: Any, x: Any, y: Any, z: Any) -> Row:
-    """The same with length 1, what it was divided by, and whether it has a direction."""
+    """Return the quaternion with length 1, one over its former length, and whether it has a direction."""
     norm2 = w * w + x * x + y * y + z * z
     has_direction = (norm2 > MIN_QUAT_NORM2) & (norm2 < MAX_QUAT_NORM2)
     n = ONE / square_roots(select(has_direction, norm2, ONE))
@@ -165,7 +165,7 @@ def log2_of(x: Any) -> Any:
 
 @inlined
 def ellipse(a: Any, b: Any, c: Any, extent: Any) -> Row:
-    """How far a splat reaches: three fields of its record."""
+    """Return reach_x, reach_y and lowest_x of a splat's record (`layout`)."""
     inverse_a = ONE / a
     reach_y = square_roots(extent) / c
     reach_x = square_roots(extent * (b * b + c * c)) * inverse_a / c
@@ -174,14 +174,14 @@ def ellipse(a: Any, b: Any, c: Any, extent: Any) -> Row:
 
 @inlined
 def times_axes(V: Row, ax: Any, ay: Any, az: Any) -> Row:
-    """V [2, 3] a [3]."""
+    """Return V [2, 3] a [3]."""
     return V[0] * ax + V[1] * ay + V[2] * az, V[3] * ax + V[4] * ay + V[5] * az
 
 
 @inlined
 def screen_slopes(W: Row, px: Any, py: Any) -> Row:
-    """Slopes of the luminance along u and v, of V a = (px, py): see `types.Gaussians.slopes`. With
-    C = 2 ln 2 W^T W the conic, a V^T C d = (2 ln 2 W V a) . (W d)."""
+    """Return the slopes of the luminance along u and v, given V a = (px, py): see `types.Gaussians.slopes`.
+    With C = 2 ln 2 W^T W the conic, a V^T C d = (2 ln 2 W V a) . (W d)."""
     along, across, down = W
     return TWO_LN2 * (along * px + across * py), TWO_LN2 * down * py
 
@@ -291,7 +291,7 @@ def project(
     view: F32,  # [20] of `pinhole.pack`
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
-    next_block: I64,  # [1] for the workers
+    next_block: I64,  # [1] shared counter of the workers
     splats: F32,  # [16 N] written: SPLAT records
     depths: F32,  # [N] written; 0 where not drawn
 ) -> None:

@@ -1,4 +1,4 @@
-"""The derivative of the projection (`projection`) by every parameter, from the gradients of pairs, which are
+"""The derivative of the projection (`projection`) with respect to every parameter. The gradients of pairs are
 summed first."""
 
 from typing import Any
@@ -78,8 +78,8 @@ V_RED, CONTRIBUTION, SPREAD = (
 
 @inlined
 def _sum_pairs(S: F32, slots: Any, v_pairs: F32, first: int, filled: int) -> Any:
-    """Write each splat's sum over its pairs, in the order of their slots, to the block's records. Whether any
-    is drawn."""
+    """Write each splat's sum over its pairs, in the order of their slots, to the block's records. Return
+    whether any splat is drawn."""
     any_drawn = False
     for lane in range(filled):
         soon = slots[min(first + lane + AHEAD, slots.size - 1)].first * RECORD
@@ -268,7 +268,7 @@ def project_backward(
     view: F32,  # [20] of `pinhole.pack`
     screen_filter: Row,
     scratch: F32,  # [workers, SCRATCH]
-    next_block: I64,  # [1] for the workers
+    next_block: I64,  # [1] shared counter of the workers
     slots: Any,  # [N] SLOTS
     v_pairs: F32,  # [16 slots] of `composite_backward`
     v_colors: F32,  # [N 3] written, as what follows: 0 where not drawn
@@ -280,7 +280,7 @@ def project_backward(
     v_opacities: F32,
     v_slopes: F32,
 ) -> None:
-    """From gradients of pairs to those of Gaussians."""
+    """Turn the gradients of pairs into those of Gaussians."""
     next_block[0] = 0
     for worker in numba.prange(scratch.shape[0]):
         _blocks_backward(

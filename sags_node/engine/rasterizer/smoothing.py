@@ -7,11 +7,11 @@ A Gaussian with a filter of variance f is drawn as one with covariance R S S^T R
 
 A slope is the change of luminance for each standard deviation: blurring makes it gentler. The product runs
 over the two larger axes. Mip-Splatting takes all three, which makes surfaces transparent: a flat Gaussian is
-thinner than any sampling interval, but light that falls on it face on does not meet its thickness, and its
-alpha, as it is drawn, does not depend on it either. With three axes an online model of 75,000 Gaussians lost
-1.3 dB, with two 0.1 dB; the gain at other sizes is the same (`benchmarks alias`).
+thinner than any sampling interval, but seen face on its alpha does not depend on its thickness. With three
+axes an online model of 75,000 Gaussians lost 1.3 dB, with two 0.1 dB; the gain at other sizes is the same
+(`benchmarks alias`).
 
-It does not depend on the camera, so it is applied once per drawing, before the projection. f is a constant.
+The filter does not depend on the camera: it is applied once per drawing, before the projection. f is fixed.
 """
 
 from dataclasses import replace
@@ -29,8 +29,8 @@ ZERO, ONE = f4(0.0), f4(1.0)
 
 
 def bake_filter(gaussians: Gaussians) -> Gaussians:
-    """The same picture without a filter still to be applied, for whoever does not know it: viewers, files,
-    messages. Scales and opacities are fresh arrays where there was one."""
+    """Return Gaussians that give the same picture without `smoothing`, for viewers, files and messages that
+    do not know that filter. Scales and opacities are new arrays if there was a filter."""
     if gaussians.smoothing is None:
         return gaussians
     count = len(gaussians)
@@ -96,18 +96,18 @@ def smooth_backward(
     opacities: F32,  # [N]
     smoothing: F32,  # [N] m^2
     slopes: F32,  # [N, 3]
-    v_scales: F32,  # [N, 3] of the smoothed scales; made that of the given ones
+    v_scales: F32,  # [N, 3] gradient of the smoothed scales, replaced by that of the given ones
     v_opacities: F32,  # [N] likewise
     v_slopes: F32,  # [N, 3] likewise
 ) -> None:
-    """With r = scale / scale': d scale' / d scale = r, and d opacity' / d scale = opacity f / scale'^3 times
-    the other large r, which stays finite for a scale of 0; it is 0 for the smallest axis."""
+    """Differentiate `smooth`. With r = scale / scale': d scale' / d scale = r, d opacity' / d scale = opacity
+    f / scale'^3 times the other large r. This is finite for a scale of 0, and 0 for the smallest axis."""
     for i in numba.prange(opacities.size):
         j = u8(i)
         f = smoothing[j]
         v_opacity = v_opacities[j]
         v_a, v_b, v_c = v_scales[j, u8(0)], v_scales[j, u8(1)], v_scales[j, u8(2)]
-        # 0 for all that was not drawn, whatever its scales: 0 * NaN is not 0
+        # what was not drawn keeps its gradient of 0, whatever its scales: 0 * NaN is not 0
         if f > ZERO and abs(v_opacity) + abs(v_a) + abs(v_b) + abs(v_c) > ZERO:
             a = _root(scales[j, u8(0)], f)
             b = _root(scales[j, u8(1)], f)

@@ -1,8 +1,8 @@
-"""Colour that depends on where one looks from (real spherical harmonics, degree 1 to 3), and its derivative.
+"""View-dependent colour (real spherical harmonics, degree 1 to 3), and its derivative.
 
     color = colors + sum over k of sh_rest_k Y_k(direction)      direction = unit(mean - camera centre), world
 
-Basis, signs and order are those of 3D Gaussian Splatting (Kerbl et al. 2023), so files of others can be read;
+Basis, signs and order are those of 3D Gaussian Splatting (Kerbl et al. 2023), as in other programs' files;
 `colors` holds the whole constant part (there: 0.5 + 0.282 sh_0). The colour is not clamped: it stays linear
 in `colors` and `sh_rest`, and one that leaves 0..1 still has a gradient that leads back.
 """

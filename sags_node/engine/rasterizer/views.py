@@ -17,12 +17,12 @@ SOLID = f4(0.4)  # coverage from which on a depth is stated; below it a pixel of
 
 
 def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> RenderedView:
-    """The picture that `planes` [5, h, w] of `Rasterizer.forward` show, in fresh arrays of the camera's size.
+    """Return the picture that `planes` [5, h, w] of `Rasterizer.forward` show, in new arrays of camera size.
 
-    rgb = C / alpha held in 0..1, 0 where alpha < 0.001; depth = D / alpha (m) where alpha >= 0.4, or where it
-    is at all and all four pixels beside it have that, else 0.
-    Planes of another size than the camera's are interpolated: depths, before they are divided, by straight
-    lines, which invent no depth beyond those around; colours as bytes, when somebody asks for them.
+    rgb = C / alpha clamped to 0..1, 0 where alpha <= 0.001. depth = D / alpha (m) where alpha >= 0.4, or
+    where alpha > 0.001 and all four neighbours have alpha >= 0.4; else 0.
+    Planes of another size than the camera's are interpolated: D and alpha linearly, before the division, so
+    no depth lies beyond those around it; colours as bytes, when they are asked for.
     """
     height, width = camera.height, camera.width
     colours = np.empty((*planes.shape[1:], 3), np.uint8)
@@ -38,7 +38,7 @@ def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> Re
 
 
 def colours_of(planes: F32) -> F32:
-    """RGB [H, W, 3] 0..1 that `planes` [5, H, W] show, where bytes are too coarse; as `to_view`."""
+    """Return the RGB [H, W, 3] 0..1 that `planes` [5, H, W] show, as `to_view` but not rounded to bytes."""
     with np.errstate(divide="ignore", invalid="ignore"):
         found = np.where(planes[4] > FAINT, planes[:3] / planes[4], ZERO)
     return np.ascontiguousarray(np.clip(found, ZERO, ONE).transpose(1, 2, 0))
@@ -88,7 +88,7 @@ def _write_depths_row(sums: F32, coverage: F32, depth: F32, alpha: F32) -> None:
 
 @kernel
 def _fill_holes_row(sums: F32, above: F32, coverage: F32, below: F32, depth: F32) -> None:
-    """States the depth of pixels between Gaussians that hardly touch each other: a new model has many."""
+    """Fill in the depth of single pixels between Gaussians that hardly touch; new models have many."""
     for i in range(1, sums.size - 1):
         x = u8(i)
         if FAINT < coverage[x] < SOLID:
