@@ -179,7 +179,7 @@ def bench_ablation(
     Fits a recording, by default the built-in phantom, with and without the self-adaptive decoder (an MLP of
     its size in its place), the alias-free filters and the online start, and with each choice of tokens, each
     from several seeds. Measures every eighth frame and the last three, from which nothing is learnt, training
-    frames, and smaller pictures. Takes some fifteen minutes for each seed.
+    frames, and smaller images. Takes some fifteen minutes for each seed.
 
     \b
     python -m benchmarks ablation launch/d4d_pull.yaml --out benchmarks/results/ablation_d4d.json

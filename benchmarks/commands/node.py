@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     help="Figures of sags fit, for the session they name. Default: benchmarks/results/fit_*.json.",
 )
 @figures_option
-@file_option("--plot", metavar="FILE.png", help="Draw the picture's quality over the time of a frame.")
+@file_option("--plot", metavar="FILE.png", help="Draw the image's quality over the time of a frame.")
 @force_option
 @as_json
 def bench_pareto(
@@ -71,8 +71,8 @@ def bench_pareto(
 
     Plays recordings, by default the built-in phantom, with other time budgets, working sizes and numbers of
     Gaussians than their launch files say, and with each rule that skips work on and off. Settings that no
-    other beats in both time and picture are marked. Beside them: the previous picture shown again, the left
-    picture warped into the right eye, stereo alone, and the offline fit.
+    other beats in both time and image are marked. Beside them: the previous image shown again, the left
+    image warped into the right eye, stereo alone, and the offline fit.
 
     A smaller working size is measured at that size, and once more at the launch file's, for which its
     Gaussians are drawn there: the figure to compare. Takes three to five seconds per frame.
@@ -250,9 +250,9 @@ def bench_scope(launch: tuple[str, ...], motions: tuple[Motion, ...], seconds: f
     """How accurate the pose of a moving scope stays.
 
     The phantom's scope sways, zooms and orbits over breathing, pulled tissue, at 10 Hz. Its pose is given,
-    estimated from the pictures, given by a robot that is off by some mm and a degree, and refined from that;
+    estimated from the images, given by a robot that is off by some mm and a degree, and refined from that;
     beside them a camera that takes the scene for rigid, and the pose that fits true points best. Errors of
-    the path, drift over whole breaths, pictures and depth. Takes some minutes for each motion.
+    the path, drift over whole breaths, images and depth. Takes some minutes for each motion.
 
     \b
     python -m benchmarks scope --motion orbit source.width:=320 source.height:=256
@@ -320,9 +320,9 @@ def bench_bridges(launch: tuple[str, ...], seconds: float) -> Measured:
 @shown("--frames", type=click.IntRange(1), default=150, help="Of each transport.")
 @as_json
 def bench_transport(frames: int, json_out: bool) -> None:
-    """What sending a picture costs.
+    """What sending an image costs.
 
-    A 4 MB picture goes to another process over ipc, tcp, and tcp with encryption. Milliseconds from the send
+    A 4 MB image goes to another process over ipc, tcp, and tcp with encryption. Milliseconds from the send
     call to the arrival, at 30 frames per second. Takes 20 seconds.
     """
     from benchmarks.node.transport import measure_transport
@@ -337,9 +337,9 @@ def bench_transport(frames: int, json_out: bool) -> None:
 @shown("--frames", type=click.IntRange(1), default=60, help="To measure.")
 @measures
 def bench_thin(launch: tuple[str, ...], frames: int) -> Measured:
-    """What thin pictures cost.
+    """What thin images cost.
 
-    Plays a recording, by default the built-in phantom, and makes each kind of thin picture of every frame
+    Plays a recording, by default the built-in phantom, and makes each kind of thin image of every frame
     (docs/wire.md). CPU time to make and to decode one, its size, and what it takes of a link at 30 Hz.
 
     \b
@@ -361,9 +361,9 @@ def bench_thin(launch: tuple[str, ...], frames: int) -> Measured:
 def bench_inputs(seconds: float, only: str | None) -> Measured:
     """What a live pair costs until the mapper has it.
 
-    Two pictures of 1280x1024 px, 30 times a second, by each way into the node (docs/inputs.md). CPU time of a
+    Two images of 1280x1024 px, 30 times a second, by each way into the node (docs/inputs.md). CPU time of a
     pair in the node and in the process that sends, and the time from the stamp until the pair is there. The
-    sender also makes the pictures.
+    sender also makes the images.
 
     \b
     python -m benchmarks inputs --out benchmarks/results/inputs.json

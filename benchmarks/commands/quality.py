@@ -49,9 +49,7 @@ FAULT_FRAMES = 4
     help="A depth network to compare as well.",
 )
 @figures_option
-@file_option(
-    "--picture", metavar="FILE.jpg", help="With --ct: draw the left picture, the depth and its error."
-)
+@file_option("--picture", metavar="FILE.jpg", help="With --ct: draw the left image, the depth and its error.")
 @force_option
 @as_json
 def bench_depth(
@@ -226,7 +224,7 @@ def bench_instruments(seeds: int) -> Measured:
     """How accurate the tips, axes, distances and confidence of the topic `instruments` are.
 
     Instruments are put before the phantom, 5 to 40 mm from the tissue: one, two, crossing, and leaving the
-    picture. They are compared with the mask's far end, at the tissue's depth there, and at the depth that
+    image. They are compared with the mask's far end, at the tissue's depth there, and at the depth that
     the node's stereo finds on the instrument.
 
     \b
@@ -280,18 +278,18 @@ def bench_disturbances(
     force: bool,
     json_out: bool,
 ) -> None:
-    """What bad pictures do to the node.
+    """What bad images do to the node.
 
     Plays a recording with both eyes, by default the built-in phantom, once for each disturbance, frame by
-    frame with one step of the mapper: undisturbed, disturbed for a second, undisturbed again. The picture is
+    frame with one step of the mapper: undisturbed, disturbed for a second, undisturbed again. The image is
     compared with what the tissue really looked like at that time; published depth with the recording's
     reference; anchors, pinned before, with true surface points, or with where the undisturbed run has them.
-    Tells when the node warns and stops, how soon the picture is as before, how many models were made anew.
+    Tells when the node warns and stops, how soon the image is as before, how many models were made anew.
     Instruments are found, not given (vision.tissue.method:=session gives them).
 
     \b
     smoke         fills the space, drifts, is sucked off; thicker before what is far
-    blood         covers half the picture and is sucked off
+    blood         covers half the image and is sucked off
     fog_right, fog_left, drops      on one lens, on both
     black_right, frozen_right, frozen (both), late_right (3 frames), knocked, swapped, equal
     dark, flicker, flash, blur      the lamp, the exposure, a spark, a shaken scope

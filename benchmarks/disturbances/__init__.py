@@ -1,4 +1,4 @@
-"""What goes wrong in an operating room, applied to the pictures of any recording for some time.
+"""What goes wrong in an operating room, applied to the images of any recording for some time.
 
 Imports phantom.
 """

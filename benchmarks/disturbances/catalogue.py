@@ -61,7 +61,7 @@ DISTURBANCES = {
 class Taken(NamedTuple):
     """One frame of a disturbed stream."""
 
-    clean: StereoFrame  # as it was taken: the true picture of that time
+    clean: StereoFrame  # as it was taken: the true image of that time
     given: StereoFrame | None  # as it arrives; None: it is lost
 
 

@@ -20,8 +20,8 @@ DROPS = 7  # on each lens
 DROP_RADII = 0.05, 0.12  # of the width
 DROP_BLUR = 0.012  # of the width
 DROP_TURNS = 1.6  # 1: the middle of a drop shows one place; more: it shows the scene upside down
-DROP_RIM = 0.25  # of the radius, over which it fades into the picture
-SHAKE = 0.025  # of the width: how far the picture moves while it is exposed
+DROP_RIM = 0.25  # of the radius, over which it fades into the image
+SHAKE = 0.025  # of the width: how far the image moves while it is exposed
 SHAKE_TURN = 0.9  # rad, of its direction, from frame to frame
 
 
@@ -76,7 +76,7 @@ def _through_drops(picture: U8, eye: int) -> U8:
 
 @cache
 def _lenses(shape: tuple[int, int], eye: int) -> tuple[F32, F32, F32]:
-    """The place x, y [H, W] in the picture that each pixel shows through the drops on a lens, and the drops'
+    """The place x, y [H, W] in the image that each pixel shows through the drops on a lens, and the drops'
     share of the pixel [H, W] 0..1. A drop is a thick lens: it shrinks the scene and turns it upside down."""
     height, width = shape
     random = np.random.default_rng([SEED, eye])

@@ -16,12 +16,12 @@ _LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(GAMMA)
 
 
 def to_linear(picture: U8) -> F32:
-    """Return the linear light [H, W, 3] 0..1 of a picture."""
+    """Return the linear light [H, W, 3] 0..1 of an image."""
     return np.asarray(cv2.LUT(picture, _LINEAR), np.float32)
 
 
 def to_display(linear: F32, random: np.random.Generator | None = None) -> U8:
-    """Return the picture [H, W, 3] of linear light; what is brighter than 1 is white. `random` adds the grain
+    """Return the image [H, W, 3] of linear light; what is brighter than 1 is white. `random` adds the grain
     of a camera, which stays where something veils the scene."""
     shown = np.asarray(cv2.pow(np.clip(linear, 0, 1), 1 / GAMMA)) * np.float32(255)
     if random is not None:

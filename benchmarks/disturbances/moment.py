@@ -29,7 +29,7 @@ class Moment:
 
     @property
     def right(self) -> U8:
-        """The right picture [H, W, 3] as it was taken."""
+        """The right image [H, W, 3] as it was taken."""
         return right_of(self.frame)
 
     def earlier(self, frames: int) -> StereoFrame:
@@ -47,11 +47,11 @@ class Moment:
         return np.random.default_rng([SEED, self.frame.frame_id, eye])
 
     def both(self, change: Callable[[U8, int], U8]) -> StereoFrame:
-        """Return the frame with both pictures changed; `change` is given the picture and its eye, 0 or 1."""
+        """Return the frame with both images changed; `change` is given the image and its eye, 0 or 1."""
         return replace(self.frame, left=change(self.frame.left, 0), right=change(self.right, 1))
 
 
 def right_of(frame: StereoFrame) -> U8:
-    """Return the right picture; a stream is only disturbed if it has one."""
+    """Return the right image; a stream is only disturbed if it has one."""
     assert frame.right is not None
     return frame.right

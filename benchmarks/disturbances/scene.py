@@ -14,7 +14,7 @@ SEARCHES = 8  # iterations that find the right eye's depth; each at least halves
 
 
 class Scene:
-    """The depths of a recording, as the raw pictures of a rig see them.
+    """The depths of a recording, as the raw images of a rig see them.
 
     Attributes:
         rig: its calibration.
@@ -25,7 +25,7 @@ class Scene:
     def __init__(self, rig: StereoRig, references: Mapping[int, F32]) -> None:
         """
         Args:
-            references: number of a frame -> depth [H, W] of the left rectified picture, m, 0 unknown. Between
+            references: number of a frame -> depth [H, W] of the left rectified image, m, 0 unknown. Between
                 the frames that have one it is interpolated; without any all lies at `NOMINAL_DEPTH`.
         """
         self.rig = rig
@@ -53,7 +53,7 @@ class Scene:
         return seen
 
     def rectified_left(self, picture: F32) -> F32:
-        """Rectify a raw left picture [H, W] at the calibration's size; 0 beyond its edges."""
+        """Rectify a raw left image [H, W] at the calibration's size; 0 beyond its edges."""
         eye = self.rig.left
         x, y = cv2.initUndistortRectifyMap(
             eye.K, eye.distortion, eye.R, eye.P[:, :3], (eye.width, eye.height), cv2.CV_32FC1
@@ -71,7 +71,7 @@ class Scene:
         return self._mirrors
 
     def _rectified(self, frame_id: int) -> F32:
-        """Depth [H, W] of the left rectified picture."""
+        """Depth [H, W] of the left rectified image."""
         if not self._frames:
             return np.full((self.rig.left.height, self.rig.left.width), np.float32(NOMINAL_DEPTH))
         after = int(np.searchsorted(self._frames, frame_id))

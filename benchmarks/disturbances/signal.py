@@ -26,14 +26,14 @@ def black_right(moment: Moment) -> StereoFrame:
 
 
 def frozen_right(moment: Moment) -> StereoFrame:
-    """The right eye shows the last picture from before it began, again and again."""
+    """The right eye shows the last image from before it began, again and again."""
     return replace(moment.frame, right=moment.earlier(moment.index + 1).right)
 
 
 def frozen(moment: Moment) -> StereoFrame:
-    """A live feed shows the last pictures from before it began, again and again, in both eyes."""
+    """A live feed shows the last images from before it began, again and again, in both eyes."""
     last = moment.earlier(moment.index + 1)
-    arrival_ns = moment.frame.t_capture_ns  # as a camera's pictures have one, and a recording's have not
+    arrival_ns = moment.frame.t_capture_ns  # as a camera's images have one, and a recording's have not
     return replace(moment.frame, left=last.left, right=last.right, t_arrival_ns=arrival_ns)
 
 

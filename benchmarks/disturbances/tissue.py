@@ -17,7 +17,7 @@ FARTHEST = 95  # percentile of the depths
 CLOUD_TEXEL = 0.3e-3  # m
 CLOUD_SPREAD = 0.45  # how much the smoke's density differs (standard deviation), see `phantom.camera`
 CLOUD_DRIFT = np.array([55.0, -35.0])  # texels per second
-BLOOD_COVERS = 0.5  # of the picture
+BLOOD_COVERS = 0.5  # of the image
 BLOOD_FINGERS = 0.07  # of the height, how far its front is from straight (standard deviation)
 BLOOD_FILM = 0.03  # of the height, behind the front, over which it grows thick
 BLOOD_ABSORBS = np.array([1.5, 6.0, 6.5], np.float32)  # of red, green and blue light, where it is thick
@@ -48,7 +48,7 @@ def smoke(moment: Moment) -> StereoFrame:
 
 
 def blood(moment: Moment) -> StereoFrame:
-    """Blood comes from below until it covers half the picture, and is sucked off. It lies on the surface of
+    """Blood comes from below until it covers half the image, and is sucked off. It lies on the surface of
     the tissue, hides its texture, and lets red light through where it is thin. It does not cover instruments
     that the session has masks for."""
     frame = moment.frame

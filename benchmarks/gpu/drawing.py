@@ -76,7 +76,7 @@ def measure_drawing(count: int, width: int, height: int, runs: int) -> Row:
 
 
 def _gsplat(gaussians: Gaussians, camera: Camera, runs: int) -> Row:
-    """The same times of gsplat (V. Ye et al., JMLR 2025), whose antialiased mode draws the same picture."""
+    """The same times of gsplat (V. Ye et al., JMLR 2025), whose antialiased mode draws the same image."""
     import gsplat
     import torch
 

@@ -139,7 +139,7 @@ def measure_adam(count: int, of: int, columns: int, threads: int, runs: int, pea
 def measure_losses(
     count: int, width: int, height: int, threads: int, runs: int, peak: Peak
 ) -> dict[str, Any]:
-    """Measure one row of the table: losses of a drawn surface against a darker picture of itself. The calling
+    """Measure one row of the table: losses of a drawn surface against a darker image of itself. The calling
     thread must be set to `threads`, the threads of `peak`."""
     gaussians, camera = surface(count, width, height)
     planes = make_rasterizer("numba", width, height).forward(gaussians, camera)

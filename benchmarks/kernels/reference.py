@@ -1,6 +1,6 @@
 """The readable twin of the CPU kernels in torch: the same formulas in any precision, gradients by autograd.
 
-Slow: seconds per picture. The tests compare every rasteriser with it; read it to know what kernels compute.
+Slow: seconds per image. The tests compare every rasteriser with it; read it to know what kernels compute.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ if TYPE_CHECKING:  # torch takes seconds to import; only who draws with this bac
     from torch import Tensor
 
 T = TypeVar("T", bound=np.generic)
-TILE = 64  # px; pictures are blended tile by tile to bound memory
+TILE = 64  # px; images are blended tile by tile to bound memory
 
 
 class ReferenceRasterizer:
-    """`interface.Rasterizer` in float64, for pictures of any size."""
+    """`interface.Rasterizer` in float64, for images of any size."""
 
     def __init__(self, antialias: bool = True) -> None:
         self._antialias = antialias
@@ -101,7 +101,7 @@ class Splats:
     covariance: Tensor  # [S, 2, 2] px^2, after the 2D Mip filter
     opacity: Tensor  # [S] after the filters, above 1/255
     features: Tensor  # [S, 5] r, g, b, z (m), 1
-    gradient: Tensor  # [S, 2] of the luminance in the picture, 1/px
+    gradient: Tensor  # [S, 2] of the luminance in the image, 1/px
     rows: Tensor  # [S] which Gaussian this is
 
 

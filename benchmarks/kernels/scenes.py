@@ -11,7 +11,7 @@ from sags_node.types import Camera, Gaussians
 
 
 def surface(count: int, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """Make about `count` Gaussians on a regular grid of a wavy depth picture, 40 to 90 mm away: each pixel
+    """Make about `count` Gaussians on a regular grid of a wavy depth image, 40 to 90 mm away: each pixel
     sees about twenty, whatever their number."""
     rng = np.random.default_rng(0)
     stride = math.sqrt(width * height / count)
@@ -46,14 +46,14 @@ def surface(count: int, width: int, height: int) -> tuple[Gaussians, Camera]:
 
 
 def corner(count: int, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """The surface drawn into a quarter of the width and height at the top left; the rest of the picture is
+    """The surface drawn into a quarter of the width and height at the top left; the rest of the image is
     empty. All work is in few tiles."""
     gaussians, camera = surface(count, width // 4, height // 4)
     return gaussians, Camera(width, height, camera.K, camera.T_world_cam)
 
 
 def shuffled(count: int, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """The surface, stored in random order: neighbours in the picture are not neighbours in memory."""
+    """The surface, stored in random order: neighbours in the image are not neighbours in memory."""
     gaussians, camera = surface(count, width, height)
     order = np.random.default_rng(0).permutation(len(gaussians))
     return Gaussians(

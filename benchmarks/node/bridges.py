@@ -108,7 +108,7 @@ def measure_bridges(launch: Sequence[str], seconds: float, advance: Advance) -> 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
     """Make the table; `rows` as `measure_bridges` returns them."""
     made = Table(
-        "bridge", "pictures, Hz", "MB/s", "age p50, p90, ms", "CPU ms a frame", "node: Hz", "p50, p99, ms"
+        "bridge", "images, Hz", "MB/s", "age p50, p90, ms", "CPU ms a frame", "node: Hz", "p50, p99, ms"
     )
     peer = (
         "{pictures_hz:.1f}",

@@ -46,7 +46,7 @@ def measure_crowd(launch: Sequence[str], alone: float, crowded: float, many: int
     """Measure a node in its own process: with a quiet observer alone, with a reader of everything, with a
     crowd, and alone again. The reader makes the node compute and send all; the rest is the crowd's cost.
 
-    The crowd: a fast subscriber that takes every picture and depth; a slow one that takes `SLOW` seconds for
+    The crowd: a fast subscriber that takes every image and depth; a slow one that takes `SLOW` seconds for
     each; a dead one that is connected to everything and never reads; and `many` more that listen to `SMALL`.
     They stand for other machines, and so take only what the node leaves of the cores.
 
@@ -152,7 +152,7 @@ def is_over(ending: Event) -> bool:
 
 
 def _take(folder: Path, seconds: float, ending: Event, there: Connection) -> None:
-    """Take picture and depth of the newest frame again and again, and sleep for `seconds` after each."""
+    """Take image and depth of the newest frame again and again, and sleep for `seconds` after each."""
     since_capture, since_sent = [], []
     with Subscriber(PICTURES, run_dir=folder) as subscriber:
         newest = subscriber.wait(PICTURES[0], timeout=STARTING)

@@ -30,7 +30,7 @@ from sags_node.types import U8, StereoFrame
 
 Order = Literal["there-and-back", "wrap", "walk"]
 
-MOST_BYTES = 4_000_000_000  # of pictures kept in memory
+MOST_BYTES = 4_000_000_000  # of images kept in memory
 TURN = 0.05  # chance per frame that a walk goes the other way
 WATCHED = FrameRequest(left=True, right=True)  # somebody looks at both eyes
 STILL_FRAMES = 100

@@ -64,9 +64,9 @@ def neighbours() -> dict[str, Beside | None]:
 def _played(
     launch: str | None, overrides: Sequence[str], run_dir: Path, cores: int | None, read: bool = True
 ) -> Row:
-    """One run, seen from outside; pictures are compared at the full working size."""
+    """One run, seen from outside; images are compared at the full working size."""
     played = ["source.loop:=false", "source.pace:=realtime", "mapping.iterations:=null", f"ns:={NS}"]
-    alone = "publish.detail:=false"  # the model is looked at, not the camera's pictures
+    alone = "publish.detail:=false"  # the model is looked at, not the camera's images
     forced = [*OWN_PORTS, *played, alone, f"publish.run_dir:={run_dir}"]
     session = open_session(launch, [*overrides, *forced])
     warm_up(session.config)

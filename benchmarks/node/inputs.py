@@ -26,14 +26,14 @@ WARM_UP_S = 1.0  # from the first pair on
 SILENT_S = 30.0  # a source may give nothing for so long
 
 Opener = Callable[[], AbstractContextManager[Source]]  # of a live source of that size and rate
-Send = Callable[[U8, int], object]  # a picture as both eyes', and its stamp (ns)
+Send = Callable[[U8, int], object]  # an image as both eyes', and its stamp (ns)
 
 
 # ---- GStreamer -------------------------------------------------------------------------------------------
 
 
 def _camera(height: int) -> str:
-    """A black test picture, which costs nothing; a moving one takes 18 ms of a core: too slow."""
+    """A black test image, which costs nothing; a moving one takes 18 ms of a core: too slow."""
     return (
         "videotestsrc is-live=true pattern=black "
         f"! video/x-raw,format=UYVY,width={WIDTH},height={height},framerate={RATE}/1"
@@ -80,7 +80,7 @@ def _publishing(domain: int, *names: str) -> None:
 
 
 def _send_always(send: Send) -> None:
-    """Send the same picture at the camera's rate, stamped just before, until the parent process ends."""
+    """Send the same image at the camera's rate, stamped just before, until the parent process ends."""
     picture: U8 = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     due = time.monotonic()
     while parent_lives():
@@ -103,9 +103,9 @@ WAYS: dict[str, Opener] = {
 def measure_inputs(
     seconds: float, only: str | None, progress: Callable[[int, int], None]
 ) -> list[dict[str, Any]]:
-    """Measure a row for each way: `way`, `pairs`, `unequal` (pairs of unequal stamps), `dropped` (pictures
+    """Measure a row for each way: `way`, `pairs`, `unequal` (pairs of unequal stamps), `dropped` (images
     lost or without a partner); `node_ms`, the CPU time of a pair in the node's process; `sender_ms`, that of
-    the process that makes, converts and sends the pictures; `latency_ms_p50` and `_p99` from the stamp until
+    the process that makes, converts and sends the images; `latency_ms_p50` and `_p99` from the stamp until
     the pair is there.
 
     Args:

@@ -40,14 +40,14 @@ from sags_node.quality.metrics import psnr
 from sags_node.tools.evaluation.provenance import machine_name
 
 EACH_FRAME = "tf"  # the smallest topic that is sent with every frame
-HIGH_WATER = 1000  # frames that may wait while a picture is compared
+HIGH_WATER = 1000  # frames that may wait while an image is compared
 SHOWN = TopicName("left/render/image", ReceivedImage)
 TRUTH = TopicName("left/image_rect_color", ReceivedImage)
 TISSUE = TopicName("left/tissue_mask", ReceivedImage)
 TAKEN = (SHOWN, "left/render/depth")  # by each subscriber
 RECORDED = ("left/image_rect_color", SHOWN, "anchors", EACH_FRAME, "status")
 WARM_UP = 10.0  # s before frames count
-COMPARED = 3  # pictures of each window
+COMPARED = 3  # images of each window
 SUBSCRIBERS = 3
 NO_VISITS = {"visits": 0, "pictures": 0}
 STAY, AWAY = (2.0, 20.0), (1.0, 5.0)  # s that a subscriber stays and is away: least and most
@@ -74,7 +74,7 @@ class Window:
     frames_per_s: float  # published
     latency_p50_ms: float
     latency_p99_ms: float
-    psnr: float  # dB over tissue, median of the pictures that were compared; NaN: none
+    psnr: float  # dB over tissue, median of the images that were compared; NaN: none
     rss_mb: float  # of the node at its end
     descriptors: int  # likewise
     threads: int  # likewise
@@ -187,7 +187,7 @@ def _frames(run_dir: Path, node: subprocess.Popen[bytes], heard: _Heard) -> Iter
 
 
 def _compared(run_dir: Path) -> float:
-    """PSNR (dB) over tissue of the picture now shown; NaN if no complete frame came."""
+    """PSNR (dB) over tissue of the image now shown; NaN if no complete frame came."""
     names = (SHOWN, TRUTH, TISSUE)
     with Subscriber(names, run_dir=run_dir) as subscriber:
         newest = subscriber.wait(SHOWN, timeout=1.0)
@@ -239,7 +239,7 @@ def _overall(heard: _Heard) -> dict[str, Any]:
 
 
 def _visit(run_dir: Path, _: float, ending: Event, there: Connection) -> None:
-    """Run subscribers that come, take pictures for a while, and leave; count visits and pictures."""
+    """Run subscribers that come, take images for a while, and leave; count visits and images."""
     counted = [NO_VISITS.copy() for _ in range(SUBSCRIBERS)]
     working = [
         threading.Thread(target=_come_and_go, args=(run_dir, ending, random.Random(seed), counts))
@@ -380,7 +380,7 @@ def statement(measured: Mapping[str, Any]) -> str:
     )
     visits, recordings = measured["visits"], measured["recordings"]
     lines.append(
-        f"{visits['visits']} visits of subscribers took {visits['pictures']} pictures; "
+        f"{visits['visits']} visits of subscribers took {visits['pictures']} images; "
         f"{recordings['recordings']} recordings, {recordings['failed']} failed, of "
         f"{recordings['messages']} messages {recordings['dropped']} dropped and {recordings['lost']} lost"
     )

@@ -1,4 +1,4 @@
-"""`benchmarks thin`: what thin pictures cost to make and to read, and what they take of a link."""
+"""`benchmarks thin`: what thin images cost to make and to read, and what they take of a link."""
 
 import time
 from collections.abc import Callable
@@ -29,7 +29,7 @@ NAMES = tuple(
 def measure_thin(
     session: Session, frames: int, advance: Callable[[int, int | None, str], None]
 ) -> list[dict[str, Any]]:
-    """Measure a row for each thin picture: CPU time to make and to decode it, and its size, mean of `frames`.
+    """Measure a row for each thin image: CPU time to make and to decode it, and its size, mean of `frames`.
 
     Raises:
         SagsError: the recording is too short.

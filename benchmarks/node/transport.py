@@ -1,4 +1,4 @@
-"""`benchmarks transport`: what it costs to send one picture to another process."""
+"""`benchmarks transport`: what it costs to send one image to another process."""
 
 import multiprocessing
 import tempfile

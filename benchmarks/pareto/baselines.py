@@ -1,4 +1,4 @@
-"""What the online mapper is compared with: the picture before, a warp by stereo, stereo alone, a fit."""
+"""What the online mapper is compared with: the image before, a warp by stereo, stereo alone, a fit."""
 
 import json
 import time
@@ -37,13 +37,13 @@ def measured_baselines(
     Args:
         session: what was run.
         run: what the run showed.
-        size: of the run's pictures, width and height, px.
+        size: of the run's images, width and height, px.
 
     Returns:
         A row for each baseline; none for a recording without a right eye.
 
     Raises:
-        UsageError: the pictures are too small to match at `SGBM_SCALES`.
+        UsageError: the images are too small to match at `SGBM_SCALES`.
         SagsError: the recording cannot be read again.
     """
     config = session.config
@@ -88,7 +88,7 @@ def measured_baselines(
 
     return [
         {
-            "name": "left picture, warped by stereo",
+            "name": "left image, warped by stereo",
             **figures(warped, "novel"),
             "coverage": round(float(np.mean(covered)), 4),
         },
@@ -105,7 +105,7 @@ def measured_baselines(
 
 
 def baselines_of_run(run: Row) -> list[Row]:
-    """Return the baselines that a run's figures contain: the picture before, and its own stereo stage."""
+    """Return the baselines that a run's figures contain: the image before, and its own stereo stage."""
     rows = []
     if run["predict"] is not None:
         predict = dict(run["predict"])
@@ -113,7 +113,7 @@ def baselines_of_run(run: Row) -> list[Row]:
         for name, figures in predict.items():
             if isinstance(figures, Mapping):
                 copied[name] = {"psnr": figures["copy_psnr"]}
-        rows.append({"name": "the picture before, shown again", "predict": copied})
+        rows.append({"name": "the image before, shown again", "predict": copied})
     if run["stage_ms"]["depth"] is not None:
         times_ms = {"p50": run["stage_ms"]["depth"]}
         rows.append({"name": "the stereo stage alone", "frame_ms": times_ms, "depth": run["measured_depth"]})

@@ -96,7 +96,7 @@ def why_default(rows: Sequence[Row], period_ms: float) -> str:
         return f"{default['name']} is the default, though it takes {ms:.1f} of {camera}"
     best = max((row for row in rows if _place(row)[0] <= period_ms), key=lambda row: _place(row)[1])
     if best is default:
-        return f"{default['name']} is the default: the best picture of all that stay within {camera}"
+        return f"{default['name']} is the default: the best image of all that stay within {camera}"
     gain = _place(best)[1] - psnr
     return (
         f"{default['name']} is the default and stays within {camera}; so does {best['name']}, {gain:+.2f} dB"
@@ -215,7 +215,7 @@ def _middle(runs: Sequence[Row]) -> Row:
 
 
 def _effect(on: Row, off: Row) -> Row:
-    """What a rule changes: dB of the picture, mm of depth error, and the ms of a mean frame that it saves."""
+    """What a rule changes: dB of the image, mm of depth error, and the ms of a mean frame that it saves."""
 
     def change(group: str, key: str) -> float | None:
         before, after = ((run[group] or {}).get(key) for run in (off, on))
@@ -235,7 +235,7 @@ def online_at(
     size: tuple[int, int], session: Session, run: Run, options: MeasureOptions, progress: Progress
 ) -> dict[str, Any]:
     """Return the figures `online` of a finished run, with its Gaussians drawn at `size` (width, height, px)
-    and compared with pictures of that size.
+    and compared with images of that size.
 
     Raises:
         SagsError: the recording cannot be read again.

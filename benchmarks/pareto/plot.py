@@ -1,4 +1,4 @@
-"""Draws what a frame's time buys, as a PNG: picture, depth and points of each recording."""
+"""Draws what a frame's time buys, as a PNG: image, depth and points of each recording."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawn
 
-WIDTH, HEIGHT, SMALL = 1100, 520, 260  # px: a panel's width and height; height of panels without pictures
+WIDTH, HEIGHT, SMALL = 1100, 520, 260  # px: a panel's width and height; height of panels without images
 BESIDE, LETTER, LINE = 11, 6, 12  # px: from a point to its name; width of a letter; height of a line
 COLOURS = {
     "default": "#1e1e1e",

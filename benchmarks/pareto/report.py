@@ -45,7 +45,7 @@ def _settings(session: Row) -> Table:
         _add(made, row, segments, "")
     made.add_section()
     parts = f"; dB: all / {' / '.join(segments)}" if segments else ""
-    stars = f"* no other setting is better in both, time and picture at full size{parts}"
+    stars = f"* no other setting is better in both, time and image at full size{parts}"
     made.caption = f"{stars}\n{session['why_default']}"
     return made
 
@@ -66,7 +66,7 @@ def _hosts(session: Row) -> Table:
         shown = _decibels(row, "online_at_full_size", segments)
         cells = "{name}", share, first, *TIMES, "{size[0]}x{size[1]}", shown, "{gaussians[mean]:,.0f}"
         filled(made, [row], *cells, unknown="–")
-        if "unread" in row:  # by its own account: nobody saw a picture
+        if "unread" in row:  # by its own account: nobody saw an image
             cells = "alone, nobody reads", "-", "-", *TIMES, "-", "-", "{gaussians:,.0f}"
             filled(made, [row["unread"]], *cells, unknown="–")
     return made

@@ -1,1 +1,1 @@
-"""How accurate pictures, depth, masks and poses are, regardless of time."""
+"""How accurate images, depth, masks and poses are, regardless of time."""

@@ -3,7 +3,7 @@
 Every variant is fitted to the same training frames with as many iterations, from several seeds, and
 measured on the same frames that it never saw: every eighth, and the last ones of the recording, for which it
 must look ahead. Training frames are measured, too: they tell overfitting from what was not learnt. So are
-pictures of half and a quarter of the size, for which the filters are made.
+images of half and a quarter of the size, for which the filters are made.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -35,7 +35,7 @@ from sags_node.tools.fitting.settings import ONLINE, PAPER, FitSettings, with_ch
 from sags_node.types import Bool
 
 AHEAD = 3  # last frames, not used for training
-SMALLER = {"half": 2, "quarter": 4}  # what a picture's sides are divided by
+SMALLER = {"half": 2, "quarter": 4}  # what an image's sides are divided by
 
 _PAPER = replace(PAPER, max_gaussians=30_000)
 _ONLINE = replace(ONLINE, max_gaussians=30_000)
@@ -168,7 +168,7 @@ def _measured(
 
 
 def _smaller(fit: Fit, frames: Iterable[ClipFrame], factor: int) -> float:
-    """Mean PSNR, dB, over tissue of pictures with sides divided by `factor`. A pixel's truth is the mean of
+    """Mean PSNR, dB, over tissue of images with sides divided by `factor`. A pixel's truth is the mean of
     the pixels that it stands for."""
     found = []
     for frame in frames:

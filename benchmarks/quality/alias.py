@@ -1,4 +1,4 @@
-"""Does the picture stay right at another size, or from another distance, than it was trained at?
+"""Does the image stay right at another size, or from another distance, than it was trained at?
 
 That is what both filters of Mip-Splatting (Yu et al., CVPR 2024) are for; at the trained size they bring
 nothing. Four models of one instant of the phantom are trained by the mapper, each with its own choice of
@@ -31,7 +31,7 @@ from sags_node.tools.evaluation.provenance import machine_name
 from sags_node.tools.evaluation.receipt import Receipt
 from sags_node.types import F32, U8, Camera, Gaussians, Observation, StereoFrame
 
-CROPS = {0.25: (0.45, 0.45, 0.4), 4.0: (0.62, 0.6, 0.1)}  # size -> left, top, side: shares of the picture
+CROPS = {0.25: (0.45, 0.45, 0.4), 4.0: (0.62, 0.6, 0.1)}  # size -> left, top, side: shares of the image
 PANEL = (400, 320)  # px
 
 SIZES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -44,7 +44,7 @@ STEPS_PER_ROUND = 50  # between two looks for holes
 class Settings:
     """What is measured."""
 
-    width: int = 640  # px, size of the training picture
+    width: int = 640  # px, size of the training image
     height: int = 512
     max_gaussians: int = 30_000
     rounds: int = 6  # of STEPS_PER_ROUND
@@ -78,13 +78,13 @@ class Trained:
     antialias: bool
 
     def draw(self, camera: Camera) -> F32:
-        """Draw the picture [H, W, 3]."""
+        """Draw the image [H, W, 3]."""
         rasterizer = make_rasterizer("numba", camera.width, camera.height, self.antialias)
         return colours_of(rasterizer.forward(self.gaussians, camera))
 
 
 def train(observation: Observation, filters: Filters, settings: Settings) -> Trained:
-    """Train a model on one still picture with the node's own mapper."""
+    """Train a model on one still image with the node's own mapper."""
     refiner = CpuRefiner(partial(make_rasterizer, "numba", antialias=filters.screen))
     mapper = Mapper(refiner, TissueMap(settings.max_gaussians), filters.world, focus=1.0)
     mapped = mapper.update(observation, None, StepBudget(STEPS_PER_ROUND))  # places the Gaussians
@@ -164,7 +164,7 @@ def _brightness(image: F32, weight: F32) -> float:
 
 def _flicker(models: Mapping[str, Trained], truth: AliasTruth, frames: int) -> dict[str, Any]:
     """Energy of the pixels' second differences in time over a slow motion, as multiples of the truth's. Of
-    the picture 1 is right, less is blurred and more flickers; of its error 0 is right."""
+    the image 1 is right, less is blurred and more flickers; of its error 0 is right."""
     shots = list(truth.drift(DRIFT_SIZE, DRIFT_STEP, frames))
     counted = np.logical_and.reduce([shot.counted for shot in shots])
     true = np.stack([shot.image[counted] for shot in shots])
@@ -197,10 +197,10 @@ def _requested_view(model: Trained, truth: AliasTruth) -> list[dict[str, Any]]:
 
 def tables(measured: Mapping[str, Any]) -> Iterator[Table]:
     """Make the tables; `measured` as `measure_alias` returns it."""
-    yield _by_factor("PSNR, dB, at a picture size of", measured["psnr_at_size"], ".2f")
+    yield _by_factor("PSNR, dB, at an image size of", measured["psnr_at_size"], ".2f")
     yield _by_factor("PSNR, dB, from a distance of", measured["psnr_at_distance"], ".2f")
     changes = measured["thin_vessel_brightness_change"]
-    yield _by_factor("brightness of thin vessels, at a picture size of", changes, "+.2%")
+    yield _by_factor("brightness of thin vessels, at an image size of", changes, "+.2%")
     flicker = measured["flicker"]
     for part in ("picture", "error"):
         row = {"factor": flicker["size"]} | {name: flicker[name][part] for name in VARIANTS}
@@ -228,7 +228,7 @@ def picture(truth: AliasTruth, models: Mapping[str, Trained]) -> bytes:
 
 
 def _panel(image: F32, crop: tuple[float, float, float], title: str) -> U8:
-    """A titled piece of a picture; `crop`: left, top and side as shares of the picture."""
+    """A titled piece of an image; `crop`: left, top and side as shares of the image."""
     height, width = image.shape[:2]
     left, top = round(crop[0] * width), round(crop[1] * height)
     piece = image[top : top + round(crop[2] * height), left : left + round(crop[2] * width)]

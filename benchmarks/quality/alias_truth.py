@@ -1,4 +1,4 @@
-"""What the phantom's tissue really looks like at other picture sizes and from other distances."""
+"""What the phantom's tissue really looks like at other image sizes and from other distances."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,8 +12,8 @@ from sags_node.phantom.scene import Phantom
 from sags_node.types import F32, F64, Bool, Camera, Observation
 
 PHASE = 0.5  # of the phantom's session: the fold is held up
-FINEST = 4  # size of the finest picture, in multiples of the trained size
-SAMPLES = 4  # x 4 rays per pixel of the trained size; pictures of other sizes average as densely
+FINEST = 4  # size of the finest image, in multiples of the trained size
+SAMPLES = 4  # x 4 rays per pixel of the trained size; images of other sizes average as densely
 HIDDEN = 0.02  # share of the depth: what is this far off what the trained camera sees, it never saw
 BORDER = 2  # px left out around what the trained camera did not see
 THIN = 5  # px of the trained size: vessels thinner than this
@@ -44,7 +44,7 @@ class AliasTruth:
         self._depth = _shrunk(depth, self.camera)
 
     def observation(self) -> Observation:
-        """Return the training data: the picture and its exact depth."""
+        """Return the training data: the image and its exact depth."""
         shape = self._depth.shape
         picture = np.rint(self._image * 255).astype(np.uint8)
         return Observation(
@@ -60,7 +60,7 @@ class AliasTruth:
 
     def at_size(self, factor: float) -> Shot:
         """Return the trained camera's view with `factor` times as many pixels along each side (up to FINEST),
-        as means over the finest picture's pixels."""
+        as means over the finest image's pixels."""
         camera = resized(self.camera, factor)
         return Shot(camera, _shrunk(self._finest, camera), np.ones((camera.height, camera.width), np.bool_))
 

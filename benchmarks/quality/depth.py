@@ -77,7 +77,7 @@ def make_matchers(
         network: an ONNX file to compare as well.
 
     Raises:
-        UsageError: the pictures are too small to match at `SCALES`, or the file is no depth network.
+        UsageError: the images are too small to match at `SCALES`, or the file is no depth network.
     """
     matchers: dict[str, Matcher] = {"as configured": StereoDepth(config, camera, baseline)}
     for scale in SCALES:
@@ -103,7 +103,7 @@ class Tally:
     wanted: int = 0  # px that have a true depth
 
     def add(self, depth: F32, confidence: F32, truth: F32, mask: Bool, shared: Bool) -> None:
-        """Add a frame: pictures [H, W]; `mask`: pixels that count; `shared`: the first matcher has depth."""
+        """Add a frame: images [H, W]; `mask`: pixels that count; `shared`: the first matcher has depth."""
         comparable = mask & (truth > 0)
         given = comparable & (depth > 0)
         self.wanted += int(comparable.sum())
@@ -191,7 +191,7 @@ class Comparison:
 
 
 class Regions:
-    """Errors by region of the picture (`regions_of`), of the stage as configured and of the drawn model."""
+    """Errors by region of the image (`regions_of`), of the stage as configured and of the drawn model."""
 
     def __init__(self) -> None:
         self._tallies: dict[str, tuple[Tally, Tally]] = {}
@@ -270,10 +270,10 @@ def measure_faults(
     advance: Advance,
     network: Path | None = None,
 ) -> dict[str, Any]:
-    """Measure the phantom, whose depth is known exactly, with one fault of its pictures rising at a time.
+    """Measure the phantom, whose depth is known exactly, with one fault of its images rising at a time.
 
     Args:
-        size: width and height of the pictures, px.
+        size: width and height of the images, px.
         frames: of each level, evenly over the whole motion.
         faults: levels by the name of the fault in `PhantomScene`.
         network: an ONNX file to compare as well.
@@ -332,7 +332,7 @@ def regions_of(truth: F32, tissue: Bool, focal_baseline: float) -> dict[str, Boo
 
     Args:
         truth: [H, W] m, 0 unknown.
-        focal_baseline: px m, of this picture.
+        focal_baseline: px m, of this image.
     """
     comparable = tissue & (truth > 0)
     if not comparable.any():

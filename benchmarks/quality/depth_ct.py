@@ -31,7 +31,7 @@ LARGEST_FILE = 2**24  # bytes, of the surface
 HIDES_WITHIN = 13  # px: neighbouring points of the surface are at most this far apart
 HIDDEN = 2e-3  # m behind a nearer point: the organ folds over itself
 RUNS = 11  # of each matcher, for its time
-MARGIN = 30  # px around the region, in the picture
+MARGIN = 30  # px around the region, in the image
 LARGEST_SHOWN = 3.0  # mm
 JPEG_QUALITY = 72
 
@@ -42,7 +42,7 @@ class CTPair:
 
     name: str
     pair: RectifiedPair
-    evaluated: Bool  # [H, W] of the left rectified picture
+    evaluated: Bool  # [H, W] of the left rectified image
     points: F64  # [P, 3] m, left rectified camera: seen, and in the evaluated region
     pixels: F64  # [P, 2] where they are seen
     receipt: dict[str, Any]  # see `Receipt.as_json`
@@ -54,7 +54,7 @@ def read_ct_pair(folder: Path) -> CTPair:
 
     Raises:
         UsageError: a file is missing or of another form.
-        SagsError: a picture is damaged.
+        SagsError: an image is damaged.
     """
     left, right = (read_picture(folder / f"{side}.png") for side in ("left", "right"))
     height, width = left.shape[:2]
@@ -190,7 +190,7 @@ def _measured(ct: CTPair, matcher: Matcher) -> dict[str, Any]:
 
 
 def picture(ct: CTPair) -> bytes:
-    """Draw left picture, measured depth and its error against the CT surface side by side, as JPEG."""
+    """Draw left image, measured depth and its error against the CT surface side by side, as JPEG."""
     depth, _ = configured_depth(ct)
     errors, given = errors_along_z(ct, depth)
     rows, columns = np.nonzero(ct.evaluated)

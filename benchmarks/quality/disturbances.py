@@ -1,4 +1,4 @@
-"""What the node makes of disturbed pictures, for a second in the middle of a recording."""
+"""What the node makes of disturbed images, for a second in the middle of a recording."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class _Depth:
 class _Shown:
     """What one frame of a run showed."""
 
-    psnr: float  # dB over the true tissue, against the true picture
+    psnr: float  # dB over the true tissue, against the true image
     borrowed: float  # share of the published depth, see `_Run._borrowed`
     confident_borrowed: float  # share of the depth that is published as confident
     depth: _Depth | None  # None: there is no reference
@@ -80,7 +80,7 @@ def measure_disturbances(
 ) -> dict[str, Any]:
     """Play a recording once for each disturbance, frame by frame, one step of the mapper a frame.
 
-    Pictures are compared with the undisturbed picture of their time, over the tissue that the recording's own
+    Images are compared with the undisturbed image of their time, over the tissue that the recording's own
     masks say, where it has them. The undisturbed run is always played first: the others are judged by it.
 
     Args:
@@ -360,7 +360,7 @@ class _PinnedAnchors:
     def judge(self, frame_id: int, clean: _PinnedAnchors) -> Row:
         """Return shares 0..1 of the anchors in a frame, or in the first after it that came: confident and
         within `ANCHOR_WRONG` of the truth, and confident and farther away. The rest are unsure or lost.
-        Without true points, the truth is where the undisturbed run has the anchors in the picture."""
+        Without true points, the truth is where the undisturbed run has the anchors in the image."""
         frame_id = min(frame for frame in self._states if frame >= frame_id)
         states = self._states[frame_id]
         if frame_id in self._truth:

@@ -1,4 +1,4 @@
-"""Disturbances for people: a table, and pictures to look at."""
+"""Disturbances for people: a table, and images to look at."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,8 +29,8 @@ def table(measured: Mapping[str, Any]) -> Table:
 
 
 def strip(shots: Sequence[Shot]) -> bytes:
-    """Draw a PNG with a row each for before, middle and after: the left and right pictures as they came, the
-    model's picture and its depth, which is grey on tissue where none is published."""
+    """Draw a PNG with a row each for before, middle and after: the left and right images as they came, the
+    model's image and its depth, which is grey on tissue where none is published."""
     shown = [Picture(shot.view.frame_id, 0.0, shot.left, shot.view.rgb, shot.view.depth, shot.tissue)
              for shot in shots]  # fmt: skip
     near, far = depth_range(shown[::2])  # those that nothing is wrong with

@@ -1,6 +1,6 @@
-"""Points followed in one eye's pictures by common methods without a model, for comparison with anchors.
+"""Points followed in one eye's images by common methods without a model, for comparison with anchors.
 
-Each gets the points' pixels in the first picture, and is then shown the pictures in turn.
+Each gets the points' pixels in the first image, and is then shown the images in turn.
 """
 
 from collections.abc import Callable
@@ -13,23 +13,23 @@ from sags_node.types import F32, F64, U8, Bool
 
 CONSISTENT = 1.0  # px: largest forward-backward error
 WINDOW = (21, 21)  # px, of Lucas-Kanade: the size of an anchor's patch
-LEVELS = 3  # of its pyramid, beside the picture itself
+LEVELS = 3  # of its pyramid, beside the image itself
 BOX = 33  # px: side of the box around a point that CSRT tracks
 HALF_BOX = (BOX - 1) / 2
-AT_ONCE = 1 << 14  # places: OpenCV takes no picture of more than 32,766 rows
+AT_ONCE = 1 << 14  # places: OpenCV takes no image of more than 32,766 rows
 
-Step = Callable[[U8, U8, F64], tuple[F64, Bool]]  # gray pictures, pixels [P, 2] -> pixels, and if found [P]
+Step = Callable[[U8, U8, F64], tuple[F64, Bool]]  # gray images, pixels [P, 2] -> pixels, and if found [P]
 
 
 class Follower(Protocol):
     """Follows points."""
 
     def follow(self, picture: U8) -> tuple[F64, Bool]:
-        """Return the points' pixels [P, 2] in the next picture [H, W, 3] RGB, and which are not lost [P]."""
+        """Return the points' pixels [P, 2] in the next image [H, W, 3] RGB, and which are not lost [P]."""
 
 
 class Chained:
-    """Follows from each picture to the next. A point with too large a forward-backward error (Kalal et al.,
+    """Follows from each image to the next. A point with too large a forward-backward error (Kalal et al.,
     ICPR 2010) is lost for good, because nothing is kept by which it could be found again."""
 
     def __init__(self, step: Step, picture: U8, pixels: F64) -> None:
@@ -80,12 +80,12 @@ class Unmoved:
 
 
 def lucas_kanade(picture: U8, pixels: F64) -> Follower:
-    """Make a follower by pyramidal Lucas-Kanade (Bouguet, 2001) from picture to picture."""
+    """Make a follower by pyramidal Lucas-Kanade (Bouguet, 2001) from image to image."""
     return Chained(_lucas_kanade_step, picture, pixels)
 
 
 def dense_flow(picture: U8, pixels: F64) -> Follower:
-    """Make a follower by dense inverse search (Kroeger et al., ECCV 2016) from picture to picture."""
+    """Make a follower by dense inverse search (Kroeger et al., ECCV 2016) from image to image."""
     flow = dis_flow()
 
     def step(before: U8, after: U8, pixels: F64) -> tuple[F64, Bool]:

@@ -31,7 +31,7 @@ BEFORE, RATE, STEPS = 3, 5.0, 2  # frames without instruments; a second; steps o
 DISTANCES = (0.005, 0.010, 0.020, 0.040)  # m, along the axis
 SIDES = {"one": ("left",), "two": ("left", "right"), "crossing": ("left", "right"), "leaving": ("right",)}
 TROCARS = {"left": np.array([-0.105, 0.125, -0.010]), "right": np.array([0.125, 0.105, 0.0])}  # m
-WHERE = {  # column of the tip, as a share of the picture's width: from, to
+WHERE = {  # column of the tip, as a share of the image's width: from, to
     "one": (0.25, 0.70), "two left": (0.20, 0.45), "two right": (0.55, 0.80), "crossing left": (0.55, 0.75),
     "crossing right": (0.25, 0.45), "leaving": (-0.30, -0.05),
 }  # fmt: skip

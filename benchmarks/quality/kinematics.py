@@ -1,4 +1,4 @@
-"""How accurately tips are placed by a robot's kinematics, with and without the picture, on the phantom."""
+"""How accurately tips are placed by a robot's kinematics, with and without the image, on the phantom."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,13 +20,13 @@ from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.types import F64, InstrumentStates, ToolPose
 from sags_node.vision.pyramid import pyramids
 
-RATE, SECONDS, LEAVES = 5.0, 8.0, 6.0  # a second; s; s after which the tip leaves the picture
+RATE, SECONDS, LEAVES = 5.0, 8.0, 6.0  # a second; s; s after which the tip leaves the image
 SETTLED = 2.0  # s, after which corrected poses are counted apart
 SHIFT, TURN = 0.005, np.radians(5.0)  # m; rad about MIDDLE: the error of the kinematics
 MIDDLE = np.array([0.0, 0.0, 0.06])  # m, of where instruments work
 FIGURES = ("tip_mm", "axis_deg")
 ERROR = 0.010  # m, the default in robot.tools
-CASES = {  # whether the picture is used, and whether the robot's kinematics are: exact, or off
+CASES = {  # whether the image is used, and whether the robot's kinematics are: exact, or off
     "picture": (True, None), "exact": (False, "exact"), "off": (False, "off"),
     "exact_corrected": (True, "exact"), "off_corrected": (True, "off"),
 }  # fmt: skip
@@ -82,7 +82,7 @@ def measure_kinematics(seeds: int, advance: Advance) -> dict[str, Any]:
 
 
 def _pixel(t: float) -> F64:
-    """The tip's pixel [2]: it moves about in the picture, and leaves it after `LEAVES` s."""
+    """The tip's pixel [2]: it moves about in the image, and leaves it after `LEAVES` s."""
     u, v = 0.45 + 0.18 * np.sin(1.3 * t), 0.45 + 0.15 * np.sin(2.1 * t + 1)
     u -= 0.8 * max(0.0, t - LEAVES) ** 0.5 * (t > LEAVES)
     return np.array([u, v]) * SIZE

@@ -27,7 +27,7 @@ def measure_masks(session: Session, advance: Advance) -> Row:
     """Play a recording that has masks of its own, with those that its launch file asks for, one step of the
     mapper a frame.
 
-    Masks are compared with the recording's own without dilation. Pictures and depth are measured under the
+    Masks are compared with the recording's own without dilation. Images and depth are measured under the
     recording's own mask, whatever the mapper was given, so figures of different sources are comparable.
 
     Raises:

@@ -53,7 +53,7 @@ def measure_methods(
             chosen = [
                 *overrides, f"mapping.method:={method}", f"vision.width:={width}", f"vision.height:={height}"
             ]  # fmt: skip
-            alone = [*chosen, "publish.detail:=false"]  # the model is compared, not the camera's pictures
+            alone = [*chosen, "publish.detail:=false"]  # the model is compared, not the camera's images
             seen = evaluate(launch, alone, MeasureOptions(hold_out=0), pace="realtime")
             live = seen.summary
             fixed = [*chosen, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]

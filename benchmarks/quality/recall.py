@@ -38,11 +38,11 @@ BEFORE = 2.5  # s in sight; the anchors are pinned in its first third
 AFTER = 2.5  # s in sight again
 MOST = 60  # anchors
 STEPS = 2  # of the mapper, each frame
-BORDER = 30  # px: what is nearer to the picture's edge is not pinned
+BORDER = 30  # px: what is nearer to the image's edge is not pinned
 COVERED = (0.25, 0.85)  # of the width: what a cloth hides
 CLOTH = (190, 230)  # grey levels
 DISPARITY = 0.05  # of the width; the cloth is nearer than the tissue
-TURN = 45.0  # degrees, so far that nothing seen before is in the picture
+TURN = 45.0  # degrees, so far that nothing seen before is in the image
 TURNING = 1.5  # s, there and back
 MOVED = np.array([0.006, -0.004, 0.004])  # m, in the dark
 ROLLED = 8.0  # degrees, in the dark
@@ -55,7 +55,7 @@ class _Moment:
 
     frame: PhantomFrame
     T_world_cam: F64
-    hidden: Bool | None  # [H, W] raw left picture, True = cloth
+    hidden: Bool | None  # [H, W] raw left image, True = cloth
 
 
 def measure_recall(session: Session, away: float, advance: Advance) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def measure_recall(session: Session, away: float, advance: Advance) -> dict[str,
         `rows`, by scenario: anchors, and shares of those whose points are in sight. `found`: sure and right,
         `wrong`: sure and farther off than `WRONG`, 2.4 s after they are back, and `before` they went;
         `unmoved`: right if they had not moved. `reliability_mm`, `reliability_px`: of all anchors in all
-        frames that were not held; in px only of those whose points are in the picture or hidden there.
+        frames that were not held; in px only of those whose points are in the image or hidden there.
 
     Raises:
         UsageError: the session is not the phantom's.
@@ -94,7 +94,7 @@ class _Said:
     near_px: list[Bool] = field(default_factory=list)
     near_mm: list[Bool] = field(default_factory=list)
     in_sight: list[Bool] = field(default_factory=list)
-    inside: list[Bool] = field(default_factory=list)  # the point is in the picture, seen or hidden
+    inside: list[Bool] = field(default_factory=list)  # the point is in the image, seen or hidden
 
     def add(self, result: FrameResult, pinned: dict[int, int], truth: F64, points: F64) -> None:
         """Add a frame, given `truth` [P, 2] px and `points` [P, 3] m of all the phantom's points. A held
@@ -234,7 +234,7 @@ def _stereo(number: int, moment: _Moment) -> StereoFrame:
 
 
 def _truth(result: FrameResult, moment: _Moment) -> tuple[F64, Bool]:
-    """Pixels [P, 2] of the phantom's points, and which are in the picture and not hidden [P]."""
+    """Pixels [P, 2] of the phantom's points, and which are in the image and not hidden [P]."""
     camera = replace(result.pair.camera, T_world_cam=moment.T_world_cam)
     pixels: F64 = np.asarray(project(camera, moment.frame.points)[0], np.float64)
     return pixels, moment.frame.visible & _inside(pixels, camera)

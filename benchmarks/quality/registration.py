@@ -143,7 +143,7 @@ def _node_sees(config: LaunchConfig, phantom: Phantom, receipt: Receipt) -> tupl
 
 
 def part(rng: np.random.Generator, phantom: Phantom, camera: Camera, phase: float = 0.0) -> tuple[I64, I32]:
-    """Return the tissue's vertices (indices) within an ellipse of the picture, and triangles of these."""
+    """Return the tissue's vertices (indices) within an ellipse of the image, and triangles of these."""
     vertices = phantom.tissue.vertices(phase).reshape(-1, 3).astype(np.float64)
     triangles = phantom.tissue.faces.astype(np.int32)
     size = np.array([camera.width, camera.height])
@@ -237,7 +237,7 @@ def _on_ct(pair: CTPair, seeds: int) -> Iterable[Placing]:
 
 
 def _joined_in_picture(pixels: F32, points: F64) -> I32:
-    """Triangles [T, 3] of neighbours in the picture (Delaunay) that are neighbours on the surface, too."""
+    """Triangles [T, 3] of neighbours in the image (Delaunay) that are neighbours on the surface, too."""
     width, height = np.ceil(pixels.max(0)).astype(int) + 2
     mesh = cv2.Subdiv2D((0, 0, int(width), int(height)))
     numbers = {tuple(np.round(pixel, 3)): number for number, pixel in enumerate(pixels)}

@@ -1,6 +1,6 @@
 """How accurate the pose of a moving scope stays over minutes: on the phantom, whose tissue moves, too.
 
-The same pictures are played once for each way to know the pose. The node's own ways are compared with rigid
+The same images are played once for each way to know the pose. The node's own ways are compared with rigid
 odometry, and with the pose that fits the true surface points best. That pose says how much of an error is a
 matter of definition, since a motion that all tissue shares cannot be told from the scope's.
 """
@@ -62,7 +62,7 @@ class Robot:
 
 @dataclass(slots=True)
 class _Played:
-    """What the node makes of the pictures with one way to know the scope's pose."""
+    """What the node makes of the images with one way to know the scope's pose."""
 
     pipeline: Pipeline
     budget: StepBudget = field(default_factory=lambda: StepBudget(STEPS))
@@ -103,7 +103,7 @@ def measure_scope(
     Returns:
         `rows`, by `motion` and `way`. `session`: the true poses are given; `estimate`: none; `robot`: those
         of a `Robot`; `refine`: the same, corrected; `rigid` and `points`: see the module. Errors are those of
-        `trajectory_errors` and `drift`, pictures and depth over frames that were not `held`.
+        `trajectory_errors` and `drift`, images and depth over frames that were not `held`.
 
     Raises:
         UsageError: the source is not the phantom, or the time is too short.

@@ -41,7 +41,7 @@ class PlainSGBM:
 
 
 class JudgedSGBM:
-    """SGBM in place of the stage's own matcher: on the stage's pictures, and the stage judges the matches."""
+    """SGBM in place of the stage's own matcher: on the stage's images, and the stage judges the matches."""
 
     def __init__(self, config: StereoConfig, camera: Camera, baseline: float, scale: int) -> None:
         self._stage = StereoDepth(config.model_copy(update={"scale": scale}), camera, baseline)
@@ -57,7 +57,7 @@ class JudgedSGBM:
         )  # fmt: skip
 
     def __call__(self, pair: RectifiedPair, tissue: Bool) -> tuple[F32, F32]:
-        # OpenCV leaves out the columns that the largest disparity would push out of the picture: pad them.
+        # OpenCV leaves out the columns that the largest disparity would push out of the image: pad them.
         left, right = (
             cv2.copyMakeBorder(self._gray(eye), 0, 0, self._pad, 0, cv2.BORDER_REPLICATE)
             for eye in pyramids(pair)

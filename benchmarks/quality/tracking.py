@@ -31,7 +31,7 @@ from sags_node.types import F32, F64, I64, AnchorStates, Bool, FrameResult, Ster
 
 SPACING = 34  # px between anchors
 BESIDE = 40  # points, at most, that all methods are compared on: CSRT is slow
-BORDER = 60  # px: what is nearer to the picture's edge soon leaves it
+BORDER = 60  # px: what is nearer to the image's edge soon leaves it
 RIGHT = 4.0 / 640  # of the width: a confident anchor should be this near to its point
 RIGHT_MM = 2.0  # mm, the same in space
 WRONG = 8.0 / 640  # of the width: what is farther, and said to be seen there, is wrong
@@ -43,7 +43,7 @@ class _Truth:
 
     pixels: F64  # [P, 2]
     known: Bool  # [P] whether that is known
-    visible: Bool  # [P] known, in the picture, and not hidden
+    visible: Bool  # [P] known, in the image, and not hidden
     points: F64 | None = None  # [P, 3] m, world
 
 
@@ -69,7 +69,7 @@ def measure_tracking(
     Args:
         session: a recording.
         frames: after how many to measure.
-        beside: names of `FOLLOWERS`, shown the same points and pictures.
+        beside: names of `FOLLOWERS`, shown the same points and images.
 
     Raises:
         SagsError: the recording is too short, or nothing can be pinned.
@@ -249,14 +249,14 @@ def _visible(frame: StereoFrame) -> Bool:
 
 
 def _grid(result: FrameResult) -> F64:
-    """A regular grid of pixels [P, 2] over the picture."""
+    """A regular grid of pixels [P, 2] over the image."""
     height, width = result.observation.tissue.shape
     columns, rows = np.arange(BORDER, width - BORDER, SPACING), np.arange(BORDER, height - BORDER, SPACING)
     return np.stack(np.meshgrid(columns, rows), 2).reshape(-1, 2).astype(np.float64)
 
 
 def middle(places: F64, result: FrameResult) -> Bool:
-    """Tell which of some pixels [P, 2] are not near the picture's edge."""
+    """Tell which of some pixels [P, 2] are not near the image's edge."""
     height, width = result.observation.tissue.shape
     inside = (places >= BORDER) & (places < [width - BORDER, height - BORDER])
     return np.asarray(inside.all(1))

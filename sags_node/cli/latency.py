@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option(
-    "--push", metavar="ENDPOINT", help="Push coded images of the phantom there: without a camera."
-)
+@click.option("--push", metavar="ENDPOINT", help="Push coded images of the phantom there: without a camera.")
 @shown("--rate", type=positive, default=30.0, help="Hz of pushed images.")
 @shown("--port", type=click.IntRange(0, 65535), default=8768, help="Of the page; 0: any free one.")
 @click.option("--overlay", metavar="NS", help="Wait for each image's overlay, in this namespace.")

@@ -39,7 +39,7 @@ class Rasterizer(Protocol):
 
         Args:
             gaussians: what is drawn.
-            camera: of the rasteriser's picture size.
+            camera: of the rasteriser's image size.
             tiles: [ceil(H / TILE_HEIGHT), ceil(W / TILE_WIDTH)] True: this tile is drawn. The pixels of the
                 others keep what the call before left there, and their part of `v_planes` is ignored. None:
                 all are drawn.
@@ -51,7 +51,7 @@ class Rasterizer(Protocol):
 
         Raises:
             UsageError: an array or a camera has the wrong shape or size.
-            SagsError: the picture needs more memory than the engine allows itself.
+            SagsError: the image needs more memory than the engine allows itself.
         """
         ...
 

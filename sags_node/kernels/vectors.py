@@ -14,7 +14,7 @@ the same on all processors.
 
 `LANES` is 16 where the compile target has AVX-512, else 8; a narrower processor takes a vector in pieces.
 
-A vector can hold a *block* of a picture: `BLOCK_WIDTH` px wide and `LANES / BLOCK_WIDTH` rows high, row after
+A vector can hold a *block* of an image: `BLOCK_WIDTH` px wide and `LANES / BLOCK_WIDTH` rows high, row after
 row. `block_x` and `block_y` say where a lane's pixel lies in its block.
 """
 
@@ -355,7 +355,7 @@ def store_records(typing_context: Any, array: Any, index: Any, fields: Any) -> A
 
 @intrinsic
 def load_block(typing_context: Any, picture: Any, first: Any, width: Any) -> Any:
-    """Read a block of a flat picture whose rows have `width` px; `first` is the block's first pixel."""
+    """Read a block of a flat image whose rows have `width` px; `first` is the block's first pixel."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         start = _address(context, builder, sig, args, 0)

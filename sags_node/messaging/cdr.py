@@ -59,9 +59,7 @@ class Content:
     scale: float = 0.0  # size of one step of a thin image of integers; 0: none
     window: tuple[int, ...] = ()  # of a thin image: x, y, and px of the whole image per px of its own
     relative: bool = False  # its lengths have no unit
-    detail_age_ns: int | None = (
-        None  # ns from the oldest image in a view to its frame; None: the model alone
-    )
+    detail_age_ns: int | None = None  # ns from the oldest image in a view to its frame; None: the model alone
 
     def cdr(self) -> bytes:
         """The whole message."""

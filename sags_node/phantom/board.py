@@ -15,10 +15,10 @@ LENS_BLUR = 0.6  # px
 
 @dataclass(frozen=True, slots=True)
 class PrintedBoard:
-    """A board's picture and its scale."""
+    """A board's image and its scale."""
 
     picture: U8  # [h, w]
-    origin: float  # px of the picture: x and y of the first inner corner
+    origin: float  # px of the image: x and y of the first inner corner
     square: float  # m, side of a square
 
 

@@ -1,4 +1,4 @@
-"""Renders the picture of one raw eye: its view in linear light, then smoke, then lens and sensor."""
+"""Renders the image of one raw eye: its view in linear light, then smoke, then lens and sensor."""
 
 import cv2
 import numpy as np
@@ -84,7 +84,7 @@ def _lit(points: F32, bodies: Bodies, lamp: Lamp) -> F32:
 
 
 def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F64, density: float) -> F32:
-    """Add smoke to a picture [H, W, 3]: a lit cloud [S, S] that hangs in front of the tissue.
+    """Add smoke to an image [H, W, 3]: a lit cloud [S, S] that hangs in front of the tissue.
 
     `drift` [2] moves the cloud, in its own pixels; `density` 0..1.
     """
@@ -97,7 +97,7 @@ def add_smoke(picture: F32, directions: F32, offset: float, cloud: F32, drift: F
 
 
 def expose(linear: F32, blur: float, noise: float, rng: np.random.Generator) -> U8:
-    """Return the recorded picture [H, W, 3]: lens blur (px, standard deviation), tone curve, noise (0..1)."""
+    """Return the recorded image [H, W, 3]: lens blur (px, standard deviation), tone curve, noise (0..1)."""
     sharpness = float(np.hypot(LENS_BLUR, blur))
     shown = develop(cv2.GaussianBlur(linear, (0, 0), sharpness))
     if noise > 0:

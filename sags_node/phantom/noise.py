@@ -1,4 +1,4 @@
-"""Smooth random pictures, from which shapes and colours are made."""
+"""Smooth random images, from which shapes and colours are made."""
 
 import cv2
 import numpy as np

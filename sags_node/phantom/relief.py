@@ -14,7 +14,7 @@ from sags_node.types import F32, F64
 
 SPACING = 0.6e-3  # m between vertices
 BED_DEPTH = 0.082  # m, on the optical axis
-BED_SLOPE = -0.16  # the far side is at the top of the picture
+BED_SLOPE = -0.16  # the far side is at the top of the image
 FARTHEST = 0.098  # m, the extent covers the view at this depth
 MARGIN = 0.010  # m, for camera motion and the second eye
 

@@ -16,7 +16,7 @@ _TOE_IN = np.radians([0.25, 0.6, -0.3])  # rotation vector, left axes to right a
 
 
 def phantom_rig(width: int, height: int) -> StereoRig:
-    """Return the rig for raw pictures of `width` x `height` px, rectified at that size."""
+    """Return the rig for raw images of `width` x `height` px, rectified at that size."""
     focal = FOCAL_PER_WIDTH * max(width, height)
     K_left, K_right = np.eye(3), np.eye(3)
     K_left[0, 0], K_left[1, 1] = focal, focal

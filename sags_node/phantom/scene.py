@@ -1,4 +1,4 @@
-"""The phantom itself: one call gives both raw pictures of a frame and its ground truth."""
+"""The phantom itself: one call gives both raw images of a frame and its ground truth."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class PhantomFrame:
 
     left: U8  # [H, W, 3] RGB, raw
     right: U8  # [H, W, 3] RGB, raw
-    tool: Bool  # [H, W] raw left picture, True = instrument
-    depth: F32  # [H, W] m, left rectified picture; 0 = instrument or nothing
+    tool: Bool  # [H, W] raw left image, True = instrument
+    depth: F32  # [H, W] m, left rectified image; 0 = instrument or nothing
     points: F64  # [P, 3] m, world
     visible: Bool  # [P]
     T_world_cam: F64  # [4, 4] left rectified camera
@@ -156,7 +156,7 @@ class Phantom:
         return Still(bodies, self._relief, self._skin, lamp, eye=T_world_cam[:3, 3])
 
     def _visible(self, bodies: Bodies, points: F64, T_world_cam: F64) -> Bool:
-        """Which points [P] are inside the left rectified picture and not hidden."""
+        """Which points [P] are inside the left rectified image and not hidden."""
         eye = self.rig.left
         local = transform(invert(T_world_cam), points)
         pixels = local @ eye.P[:, :3].T
@@ -171,7 +171,7 @@ class Still:
     """The tissue at one instant, without instruments, noise or lens: exact truth for any pinhole camera.
 
     Light and highlights stay as the scope's camera sees them, so that a view from elsewhere differs only by
-    its geometry. Nothing casts a shadow: the phantom softens shadows in a picture, by a number of pixels."""
+    its geometry. Nothing casts a shadow: the phantom softens shadows in an image, by a number of pixels."""
 
     bodies: Bodies
     relief: Relief

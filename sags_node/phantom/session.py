@@ -1,4 +1,4 @@
-"""A phantom session on disk: pictures, masks, truth, calibration and the launch file that plays them."""
+"""A phantom session on disk: images, masks, truth, calibration and the launch file that plays them."""
 
 import hashlib
 import json
@@ -136,5 +136,5 @@ def _write_pictures(frame: PhantomFrame, folder: Path, stem: str) -> None:
 
 
 def _write(file: Path, picture: np.ndarray, options: list[int]) -> None:
-    """Write a picture, and raise on a full disk, where `cv2.imwrite` would only return False."""
+    """Write an image, and raise on a full disk, where `cv2.imwrite` would only return False."""
     file.write_bytes(cv2.imencode(file.suffix, picture, options)[1].tobytes())

@@ -1,4 +1,4 @@
-"""Dot products and unit vectors of pictures of float32 vectors, several times faster than `numpy.linalg`."""
+"""Dot products and unit vectors of images of float32 vectors, several times faster than `numpy.linalg`."""
 
 import numpy as np
 

@@ -77,9 +77,7 @@ def judge_stamps(
         stamped = [stamp for _, stamp in pictures]
         if not np.array_equal(taken(pictures), stamped):
             count = len(set(stamped))
-            what = (
-                f"{len(pictures)} {eye} images have {count} stamps: when they were recorded counts instead"
-            )
+            what = f"{len(pictures)} {eye} images have {count} stamps: when they were recorded counts instead"
             found.append(Finding("warning", what, "let the driver stamp each image when it is taken"))
     came = np.array([[each[0] for each in pair] for pair in keys], np.int64)
     later = float(np.median((came - stamps) @ [-1, 1])) * 1e-6

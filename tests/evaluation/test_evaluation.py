@@ -407,7 +407,7 @@ def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_p
     assert len(text) < 2_000_000
     assert "frame 7," in text and "the worst" in text
     assert "<b>name" not in text and "http" not in text
-    order = [text.index(each) for each in ("overlay.mp4", "<h2>Pictures", "<h2>Over time", "<h2>Figures")]
+    order = [text.index(each) for each in ("overlay.mp4", "<h2>Images", "<h2>Over time", "<h2>Figures")]
     assert order == sorted(order)
     groups = text[order[-1] :]
     assert "the image before, shown again:" in groups and "stereo alone:" in groups

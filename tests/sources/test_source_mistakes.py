@@ -183,9 +183,7 @@ def test_poses_of_other_pictures_are_refused(
 ) -> None:
     np.savez(tmp_path / "poses.npz", T_world_cam=np.tile(np.eye(4), (count, 1, 1)))
     config = folders.model_copy(update={"poses": tmp_path / "poses.npz", "stride": stride})
-    refused_at_opening(
-        lambda: config, rf"poses.npz holds {count} poses, the recording 12 images of the left"
-    )
+    refused_at_opening(lambda: config, rf"poses.npz holds {count} poses, the recording 12 images of the left")
 
 
 @pytest.mark.parametrize(

@@ -68,14 +68,14 @@ class DeviceRasterizer:
 
         Args:
             tables: by the names and of the types of `KINDS`.
-            view: of `arguments.view_of`, for a camera of the rasteriser's picture size.
+            view: of `arguments.view_of`, for a camera of the rasteriser's image size.
             tiles: as `interface.Rasterizer.forward` has them.
 
         Returns:
             `planes`.
 
         Raises:
-            SagsError: the picture needs more memory than the engine allows itself.
+            SagsError: the image needs more memory than the engine allows itself.
         """
         n = self._count = len(tables["means"])
         self._tables = tables
@@ -87,7 +87,7 @@ class DeviceRasterizer:
         if total > MAX_PAIRS:
             raise SagsError(
                 f"drawing {n} Gaussians takes {total} Gaussian-tile pairs, the limit is {MAX_PAIRS}: the "
-                "Gaussians are too large for the picture; draw fewer or smaller ones"
+                "Gaussians are too large for the image; draw fewer or smaller ones"
             )
         if total > self._pair_room:
             self._hold_pairs(int(total * SPARE))

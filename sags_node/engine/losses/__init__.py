@@ -1,1 +1,1 @@
-"""The loss of a drawn picture, and its derivative, for the CPU."""
+"""The loss of a drawn image, and its derivative, for the CPU."""

@@ -1,7 +1,7 @@
-"""Copies runs of pixels between whole pictures and the small scratch array that a kernel computes in.
+"""Copies runs of pixels between whole images and the small scratch array that a kernel computes in.
 
 A loop over many arrays does not vectorise, because LLVM would have to prove that none overlap; a loop over
-planes of one scratch array does (see `jit`). Pictures are flat here, [P] with P pixels; a run starts at pixel
+planes of one scratch array does (see `jit`). Images are flat here, [P] with P pixels; a run starts at pixel
 `start` (uint64) and has `count` pixels. Where `count` is a constant these loops become straight copies.
 """
 
@@ -14,7 +14,7 @@ from sags_node.types import F32, U8, Bool
 
 u8 = np.uint64
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-LEVEL = np.float32(1 / 255)  # one step of a picture's bytes, which stand for 0..1
+LEVEL = np.float32(1 / 255)  # one step of an image's bytes, which stand for 0..1
 
 PIECE = 256  # pixels that a kernel takes at a time
 PLANE = PIECE + 16  # floats; 64 bytes of padding

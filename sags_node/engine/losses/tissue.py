@@ -34,7 +34,7 @@ COVERED = f4(0.05)  # below this coverage the normalised colour means nothing
 DEPTH_COVERED = f4(0.3)  # the same for depth
 FULL = f4(0.9)  # coverage that tissue should reach
 COVERAGE_WEIGHT = 2e-3  # of the push towards that coverage, relative to the colour term
-MAX_RESIDUAL = f4(1e3)  # also rejects NaN in the picture
+MAX_RESIDUAL = f4(1e3)  # also rejects NaN in the image
 
 WEIGHT = u8(FREE * PLANE)  # planes beyond those of `pieces`
 RESIDUAL, USED = TRUE_RED, TISSUE  # results overwrite the inputs

@@ -32,7 +32,7 @@ def view_of(camera: Camera) -> F32:
 
 
 def check_size(width: int, height: int, camera: Camera, tiles: Bool | None) -> None:
-    """Raise UsageError where a camera or tiles do not fit a rasteriser of this picture size, px."""
+    """Raise UsageError where a camera or tiles do not fit a rasteriser of this image size, px."""
     if (camera.width, camera.height) != (width, height):
         raise UsageError(
             f"this rasteriser draws {width}x{height} px, "

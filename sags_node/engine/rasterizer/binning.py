@@ -54,7 +54,7 @@ def _down(value: Any, low: int, high: int) -> Any:
 
 @inlined
 def _pixels(mean: Any, radius: Any, size: int) -> Any:
-    """First and last pixel of the picture whose centre lies within `radius` of `mean`; where there is none
+    """First and last pixel of the image whose centre lies within `radius` of `mean`; where there is none
     the first is larger."""
     return _up(mean - radius - HALF, 0, size), _down(mean + radius - HALF, -1, size - 1)
 
@@ -62,7 +62,7 @@ def _pixels(mean: Any, radius: Any, size: int) -> Any:
 @inlined
 def _box(splat: Any, width: int, height: int, tile_width_bits: int) -> Any:
     """Return what a splat's bounding box touches: the first column of tiles and one after the last; the first
-    and last row of pixels. Both ranges are empty if the box lies outside the picture."""
+    and last row of pixels. Both ranges are empty if the box lies outside the image."""
     x_first, x_last = _pixels(splat.mean_x, splat.reach_x, width)
     y_first, y_last = _pixels(splat.mean_y, splat.reach_y, height)
     left, right = x_first >> tile_width_bits, (x_last >> tile_width_bits) + 1
@@ -76,7 +76,7 @@ def _drop_block(
     splats: Any, depths: F32, first: int, last: int, sums: I32, width: int, height: int, tile_width_bits: int,
     tile_height_bits: int,
 ) -> None:  # fmt: skip
-    row = ((width + (1 << tile_width_bits) - 1) >> tile_width_bits) + 1  # of the integral picture
+    row = ((width + (1 << tile_width_bits) - 1) >> tile_width_bits) + 1  # of the integral image
     for i in range(first, last):
         splat = splats[i]
         if splat.extent > ZERO:
@@ -92,7 +92,7 @@ def _drop_block(
 def drop_untouched(
     splats: Any,  # [N] SPLAT; extent made 0 where no active tile is touched
     depths: F32,  # [N] likewise
-    active_sums: I32,  # [(tile rows + 1) (tile columns + 1)] integral picture of the active tiles
+    active_sums: I32,  # [(tile rows + 1) (tile columns + 1)] integral image of the active tiles
     width: int,
     height: int,
     tile_width_bits: int,  # tiles are 2**bits px
@@ -153,7 +153,7 @@ def sort_by_depth(depths: F32, slots: Any, order: I32, spare_order: I32, keys: I
 
 @inlined
 def _find_rows(splat: Any, box: Any, height: int, tile_width_bits: int, rows: I32, n: int) -> Any:
-    """Find which rows of the picture a splat touches in each 8 px wide column of its box. Return the place in
+    """Find which rows of the image a splat touches in each 8 px wide column of its box. Return the place in
     `rows` for the next splat.
 
     Rotated by 180 degrees, the splat's upper end is its lower end. So half of a vector's lanes find the lower

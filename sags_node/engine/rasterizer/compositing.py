@@ -93,7 +93,7 @@ def whitened(a: Any, b: Any, c: Any, dx: Any, dy: Any) -> Any:
 
 @inlined
 def place_of(t: int, width: int, height: int) -> Any:
-    """Return a tile's first column and row in the picture, and its numbers of columns and rows, px."""
+    """Return a tile's first column and row in the image, and its numbers of columns and rows, px."""
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     x0, y0 = t % tiles_x * TILE_WIDTH, t // tiles_x * TILE_HEIGHT
     return x0, y0, min(TILE_WIDTH, width - x0), min(TILE_HEIGHT, height - y0)
@@ -101,7 +101,7 @@ def place_of(t: int, width: int, height: int) -> Any:
 
 @inlined
 def is_whole(columns: int, rows: int) -> bool:
-    """Tell whether all of a tile lies in the picture."""
+    """Tell whether all of a tile lies in the image."""
     return columns == TILE_WIDTH and rows == TILE_HEIGHT
 
 
@@ -114,7 +114,7 @@ def place_in_scratch(x: int, y: int, stride: int) -> int:
 
 @inlined
 def open_tile(tile: F32, stride: int, columns: int, rows: int) -> None:
-    """Set the transmittance to 1 inside the picture, 0 outside: pixels outside do not keep a tile open."""
+    """Set the transmittance to 1 inside the image, 0 outside: pixels outside do not keep a tile open."""
     for block in range(COLUMNS * BLOCKS):
         store(tile, block * stride + TRANSMITTANCE, spread(ONE))
     if not is_whole(columns, rows):
@@ -137,7 +137,7 @@ def any_above(tile: F32, stride: int, transmittance: Any) -> Any:
 def write_plane(
     tile: Any, plane: int, stride: int, picture: Any, start: int, width: int, columns: int, rows: int
 ) -> None:
-    """Copy a plane of the scratch into the tile's part of a picture [H W]; `start` is its first pixel."""
+    """Copy a plane of the scratch into the tile's part of an image [H W]; `start` is its first pixel."""
     if is_whole(columns, rows):
         for block in range(COLUMNS * BLOCKS):
             y, x = block % BLOCKS * BLOCK_HEIGHT, block // BLOCKS * BLOCK_WIDTH

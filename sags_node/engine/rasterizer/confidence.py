@@ -18,7 +18,7 @@ from sags_node.engine.pinhole import pack, to_camera, to_pixel
 from sags_node.kernels.jit import kernel, parallel_kernel, read_only
 from sags_node.types import F32, DepthGrid, Gaussians, RenderedView
 
-CELLS = 80  # across the picture
+CELLS = 80  # across the image
 SHARES = 4  # parts of the Gaussians that are summed in parallel
 ENOUGH = 3  # Gaussians per cell on average; with more, only every n-th is used
 

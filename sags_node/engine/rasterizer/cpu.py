@@ -150,7 +150,7 @@ class CpuRasterizer:
             if needed > MAX_PAIRS:
                 raise SagsError(
                     f"drawing {len(splats)} Gaussians takes about {needed} Gaussian-tile pairs, the limit is "
-                    f"{MAX_PAIRS}: the Gaussians are too large for the picture; draw fewer or smaller ones"
+                    f"{MAX_PAIRS}: the Gaussians are too large for the image; draw fewer or smaller ones"
                 )
             if needed <= len(self._emitted):
                 break

@@ -90,7 +90,7 @@ def rotation(w: Any, x: Any, y: Any, z: Any) -> Row:
 
 @inlined
 def screen_axes(R: Row, j00: Any, j02: Any, j11: Any, j12: Any) -> Row:
-    """Return J R_cam [2, 3]: how a small step in the world moves a point in the picture."""
+    """Return J R_cam [2, 3]: how a small step in the world moves a point in the image."""
     return (
         j00 * R[0] + j02 * R[6], j00 * R[1] + j02 * R[7], j00 * R[2] + j02 * R[8],
         j11 * R[3] + j12 * R[6], j11 * R[4] + j12 * R[7], j11 * R[5] + j12 * R[8],

@@ -12,19 +12,19 @@ __all__ = [
 
 
 def make_rasterizer(backend: str, width: int, height: int, antialias: bool = True) -> Rasterizer:
-    """A rasteriser for pictures of one size (px).
+    """A rasteriser for images of one size (px).
 
     Args:
         backend: "numba" (CPU) or "warp" (GPU).
         width, height: px.
         antialias: the 2D filter of Mip-Splatting. False: the fixed dilation of 3D Gaussian Splatting in its
-            place, which grows brighter and thicker when the picture gets smaller. For comparison only.
+            place, which grows brighter and thicker when the image gets smaller. For comparison only.
 
     Raises:
-        UsageError: unknown backend, one that cannot be used here, or an empty picture.
+        UsageError: unknown backend, one that cannot be used here, or an empty image.
     """
     if width < 1 or height < 1:
-        raise UsageError(f"cannot draw a picture of {width}x{height} px; give a size of at least 1x1")
+        raise UsageError(f"cannot draw an image of {width}x{height} px; give a size of at least 1x1")
     if backend == "numba":
         from sags_node.engine.rasterizer.cpu import CpuRasterizer
 

@@ -29,7 +29,7 @@ ZERO, ONE = f4(0.0), f4(1.0)
 
 
 def bake_filter(gaussians: Gaussians) -> Gaussians:
-    """Return Gaussians that give the same picture without `smoothing`, for viewers, files and messages that
+    """Return Gaussians that give the same image without `smoothing`, for viewers, files and messages that
     do not know that filter. Scales and opacities are new arrays if there was a filter."""
     if gaussians.smoothing is None:
         return gaussians

@@ -1,4 +1,4 @@
-"""From blended planes to the picture that is shown: colour and depth normalised by coverage."""
+"""From blended planes to the image that is shown: colour and depth normalised by coverage."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ SOLID = f4(0.4)  # coverage from which on a depth is stated; below it a pixel of
 
 
 def to_view(planes: F32, camera: Camera, frame_id: int, t_capture_ns: int) -> RenderedView:
-    """Return the picture that `planes` [5, h, w] of `Rasterizer.forward` show, in new arrays of camera size.
+    """Return the image that `planes` [5, h, w] of `Rasterizer.forward` show, in new arrays of camera size.
 
     rgb = C / alpha clamped to 0..1, 0 where alpha <= 0.001. depth = D / alpha (m) where alpha >= 0.4, or
     where alpha > 0.001 and all four neighbours have alpha >= 0.4; else 0.

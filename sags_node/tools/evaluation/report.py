@@ -63,7 +63,7 @@ def write_report(
             f'<p class="quiet">{escape("{command}; {date}; revision {revision}".format(**provenance()))}</p>',
             f'<div class="first">{_video(video)}{_verdict(summary)}</div>',
             warning_table(rows),
-            "<h2>Pictures</h2>",
+            "<h2>Images</h2>",
             _pictures(pictures, sheet),
             f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
             f"{far * 1e3:.0f} mm. The error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",

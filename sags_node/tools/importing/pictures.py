@@ -131,9 +131,7 @@ def check_eyes(left: Collection[U8], right: Collection[U8]) -> list[Finding]:
     rows = float(np.median(np.abs(matches[:, 1] - matches[:, 3])))
     figures = {"disparity_px": round(across, 2), "rows_px": round(rows, 2)}
     if np.mean(matches[:, 0] < matches[:, 2]) > 0.8:
-        fix = (
-            "exchange left and right, unless each image was cut out elsewhere (then calibrate as they are)"
-        )
+        fix = "exchange left and right, unless each image was cut out elsewhere (then calibrate as they are)"
         what = "points lie farther to the right in the right eye: eyes exchanged?"
         return [Finding("warning", what, fix, figures, launch=(RIGHT_FIRST,))]
     aligned = rows < 1 / 180 * pairs[0][0].shape[1]
