@@ -22,7 +22,7 @@ CELLS = 8  # across and down: the mean colours of these cells tell one recording
 # What identifies a clip, see `_known`, and the mean difference up to which a frame counts as the same:
 # decoders and processors round differently.
 SAME: dict[str, tuple[str, float]] = {
-    "clip.looks": ("pictures", 4.0),  # levels of 255
+    "clip.looks": ("images", 4.0),  # levels of 255
     "clip.times": ("times", 1e-4),  # s
     "clip.K": ("camera matrix", 1e-2),  # px
     "clip.poses": ("camera poses", 1e-5),  # m, and parts of a rotation matrix
