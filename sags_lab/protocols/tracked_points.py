@@ -69,7 +69,7 @@ def tracked_sequence(folder: Path) -> TrackedSequence:
         raise UsageError(f"{folder} lacks images: video_frames/000001l.png and 000001r.png of each frame")
     _, poses = read_tum(folder / "groundtruth.txt")
     pixels, visible = _tracks(folder / TRACKS)
-    counts = {"pictures": len(left), "poses": len(poses), "frames with points": pixels.shape[1]}
+    counts = {"images": len(left), "poses": len(poses), "frames with points": pixels.shape[1]}
     needed = len(range(*frames.indices(len(left))))
     short = {what: count for what, count in counts.items() if len(range(*frames.indices(count))) < needed}
     if short or needed < 2:
