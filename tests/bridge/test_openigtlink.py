@@ -404,5 +404,5 @@ def test_a_taken_port_and_an_unknown_output_are_said(tmp_path: Path) -> None:
         port = taken.getsockname()[1]
         with pytest.raises(SagsError, match=f"port {port}.*choose another --port"):
             run_openigtlink(options(tmp_path, port=port), lambda *_: None, threading.Event())
-    with pytest.raises(UsageError, match="--send depth: there is image"):
+    with pytest.raises(UsageError, match="--send depth: there is picture"):
         run_openigtlink(options(tmp_path, send=("depth",)), lambda *_: None, threading.Event())

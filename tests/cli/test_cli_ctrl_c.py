@@ -202,7 +202,7 @@ class Kept:
 
 def work(picture=np.zeros((1000, 1000), np.uint8)):
     while True:
-        cv2.blur(image, (9, 9))
+        cv2.blur(picture, (9, 9))
         began.set()
 
 def command():
