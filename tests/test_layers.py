@@ -45,7 +45,7 @@ LINES = {
     "sags_node/detail": 954,
     "sags_node/engine": 3997,
     "sags_node/instruments": 812,
-    "sags_node/field": 1962,
+    "sags_node/field": 1963,
     "sags_node/kernels": 1219,
     "sags_node/mapping": 5535,
     "sags_node/media": 909,
