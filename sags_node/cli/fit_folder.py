@@ -216,7 +216,7 @@ def fit_verdict(found: dict[str, Any]) -> list[tuple[str, str]]:
     mean = (found["between"] or {}).get("mean")
     lines = {}
     if tested["frames"]:  # else none was held out
-        lines["picture"] = f"{_number(tested['psnr'], 'dB')} PSNR on {tested['frames']} frames kept back" + (
+        lines["image"] = f"{_number(tested['psnr'], 'dB')} PSNR on {tested['frames']} frames kept back" + (
             "" if mean is None else f" (the mean of the images around: {_number(mean['psnr'], 'dB')})"
         )
         if found["published"]:

@@ -500,6 +500,7 @@ def test_demo_prints_nothing_but_json(user_files: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     summary = pure_json(result.stdout)
     assert summary["frames"] == 35 and summary["overlay"]["frames"] > 0
+    assert {"revision", "machine"} < set(summary["provenance"]) and summary["receipt"]["frames"]["count"] > 0
     assert summary["overlay"]["saved"] == str(tmp_path / "demo/overlay.mp4")
     assert "images of {width}x{height} px".format_map(summary["settings"]) in result.stderr
     assert {file.name for file in (tmp_path / "demo").iterdir()} >= {"report.html", "overlay.mp4"}
@@ -520,8 +521,8 @@ def test_eval_says_what_it_found_in_a_dozen_lines(user_files: Path, tmp_path: Pa
     lines = result.stdout.splitlines()
     assert 5 <= len(lines) <= 12 and lines[-1].split() == ["report", f"{tmp_path}/report/report.html"]
     said = dict(line.split(None, 1) for line in lines)
-    assert "dB PSNR of the next frame" in said["picture"] and "ms (p99)" in said["latency"]
-    assert "The image before, shown again:" in said["picture"]
+    assert "dB PSNR of the next frame" in said["image"] and "ms (p99)" in said["latency"]
+    assert "The image before, shown again:" in said["image"]
     all_figures = sags("eval", *session, "--verbose").stdout
     assert "of that, median of: rectify" in all_figures and len(all_figures.splitlines()) > 30
     assert "{" not in all_figures + result.stdout and "None" not in all_figures

@@ -398,7 +398,10 @@ def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_p
     summary = {**summary_of(measurer, motion=(2, 5)), "session": "<b>name</b>"}
     pictures = measurer.gallery.pictures
     assert [picture.frame_id for picture in pictures] == [0, 7, 10, 19]
-    file = write_report(tmp_path / "out", summary, measurer.rows, pictures, "overlay.mp4")
+    rows, first = measurer.rows, measurer.rows[0]
+    assert first.facts is not None
+    rows[0] = replace(first, facts=replace(first.facts, warnings={"picture_dark": "dark < black"}))
+    file = write_report(tmp_path / "out", summary, rows, pictures, "overlay.mp4")
     text = file.read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
@@ -406,10 +409,15 @@ def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_p
     assert kinds["data:image/jpeg"] == 16 and kinds["data:image/svg+xml"] == 4 and len(kinds) == 2
     assert len(text) < 2_000_000
     assert "frame 7," in text and "the worst" in text
+    assert "dark &lt; black</td><td>1 frames, 0 to 0" in text
     assert "<b>name" not in text and "http" not in text
-    order = [text.index(each) for each in ("overlay.mp4", "<h2>Images", "<h2>Over time", "<h2>Figures")]
+    order = [text.index(each) for each in ("overlay.mp4", "<h2>Over time", "<h2>Figures", "<h2>Images")]
     assert order == sorted(order)
-    groups = text[order[-1] :]
+    style, body = text.split("</style>")
+    assert {name for used in re.findall(r'class="([^"]+)"', body) for name in used.split()} == (
+        set(re.findall(r"\.([a-z]+)", style.split("<style>")[1]))
+    )
+    groups = text[order[2] : order[3]]
     assert "the image before, shown again:" in groups and "stereo alone:" in groups
     assert "<td></td></tr><tr>" not in groups.replace("\n", "") and "None" not in groups and "{" not in groups
     sheet = cv2.imread(str(file.parent / "sheet.png"))

@@ -46,14 +46,14 @@ def live() -> dict[str, Any]:
 
 def test_a_verdict_has_what_an_overlay_needs_first_with_units_and_baselines() -> None:
     said = dict(verdict(flat(live())))
-    names = ["overlay", "points", "depth", "right eye", "hidden", "speed", "latency", "picture"]
+    names = ["overlay", "points", "depth", "right eye", "hidden", "speed", "latency", "image"]
     assert list(said)[: len(names)] == names and len(said) < 12  # where the report is comes after them
     depth = "0.24 mm off (median), nine of ten within 0.98 mm, on 99% of the tissue, against exact truth"
     assert said.pop("depth") == f"{depth}; stereo alone: 0.17 mm on 87%"
     assert said == {
         "speed": "268 of 300 frames shown at 27.6 frames/s, 32 missed",
         "latency": "39 ms (p50), 97 ms (p99) from the camera's stamp to sending; 314 ms for the first frame",
-        "picture": "36.9 dB PSNR of the next frame, the model alone 33.6 dB. The image before, shown again:"
+        "image": "36.9 dB PSNR of the next frame, the model alone 33.6 dB. The image before, shown again:"
         " 35.8 dB; near while tissue rests, but without depth, another view or hidden tissue",
         "points": "0.38 mm off (median), nine of ten within 0.88 mm;"
         " 33% lost with their Gaussians (anchors take new ones)",

@@ -256,7 +256,7 @@ def verdict(figures: Flat) -> list[tuple[str, str]]:
         "speed": _speed(figures),
         "latency": _latency(figures),
         "unseen": _said(figures, *unseen),
-        "picture": _picture(figures),
+        "image": _image(figures),
         "quality": _quality(figures),
         "warnings": ", ".join(f"{code} ({count} frames)" for code, count in warned),
         "played again": _said(figures, ("second_run.frames", again)),
@@ -320,7 +320,7 @@ def _latency(figures: Flat) -> str:
     return _said(figures, *_middle("latency_ms"), first) or (worked and f"{worked} of work on a frame")
 
 
-def _picture(figures: Flat) -> str:
+def _image(figures: Flat) -> str:
     """The line on the image: how good a view of the next frame is, as a frame's left render is mostly its
     own image. Of a live run, whose views are not known, it is on that render."""
     shown = {

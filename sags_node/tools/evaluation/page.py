@@ -26,10 +26,10 @@ td { overflow-wrap: anywhere }
 .figures td { border-top: 1px solid #ddd } .figures th { font-size: 17px; color: #222 }
 .figures tr:first-child td { vertical-align: bottom; border-top: 0 }
 .figures td { overflow-wrap: break-word } .number { font-variant-numeric: tabular-nums; white-space: nowrap }
-.pictures { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px }
+.images { display: grid; grid-template-columns: repeat(4, 1fr); gap: 4px }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 560px), 1fr)); gap: 8px }
 figure { margin: 0 } figcaption { color: #666; font-size: 13px } img { width: 100%; display: block }
-@media (max-width: 700px) { .pictures { grid-template-columns: repeat(2, 1fr) } }
+@media (max-width: 700px) { .images { grid-template-columns: repeat(2, 1fr) } }
 """
 
 

@@ -1,4 +1,4 @@
-"""A run on one page: its video, what it was worth, images, plots over time, and every figure."""
+"""A run on one page: its video, what it was worth, plots over time, every figure, and images."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -63,14 +63,14 @@ def write_report(
             f'<p class="quiet">{escape("{command}; {date}; revision {revision}".format(**provenance()))}</p>',
             f'<div class="first">{_video(video)}{_verdict(summary)}</div>',
             warning_table(rows),
-            "<h2>Images</h2>",
-            _pictures(pictures, sheet),
-            f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
-            f"{far * 1e3:.0f} mm. The error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
             "<h2>Over time</h2>",
             _plots(rows, summary.get("segments") or {}),
             "<h2>Figures</h2>",
             _figure_groups(summary),
+            "<h2>Images</h2>",
+            _pictures(pictures, sheet),
+            f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
+            f"{far * 1e3:.0f} mm. The error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
         ],
     )
     report = folder / REPORT
@@ -144,38 +144,11 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
         off, against = "stereo", "from the frame's own stereo: mm"
     plots = [
         line_plot(
-            "How near the image is to the camera's: PSNR, dB; higher is better",
-            [
-                series("left render, mostly this image", BLUE, "shown.psnr"),
-                series("a frame ahead", ORANGE, "predict.psnr"),
-                series("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
-                series("the image before, again", GREY, "predict.copy_psnr"),
-                series("kept back, never seen", GREEN, "heldout.psnr", dots=True),
-            ],
-            spans,
-        ),
-        line_plot(
-            "How long a frame took: ms (grey: missed or kept back)",
-            [series("stamp to sending", BLUE, "latency_ms"), series("work", ORANGE, "frame_ms")],
-            spans,
-            gaps=missed,
-        ),
-        line_plot(
             f"How far the depth is {against}",
             [
                 series("nine of ten below", ORANGE, f"{off}.p90_mm"),
                 series("half below", BLUE, f"{off}.median_mm"),
                 series("half below, stereo alone", GREY, "measured_depth.median_mm"),
-            ],
-            spans,
-        ),
-        line_plot(
-            "Right eye and hidden tissue: PSNR, dB; higher is better",
-            [
-                series("right eye", ORANGE, "right.psnr"),
-                series("left image, warped", GREY, "right.warp_psnr"),
-                series("hidden tissue", BLUE, "hidden.psnr", dots=True),
-                series("as it was last seen", GREY, "hidden.copy_psnr", dots=True),
             ],
             spans,
         ),
@@ -190,11 +163,38 @@ def _plots(rows: Sequence[FrameRow], spans: Mapping[str, tuple[int, int]]) -> st
             across="predicted",
             up="real",
         ),
+        line_plot(
+            "Right eye and hidden tissue: PSNR, dB; higher is better",
+            [
+                series("right eye", ORANGE, "right.psnr"),
+                series("left image, warped", GREY, "right.warp_psnr"),
+                series("hidden tissue", BLUE, "hidden.psnr", dots=True),
+                series("as it was last seen", GREY, "hidden.copy_psnr", dots=True),
+            ],
+            spans,
+        ),
+        line_plot(
+            "How long a frame took: ms (grey: missed or kept back)",
+            [series("stamp to sending", BLUE, "latency_ms"), series("work", ORANGE, "frame_ms")],
+            spans,
+            gaps=missed,
+        ),
+        line_plot(
+            "How near the image is to the camera's: PSNR, dB; higher is better",
+            [
+                series("left render, mostly this image", BLUE, "shown.psnr"),
+                series("a frame ahead", ORANGE, "predict.psnr"),
+                series("the model alone, of a frame that it learnt from", BLUE, "online.psnr"),
+                series("the image before, again", GREY, "predict.copy_psnr"),
+                series("kept back, never seen", GREEN, "heldout.psnr", dots=True),
+            ],
+            spans,
+        ),
     ]
     plots = [plot for plot in plots if plot]
     if len(plots) % 2:  # two stand in a row
         gaussians = series("Gaussians", BLUE, "gaussians")
-        plots.append(line_plot("How many Gaussians the model has", [gaussians], spans))
+        plots.insert(-1, line_plot("How many Gaussians the model has", [gaussians], spans))
     return plot_grid(plots)
 
 
