@@ -212,9 +212,10 @@ def check_files(*files: Path | None, force: bool | None = None) -> None:
 def show_outcome(summary: Mapping[str, Any], report: Path | None, verbose: bool, json_out: bool) -> None:
     """Print what a measured run was worth, where its report is, and if asked for all of its figures."""
     from sags_node.tools.evaluation.figures import flat, groups, headings, verdict
+    from sags_node.tools.evaluation.provenance import provenance
 
     if json_out:
-        show(dict(summary))
+        show({"provenance": provenance()} | dict(summary))
         if report is not None:
             console.print(f"report: {report}", markup=False, soft_wrap=True)
         return

@@ -39,7 +39,7 @@ _OPTIONS = MeasureOptions(hold_out=0, second=True)
 class Demo:
     """What a demo leaves behind."""
 
-    summary: dict[str, Any]  # as `sags eval`, and what the overlay subscriber counted under "overlay"
+    summary: dict[str, Any]  # as `sags eval --out`, and what the overlay subscriber counted under "overlay"
     report: Path
 
 
@@ -86,7 +86,7 @@ def run_demo(session: Session, out: Path, progress: Callable[[int, int | None, s
             )
             video.finish()
     outcome = completed(outcome, session, _OPTIONS, lambda what, done, count: progress(done, count, what))
-    outcome.summary["overlay"] = consumed | {"saved": str(out / VIDEO)}
+    outcome.summary.update(overlay=consumed | {"saved": str(out / VIDEO)}, receipt=outcome.receipt)
     page = write_report(out, outcome.summary, outcome.rows, outcome.pictures, VIDEO)
     return Demo(outcome.summary, page)
 
