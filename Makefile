@@ -34,7 +34,8 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PIP) uv
 	@# torch for the card that is there, or for the CPU. uv takes a fifth of pip's time; it does not know pip's
 	@# configuration, so where it fails pip goes on.
-	@$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt --torch-backend auto torch 2>/dev/null || $(PIP) torch
+	@$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt --torch-backend auto torch 2>/dev/null || \
+	  { echo "uv could not get torch for this machine; pip takes its own, which may bring CUDA: 4 GB"; $(PIP) torch; }
 	@$(BIN)/uv pip install -q --python $(BIN)/python -c constraints.txt -e '.[dev]' || \
 	  { echo "uv could not; pip goes on"; $(PIP) -e '.[dev]'; }
 	@touch $@
