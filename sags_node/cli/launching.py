@@ -262,6 +262,5 @@ def write_json(file: Path | None, figures: Mapping[str, Any] | list[Any]) -> Non
         from sags_node.tools.evaluation.provenance import provenance
 
         rows = {"rows": figures} if isinstance(figures, list) else figures
-        lines = json_text({"provenance": provenance()} | dict(rows), indent=1)
         with whole(file) as partial:
-            partial.write_text(lines + "\n", encoding="utf-8")
+            partial.write_text(json_text({"provenance": provenance()} | dict(rows), indent=1) + "\n", "utf-8")
