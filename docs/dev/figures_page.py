@@ -36,6 +36,26 @@ LADDER_ROW = (
     "| {d4d[depth][median_mm]:.2f} | {phantom[frame_ms][p50]:.1f} | {phantom[online][psnr]:.1f} "
     "| {phantom[depth][median_mm]:.3f} | {phantom[track][median_mm]:.3f}"
 )
+CROWD_ROW = (
+    "{phase} | {rate_hz[p50]:.1f} | {latency_p50_ms:.0f} / {latency_p99_ms:.0f} ms "
+    "| {rss_mb[start]:.0f} to {rss_mb[end]:.0f} MB, {rss_mb_per_minute:+.1f} MB a minute"
+)
+HOST_ROW = (
+    "{name} | {share_after_first_second:.1%} | {latency_ms[p50]:.0f}, {latency_ms[p99]:.0f} ms "
+    "| {online_at_full_size[psnr]:.1f}, {online_at_full_size[motion][psnr]:.1f} | {gaussians[mean]:,.0f}"
+)
+INPUT_ROW = "{way} | {node_ms:.1f} | {sender_ms:.1f} | {latency_ms_p50:.1f} / {latency_ms_p99:.1f} ms"
+RIGHT = {  # results of the right eye with 24,000 Gaussians
+    "D4D, 179 frames": "right_d4d[right]", "... its lift, frames 75 to 105": "right_d4d[right][motion]",
+    "Hamlyn heart, 100 frames": "right_hamlyn[right]", "phantom, 120 frames": "right_phantom[right]",
+}  # fmt: skip
+RIGHT_ROW = "{shown[psnr]:.1f} | {shown[warp_psnr]:.1f} | {shown[model_psnr]:.1f} | {shown[copy_psnr]:.1f}"
+STEPS = {  # results frame by frame whose depth says how sure it is
+    "phantom, exact depth": "phantom_step", "D4D at 60 to 180 mm, depth of a network": "d4d_step",
+}  # fmt: skip
+SURE_ROW = (
+    "{depth[coverage]:.0%} | {depth_confidence[sure_share]:.0%} | {depth_confidence[sure_p90_mm]:.2f} mm"
+)
 METHOD_ROW = (
     "{width}x{height} `{method}` | {live[rate_hz]:.1f} Hz, {live[latency_ms][p50]:.0f} / "
     "{live[latency_ms][p99]:.0f} ms | {live[psnr]:.1f} dB | {step[online]:.1f} dB | {step[predict]:.1f} dB "
@@ -49,6 +69,8 @@ def result(file: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8"))
     if "processed" in found:
         found["share"] = found["processed"] / found["frames"]
+    if "overlay" in found:
+        found["overlay"]["share"] = found["overlay"]["overlay"] / found["overlay"]["frames"]
     return found
 
 
@@ -63,8 +85,8 @@ class Figure:
 
     Of a list: a place, the row in which one of the values is that word, or `*` for all rows. What is asked of
     all rows is written as the range of its values, what is asked of several runs as one value each, or behind
-    `*` as their range. `test`
-    is the half of a clip that no constant was chosen on, and all of a clip that has none.
+    `*` as their range. `test` is the half of a clip that no constant was chosen on, and all of a clip that
+    has none.
     """
 
     def __init__(self, runs: list[Any], rows: bool = False) -> None:
@@ -80,7 +102,8 @@ class Figure:
     def __format__(self, how: str) -> str:
         if self._rows:
             values = [value for value in self._runs if value is not None]
-            return f"{min(values):{how}} to {max(values):{how}}"
+            least, most = f"{min(values):{how}}", f"{max(values):{how}}"
+            return least if least == most else f"{least} to {most}"
         return ", ".join("-" if value is None else f"{value:{how}}" for value in self._runs)
 
 
@@ -118,9 +141,12 @@ def pages() -> dict[Path, str]:
     """What each page should be."""
     written = {
         "README.md": (_plain("why.txt"), _plain("headline.txt")),
-        "benchmarks/README.md": (_claims(), _live()),
-        "benchmarks/ladder.md": (_ladder(),),
+        "benchmarks/README.md": (_claims(), _live(), _crowd()),
+        "benchmarks/depth.md": (_sure(), _predicted()),
+        "benchmarks/ladder.md": (_ladder(), _hosts()),
+        "benchmarks/mapping.md": (_right(),),
         "docs/how-it-works.md": (_methods(),),
+        "docs/inputs.md": (_inputs(),),
     }
     return {ROOT / page: _replaced((ROOT / page).read_text("utf-8"), *new) for page, new in written.items()}
 
@@ -132,8 +158,9 @@ def _replaced(page: str, *tables: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """A table of README.md."""
-    return table(" | the model | compared with", list(map(filled, lines(name))))
+    """A table of README.md; its first line has the titles."""
+    titles, *rows = lines(name)
+    return table(titles, list(map(filled, rows)))
 
 
 def _claims() -> str:
@@ -177,6 +204,41 @@ def _ladder() -> str:
         "| online, dB | depth, mm | points, mm"
     )
     return table(titles, rows)
+
+
+def _crowd() -> str:
+    titles = " | updates / s | latency p50 / p99 | memory, start to end"
+    return table(titles, [CROWD_ROW.format(**phase) for phase in result("crowd")["phases"]])
+
+
+def _hosts() -> str:
+    titles = " | frames after the first second | latency p50, p99 | dB at full size, all, lift | Gaussians"
+    return table(titles, [HOST_ROW.format(**host) for host in result("hosts")["sessions"][0]["hosts"]])
+
+
+def _inputs() -> str:
+    titles = " | node, CPU ms a pair | sender, CPU ms a pair | stamp to mapper, p50 / p99"
+    return table(titles, [INPUT_ROW.format(**way) for way in result("inputs")["rows"]])
+
+
+def _sure() -> str:
+    steps = {what: result(file) for what, file in STEPS.items()}
+    rows = [f"{what} | {SURE_ROW.format(**found)}" for what, found in steps.items()]
+    titles = " one step a frame, 640x512 (`results/*_step.json`) | stated | sure (confidence from 0.5 on)"
+    return table(f"{titles} | real error of those, p90", rows)
+
+
+def _predicted() -> str:
+    """For each group of predicted errors, what nine of ten real ones stay below, mm."""
+    steps = {what: result(file)["depth_confidence"]["by_predicted_mm"] for what, file in STEPS.items()}
+    real = {what: [Figure([group["p90_mm"]]) for group in found.values()] for what, found in steps.items()}
+    rows = [" | ".join([what, *(f"{each:.2f}" for each in found)]) for what, found in real.items()]
+    return table(" | ".join([" predicted", *next(iter(steps.values()))]), rows)
+
+
+def _right() -> str:
+    rows = [f"{what} | " + filled(RIGHT_ROW.replace("shown", key)) for what, key in RIGHT.items()]
+    return table(" dB | shown | the warp | the model alone | the right image before, again", rows)
 
 
 def _methods() -> str:
