@@ -8,7 +8,7 @@ import pytest
 from engine_scenes import round_gaussians
 from flat_scene import camera_in_front
 from places import SESSION
-from recorded_session import frames_of, opened
+from recorded_session import both, frames_of, opened
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import (
@@ -27,6 +27,7 @@ from sags_node.detail.share import Share
 from sags_node.detail.show import Detail, Lessons
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
+from sags_node.messaging import published
 from sags_node.messaging.requests import ViewRequest
 from sags_node.node.allowance import Allowance
 from sags_node.node.views import Views
@@ -282,6 +283,22 @@ def test_what_is_seen_is_the_picture_and_what_is_hidden_comes_from_before() -> N
     far[90:160, 110:190] = False
     agree = (view.shown.rgb == truth).all(-1)[far]
     assert agree.mean() > 0.9  # the rest lies at seams
+
+
+@pytest.mark.parametrize("published_px", [320, 640])
+def test_an_image_in_another_light_is_shown_in_that_of_the_model(published_px: int) -> None:
+    """At half the exposure, the image is multiplied out: off by half a level of that, and a gain's error."""
+    session = opened("mapping.max_gaussians:=3000", f"vision.width:={published_px // 2}")
+    pipeline = Pipeline(session.config, session.rig)
+    *before, last = list(frames_of(session))[:8]
+    for frame in before:
+        pipeline.process(frame, StepBudget(1), FrameRequest(left=True))
+    dark = both(last, lambda eye: np.rint(0.5 * eye))
+    view = pipeline.process(dark, StepBudget(1), FrameRequest(left=True)).views["left"]
+    assert view.shown is not None
+    truth = published.picture(pipeline.rectifier(last), "left")
+    sure = published.nearest(pipeline.rectifier(last), pipeline.seen[0].sure_tissue.astype(bool))
+    assert np.median(np.abs(view.shown.rgb.astype(int) - truth)[sure]) <= 2
 
 
 def test_a_source_of_hidden_tissue_is_kept_while_the_memory_is_the_same_and_it_saw_enough(
