@@ -449,8 +449,8 @@ class Pipeline:
             partial(published.picture, seen, "left"), observation.tissue, mapped.view.depth,
             self._matched(seen.t_capture_ns, mapped.view.depth, observation.depth),
         )  # fmt: skip
-        self.seen = now, *self._memory.frames
         self._memory.add(now)
+        self.seen = now, *self._memory.frames
 
     def _left_eye(self, view: RenderedView, pair: RectifiedPair, wanted: bool) -> RenderedView:
         """The model drawn for the left eye; with the image's detail, if somebody looks."""
