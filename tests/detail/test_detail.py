@@ -13,6 +13,7 @@ from recorded_session import both, frames_of, opened
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import (
     EVERY,
+    HIDDEN,
     MATCHED,
     MOST,
     OLDEST,
@@ -215,11 +216,23 @@ def test_a_share_is_the_least_squares_mix_of_both_guesses() -> None:
 def test_memory_is_bounded_and_keeps_what_is_seldom() -> None:
     memory = Memory()
     for step in range(300):
-        memory.add(seen(step * 33_333_333))
-        ages = [(step * 33_333_333 - one.t_capture_ns) * 1e-9 for one in memory.frames]
-        assert len(ages) <= MOST and ages == sorted(ages) and max(ages) <= OLDEST
+        now = step * 33_333_333
+        memory.add(seen(now))
+        ages = [(now - one.t_capture_ns) * 1e-9 for one in memory.frames]
+        assert len(ages) <= MOST and ages == sorted(ages) and max(ages, default=0) <= OLDEST
         assert min(np.diff(ages), default=EVERY) >= EVERY - 1e-6
     assert max(ages) > 3  # s, though the newest ten lie within two
+
+
+@pytest.mark.parametrize(("share", "kept"), [(2 * HIDDEN, True), (0.5 * HIDDEN, False)])
+def test_the_last_frame_before_tissue_is_hidden_is_kept(share: float, kept: bool) -> None:
+    memory, mask = Memory(), np.ones((HEIGHT, WIDTH), np.bool_)
+    mask.reshape(-1)[: round(share * mask.size)] = False
+    for stamp_ns in (0, 10_000_000, 20_000_000):
+        memory.add(seen(stamp_ns))
+    memory.add(replace(seen(30_000_000), mask=mask))
+    memory.add(replace(seen(40_000_000), mask=mask))
+    assert [one.t_capture_ns for one in memory.frames] == ([20_000_000, 0] if kept else [0])
 
 
 def test_hidden_tissue_comes_from_the_newest_frame_that_saw_it_in_the_light_of_now() -> None:
