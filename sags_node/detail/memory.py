@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from sags_node.detail.seen import MatchedDepth, SeenFrame
 from sags_node.types import F32, Gaussians
 
 EVERY = 0.2  # s between frames that are kept
+HIDDEN = 0.005  # of a frame's pixels were tissue in the frame before, which is kept then
 MOST = 10  # frames kept
 OLDEST = 10.0  # s: what nobody has seen for longer is drawn as the model has it
 NEARLY = 0.5  # of what the best frame saw: a newer frame that saw more than this is taken instead
@@ -18,7 +20,7 @@ BRIGHTER = 2.0  # largest factor between the light of a source and of the view
 
 
 class Memory:
-    """Keeps frames: recent ones close in time, older ones farther apart.
+    """Keeps frames: recent ones close in time, older ones farther apart, and the last before tissue was hidden.
 
     Attributes:
         frames: the newest first.
@@ -26,24 +28,32 @@ class Memory:
 
     def __init__(self) -> None:
         self.frames: tuple[SeenFrame, ...] = ()
+        self._last: SeenFrame | None = None  # kept once the next frame tells whether it hides something
 
     def forget(self) -> None:
         """Drop all frames: ids now stand for other Gaussians."""
-        self.frames = ()
+        self.frames, self._last = (), None
 
     def add(self, frame: SeenFrame) -> None:
-        """Keep a frame, unless one from less than `EVERY` before it is kept."""
+        """Take a new frame, and keep the one before it if none was kept for `EVERY`, or if the new one hides
+        `HIDDEN` of its pixels."""
+        last, self._last = self._last, frame
         now = frame.t_capture_ns
         kept = [one for one in self.frames if 0 <= now - one.t_capture_ns <= OLDEST * 1e9]
-        if kept and now - kept[0].t_capture_ns < EVERY * 1e9:
-            return
-        picture = frame.picture()  # made now, so that the rest of the frame it is made from can be freed
-        kept.insert(0, replace(frame, picture=lambda: picture, matched=None))
+        if last is not None and 0 <= now - last.t_capture_ns <= OLDEST * 1e9:
+            due = not kept or last.t_capture_ns - kept[0].t_capture_ns >= EVERY * 1e9
+            if due or _hides(frame, last):
+                picture = last.picture()  # made now, so that the rest of the frame can be freed
+                kept.insert(0, replace(last, picture=lambda: picture, matched=None))
         if len(kept) > MOST:
             ages = [EVERY + (now - one.t_capture_ns) * 1e-9 for one in kept]
             # The frame whose neighbours in time have the smallest ratio of ages is missed least.
             del kept[min(range(1, len(kept) - 1), key=lambda i: ages[i + 1] / ages[i - 1])]
         self.frames = tuple(kept)
+
+
+def _hides(frame: SeenFrame, last: SeenFrame) -> bool:
+    return cv2.countNonZero(cv2.subtract(last.tissue, frame.tissue)) > HIDDEN * frame.tissue.size
 
 
 class Matched:

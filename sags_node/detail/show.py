@@ -16,8 +16,8 @@ from sags_node.mapping.right_eye import coarse_right_eye_mask
 from sags_node.model.gaussians import for_right_eye
 from sags_node.types import F32, U8, Bool, Camera, Gaussians, Shown, Snapshot
 
-LESSON_EVERY = 4  # frames between lessons: what they teach changes slowly, and each costs a small view
-ASIDE_EVERY = 12  # frames between lessons from the right eye
+LESSON_EVERY = 4  # views drawn between lessons: what they teach changes slowly, and each costs a small view
+ASIDE_EVERY = 12  # views drawn between lessons from the right eye
 LOOKED_AT = 4  # px, along both axes, between the pixels that a lesson compares
 COMPARED = 8  # px between the pixels at which an image's sharpness is compared with the model's error
 AROUND = np.ones((5, 5), np.uint8)  # px of the working size: around hidden tissue, also filled as if hidden

@@ -303,7 +303,7 @@ class Pipeline:
             mapped = self._mapped(observation, tracks, budget, still, judged.learn, right)
         # Then draw what consumers watch: the right eye, and their anchors.
         with clock("render"):
-            self._lend(mapped, pair, observation, judged)
+            self._lend(mapped, seen, observation, judged)
             views = {"left": self._left_eye(mapped.view, pair, request.left or right)}
             if right:
                 views["right"] = self._right_eye(mapped, observation, pair, seen, judged, by_both)
@@ -433,20 +433,24 @@ class Pipeline:
         self._camera.learn(observation, mapped.view)
         return mapped
 
-    def _lend(self, mapped: Mapped, pair: RectifiedPair, observation: Observation, judged: Judgement) -> None:
-        """Note the images from which views may take detail. None is taken from one in another light, or if
-        the model is empty."""
+    def _lend(self, mapped: Mapped, seen: RectifiedPair, observation: Observation, judged: Judgement) -> None:
+        """Note the images from which views may take detail. None is taken from one that is not learnt from,
+        or if the model is empty.
+
+        Args:
+            seen: the frame in the exposure of the model.
+        """
         self.seen = ()
         known = len(mapped.snapshot.gaussians) > 0
-        if self._detail is None or not known or not judged.learn or judged.gain is not None:
+        if self._detail is None or not known or not judged.learn:
             return
         now = SeenFrame(
-            pair.t_capture_ns, observation.camera, mapped.snapshot.gaussians,
-            partial(published.picture, pair, "left"), observation.tissue, mapped.view.depth,
-            self._matched(pair.t_capture_ns, mapped.view.depth, observation.depth),
+            seen.t_capture_ns, observation.camera, mapped.snapshot.gaussians,
+            partial(published.picture, seen, "left"), observation.tissue, mapped.view.depth,
+            self._matched(seen.t_capture_ns, mapped.view.depth, observation.depth),
         )  # fmt: skip
-        self.seen = now, *self._memory.frames
         self._memory.add(now)
+        self.seen = now, *self._memory.frames
 
     def _left_eye(self, view: RenderedView, pair: RectifiedPair, wanted: bool) -> RenderedView:
         """The model drawn for the left eye; with the image's detail, if somebody looks."""
@@ -477,7 +481,7 @@ class Pipeline:
             shown = self._detail.view(drawn, view.depth, camera, gaussians, now, baseline, tint=tint)
             view = replace(view, shown=shown)
             if self._right_views % ASIDE_EVERY == 1:
-                self._detail.learn_aside(now, mapped.snapshot, published.picture(pair, "right"), baseline)
+                self._detail.learn_aside(now, mapped.snapshot, published.picture(seen, "right"), baseline)
         if self._right_views % LEARN_EVERY == 0:
             assert seen.right is not None  # else nothing is drawn for it
             rgb = view.rgb

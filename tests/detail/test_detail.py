@@ -8,11 +8,12 @@ import pytest
 from engine_scenes import round_gaussians
 from flat_scene import camera_in_front
 from places import SESSION
-from recorded_session import frames_of, opened
+from recorded_session import both, frames_of, opened
 
 from sags_node.detail.carry import carry, coarse_camera, every_fourth, trace
 from sags_node.detail.memory import (
     EVERY,
+    HIDDEN,
     MATCHED,
     MOST,
     OLDEST,
@@ -27,6 +28,7 @@ from sags_node.detail.share import Share
 from sags_node.detail.show import Detail, Lessons
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
+from sags_node.messaging import published
 from sags_node.messaging.requests import ViewRequest
 from sags_node.node.allowance import Allowance
 from sags_node.node.views import Views
@@ -214,11 +216,23 @@ def test_a_share_is_the_least_squares_mix_of_both_guesses() -> None:
 def test_memory_is_bounded_and_keeps_what_is_seldom() -> None:
     memory = Memory()
     for step in range(300):
-        memory.add(seen(step * 33_333_333))
-        ages = [(step * 33_333_333 - one.t_capture_ns) * 1e-9 for one in memory.frames]
-        assert len(ages) <= MOST and ages == sorted(ages) and max(ages) <= OLDEST
+        now = step * 33_333_333
+        memory.add(seen(now))
+        ages = [(now - one.t_capture_ns) * 1e-9 for one in memory.frames]
+        assert len(ages) <= MOST and ages == sorted(ages) and max(ages, default=0) <= OLDEST
         assert min(np.diff(ages), default=EVERY) >= EVERY - 1e-6
     assert max(ages) > 3  # s, though the newest ten lie within two
+
+
+@pytest.mark.parametrize(("share", "kept"), [(2 * HIDDEN, True), (0.5 * HIDDEN, False)])
+def test_the_last_frame_before_tissue_is_hidden_is_kept(share: float, kept: bool) -> None:
+    memory, mask = Memory(), np.ones((HEIGHT, WIDTH), np.bool_)
+    mask.reshape(-1)[: round(share * mask.size)] = False
+    for stamp_ns in (0, 10_000_000, 20_000_000):
+        memory.add(seen(stamp_ns))
+    memory.add(replace(seen(30_000_000), mask=mask))
+    memory.add(replace(seen(40_000_000), mask=mask))
+    assert [one.t_capture_ns for one in memory.frames] == ([20_000_000, 0] if kept else [0])
 
 
 def test_hidden_tissue_comes_from_the_newest_frame_that_saw_it_in_the_light_of_now() -> None:
@@ -282,6 +296,22 @@ def test_what_is_seen_is_the_picture_and_what_is_hidden_comes_from_before() -> N
     far[90:160, 110:190] = False
     agree = (view.shown.rgb == truth).all(-1)[far]
     assert agree.mean() > 0.9  # the rest lies at seams
+
+
+@pytest.mark.parametrize("published_px", [320, 640])
+def test_an_image_in_another_light_is_shown_in_that_of_the_model(published_px: int) -> None:
+    """At half the exposure, the image is multiplied out: off by half a level of that, and a gain's error."""
+    session = opened("mapping.max_gaussians:=3000", f"vision.width:={published_px // 2}")
+    pipeline = Pipeline(session.config, session.rig)
+    *before, last = list(frames_of(session))[:8]
+    for frame in before:
+        pipeline.process(frame, StepBudget(1), FrameRequest(left=True))
+    dark = both(last, lambda eye: np.rint(0.5 * eye))
+    view = pipeline.process(dark, StepBudget(1), FrameRequest(left=True)).views["left"]
+    assert view.shown is not None
+    truth = published.picture(pipeline.rectifier(last), "left")
+    sure = published.nearest(pipeline.rectifier(last), pipeline.seen[0].sure_tissue.astype(bool))
+    assert np.median(np.abs(view.shown.rgb.astype(int) - truth)[sure]) <= 2
 
 
 def test_a_source_of_hidden_tissue_is_kept_while_the_memory_is_the_same_and_it_saw_enough(

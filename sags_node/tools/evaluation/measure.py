@@ -306,8 +306,8 @@ class Measurer:
         )  # fmt: skip
         if self._detail is None:
             return lent
-        whole = self._detail.left(shown.rgb, shown.depth, camera, lent, self._memory.frames)
         self._memory.add(lent)
+        whole = self._detail.left(shown.rgb, shown.depth, camera, lent, self._memory.frames)
         return replace(lent, whole=whole)
 
     def _predict(self, before: _Mapped, shown: MappedFrame, now: _Recorded, frames: int) -> Figures:

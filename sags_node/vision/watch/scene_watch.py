@@ -7,6 +7,7 @@ Another scene changes most of it, and no motion explains it.
 """
 
 from dataclasses import replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import cv2
@@ -187,10 +188,13 @@ def exposed(pair: RectifiedPair, gain: F32) -> RectifiedPair:
     def change(picture: U8) -> U8:
         return np.asarray(cv2.multiply(picture, (*factors, 1.0)))
 
-    left = change(pair.left)
+    left, published = change(pair.left), pair.published
     right = None if pair.right is None else change(pair.right)
     gray = gray_pyramid(left), None if right is None else gray_pyramid(right)
-    return replace(pair, left=left, right=right, gray=gray)
+    if published is not None:
+        picture = published.picture
+        published = replace(published, picture=cache(lambda side: change(picture(side))))
+    return replace(pair, left=left, right=right, gray=gray, published=published)
 
 
 def enlarged(small: Bool, shape: tuple[int, ...]) -> Bool:
