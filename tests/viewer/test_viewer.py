@@ -185,6 +185,35 @@ def test_the_range_of_the_depth_colours_is_that_which_is_asked_for() -> None:
     assert sheet.shown == (0.01, 0.3) and (followed != fixed).any()
 
 
+def test_frames_without_known_depth_leave_the_range_of_the_depth_colours() -> None:
+    sheet, seen = Sheet(), moment()
+    for unknown in (np.full((32, 40), np.nan, np.float32), np.zeros((32, 40), np.float32)):
+        blind = replace(seen, pictures={**seen.pictures, DEPTH: unknown})
+        sheet.draw(blind, FOUR)
+        sheet.draw(seen, FOUR)
+        sheet.draw(blind, FOUR)
+        assert sheet.shown == pytest.approx((0.05, 0.08))
+
+
+@pytest.mark.parametrize("plane", [0.05, 0.08])
+def test_a_range_of_one_depth_has_colours_for_nearer_and_further(plane: float) -> None:
+    sheet = Sheet()
+    sheet.fixed = (plane, plane)
+    with np.errstate(all="raise"):
+        drawn = sheet.draw(moment(), "Depth under the cursor").astype(int)
+    near, far = drawn[100, -50], drawn[-60, -50]
+    assert near[0] > near[2] and (far[2] > far[0]) == (plane < 0.08)
+
+
+def test_the_rim_of_the_overlay_is_of_its_own_colour() -> None:
+    """The overlay's image is not premultiplied: beside what is drawn lies black, which must not count."""
+    drawn = np.zeros((576, 720, 4), np.uint8)
+    drawn[:, 361:] = (250, 0, 0, 102)  # from the middle of a pixel on
+    row = Sheet().draw(replace(moment(250), drawn={"left": drawn}), "Overlay")[150]
+    assert (row[:, 0] == 250).all(), "red over as bright a red"
+    assert (row[:180, 1] == 250).all() and row[180, 1] == 200 and (row[181:, 1] == 150).all(), "0.4 of it"
+
+
 def test_the_depth_under_the_cursor_is_the_drawn_one_and_a_guess_is_said_to_be_one() -> None:
     view = "Depth under the cursor"
     assert {DEPTH, CONFIDENCE} <= set(needs_of(view)) and CONFIDENCE not in needs_of(FOUR)

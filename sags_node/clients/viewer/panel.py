@@ -121,7 +121,8 @@ class Panel:
         self._status.content = status_line(moment, int(time.monotonic()))
 
     def _draw(self, remark: str = "") -> None:
-        self._sheet.fixed = None if self._auto.value else (self._near.value * UNIT, self._far.value * UNIT)
+        near, far = sorted((self._near.value * UNIT, self._far.value * UNIT))
+        self._sheet.fixed = None if self._auto.value else (near, far)
         sheet = self._sheet.draw(self._moment, self.view, remark)
         self._pictures.image = sheet
         self._depth.content = depth_line(self._moment, self.view, sheet.shape[0], self._unit)
@@ -197,8 +198,8 @@ class Panel:
             )
             with self._gui.add_folder("Depth colours", expand_by_default=False):
                 self._auto = self._gui.add_checkbox("Follow the tissue", True)
-                self._near = self._gui.add_number("Near (mm)", 50.0, min=1.0, max=1000.0)
-                self._far = self._gui.add_number("Far (mm)", 150.0, min=1.0, max=1000.0)
+                self._near = self._gui.add_number("Near (mm)", 50.0, min=1.0, max=1000.0, step=0.1)
+                self._far = self._gui.add_number("Far (mm)", 150.0, min=1.0, max=1000.0, step=0.1)
             self._plots = [
                 self._plot("Rate (Hz)", {"rate": BRIGHT}),
                 self._plot("Latency (ms): p50 blue, p99 orange", {"p50": BLUE, "p99": ORANGE}),
@@ -210,8 +211,8 @@ class Panel:
             """Begin the fixed range of colours with the one that is shown."""
             if not event.target.value:
                 near, far = self._sheet.shown
-                self._near.value = round(near / UNIT)  # type: ignore[misc]  # viser's setter, which mypy misses
-                self._far.value = round(far / UNIT)  # type: ignore[misc]  # as above
+                self._near.value = round(near / UNIT, 1)  # type: ignore[misc]  # viser's setter, which mypy misses
+                self._far.value = round(far / UNIT, 1)  # type: ignore[misc]  # as above
 
         panel.dock_above(self._gui.main_panel)
 
