@@ -27,6 +27,7 @@ from sags_node.clients.viewer import splats as viewer_splats
 from sags_node.clients.viewer.cursor import depth_line
 from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, TISSUE, Moment, Rung, Status
 from sags_node.clients.viewer.history import GAP, History
+from sags_node.clients.viewer.overlay import Overlay, Thing
 from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
 from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.clients.viewer.still import SILENT_AFTER
@@ -36,7 +37,7 @@ from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.phantom import write_session
-from sags_node.types import SH_DEGREE_0, Camera
+from sags_node.types import SH_DEGREE_0, Camera, Gaussians
 
 pytestmark = [pytest.mark.live, pytest.mark.alone]
 
@@ -498,3 +499,101 @@ def test_a_live_node_is_shown_obeys_and_disappears(
     until(lambda: contrast(page) < 2, page)
     own = (view.where["url"], f"blob:{view.where['url']}", "data:")
     assert page.requests and all(request.startswith(own) for request in page.requests)
+
+
+# ---- in a browser, without a node ------------------------------------------------------------------------
+
+
+class Shown:
+    """A page of moments that a test makes."""
+
+    def __init__(self, server: Any, panel: Any, scene: Any, page: Any) -> None:
+        self.server, self.panel, self.scene, self.page = server, panel, scene, page
+
+    def show(self, moment: Moment) -> None:
+        """Show it, and wait until the page has it."""
+        with self.server.atomic():
+            self.scene.show(moment)
+            self.panel.show(moment)
+        self.server.flush()
+        expected = str(moment.t_capture_ns)
+        until(lambda: self.page.locator("#sags-status").get_attribute("data-frame") == expected, self.page)
+
+
+@pytest.fixture
+def narrow() -> Iterator[Shown]:
+    """The viewer's page in a window of 600 px."""
+    from sags_node.clients.viewer.panel import Panel
+    from sags_node.clients.viewer.scene import Scene
+    from sags_node.clients.viewer.server import serving
+
+    def export(gaussians: Gaussians, camera: Camera, t_capture_ns: int, kind: str) -> bytes:
+        return f"{kind} of {len(gaussians)} at {t_capture_ns}".encode()
+
+    with serving("127.0.0.1", 0, False) as (server, url):
+        scene = Scene(server)
+        panel = Panel(server, scene, THE_NODE, export, 20.0)
+        server.on_client_connect(panel.fit)
+        with new_page(SOFTWARE_GL, viewport={"width": 600, "height": 800}) as page:
+            page.set_default_timeout(30_000)
+            page.add_init_script(KEEP_ERRORS)
+            page.goto(url)
+            page.wait_for_selector("#sags-status")
+            yield Shown(server, panel, scene, page)
+            assert page.evaluate("window.errors") == []
+
+
+def at(stamp_ns: int) -> Moment:
+    """With an anchor whose depth is a guess, and an object that it holds."""
+    anchors = np.zeros(
+        1, [(name, "f4") for name in "x y z visibility confidence depth_confidence".split()] + [("id", "u4")]
+    )
+    anchors["x"], anchors["z"], anchors["id"] = -0.0123, 0.1234, 12
+    thing = Thing(
+        "the hepatic artery", unsure="its anchors were not recognised for 2 s", anchors=({"id": 12.0},)
+    )
+    return replace(
+        moment(), t_capture_ns=stamp_ns, anchors=anchors, overlay=Overlay("running", objects=(thing,))
+    )
+
+
+@needs_viser
+def test_the_page_counts_the_frames_that_come_to_it(narrow: Shown) -> None:
+    stamps = [7, 7, 0, 8, 9, 0, 9, 10]  # shown again, and nothing to show
+    before = narrow.page.evaluate("performance.now()")
+    for stamp_ns in stamps:
+        narrow.show(at(stamp_ns) if stamp_ns else Moment("gone"))
+    came = narrow.page.evaluate("sagsFrames")
+    assert came["count"] == 4 and before < came["first"] < came["last"]
+    until(lambda: narrow.page.locator("#sags-rate").text_content() == "0 /s", narrow.page)
+
+
+OUT_OF_REACH = """() => [...document.querySelectorAll("button, input, img, .u-wrap")].filter((each) => {
+    if (each.type === "hidden" || !each.checkVisibility()) return false;  // viser's own settings are folded
+    each.scrollIntoView({ block: "center" });
+    const { left, right, top, width, height } = each.getBoundingClientRect();
+    const met = document.elementFromPoint(left + width / 2, top + height / 2);
+    const there = each.contains(met) || met?.parentElement === each.parentElement;
+    return left < 0 || right > innerWidth || !there;
+}).map((each) => each.outerHTML.slice(0, 200))"""
+SIDEWAYS = """() => [...document.querySelectorAll("*")].filter((each) =>
+    each.scrollWidth > each.clientWidth + 1 && /auto|scroll/.test(getComputedStyle(each).overflowX)
+).map((each) => each.outerHTML.slice(0, 200))"""
+
+
+@needs_viser
+def test_in_a_window_of_600_px_all_is_reached_without_scrolling_sideways(narrow: Shown) -> None:
+    page = narrow.page
+    narrow.show(at(1))
+    for folded, inside in (("Depth colours", "Near (mm)"), ("Export", "Download"), ("Recording", "Stop")):
+        page.get_by_text(folded, exact=True).click()
+        page.get_by_text(inside, exact=True).wait_for()
+    said = {text.strip() for text in page.get_by_role("button").all_inner_texts()}
+    assert {"Freeze", "Screenshot", "left camera", "Remove", "Pause", "Reset model", "Start"} <= said
+    for stamp_ns, view in enumerate(VIEWS, 2):
+        page.get_by_label("Show", exact=True).click()
+        page.get_by_role("option", name=view, exact=True).click()
+        until(lambda view=view: narrow.panel.view == view, page)
+        narrow.show(at(stamp_ns))
+        assert page.evaluate("document.documentElement.scrollWidth") <= 600
+        assert page.evaluate(SIDEWAYS) == [] and page.evaluate(OUT_OF_REACH) == []

@@ -351,7 +351,7 @@ def status_line(moment: Moment, second: int = 0) -> str:
     """One line: why nothing is shown, or how the node does; below it what it warns of.
 
     Args:
-        second: of any clock. With it the line changes every second, which `still` listens for.
+        second: of any clock. With it the line changes every second, and with each frame: `still` listens.
     """
     status = moment.status
     if moment.problem is not None:
@@ -365,8 +365,8 @@ def status_line(moment: Moment, second: int = 0) -> str:
     if status.last_error is not None:
         text += f" ({status.last_error})"
     style = f"padding:0.4em 1em;font-size:0.9em;color:{color}"
-    line = f'<div id="sags-status" data-second="{second}" style="{style}">{html.escape(text)}</div>'
-    return line + _warnings(status)
+    heard = f'data-second="{second}" data-frame="{moment.t_capture_ns}"'
+    return f'<div id="sags-status" {heard} style="{style}">{html.escape(text)}</div>' + _warnings(status)
 
 
 def _warnings(status: Status) -> str:

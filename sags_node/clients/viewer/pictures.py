@@ -139,6 +139,6 @@ def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
 def _blended(picture: U8, drawn: U8) -> U8:
     """The overlay [H, W, 4], not premultiplied, over the image [h, w, 3]."""
     # Multiplied before it shrinks: else the black of what is not drawn darkens the rim of what is.
-    drawn = cv2.cvtColor(drawn, cv2.COLOR_RGBA2mRGBA)
-    small = cv2.resize(drawn, picture.shape[1::-1], interpolation=cv2.INTER_AREA)
+    drawn = np.asarray(cv2.cvtColor(drawn, cv2.COLOR_RGBA2mRGBA), np.uint8)
+    small: U8 = cv2.resize(drawn, picture.shape[1::-1], interpolation=cv2.INTER_AREA)
     return small[..., :3] + np.rint(picture * (1 - small[..., 3:] / 255)).astype(np.uint8)
