@@ -29,6 +29,7 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT,
 from sags_node.clients.viewer.history import GAP, History
 from sags_node.clients.viewer.overlay import Overlay, Thing
 from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
+from sags_node.clients.viewer.saving import KINDS
 from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.clients.viewer.still import SILENT_AFTER
 from sags_node.config.schema import PhantomSource
@@ -566,6 +567,30 @@ def test_the_page_counts_the_frames_that_come_to_it(narrow: Shown) -> None:
     came = narrow.page.evaluate("sagsFrames")
     assert came["count"] == 4 and before < came["first"] < came["last"]
     until(lambda: narrow.page.locator("#sags-rate").text_content() == "0 /s", narrow.page)
+
+
+@needs_viser
+def test_the_buttons_give_the_moment_that_is_shown_as_files(narrow: Shown) -> None:
+    page = narrow.page
+    splats = rows_of(4, z=0.08, scale_0=1e-3, scale_1=1e-3, scale_2=1e-4, rot_w=1, opacity=0.9)
+    narrow.show(replace(at(7_000_000_000), splats=splats))
+    page.get_by_text("Export", exact=True).click()
+    for kind in KINDS:
+        page.get_by_label("What", exact=True).click()
+        page.get_by_role("option", name=kind, exact=True).click()
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Download").click()
+        assert Path(download.value.path()).read_text() == f"{kind} of 4 at 7000000000"
+        assert "_1970" in download.value.suggested_filename, "its time, not that of the click"
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    kept = cv2.imread(str(download.value.path()))
+    sheet = Sheet().draw(at(7), FOUR)
+    width = round(sheet.shape[1] * kept.shape[0] / sheet.shape[0])
+    assert kept.shape[1] > width and (kept[100 * kept.shape[0] // sheet.shape[0], 50 - width] == 90).all()
+    narrow.show(Moment("gone"))
+    page.get_by_role("button", name="Download").click()
+    page.get_by_text("there is no model now: gone").wait_for()
 
 
 OUT_OF_REACH = """() => [...document.querySelectorAll("button, input, img, .u-wrap")].filter((each) => {
