@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from browsers import new_page
 from command_line import killed, refused, start, stopped
-from waiting import START_SECONDS
+from waiting import START_SECONDS, repeating
 
 from sags_node.clients.viewer import splats as viewer_splats
 from sags_node.clients.viewer.cursor import depth_line
@@ -29,7 +29,6 @@ from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT,
 from sags_node.clients.viewer.history import GAP, History
 from sags_node.clients.viewer.overlay import Overlay, Thing
 from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
-from sags_node.clients.viewer.saving import KINDS
 from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.clients.viewer.still import SILENT_AFTER
 from sags_node.config.schema import PhantomSource
@@ -143,6 +142,14 @@ def moment(level: int = 90) -> Moment:
     camera = Camera(160, 128, np.diag([100.0, 100.0, 1.0]), np.eye(4))
     status = Status("running", 30.0, {"p50": 20.0, "p99": None}, rung=Rung(3, 16))
     return Moment(None, status, pictures, camera)
+
+
+def anchors_of(*numbers: int) -> np.ndarray:
+    """Rows of `anchors` that are not sure of their place."""
+    names = "x", "y", "z", "visibility", "confidence", "depth_confidence"
+    rows = np.zeros(len(numbers), [("id", "u4"), *((name, "f4") for name in names)])
+    rows["id"], rows["x"], rows["z"] = numbers, -0.0123, 0.1234
+    return rows
 
 
 def test_the_sheet_shows_what_is_new_and_nothing_else() -> None:
@@ -273,6 +280,24 @@ def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
         assert panel.chosen == 1, "nothing fresh came: it stays"
         panel.show(Moment("the node is starting", Status(session="second")))
         assert panel.chosen is None, "number 1 is another anchor now"
+
+
+@needs_viser
+def test_an_anchor_that_was_just_pinned_stays_chosen_until_a_frame_has_it() -> None:
+    from sags_node.clients.viewer.panel import Panel
+    from sags_node.clients.viewer.scene import Scene
+    from sags_node.clients.viewer.server import serving
+
+    with serving("127.0.0.1", 0, False) as (server, _):
+        panel = Panel(server, Scene(server), THE_NODE, None, 20.0)
+        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
+        panel.choose(3)
+        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
+        assert panel.chosen == 3, "that frame was captured before"
+        panel.show(replace(moment(), anchors=anchors_of(1, 2, 3)))
+        assert panel.chosen == 3
+        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
+        assert panel.chosen is None, "somebody has removed it"
 
 
 # ---- the command -----------------------------------------------------------------------------------------
@@ -510,14 +535,19 @@ class Shown:
 
     def __init__(self, server: Any, panel: Any, scene: Any, page: Any) -> None:
         self.server, self.panel, self.scene, self.page = server, panel, scene, page
+        self.moment = Moment("nothing yet")
+
+    def update(self, _: int) -> None:
+        """Bring the page up to date, as the command does again and again: else it covers itself."""
+        with self.server.atomic():
+            self.scene.show(self.moment)
+            self.panel.show(self.moment)
+        self.server.flush()
+        time.sleep(0.5)
 
     def show(self, moment: Moment) -> None:
         """Show it, and wait until the page has it."""
-        with self.server.atomic():
-            self.scene.show(moment)
-            self.panel.show(moment)
-        self.server.flush()
-        expected = str(moment.t_capture_ns)
+        self.moment, expected = moment, str(moment.t_capture_ns)
         until(lambda: self.page.locator("#sags-status").get_attribute("data-frame") == expected, self.page)
 
 
@@ -540,21 +570,19 @@ def narrow() -> Iterator[Shown]:
             page.add_init_script(KEEP_ERRORS)
             page.goto(url)
             page.wait_for_selector("#sags-status")
-            yield Shown(server, panel, scene, page)
+            shown = Shown(server, panel, scene, page)
+            with repeating(shown.update):
+                yield shown
             assert page.evaluate("window.errors") == []
 
 
 def at(stamp_ns: int) -> Moment:
     """With an anchor whose depth is a guess, and an object that it holds."""
-    anchors = np.zeros(
-        1, [(name, "f4") for name in "x y z visibility confidence depth_confidence".split()] + [("id", "u4")]
-    )
-    anchors["x"], anchors["z"], anchors["id"] = -0.0123, 0.1234, 12
     thing = Thing(
         "the hepatic artery", unsure="its anchors were not recognised for 2 s", anchors=({"id": 12.0},)
     )
     return replace(
-        moment(), t_capture_ns=stamp_ns, anchors=anchors, overlay=Overlay("running", objects=(thing,))
+        moment(), t_capture_ns=stamp_ns, anchors=anchors_of(12), overlay=Overlay("running", objects=(thing,))
     )
 
 
@@ -571,16 +599,18 @@ def test_the_page_counts_the_frames_that_come_to_it(narrow: Shown) -> None:
 
 @needs_viser
 def test_the_buttons_give_the_moment_that_is_shown_as_files(narrow: Shown) -> None:
-    page = narrow.page
+    from sags_node.clients.viewer.saving import KINDS
+
+    page, stamp_ns = narrow.page, 10**16  # in April 1970
     splats = rows_of(4, z=0.08, scale_0=1e-3, scale_1=1e-3, scale_2=1e-4, rot_w=1, opacity=0.9)
-    narrow.show(replace(at(7_000_000_000), splats=splats))
+    narrow.show(replace(at(stamp_ns), splats=splats))
     page.get_by_text("Export", exact=True).click()
     for kind in KINDS:
         page.get_by_label("What", exact=True).click()
         page.get_by_role("option", name=kind, exact=True).click()
         with page.expect_download() as download:
             page.get_by_role("button", name="Download").click()
-        assert Path(download.value.path()).read_text() == f"{kind} of 4 at 7000000000"
+        assert Path(download.value.path()).read_text() == f"{kind} of 4 at {stamp_ns}"
         assert "_1970" in download.value.suggested_filename, "its time, not that of the click"
     with page.expect_download() as download:
         page.get_by_role("button", name="Screenshot").click()

@@ -53,6 +53,7 @@ class Panel:
         self._sheet, self._history = Sheet(), History()
         self._moment, self._unit, self._session = Moment("connecting"), "mm", ""
         self._frozen_since: float | None = None
+        self._awaited: set[str] = set()  # anchors pinned a moment ago: they come with one of the next frames
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"sags view · {node.ns}")
         server.gui.main_panel.dock_right()
@@ -101,7 +102,7 @@ class Panel:
                 plot.data = self._history.series(*figures)
         self._overlay.content = _overlay_table(moment.overlay)
         if moment.status.session not in ("", self._session):  # another node: that number is another anchor's
-            self._session = moment.status.session
+            self._session, self._awaited = moment.status.session, set()
             self._chosen.value = self._other.value = NONE  # type: ignore[misc]  # viser's setter, which mypy misses
         self._list_anchors(moment.anchors)
 
@@ -306,7 +307,8 @@ class Panel:
         """Choose an anchor for Remove. The distance is measured to the one that was chosen before."""
         before = self._chosen.value
         for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
-            if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
+            if chosen not in choice.options:
+                self._awaited.add(chosen)
                 choice.options = (*choice.options, chosen)
             choice.value = chosen  # type: ignore[misc]  # as above
 
@@ -316,11 +318,12 @@ class Panel:
             return
         rows = list(anchors)
         self._anchor_rows.content = anchor_table(rows, self._unit)
-        numbers = (NONE, *(str(int(row["id"])) for row in rows))
+        by_number = {str(int(row["id"])): row for row in rows}
+        self._awaited -= by_number.keys()
+        numbers = (NONE, *by_number, *self._awaited)
         for choice in (self._chosen, self._other):
             if choice.options != numbers:
                 choice.options = numbers  # viser keeps the choice while it is there
-        by_number = {str(int(row["id"])): row for row in rows}
         first, second = (by_number.get(choice.value) for choice in (self._chosen, self._other))
         apart = None if first is None or second is None else distance(first, second, self._unit)
         self._distance.content = "" if apart is None else _line(apart)
