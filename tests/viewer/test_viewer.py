@@ -426,9 +426,9 @@ def until(met: Callable[[], bool], page: Any, seconds: float = 60) -> None:
 
 
 def contrast(page: Any) -> float:
-    """Standard deviation of the pixels in the lower half of the 3D scene, above which nothing floats."""
+    """Standard deviation of the pixels in the 3D scene between what floats above and the counter below."""
     box = page.locator("canvas").first.bounding_box()
-    clip = {**box, "y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
+    clip = {**box, "y": box["y"] + box["height"] / 2, "height": 0.4 * box["height"]}
     picture = cv2.imdecode(np.frombuffer(page.screenshot(clip=clip), np.uint8), cv2.IMREAD_COLOR)
     return float(picture.astype(np.float32).std())
 
