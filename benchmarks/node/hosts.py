@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.kernels.contention import burning_core
-from benchmarks.node.neighbours import NS, OWN_PORTS, find_browser, overlay, reader, viewer
+from benchmarks.node.neighbours import NS, OWN_PORTS, find_browser, overlay, reader, updates_per_s, viewer
 from benchmarks.node.processes import own_run_dir
 from sags_node.messaging.address import NodeAddress
 from sags_node.pipeline.session import open_session
@@ -40,6 +40,8 @@ def measure_hosts(launch: str | None, overrides: Sequence[str], progress: Callab
         with own_run_dir() as run_dir, nullcontext() if beside is None else beside(run_dir):
             cores = 1 if name == "one core" else None
             row = {"name": name, "part": "hosts", **_played(launch, overrides, run_dir, cores)}
+            if beside is viewer:
+                row["updates_per_s"] = updates_per_s(run_dir)
         if name == "alone":  # played again without a reader, to see what reading costs
             with own_run_dir() as run_dir:
                 row["unread"] = _played(launch, overrides, run_dir, cores, read=False)

@@ -14,7 +14,9 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
 from typing import Any
+from urllib.request import urlopen
 
+import websockets.sync.client as websockets
 import zmq
 
 from benchmarks.node.processes import parent_lives, program
@@ -78,7 +80,8 @@ def viewer(run_dir: Path) -> Iterator[int]:
             raise SagsError("the viewer did not start; see sags view --help")
         url = json.loads(said)["url"]
         profile = f"--user-data-dir={run_dir.parent}/browser"
-        page = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", profile, url]
+        asked = "--remote-debugging-port=0"  # see `updates_per_s`
+        page = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", asked, profile, url]
         # Not `nice`: the process of Chromium that draws takes a high priority again, where it may.
         shown = Popen(["chrt", "--idle", "0", *page], stdout=DEVNULL, stderr=DEVNULL)
         yield process.pid
@@ -87,6 +90,19 @@ def viewer(run_dir: Path) -> Iterator[int]:
         if shown is not None:
             end(shown, grace=STOPPING)
         end(process, grace=STOPPING)
+
+
+def updates_per_s(run_dir: Path) -> float:
+    """Ask the browser of `viewer` how many frames a second came to its page, by the page's own stamps; 0 if
+    there are no two."""
+    port = Path(run_dir.parent, "browser", "DevToolsActivePort").read_text().split()[0]
+    with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=STARTING) as answer:
+        (page,) = (each for each in json.load(answer) if each["type"] == "page")
+    rate = "1000 * (sagsFrames.count - 1) / (sagsFrames.last - sagsFrames.first)"
+    ask = {"expression": f"window.sagsFrames?.count > 1 ? {rate} : 0"}
+    with websockets.connect(page["webSocketDebuggerUrl"], proxy=None) as browser:
+        browser.send(json.dumps({"id": 1, "method": "Runtime.evaluate", "params": ask}))
+        return float(json.loads(browser.recv(timeout=STARTING))["result"]["result"]["value"])
 
 
 def _still_runs(process: Popen[Any], name: str) -> None:

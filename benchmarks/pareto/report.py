@@ -17,7 +17,7 @@ SETTING = (
 SKIP = "rule", "online, dB: on", "off", "change", "depth, mm: on", "off", "change", "saved, ms"
 HOST = (
     "host", "frames after the first second", "first render, ms", "frame, ms: p50", "p99",
-    "latency, ms: p50", "p99", "size, px", "online at full size, dB", "N",
+    "latency, ms: p50", "p99", "size, px", "online at full size, dB", "N", "viewer, updates/s",
 )  # fmt: skip
 TIMES = "{frame_ms[p50]:.1f}", "{frame_ms[p99]:.1f}", "{latency_ms[p50]:.1f}", "{latency_ms[p99]:.1f}"
 
@@ -63,11 +63,11 @@ def _hosts(session: Row) -> Table:
     made, segments = _table(session, *HOST), list(session["segments"])
     for row in session["hosts"]:
         share, first = "{share_after_first_second:.1%}", "{first_render_ms:.0f}"
-        shown = _decibels(row, "online_at_full_size", segments)
-        cells = "{name}", share, first, *TIMES, "{size[0]}x{size[1]}", shown, "{gaussians[mean]:,.0f}"
+        shown = "{size[0]}x{size[1]}", _decibels(row, "online_at_full_size", segments)
+        cells = "{name}", share, first, *TIMES, *shown, "{gaussians[mean]:,.0f}", "{updates_per_s:.1f}"
         filled(made, [row], *cells, unknown="–")
         if "unread" in row:  # by its own account: nobody saw an image
-            cells = "alone, nobody reads", "-", "-", *TIMES, "-", "-", "{gaussians:,.0f}"
+            cells = "alone, nobody reads", "-", "-", *TIMES, "-", "-", "{gaussians:,.0f}", "-"
             filled(made, [row["unread"]], *cells, unknown="–")
     return made
 

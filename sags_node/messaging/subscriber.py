@@ -62,6 +62,7 @@ class Receiver:
     Attributes:
         refusal: why the node does not let this client in.
         absent: why no node can be found; None: one was found.
+        refused: topics that the node does not make, and why; changed by another thread.
         rejected: malformed messages.
 
     Raises:
@@ -97,7 +98,7 @@ class Receiver:
         self._clock_ns = clock_ns if clock is None else clock.latest_ns
         self._fresh = {topic.name: Freshness(rates.get(topic.name), topic.periodic) for topic in wanted}
         self._types = {topic.name: topic.type for topic in wanted}
-        self._refused: dict[str, str] = {}  # topic: why the node does not make it
+        self.refused: dict[str, str] = {}
         self._kept: dict[str, deque[Received]] = {topic.name: deque(maxlen=kept) for topic in wanted}
         self._arrived = threading.Condition()
         self._wakes: list[Callable[[], None]] = []
@@ -230,7 +231,7 @@ class Receiver:
         return matches if len(matches) == len(names) else None
 
     def _problem(self, name: str, max_age: float | None) -> str | None:
-        if (refused := self._refused.get(name)) is not None:  # another thread may take it out
+        if (refused := self.refused.get(name)) is not None:  # another thread may take it out
             return refused
         problem = self._fresh[name].problem(self._clock_ns(), max_age)
         if problem is not None and (why := self.refusal or self.absent) is not None:
@@ -308,11 +309,11 @@ class Receiver:
                 return
             received = interpret(message, self._clock_ns())
             if self._types[name] == topics.COMPRESSED_IMAGE and isinstance(received, ReceivedText):
-                self._refused[name] = received.text
+                self.refused[name] = received.text
                 return
             if message.meta.type != self._types[name]:
                 raise WireError(f"{message.topic}: not what was subscribed to")
-            self._refused.pop(name, None)
+            self.refused.pop(name, None)
         except WireError:
             with self._arrived:
                 self.rejected += 1

@@ -57,7 +57,7 @@ def depth_range(pictures: Sequence[Picture]) -> tuple[float, float]:
     if depths.size == 0:
         return 0.0, 1.0
     near, far = np.percentile(depths, [0.5, 99.5])
-    return float(near), float(max(far, near + 1e-4))
+    return float(near), float(far)
 
 
 def tiles(picture: Picture, near: float, far: float) -> list[U8]:
@@ -72,7 +72,7 @@ def tiles(picture: Picture, near: float, far: float) -> list[U8]:
 
 def depth_tile(picture: Picture, near: float, far: float) -> U8:
     """The depth of one frame in colours; near is warm."""
-    share = 1 - (picture.depth - near) / (far - near)
+    share = 1 - (picture.depth - near) / max(far - near, 1e-4)  # a plane has one depth
     tile = shrunk(_coloured(share, cv2.COLORMAP_TURBO, picture.tissue & (picture.depth > 0)))
     return _with_bar(tile, cv2.COLORMAP_TURBO, f"{far * 1e3:.0f} mm", f"{near * 1e3:.0f} mm")
 

@@ -64,6 +64,17 @@ def test_of_a_frame_that_was_not_taken_in_its_picture_alone_is_shown(tmp_path: P
     assert moment.problem == "waiting for the model of this image"
 
 
+def test_a_node_without_a_right_eye_shows_the_left_one_and_says_so(tmp_path: Path) -> None:
+    with node_sockets(tmp_path / "run") as running, making(running, plane_result()):
+        feed = Feed(NodeAddress(run_dir=tmp_path / "run"))
+        until(lambda: feed.now((MODEL, RIGHT), steady=True).camera is not None)
+        moment = feed.now((MODEL, RIGHT), steady=True)
+        assert set(moment.pictures) == {LEFT, MODEL} and moment.splats is not None
+        assert moment.problem is not None and "right/image_rect_color is not published" in moment.problem
+        assert feed.now((MODEL,), steady=True).problem is None, "nobody looks at that eye"
+        feed.close()
+
+
 def test_of_the_overlay_the_picture_of_exactly_that_frame_is_shown(tmp_path: Path) -> None:
     drawn = np.full((HEIGHT, WIDTH, 4), 200, np.uint8)
     anchors = [{"id": 3, "confidence": None}]

@@ -21,12 +21,13 @@ import numpy as np
 import pytest
 from browsers import new_page
 from command_line import killed, refused, start, stopped
-from waiting import START_SECONDS
+from waiting import START_SECONDS, repeating
 
 from sags_node.clients.viewer import splats as viewer_splats
 from sags_node.clients.viewer.cursor import depth_line
 from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, TISSUE, Moment, Rung, Status
 from sags_node.clients.viewer.history import GAP, History
+from sags_node.clients.viewer.overlay import Overlay, Thing
 from sags_node.clients.viewer.pictures import BAR, VIEWS, Sheet, needs_of
 from sags_node.clients.viewer.splats import Splats, splats_of
 from sags_node.clients.viewer.still import SILENT_AFTER
@@ -36,7 +37,7 @@ from sags_node.messaging.content import SPLAT_FIELDS
 from sags_node.messaging.received import ReceivedCloud
 from sags_node.messaging.subscriber import Subscriber
 from sags_node.phantom import write_session
-from sags_node.types import SH_DEGREE_0, Camera
+from sags_node.types import SH_DEGREE_0, Camera, Gaussians
 
 pytestmark = [pytest.mark.live, pytest.mark.alone]
 
@@ -143,6 +144,14 @@ def moment(level: int = 90) -> Moment:
     return Moment(None, status, pictures, camera)
 
 
+def anchors_of(*numbers: int) -> np.ndarray:
+    """Rows of `anchors` that are not sure of their place."""
+    names = "x", "y", "z", "visibility", "confidence", "depth_confidence"
+    rows = np.zeros(len(numbers), [("id", "u4"), *((name, "f4") for name in names)])
+    rows["id"], rows["x"], rows["z"] = numbers, -0.0123, 0.1234
+    return rows
+
+
 def test_the_sheet_shows_what_is_new_and_nothing_else() -> None:
     sheet = Sheet()
     ground = sheet.draw(Moment("gone"), FOUR)
@@ -183,6 +192,35 @@ def test_the_range_of_the_depth_colours_is_that_which_is_asked_for() -> None:
     sheet.fixed = (0.01, 0.3)
     fixed = sheet.draw(moment(), "Depth under the cursor")[100, -50]
     assert sheet.shown == (0.01, 0.3) and (followed != fixed).any()
+
+
+def test_frames_without_known_depth_leave_the_range_of_the_depth_colours() -> None:
+    sheet, seen = Sheet(), moment()
+    for unknown in (np.full((32, 40), np.nan, np.float32), np.zeros((32, 40), np.float32)):
+        blind = replace(seen, pictures={**seen.pictures, DEPTH: unknown})
+        sheet.draw(blind, FOUR)
+        sheet.draw(seen, FOUR)
+        sheet.draw(blind, FOUR)
+        assert sheet.shown == pytest.approx((0.05, 0.08))
+
+
+@pytest.mark.parametrize("plane", [0.05, 0.08])
+def test_a_range_of_one_depth_has_colours_for_nearer_and_further(plane: float) -> None:
+    sheet = Sheet()
+    sheet.fixed = (plane, plane)
+    with np.errstate(all="raise"):
+        drawn = sheet.draw(moment(), "Depth under the cursor").astype(int)
+    near, far = drawn[100, -50], drawn[-60, -50]
+    assert near[0] > near[2] and (far[2] > far[0]) == (plane < 0.08)
+
+
+def test_the_rim_of_the_overlay_is_of_its_own_colour() -> None:
+    """The overlay's image is not premultiplied: beside what is drawn lies black, which must not count."""
+    drawn = np.zeros((576, 720, 4), np.uint8)
+    drawn[:, 361:] = (250, 0, 0, 102)  # from the middle of a pixel on
+    row = Sheet().draw(replace(moment(250), drawn={"left": drawn}), "Overlay")[150]
+    assert (row[:, 0] == 250).all(), "red over as bright a red"
+    assert (row[:180, 1] == 250).all() and row[180, 1] == 200 and (row[181:, 1] == 150).all(), "0.4 of it"
 
 
 def test_the_depth_under_the_cursor_is_the_drawn_one_and_a_guess_is_said_to_be_one() -> None:
@@ -242,6 +280,24 @@ def test_what_is_chosen_goes_with_the_node_that_numbered_it() -> None:
         assert panel.chosen == 1, "nothing fresh came: it stays"
         panel.show(Moment("the node is starting", Status(session="second")))
         assert panel.chosen is None, "number 1 is another anchor now"
+
+
+@needs_viser
+def test_an_anchor_that_was_just_pinned_stays_chosen_until_a_frame_has_it() -> None:
+    from sags_node.clients.viewer.panel import Panel
+    from sags_node.clients.viewer.scene import Scene
+    from sags_node.clients.viewer.server import serving
+
+    with serving("127.0.0.1", 0, False) as (server, _):
+        panel = Panel(server, Scene(server), THE_NODE, None, 20.0)
+        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
+        panel.choose(3)
+        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
+        assert panel.chosen == 3, "that frame was captured before"
+        panel.show(replace(moment(), anchors=anchors_of(1, 2, 3)))
+        assert panel.chosen == 3
+        panel.show(replace(moment(), anchors=anchors_of(1, 2)))
+        assert panel.chosen is None, "somebody has removed it"
 
 
 # ---- the command -----------------------------------------------------------------------------------------
@@ -370,9 +426,9 @@ def until(met: Callable[[], bool], page: Any, seconds: float = 60) -> None:
 
 
 def contrast(page: Any) -> float:
-    """Standard deviation of the pixels in the lower half of the 3D scene, above which nothing floats."""
+    """Standard deviation of the pixels in the 3D scene between what floats above and the counter below."""
     box = page.locator("canvas").first.bounding_box()
-    clip = {**box, "y": box["y"] + box["height"] / 2, "height": box["height"] / 2}
+    clip = {**box, "y": box["y"] + box["height"] / 2, "height": 0.4 * box["height"]}
     picture = cv2.imdecode(np.frombuffer(page.screenshot(clip=clip), np.uint8), cv2.IMREAD_COLOR)
     return float(picture.astype(np.float32).std())
 
@@ -469,3 +525,130 @@ def test_a_live_node_is_shown_obeys_and_disappears(
     until(lambda: contrast(page) < 2, page)
     own = (view.where["url"], f"blob:{view.where['url']}", "data:")
     assert page.requests and all(request.startswith(own) for request in page.requests)
+
+
+# ---- in a browser, without a node ------------------------------------------------------------------------
+
+
+class Shown:
+    """A page of moments that a test makes."""
+
+    def __init__(self, server: Any, panel: Any, scene: Any, page: Any) -> None:
+        self.server, self.panel, self.scene, self.page = server, panel, scene, page
+        self.moment = Moment("nothing yet")
+
+    def update(self, _: int) -> None:
+        """Bring the page up to date, as the command does again and again: else it covers itself."""
+        with self.server.atomic():
+            self.scene.show(self.moment)
+            self.panel.show(self.moment)
+        self.server.flush()
+        time.sleep(0.5)
+
+    def show(self, moment: Moment) -> None:
+        """Show it, and wait until the page has it."""
+        self.moment, expected = moment, str(moment.t_capture_ns)
+        until(lambda: self.page.locator("#sags-status").get_attribute("data-frame") == expected, self.page)
+
+
+@pytest.fixture
+def narrow() -> Iterator[Shown]:
+    """The viewer's page in a window of 600 px."""
+    from sags_node.clients.viewer.panel import Panel
+    from sags_node.clients.viewer.scene import Scene
+    from sags_node.clients.viewer.server import serving
+
+    def export(gaussians: Gaussians, camera: Camera, t_capture_ns: int, kind: str) -> bytes:
+        return f"{kind} of {len(gaussians)} at {t_capture_ns}".encode()
+
+    with serving("127.0.0.1", 0, False) as (server, url):
+        scene = Scene(server)
+        panel = Panel(server, scene, THE_NODE, export, 20.0)
+        server.on_client_connect(panel.fit)
+        with new_page(SOFTWARE_GL, viewport={"width": 600, "height": 800}) as page:
+            page.set_default_timeout(30_000)
+            page.add_init_script(KEEP_ERRORS)
+            page.goto(url)
+            page.wait_for_selector("#sags-status")
+            shown = Shown(server, panel, scene, page)
+            with repeating(shown.update):
+                yield shown
+            assert page.evaluate("window.errors") == []
+
+
+def at(stamp_ns: int) -> Moment:
+    """With an anchor whose depth is a guess, and an object that it holds."""
+    thing = Thing(
+        "the hepatic artery", unsure="its anchors were not recognised for 2 s", anchors=({"id": 12.0},)
+    )
+    return replace(
+        moment(), t_capture_ns=stamp_ns, anchors=anchors_of(12), overlay=Overlay("running", objects=(thing,))
+    )
+
+
+@needs_viser
+def test_the_page_counts_the_frames_that_come_to_it(narrow: Shown) -> None:
+    stamps = [7, 7, 0, 8, 9, 0, 9, 10]  # shown again, and nothing to show
+    before = narrow.page.evaluate("performance.now()")
+    for stamp_ns in stamps:
+        narrow.show(at(stamp_ns) if stamp_ns else Moment("gone"))
+    came = narrow.page.evaluate("sagsFrames")
+    assert came["count"] == 4 and before < came["first"] < came["last"]
+    until(lambda: narrow.page.locator("#sags-rate").text_content() == "0 /s", narrow.page)
+
+
+@needs_viser
+def test_the_buttons_give_the_moment_that_is_shown_as_files(narrow: Shown) -> None:
+    from sags_node.clients.viewer.saving import KINDS
+
+    page, stamp_ns = narrow.page, 10**16  # in April 1970
+    splats = rows_of(4, z=0.08, scale_0=1e-3, scale_1=1e-3, scale_2=1e-4, rot_w=1, opacity=0.9)
+    narrow.show(replace(at(stamp_ns), splats=splats))
+    page.get_by_text("Export", exact=True).click()
+    for kind in KINDS:
+        page.get_by_label("What", exact=True).click()
+        page.get_by_role("option", name=kind, exact=True).click()
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Download").click()
+        assert Path(download.value.path()).read_text() == f"{kind} of 4 at {stamp_ns}"
+        assert "_1970" in download.value.suggested_filename, "its time, not that of the click"
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    kept = cv2.imread(str(download.value.path()))
+    sheet = Sheet().draw(at(7), FOUR)
+    width = round(sheet.shape[1] * kept.shape[0] / sheet.shape[0])
+    assert kept.shape[1] > width and (kept[100 * kept.shape[0] // sheet.shape[0], 50 - width] == 90).all()
+    narrow.show(Moment("gone"))
+    page.get_by_role("button", name="Download").click()
+    page.get_by_text("there is no model now: gone").wait_for()
+
+
+OUT_OF_REACH = """() => [...document.querySelectorAll("button, input, img, .u-wrap")].filter((each) => {
+    if (each.type === "hidden" || !each.checkVisibility()) return false;  // viser's own settings are folded
+    each.scrollIntoView({ block: "center" });
+    const { left, right, top, width, height } = each.getBoundingClientRect();
+    const met = document.elementFromPoint(left + width / 2, top + height / 2);
+    const there = each.contains(met) || met?.parentElement === each.parentElement;
+    return left < 0 || right > innerWidth || !there;
+}).map((each) => each.outerHTML.slice(0, 200))"""
+SIDEWAYS = """() => [...document.querySelectorAll("*")].filter((each) =>
+    each.scrollWidth > each.clientWidth + 1 && /auto|scroll/.test(getComputedStyle(each).overflowX)
+).map((each) => each.outerHTML.slice(0, 200))"""
+
+
+@needs_viser
+def test_in_a_window_of_600_px_all_is_reached_without_scrolling_sideways(narrow: Shown) -> None:
+    page = narrow.page
+    narrow.show(at(1))
+    for folded, inside in (("Depth colours", "Near (mm)"), ("Export", "Download"), ("Recording", "Stop")):
+        page.get_by_text(folded, exact=True).click()
+        page.get_by_text(inside, exact=True).wait_for()
+    said = {text.strip() for text in page.get_by_role("button").all_inner_texts()}
+    assert {"Freeze", "Screenshot", "left camera", "Remove", "Pause", "Reset model", "Start"} <= said
+    for stamp_ns, view in enumerate(VIEWS, 2):
+        page.get_by_label("Show", exact=True).click()
+        page.get_by_role("option", name=view, exact=True).click()
+        until(lambda view=view: narrow.panel.view == view, page)
+        narrow.show(at(stamp_ns))
+        assert page.evaluate("document.documentElement.scrollWidth") <= 600
+        assert page.evaluate(SIDEWAYS) == [] and page.evaluate(OUT_OF_REACH) == []

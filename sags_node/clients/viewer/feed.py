@@ -128,7 +128,8 @@ class Feed:
             picture = subscriber.wait(LEFT, WAIT_FOR_PICTURE, after=self._shown) if sends else None
             if picture is not None:
                 self._shown = picture
-                whole = subscriber.aligned(names, picture.stamp_ns, WAIT_FOR_REST)
+                made = {LEFT} | (set(names) - subscriber.refused.copy().keys())
+                whole = subscriber.aligned(made, picture.stamp_ns, WAIT_FOR_REST)
                 self._frame = whole or self._frame
             return self._seen(subscriber, set(names), overlaid)
         finally:
@@ -149,16 +150,21 @@ class Feed:
             return Moment(problem, status, overlay=overlay)
         newest = subscriber.latest(LEFT)
         assert newest is not None  # else there was a problem
-        frame = self._frame
-        if frame is None or not names <= frame.keys() or not self._is_fresh(frame[LEFT], newest):
+        refused, frame = subscriber.refused.copy(), self._frame
+        if (
+            frame is None
+            or not names <= frame.keys() | refused.keys()
+            or not self._is_fresh(frame[LEFT], newest)
+        ):
             frame = {LEFT: newest}
         try:
             shown = {name: part.array for name, part in frame.items() if isinstance(part, ReceivedCompressed)}
             camera = _camera(frame)
         except WireError as error:  # a damaged file, or no pose
             return Moment(f"the node sends what cannot be read: {error}", status, overlay=overlay)
+        lacks = next((why for name, why in refused.items() if name in names), None)
         return Moment(
-            problem=None if camera is not None else "waiting for the model of this image",
+            problem="waiting for the model of this image" if camera is None else lacks,
             status=status,
             pictures=shown,
             camera=camera,

@@ -53,6 +53,7 @@ class Panel:
         self._sheet, self._history = Sheet(), History()
         self._moment, self._unit, self._session = Moment("connecting"), "mm", ""
         self._frozen_since: float | None = None
+        self._awaited: set[str] = set()  # anchors pinned a moment ago: they come with one of the next frames
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"sags view · {node.ns}")
         server.gui.main_panel.dock_right()
@@ -101,7 +102,7 @@ class Panel:
                 plot.data = self._history.series(*figures)
         self._overlay.content = _overlay_table(moment.overlay)
         if moment.status.session not in ("", self._session):  # another node: that number is another anchor's
-            self._session = moment.status.session
+            self._session, self._awaited = moment.status.session, set()
             self._chosen.value = self._other.value = NONE  # type: ignore[misc]  # viser's setter, which mypy misses
         self._list_anchors(moment.anchors)
 
@@ -121,7 +122,8 @@ class Panel:
         self._status.content = status_line(moment, int(time.monotonic()))
 
     def _draw(self, remark: str = "") -> None:
-        self._sheet.fixed = None if self._auto.value else (self._near.value * UNIT, self._far.value * UNIT)
+        near, far = sorted((self._near.value * UNIT, self._far.value * UNIT))
+        self._sheet.fixed = None if self._auto.value else (near, far)
         sheet = self._sheet.draw(self._moment, self.view, remark)
         self._pictures.image = sheet
         self._depth.content = depth_line(self._moment, self.view, sheet.shape[0], self._unit)
@@ -197,8 +199,8 @@ class Panel:
             )
             with self._gui.add_folder("Depth colours", expand_by_default=False):
                 self._auto = self._gui.add_checkbox("Follow the tissue", True)
-                self._near = self._gui.add_number("Near (mm)", 50.0, min=1.0, max=1000.0)
-                self._far = self._gui.add_number("Far (mm)", 150.0, min=1.0, max=1000.0)
+                self._near = self._gui.add_number("Near (mm)", 50.0, min=1.0, max=1000.0, step=0.1)
+                self._far = self._gui.add_number("Far (mm)", 150.0, min=1.0, max=1000.0, step=0.1)
             self._plots = [
                 self._plot("Rate (Hz)", {"rate": BRIGHT}),
                 self._plot("Latency (ms): p50 blue, p99 orange", {"p50": BLUE, "p99": ORANGE}),
@@ -210,8 +212,8 @@ class Panel:
             """Begin the fixed range of colours with the one that is shown."""
             if not event.target.value:
                 near, far = self._sheet.shown
-                self._near.value = round(near / UNIT)  # type: ignore[misc]  # viser's setter, which mypy misses
-                self._far.value = round(far / UNIT)  # type: ignore[misc]  # as above
+                self._near.value = round(near / UNIT, 1)  # type: ignore[misc]  # viser's setter, which mypy misses
+                self._far.value = round(far / UNIT, 1)  # type: ignore[misc]  # as above
 
         panel.dock_above(self._gui.main_panel)
 
@@ -305,7 +307,8 @@ class Panel:
         """Choose an anchor for Remove. The distance is measured to the one that was chosen before."""
         before = self._chosen.value
         for choice, chosen in ((self._other, before), (self._chosen, str(anchor))):
-            if chosen not in choice.options:  # pinned a moment ago: it comes with one of the next frames
+            if chosen not in choice.options:
+                self._awaited.add(chosen)
                 choice.options = (*choice.options, chosen)
             choice.value = chosen  # type: ignore[misc]  # as above
 
@@ -315,11 +318,12 @@ class Panel:
             return
         rows = list(anchors)
         self._anchor_rows.content = anchor_table(rows, self._unit)
-        numbers = (NONE, *(str(int(row["id"])) for row in rows))
+        by_number = {str(int(row["id"])): row for row in rows}
+        self._awaited -= by_number.keys()
+        numbers = (NONE, *by_number, *self._awaited)
         for choice in (self._chosen, self._other):
             if choice.options != numbers:
                 choice.options = numbers  # viser keeps the choice while it is there
-        by_number = {str(int(row["id"])): row for row in rows}
         first, second = (by_number.get(choice.value) for choice in (self._chosen, self._other))
         apart = None if first is None or second is None else distance(first, second, self._unit)
         self._distance.content = "" if apart is None else _line(apart)
@@ -350,7 +354,7 @@ def status_line(moment: Moment, second: int = 0) -> str:
     """One line: why nothing is shown, or how the node does; below it what it warns of.
 
     Args:
-        second: of any clock. With it the line changes every second, which `still` listens for.
+        second: of any clock. With it the line changes every second, and with each frame: `still` listens.
     """
     status = moment.status
     if moment.problem is not None:
@@ -364,8 +368,8 @@ def status_line(moment: Moment, second: int = 0) -> str:
     if status.last_error is not None:
         text += f" ({status.last_error})"
     style = f"padding:0.4em 1em;font-size:0.9em;color:{color}"
-    line = f'<div id="sags-status" data-second="{second}" style="{style}">{html.escape(text)}</div>'
-    return line + _warnings(status)
+    heard = f'data-second="{second}" data-frame="{moment.t_capture_ns}"'
+    return f'<div id="sags-status" {heard} style="{style}">{html.escape(text)}</div>' + _warnings(status)
 
 
 def _warnings(status: Status) -> str:

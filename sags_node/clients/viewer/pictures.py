@@ -47,15 +47,18 @@ class Sheet:
     """Draws one sheet after another, with steady depth colours.
 
     Attributes:
-        shown: the range of the depth colours, m.
         fixed: the range that they are to have, m; None: they follow the tissue.
     """
 
     def __init__(self) -> None:
-        self.shown = (0.0, 1.0)
         self.fixed: tuple[float, float] | None = None
         self._followed: tuple[float, float] | None = None
         self._height = round(TILE_WIDTH * 0.8)  # of a tile; that of the last image
+
+    @property
+    def shown(self) -> tuple[float, float]:
+        """The range of the depth colours, m."""
+        return self.fixed or self._followed or (0.0, 1.0)
 
     def draw(self, moment: Moment, view: str, remark: str = "") -> U8:
         """Draw the images of a view [h, w, 3], RGB; a place is left empty where nothing is new."""
@@ -98,14 +101,14 @@ class Sheet:
         return picture if drawn is None else _blended(picture, drawn)
 
     def _follow(self, model: Picture) -> None:
-        near, far = depth_range([model])
-        if self._followed is not None:
-            near, far = (
-                RANGE_MEMORY * last + (1 - RANGE_MEMORY) * now
-                for last, now in zip(self._followed, (near, far), strict=True)
-            )
+        if not (model.tissue & (model.depth > 0)).any():
+            return  # it tells nothing of where the tissue is
+        new = depth_range([model])
+        near, far = (
+            RANGE_MEMORY * last + (1 - RANGE_MEMORY) * now
+            for last, now in zip(self._followed or new, new, strict=True)
+        )
         self._followed = (near, far)
-        self.shown = self.fixed or self._followed
 
 
 def needs_of(view: str) -> list[str]:
@@ -135,5 +138,7 @@ def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
 
 def _blended(picture: U8, drawn: U8) -> U8:
     """The overlay [H, W, 4], not premultiplied, over the image [h, w, 3]."""
-    small = cv2.resize(drawn, picture.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
-    return np.asarray(picture + small[..., 3:] / 255 * (small[..., :3] - picture), np.uint8)
+    # Multiplied before it shrinks: else the black of what is not drawn darkens the rim of what is.
+    drawn = np.asarray(cv2.cvtColor(drawn, cv2.COLOR_RGBA2mRGBA), np.uint8)
+    small: U8 = cv2.resize(drawn, picture.shape[1::-1], interpolation=cv2.INTER_AREA)
+    return small[..., :3] + np.rint(picture * (1 - small[..., 3:] / 255)).astype(np.uint8)

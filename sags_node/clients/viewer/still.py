@@ -1,15 +1,29 @@
-"""The page covers itself when nothing comes from here: it alone knows that a link, or this process, hangs."""
+"""The page covers itself when nothing comes from here: it alone knows that a link, or this process, hangs.
+
+In a corner it says how many frames a second come to it.
+"""
 
 SILENT_AFTER = 6.0  # s; an update by `run` takes 5.3 s where images come late and the browser is slow
-# Runs in the page, before viser. Its status comes every second, also to a page that has folded it away: it is
-# heard where viser's own thread hands it over. A page that was busy itself gets a second look.
+RATE_OVER = 2.0  # s
+# Runs in the page, before viser. The status comes every second, also to a page that has folded it away: it is
+# heard where viser's own thread hands it over, with the capture time of what is shown. A page that was busy
+# itself gets a second look.
 SCRIPT = """<script>
 (() => {
-  let since = null, looks = 0;
-  const isStatus = ({ updates }) => String(updates?.content).includes("sags-status");
+  let since = null, looks = 0, shown = "0", recent = [];
+  const came = window.sagsFrames = { count: 0 };  // of all, and `first` and `last`, ms
+  const frame = ({ updates }) => /data-frame="(\\d+)"/.exec(updates?.content)?.[1];
   const hear = ({ data }) => {
-    if (data?.type !== "message_batch" || (since !== null && !data.messages.some(isStatus))) return;
-    [since, looks] = [performance.now(), 0];
+    if (data?.type !== "message_batch") return;
+    const told = data.messages.map(frame).filter(Boolean), now = performance.now();
+    if (since !== null && !told.length) return;
+    [since, looks] = [now, 0];
+    for (const each of told) if (each !== "0" && each !== shown) {
+      [shown, came.last] = [each, now];
+      came.first ??= now;
+      came.count++;
+      recent.push(now);
+    }
   };
   window.Worker = class extends Worker {
     constructor(...said) { super(...said); this.addEventListener("message", hear); }
@@ -17,7 +31,13 @@ SCRIPT = """<script>
   const cover = document.createElement("div");
   cover.id = "sags-still";
   cover.style = "position:fixed;inset:0;z-index:99999;padding:2em;background:#111;color:#ff922b";
+  const rate = document.createElement("div");
+  rate.id = "sags-rate";
+  rate.style = "position:fixed;left:8px;bottom:4px;font:12px sans-serif;color:#8b949e;pointer-events:none";
   setInterval(() => {
+    recent = recent.filter((each) => each > performance.now() - 1000 * RATE_OVER);
+    rate.textContent = `${Math.round(recent.length / RATE_OVER)} /s`;
+    if (!rate.isConnected) document.body.append(rate);
     const silent = since === null ? 0 : (performance.now() - since) / 1000;
     if (silent < SILENT_AFTER || ++looks < 2) return cover.remove();
     cover.textContent = `no word from sags view for ${silent.toFixed(0)} s: what was here is old. `
@@ -25,4 +45,4 @@ SCRIPT = """<script>
     if (!cover.isConnected) document.body.append(cover);
   }, 250);
 })();
-</script>""".replace("SILENT_AFTER", str(SILENT_AFTER))
+</script>""".replace("SILENT_AFTER", str(SILENT_AFTER)).replace("RATE_OVER", str(RATE_OVER))
