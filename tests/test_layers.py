@@ -29,7 +29,7 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9925,
+    "benchmarks": 9943,
     "sags_lab": 5022,
     "sags_node": 1299,
     "sags_node/bags": 1001,
@@ -40,7 +40,7 @@ LINES = {
     "sags_node/clients/overlay": 3159,
     "sags_node/clients/recording": 1496,
     "sags_node/clients/registration": 518,
-    "sags_node/clients/viewer": 1505,
+    "sags_node/clients/viewer": 1540,
     "sags_node/config": 1524,
     "sags_node/detail": 964,
     "sags_node/engine": 3997,
@@ -49,7 +49,7 @@ LINES = {
     "sags_node/kernels": 1219,
     "sags_node/mapping": 5535,
     "sags_node/media": 909,
-    "sags_node/messaging": 5363,
+    "sags_node/messaging": 5364,
     "sags_node/model": 1077,
     "sags_node/node": 1836,
     "sags_node/phantom": 1552,
@@ -66,7 +66,7 @@ LINES = {
     "sags_node/tools/fitting": 1853,
     "sags_node/tools/importing": 1166,
     "sags_node/vision": 5394,
-    "tests": 50093,
+    "tests": 50292,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 
