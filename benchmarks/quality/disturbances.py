@@ -252,8 +252,6 @@ class _Run:
             for key in ("psnr", "model_psnr")
             for when, frames in {"before": before, "during": within, "after": after}.items()
         }
-        psnr = {frame: shown.psnr for frame, shown in self._shown.items()}
-        clean_psnr = {frame: shown.psnr for frame, shown in self._clean._shown.items()}
         known = frozenset[str]().union(*(shown.warnings for shown in before))
         fresh = {frame: shown.warnings - known for frame, shown in self._shown.items() if frame >= first}
         warned, cleared = warning_times(fresh, self.during, self._rate)
@@ -272,10 +270,18 @@ class _Run:
             "warned_after_s": _round(warned),
             "cleared_after_s": _round(cleared),
             "warned_of": sorted(frozenset[str]().union(*fresh.values())),
-            "frames_to_recover": frames_to_recover(psnr, clean_psnr, stop, psnrs["psnr_before"]),
+            "frames_to_recover": self._recovers("psnr", psnrs["psnr_before"]),
+            "model_frames_to_recover": self._recovers("model_psnr", psnrs["model_psnr_before"]),
             "restarts": self._shown[last].restarts - before[-1].restarts,
             **anchors,
         }
+
+    def _recovers(self, key: str, before: float | None) -> int | None:
+        """Return `frames_to_recover` of a PSNR of `_Shown`."""
+        psnr, clean = (
+            {frame: getattr(shown, key) for frame, shown in run._shown.items()} for run in (self, self._clean)
+        )
+        return frames_to_recover(psnr, clean, self.during.stop, before)
 
 
 def frames_to_recover(

@@ -14,6 +14,7 @@ from sags_node.quality.gallery import Picture, depth_range, depth_tile, shrunk
 _COLUMNS = {
     "PSNR* before": "{psnr_before:.1f}", "during": "{psnr_during:.1f}", "after, dB": "{psnr_after:.1f}",
     "model alone: during": "{model_psnr_during:.1f}", "after ": "{model_psnr_after:.1f}",
+    "recovers ": "{model_frames_to_recover}",
     "depth p90, mm": "{confident_depth_p90_mm:.1f}", "median": "{depth_median_mm:.1f}",
     "coverage": "{coverage:.0%}", "borrowed": "{borrowed_share:.0%}",
     "warned, s": "{warned_after_s:.1f}", "cleared": "{cleared_after_s:.1f}",
