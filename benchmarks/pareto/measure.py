@@ -38,7 +38,7 @@ from sags_node.vision.tissue import TissueMask
 SHORTEST = 3  # frames; the first one, in which the model is made, takes another time
 KEPT = (
     "frame_ms", "cpu_ms", "stage_ms", "rate_hz", "iterations_per_frame", "online", "predict", "heldout",
-    "between", "novel", "depth", "measured_depth", "track", "gaussians", "skipped",
+    "between", "novel", "right", "depth", "measured_depth", "track", "gaussians", "skipped",
 )  # fmt: skip
 
 Row = dict[str, Any]

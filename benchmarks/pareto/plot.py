@@ -38,7 +38,7 @@ class Figure(NamedTuple):
         return row["frame_ms"]["p50"], row[self.group][self.key]
 
 
-PICTURE = Figure("online PSNR* at full size", "dB", "online_at_full_size", "psnr")
+PICTURE = Figure("PSNR* of the model at full size", "dB", "online_at_full_size", "psnr")
 DEPTH = Figure("median depth error", "mm", "depth", "median_mm")
 POINTS = Figure("median error of points on the tissue", "mm", "track", "median_mm")
 FIGURES = (PICTURE, DEPTH, POINTS)

@@ -11,13 +11,13 @@ Row = Mapping[str, Any]
 
 PICTURES = "online", "online_at_full_size", "predict", "heldout", "novel"
 SETTING = (
-    "", "", "ms p50", "p99", "CPU", "online, dB", "at full size", "predict", "held out", "right eye",
+    "", "", "ms p50", "p99", "CPU", "model, dB", "at full size", "next, shown", "held out", "right eye",
     "depth, mm", "p90", "cover", "points, mm", "N",
 )  # fmt: skip
-SKIP = "rule", "online, dB: on", "off", "change", "depth, mm: on", "off", "change", "saved, ms"
+SKIP = "rule", "model, dB: on", "off", "change", "depth, mm: on", "off", "change", "saved, ms"
 HOST = (
     "host", "frames after the first second", "first render, ms", "frame, ms: p50", "p99",
-    "latency, ms: p50", "p99", "size, px", "online at full size, dB", "N", "viewer, updates/s",
+    "latency, ms: p50", "p99", "size, px", "model at full size, dB", "N", "viewer, updates/s",
 )  # fmt: skip
 TIMES = "{frame_ms[p50]:.1f}", "{frame_ms[p99]:.1f}", "{latency_ms[p50]:.1f}", "{latency_ms[p99]:.1f}"
 

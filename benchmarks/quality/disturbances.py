@@ -17,7 +17,8 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.findings import by_code
 from sags_node.kernels.threads import configure_threads
 from sags_node.mapping.budget import StepBudget
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.messaging import published
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.quality import metrics
 from sags_node.sources.source import open_source
@@ -46,6 +47,7 @@ class Shot:
 
     left: U8  # [H, W, 3] rectified, as it came
     right: U8  # [H, W, 3] likewise
+    shown: U8  # [H, W, 3] the left view as it is published
     view: RenderedView
     tissue: Bool  # [H, W] in truth
 
@@ -62,7 +64,8 @@ class _Depth:
 class _Shown:
     """What one frame of a run showed."""
 
-    psnr: float  # dB over the true tissue, against the true image
+    psnr: float  # dB of what is published over the true tissue, against the true image
+    model_psnr: float  # dB, the same of the model alone
     borrowed: float  # share of the published depth, see `_Run._borrowed`
     confident_borrowed: float  # share of the depth that is published as confident
     depth: _Depth | None  # None: there is no reference
@@ -197,17 +200,20 @@ class _Run:
         """Play one frame and measure it. If it is lost, nothing new is shown and nothing is measured."""
         if taken.given is None:
             return
-        result = self._pipeline.process(taken.given, self._budget)
+        result = self._pipeline.process(taken.given, self._budget, FrameRequest(left=True))
         frame, view = taken.clean, result.views["left"]
         truth = self._pipeline.rectifier(frame)
         tissue = self._true_tissue(frame, truth)
         self.receipt.add(frame, tissue)
+        size, where = published.size_of(truth), published.nearest(truth, tissue)
+        shown, true = published.colours(view, size), metrics.as_float(published.picture(truth, "left"))
         borrowed = self._borrowed(frame.frame_id, result)
-        published = view.depth > 0
-        confident = published & _is_confident(view)
+        drawn = view.depth > 0
+        confident = drawn & _is_confident(view)
         self._shown[frame.frame_id] = _Shown(
-            psnr=metrics.psnr(metrics.as_float(view.rgb), metrics.as_float(truth.left), tissue),
-            borrowed=_share(borrowed, published),
+            psnr=metrics.psnr(metrics.as_float(shown), true, where),
+            model_psnr=metrics.psnr(metrics.as_float(view.colours.at(*size)), true, where),
+            borrowed=_share(borrowed, drawn),
             confident_borrowed=_share(borrowed, confident),
             depth=_depth_errors(frame, view, confident, tissue),
             warnings=frozenset(by_code(self._pipeline.warnings)),
@@ -219,7 +225,7 @@ class _Run:
         if self._shoot_at and frame.frame_id >= self._shoot_at[0]:
             del self._shoot_at[0]
             assert result.pair.right is not None
-            self.shots.append(Shot(result.pair.left, result.pair.right, view, tissue))
+            self.shots.append(Shot(result.pair.left, result.pair.right, shown, view, tissue))
 
     def _borrowed(self, frame_id: int, result: FrameResult) -> Bool:
         """Where [H, W] stereo has not measured a depth for `SUPPORTED_SECONDS`: depth that is published there
@@ -241,9 +247,11 @@ class _Run:
             for frame, shown in self._shown.items()
             if first <= frame < stop + RECOVERY and shown.depth is not None
         ]
-        psnr_before = _over(shown.psnr for shown in before)
-        psnr = {frame: shown.psnr for frame, shown in self._shown.items()}
-        clean_psnr = {frame: shown.psnr for frame, shown in self._clean._shown.items()}
+        psnrs = {
+            f"{key}_{when}": _over(getattr(shown, key) for shown in frames)
+            for key in ("psnr", "model_psnr")
+            for when, frames in {"before": before, "during": within, "after": after}.items()
+        }
         known = frozenset[str]().union(*(shown.warnings for shown in before))
         fresh = {frame: shown.warnings - known for frame, shown in self._shown.items() if frame >= first}
         warned, cleared = warning_times(fresh, self.during, self._rate)
@@ -252,9 +260,7 @@ class _Run:
         return {
             "name": self._name,
             "frames": len(self.during),
-            "psnr_before": psnr_before,
-            "psnr_during": _over(shown.psnr for shown in within),
-            "psnr_after": _over(shown.psnr for shown in after),
+            **psnrs,
             "confident_depth_p90_mm": _over((depth.confident.p90_mm for depth in depths), max),
             "depth_median_mm": _over((depth.all.median_mm for depth in depths), max),
             "coverage": _over((depth.all.coverage for depth in depths), min),
@@ -264,10 +270,18 @@ class _Run:
             "warned_after_s": _round(warned),
             "cleared_after_s": _round(cleared),
             "warned_of": sorted(frozenset[str]().union(*fresh.values())),
-            "frames_to_recover": frames_to_recover(psnr, clean_psnr, stop, psnr_before),
+            "frames_to_recover": self._recovers("psnr", psnrs["psnr_before"]),
+            "model_frames_to_recover": self._recovers("model_psnr", psnrs["model_psnr_before"]),
             "restarts": self._shown[last].restarts - before[-1].restarts,
             **anchors,
         }
+
+    def _recovers(self, key: str, before: float | None) -> int | None:
+        """Return `frames_to_recover` of a PSNR of `_Shown`."""
+        psnr, clean = (
+            {frame: getattr(shown, key) for frame, shown in run._shown.items()} for run in (self, self._clean)
+        )
+        return frames_to_recover(psnr, clean, self.during.stop, before)
 
 
 def frames_to_recover(

@@ -13,6 +13,8 @@ from sags_node.quality.gallery import Picture, depth_range, depth_tile, shrunk
 
 _COLUMNS = {
     "PSNR* before": "{psnr_before:.1f}", "during": "{psnr_during:.1f}", "after, dB": "{psnr_after:.1f}",
+    "model alone: during": "{model_psnr_during:.1f}", "after ": "{model_psnr_after:.1f}",
+    "recovers ": "{model_frames_to_recover}",
     "depth p90, mm": "{confident_depth_p90_mm:.1f}", "median": "{depth_median_mm:.1f}",
     "coverage": "{coverage:.0%}", "borrowed": "{borrowed_share:.0%}",
     "warned, s": "{warned_after_s:.1f}", "cleared": "{cleared_after_s:.1f}",
@@ -29,9 +31,9 @@ def table(measured: Mapping[str, Any]) -> Table:
 
 
 def strip(shots: Sequence[Shot]) -> bytes:
-    """Draw a PNG with a row each for before, middle and after: the left and right images as they came, the
-    model's image and its depth, which is grey on tissue where none is published."""
-    shown = [Picture(shot.view.frame_id, 0.0, shot.left, shot.view.rgb, shot.view.depth, shot.tissue)
+    """Draw a PNG with a row each for before, middle and after: the left and right images as they came, what
+    is shown, and the depth, which is grey on tissue where none is published."""
+    shown = [Picture(shot.view.frame_id, 0.0, shot.left, shot.shown, shot.view.depth, shot.tissue)
              for shot in shots]  # fmt: skip
     near, far = depth_range(shown[::2])  # those that nothing is wrong with
     lines = [

@@ -56,7 +56,7 @@ def measure_methods(
             alone = [*chosen, "publish.detail:=false"]  # the model is compared, not the camera's images
             seen = evaluate(launch, alone, MeasureOptions(hold_out=0), pace="realtime")
             live = seen.summary
-            fixed = [*chosen, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]
+            fixed = [*alone, f"mapping.iterations:={iterations}", f"mapping.rung:={rung}"]
             row: dict[str, Any] = {"method": method, "width": width, "height": height}
             row["live"] = {
                 "rate_hz": live["rate_hz"],

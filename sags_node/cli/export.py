@@ -57,7 +57,10 @@ NO_CAMERAS = "live cameras are exported from the running node; name no recording
 )
 @file_option("--tracks", metavar="F.npz", help="64 points that are followed through a recording, in 3D.")
 @file_option(
-    "--render", metavar="F.mp4", help="The model as the left eye sees it, each frame of a recording."
+    "--render",
+    metavar="F.mp4",
+    help="The tissue without instruments as the left eye sees it, each frame of a recording: as published in "
+    "left/render/image. publish.detail:=false shows the model alone.",
 )
 @folder_option(
     "--depth",

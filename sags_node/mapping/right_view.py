@@ -70,7 +70,7 @@ class RightView:
             view: as it was drawn for that frame.
             shown: [H, W, 3] RGB, what was shown of it.
             model: which may have changed since.
-            image: [H, W, 3] RGB of the right eye.
+            picture: [H, W, 3] RGB of the right eye.
             tissue: [H, W] of the left image, without what the right eye does not see.
             baseline: m.
         """

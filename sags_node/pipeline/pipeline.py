@@ -273,8 +273,9 @@ class Pipeline:
         self._on_rectified(pair, self._epoch(frame))
         # 1. Watch: may this frame be trusted? If not, it is held. An equal one repeats the last result.
         right = pair.right is not None and (request.right or self._config.publish.right is True)
+        left = request.left or right
         with clock("watch"):
-            judged = self._watch(frame, pair, right, request.instruments)
+            judged = self._watch(frame, pair, left, right, request.instruments)
         if self.newest is not None and (judged.hold or judged.repeats):
             return self._carried_on(frame, pair, judged, unseen(pair), clock)
         if judged.is_new_scene:
@@ -304,7 +305,7 @@ class Pipeline:
         # Then draw what consumers watch: the right eye, and their anchors.
         with clock("render"):
             self._lend(mapped, seen, observation, judged)
-            views = {"left": self._left_eye(mapped.view, pair, request.left or right)}
+            views = {"left": self._left_eye(mapped.view, pair, left)}
             if right:
                 views["right"] = self._right_eye(mapped, observation, pair, seen, judged, by_both)
         if not still:  # still frames cost less: they would bias the estimate
@@ -330,13 +331,17 @@ class Pipeline:
         """Rectify a frame. Until its pose is found, it has the last camera pose, or the given one."""
         return self.rectifier(replace(frame, T_world_cam=self._camera.guess(frame.T_world_cam)), pictures)
 
-    def _watch(self, frame: StereoFrame, pair: RectifiedPair, right: bool, instruments: bool) -> Judgement:
+    def _watch(
+        self, frame: StereoFrame, pair: RectifiedPair, left: bool, right: bool, instruments: bool
+    ) -> Judgement:
         """Return the judgement of all watchers on a frame."""
         if self._reset_due and frame.pose_problem is None:
             self._forget()
         last = self.newest
         lacks = last is not None and (  # somebody has just asked for it
-            (right and "right" not in last.views) or (instruments and not self._instruments_asked)
+            (left and len(self.seen) > 0 and last.views["left"].shown is None)
+            or (right and "right" not in last.views)
+            or (instruments and not self._instruments_asked)
         )
         equal = last is not None and self._skips.duplicates and not lacks and is_repeat(pair, last.pair)
         evidence = Evidence(frame, pair, last, equal, self.depth.eyes_are_late)

@@ -18,7 +18,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One frame: what the camera saw and what the model showed."""
+    """One frame: what the camera saw and what was shown, by the model or with the detail of images."""
 
     frame_id: int
     psnr: float  # dB, tissue

@@ -81,7 +81,7 @@ class References:
         """Return a warning if a depth file has the name of another frame's image; else "".
 
         Args:
-            images: of all frames, in order.
+            pictures: of all frames, in order.
         """
         places = {file.stem: place for place, file in enumerate(pictures)}
         for number, file in self._depth_files.items():

@@ -61,7 +61,7 @@ def start(picture: F32, stride: int, coarse: F32, coarse_stride: float, corner: 
     """Interpolate a field to search from out of a coarser one.
 
     Args:
-        image: the one whose patches are to be searched.
+        picture: the one whose patches are to be searched.
         coarse: [r, c, channels] px, of an image `scale` times smaller; its samples stand `coarse_stride` px
             apart, the first one at pixel (corner, corner).
 

@@ -80,8 +80,12 @@ def test_disturbances(tmp_path: Path) -> None:
     asked = ["--only", "clean", "--only", "black_right", "--from", 12, "--pictures", tmp_path]
     found = measured(tmp_path, "disturbances", SESSION, "source.frames:=36", *asked)
     clean, black = found["rows"]
-    assert clean["psnr_before"] == black["psnr_before"]  # the same until then
-    assert clean["frames_to_recover"] == 0 and clean["warned_after_s"] is None
+    for key in ("psnr_before", "model_psnr_before"):
+        assert clean[key] == black[key]  # the same until then
+    for row in found["rows"]:
+        assert all(row[f"psnr_{when}"] > row[f"model_psnr_{when}"] for when in ("before", "during", "after"))
+    assert clean["frames_to_recover"] == clean["model_frames_to_recover"] == 0
+    assert clean["warned_after_s"] is None
     assert clean["anchors_wrong"] <= 0.1
     assert black["warned_of"] == ["right_eye_black"]
     assert black["borrowed_share"] > clean["borrowed_share"] + 0.2  # nothing is measured after half a second
@@ -94,6 +98,7 @@ def test_endurance(tmp_path: Path) -> None:
     found = measured(tmp_path, "endurance", SESSION, *asked)
     assert found["recorded_frames"] == 12 and [each["frames"] for each in found["windows"]] == [6, 12, 18, 24]
     assert all(slope is not None for slope in found["per_1000_frames"].values())
+    assert all(each["psnr"] > each["model_psnr"] for each in found["windows"])
     still = found["still"]
     assert still["settled"] < still["recognised"] <= still["frames"]
     assert "per 1000 frames" in sags("endurance", SESSION, *asked, command=main).stdout

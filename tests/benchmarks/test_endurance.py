@@ -16,7 +16,7 @@ from benchmarks.node.soak import worsening
 from sags_node.errors import SagsError
 from sags_node.pipeline.session import open_session
 
-QUIET = Window(0, 25.0, 30.0, 35.0, 30_000, 500, 400.0, 0, 0, 0)
+QUIET = Window(0, 25.0, 30.0, 45.0, 35.0, 30_000, 500, 400.0, 0, 0, 0)
 
 
 # ---- the order of frames ---------------------------------------------------------------------------------

@@ -314,6 +314,22 @@ def test_an_image_in_another_light_is_shown_in_that_of_the_model(published_px: i
     assert np.median(np.abs(view.shown.rgb.astype(int) - truth)[sure]) <= 2
 
 
+def test_who_comes_while_frames_are_equal_is_shown_detail_at_once() -> None:
+    """Equal frames are not mapped: the first that somebody looks at is, those after it are not."""
+    session = opened("source.frames:=3", "mapping.max_gaussians:=3000")
+    pipeline = Pipeline(session.config, session.rig)
+    frames = frames_of(session)
+    for frame in (*frames, replace(frames[-1], frame_id=3)):
+        result = pipeline.process(frame, StepBudget(1))
+    assert "frame" in result.skipped and result.views["left"].shown is None
+    came, after = (
+        pipeline.process(replace(frames[-1], frame_id=n), StepBudget(1), FrameRequest(left=True))
+        for n in (4, 5)
+    )
+    assert came.views["left"].shown is after.views["left"].shown is not None
+    assert "frame" in after.skipped
+
+
 def test_a_source_of_hidden_tissue_is_kept_while_the_memory_is_the_same_and_it_saw_enough(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

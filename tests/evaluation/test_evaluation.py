@@ -425,9 +425,14 @@ def test_report_opens_and_shows_the_worst_frame(frames: list[StereoFrame], tmp_p
 
 
 def test_report_of_a_run_without_anything_optional(frames: list[StereoFrame], tmp_path: Path) -> None:
+    """Of a live run with detail what is shown stands there, which is neither the model nor has its error."""
     measurer = measured_run([replace(frames[0], reference=None)], SPEED, MeasureOptions(hold_out=0))
-    file = write_report(tmp_path, summary_of(measurer), measurer.rows, measurer.gallery.pictures)
-    assert sum("jpeg" in uri for uri in Page(file.read_text()).images) == 4
+    live = [replace(row, figures={"shown": row.figures["online"]}) for row in measurer.rows]
+    for rows, columns in ((measurer.rows, "camera model depth error"), (live, "camera shown depth")):
+        file = write_report(tmp_path, summary_of(measurer), rows, measurer.gallery.pictures)
+        text = file.read_text()
+        assert re.findall("<figcaption>(.+?)</figcaption>", text) == columns.split()
+        assert ("The error is brightest" in text) == ("error" in columns)
 
 
 def test_a_plot_is_valid_svg_with_a_gap_where_nothing_is_known() -> None:

@@ -149,6 +149,20 @@ def test_the_video_has_every_frame(exported: Path) -> None:
     assert np.abs(pictures[3].astype(float) - shown)[known].mean() < 16  # of 255: the same scene
 
 
+def test_the_video_has_the_detail_that_the_model_alone_has_not(exported: Path, tmp_path: Path) -> None:
+    session, frames = exported / "session0", rectified(exported / "session0")
+    options = ("mapping.iterations:=1", "mapping.max_gaussians:=4000", "publish.detail:=false")
+    into = ("--render", tmp_path / "model.mp4", "--depth", tmp_path / "depth")
+    assert sags("export", session, *options, *into).exit_code == 0
+    pairs = zip(pictures_of(exported / "0/model.mp4"), pictures_of(tmp_path / "model.mp4"), strict=True)
+    for frame, (shown, model) in zip(frames, pairs, strict=True):
+        known = (shown.max(-1) > 0) & (model.max(-1) > 0)
+        near, far = (np.abs(each.astype(float) - frame.left)[known].mean() for each in (shown, model))
+        assert near < far
+    for file in (tmp_path / "depth").iterdir():  # which is the model's in both
+        assert file.read_bytes() == (exported / "0/depth" / file.name).read_bytes()
+
+
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])
 def test_three_sessions_are_one_data_set(exported: Path, tmp_path: Path, version: Version) -> None:
     """In the form of lerobot 0.4.4 and 0.3.3, `datasets/utils.py`; Parquet and MP4 are read by others."""

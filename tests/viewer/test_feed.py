@@ -11,13 +11,13 @@ from thin_sender import making, node_sockets
 from waiting import repeating, until
 
 from sags_node.clients.overlay.stream import OverlayStream
-from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, TISSUE, WHOLE, Feed
+from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, RIGHT, SHOWN, TISSUE, WHOLE, Feed
 from sags_node.clients.viewer.overlay import OverlayFeed
 from sags_node.messaging.address import NodeAddress
 
 pytestmark = pytest.mark.live
 
-FOUR = (LEFT, MODEL, DEPTH, CONFIDENCE, TISSUE)
+FOUR = (LEFT, SHOWN, DEPTH, CONFIDENCE, TISSUE)
 
 
 @pytest.mark.parametrize("rate", [50.0, 2.0])

@@ -29,13 +29,13 @@ from sags_node.types import U8, Camera
 
 # Numbers are subsampled, not averaged: taking every fourth pixel costs a fifth of every second one.
 LEFT = "thin/half/left/image_rect_color/jpeg"
-MODEL = "thin/half/left/render/image/jpeg"
+SHOWN = "thin/half/left/render/image/jpeg"
 RIGHT = "thin/half/right/image_rect_color/jpeg"
-RIGHT_MODEL = "thin/half/right/render/image/jpeg"
+RIGHT_SHOWN = "thin/half/right/render/image/jpeg"
 DEPTH = "thin/quarter/left/render/depth/png"
 CONFIDENCE = "thin/quarter/left/render/depth_confidence/png"
 TISSUE = "thin/quarter/left/tissue_mask/png"
-PICTURES = (LEFT, MODEL, RIGHT, RIGHT_MODEL, DEPTH, CONFIDENCE, TISSUE)
+PICTURES = (LEFT, SHOWN, RIGHT, RIGHT_SHOWN, DEPTH, CONFIDENCE, TISSUE)
 SPLATS, ANCHORS, INFO, POSE = "splats", "anchors", "left/camera_info", "tf"
 WHOLE = (SPLATS, ANCHORS, INFO, POSE)  # always asked for, with LEFT
 SPLAT_FIELDS = {"scale_0", "rot_w", "f_dc_0", "opacity", "id"}
@@ -114,7 +114,7 @@ class Feed:
         """Return what may be shown now. Wait up to `WAIT_FOR_PICTURE` for an image newer than the last one.
 
         Args:
-            images: those of `PICTURES` that are looked at. The node makes no others.
+            pictures: those of `PICTURES` that are looked at. The node makes no others.
             overlaid: eyes whose overlay is looked at.
             steady: let the node go on sending until the next call, which follows at once; else it sends one
                 frame for each call, and nothing in between.

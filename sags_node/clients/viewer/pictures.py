@@ -1,4 +1,4 @@
-"""Images of the newest frame on one sheet: of both eyes, of the model, its depth and error, the overlay."""
+"""Images of the newest frame on one sheet: what both eyes saw and are shown, the depth, the overlay."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,31 +7,30 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, MODEL, RIGHT, RIGHT_MODEL, TISSUE, Moment
-from sags_node.quality.gallery import TILE_WIDTH, Picture, depth_range, depth_tile, error_tile, shrunk
+from sags_node.clients.viewer.feed import CONFIDENCE, DEPTH, LEFT, RIGHT, RIGHT_SHOWN, SHOWN, TISSUE, Moment
+from sags_node.quality.gallery import TILE_WIDTH, Picture, depth_range, depth_tile, shrunk
 from sags_node.types import U8
 
-# The topics that each image is made of.
+# The topics that each image is made of. What is shown is mostly the input: it is no measure of the model.
 NEEDS = {
     "Left input": (LEFT,),
-    "Model": (MODEL,),
+    "Left shown": (SHOWN,),
     "Depth": (DEPTH, TISSUE),
-    "Error on tissue": (LEFT, MODEL, TISSUE),
     "Right input": (RIGHT,),
-    "Right model": (RIGHT_MODEL,),
+    "Right shown": (RIGHT_SHOWN,),
     "Left overlay": (LEFT,),
     "Right overlay": (RIGHT,),
 }
 OVERLAID = {"Left overlay": "left", "Right overlay": "right"}
 # What somebody may look at; the first is shown first.
 VIEWS = {
-    "Input, model, depth, error": ("Left input", "Model", "Depth", "Error on tissue"),
+    "Input, shown, depth": ("Left input", "Left shown", "Depth"),
     "Input": ("Left input",),
-    "Model": ("Model",),
+    "Shown": ("Left shown",),
     "Depth under the cursor": ("Left input", "Depth"),
-    "Right eye": ("Right input", "Right model"),
+    "Right eye": ("Right input", "Right shown"),
     "Stereo input": ("Left input", "Right input"),
-    "Stereo model": ("Model", "Right model"),
+    "Stereo shown": ("Left shown", "Right shown"),
     "Overlay": ("Left overlay",),
     "Stereo overlay": ("Left overlay", "Right overlay"),
 }
@@ -62,17 +61,17 @@ class Sheet:
 
     def draw(self, moment: Moment, view: str, remark: str = "") -> U8:
         """Draw the images of a view [h, w, 3], RGB; a place is left empty where nothing is new."""
-        model = _model(moment.pictures)
+        known = _known(moment.pictures)
         if DEPTH in moment.pictures and TISSUE in moment.pictures:
-            self._follow(model)
+            self._follow(known)
         if (left := moment.pictures.get(LEFT)) is not None:
             self._height = shrunk(left).shape[0]
         names, high = VIEWS[view], BAR + self._height
         columns = min(COLUMNS, len(names))
-        sheet = np.full((len(names) // columns * high, columns * TILE_WIDTH, 3), _GROUND, np.uint8)
+        sheet = np.full((-(-len(names) // columns) * high, columns * TILE_WIDTH, 3), _GROUND, np.uint8)
         for place, name in enumerate(names):
             top, left_edge = place // columns * high, place % columns * TILE_WIDTH
-            tile, text = self._tile(name, model, moment), f"{name}{remark}"
+            tile, text = self._tile(name, known, moment), f"{name}{remark}"
             if tile is None:
                 text = f"{name}: nothing new"
             else:
@@ -86,24 +85,22 @@ class Sheet:
             cv2.putText(sheet, moment.problem, (6, high - 8), _FONT, 0.5, _MARKED, 1, cv2.LINE_AA)
         return sheet
 
-    def _tile(self, name: str, model: Picture, moment: Moment) -> U8 | None:
+    def _tile(self, name: str, known: Picture, moment: Moment) -> U8 | None:
         needed = NEEDS[name]
         if not all(topic in moment.pictures for topic in needed):
             return None
         if name == "Depth":
-            return depth_tile(model, *self.shown)
-        if name == "Error on tissue":
-            return error_tile(model)
+            return depth_tile(known, *self.shown)
         picture = shrunk(moment.pictures[needed[0]])
         if name not in OVERLAID:
             return picture
         drawn = moment.drawn.get(OVERLAID[name])
         return picture if drawn is None else _blended(picture, drawn)
 
-    def _follow(self, model: Picture) -> None:
-        if not (model.tissue & (model.depth > 0)).any():
+    def _follow(self, known: Picture) -> None:
+        if not (known.tissue & (known.depth > 0)).any():
             return  # it tells nothing of where the tissue is
-        new = depth_range([model])
+        new = depth_range([known])
         near, far = (
             RANGE_MEMORY * last + (1 - RANGE_MEMORY) * now
             for last, now in zip(self._followed or new, new, strict=True)
@@ -122,18 +119,10 @@ def overlaid_in(view: str) -> list[str]:
     return [OVERLAID[name] for name in VIEWS[view] if name in OVERLAID]
 
 
-def _model(pictures: Mapping[str, NDArray[Any]]) -> Picture:
-    """The images of a frame, resized to its mask and depth: all that follows costs time per pixel."""
-    tissue = pictures.get(TISSUE, _NOTHING)
-    size = tissue.shape[::-1]
-    truth, render = (
-        cv2.resize(pictures[name], size, interpolation=cv2.INTER_AREA)
-        if name in pictures and TISSUE in pictures
-        else _NOTHING
-        for name in (LEFT, MODEL)
-    )
+def _known(pictures: Mapping[str, NDArray[Any]]) -> Picture:
+    """The depth and tissue of a frame."""
     depth = np.nan_to_num(pictures.get(DEPTH, _NOTHING), nan=0.0)
-    return Picture(0, np.nan, truth, render, depth, tissue > 0)
+    return Picture(0, np.nan, _NOTHING, _NOTHING, depth, pictures.get(TISSUE, _NOTHING) > 0)
 
 
 def _blended(picture: U8, drawn: U8) -> U8:

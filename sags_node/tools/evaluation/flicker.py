@@ -33,7 +33,7 @@ class Flicker:
         """Take in the next frame.
 
         Args:
-            image: [H, W, 3] the input of the left eye.
+            picture: [H, W, 3] the input of the left eye.
             shown: what the run made of it.
 
         Returns:

@@ -20,6 +20,7 @@ from sags_node.types import U8
 BLUE, ORANGE, GREEN, GREY = "#2166ac", "#d6604d", "#1b7837", "#777777"
 REPORT, SHEET, TITLE = "report.html", "sheet.png", "SAGS: "
 COLUMNS = ("camera", "model", "depth", "error")
+SHOWN = ("camera", "shown", "depth")  # mostly the camera's image: its error would say nothing of the model
 
 
 def check_report(folder: Path, *more: str) -> None:
@@ -56,7 +57,9 @@ def write_report(
     """
     check_folder(folder)
     near, far = depth_range(pictures)
-    sheet = [tiles(picture, near, far) for picture in pictures]
+    columns = SHOWN if any("shown" in row.figures for row in rows) else COLUMNS
+    sheet = [tiles(picture, near, far)[: len(columns)] for picture in pictures]
+    brightest = f" The error is brightest at {ERROR_AT_TOP:.0%} of full scale." if columns is COLUMNS else ""
     text = page(
         f"{TITLE}{summary['session']}",
         [
@@ -68,9 +71,9 @@ def write_report(
             "<h2>Figures</h2>",
             _figure_groups(summary),
             "<h2>Images</h2>",
-            _pictures(pictures, sheet),
+            _pictures(pictures, columns, sheet),
             f'<p class="quiet">Grey: not tissue, or nothing known. Depth from {near * 1e3:.0f} to '
-            f"{far * 1e3:.0f} mm. The error is brightest at {ERROR_AT_TOP:.0%} of full scale.</p>",
+            f"{far * 1e3:.0f} mm.{brightest}</p>",
         ],
     )
     report = folder / REPORT
@@ -94,14 +97,14 @@ def _verdict(summary: Mapping[str, Any]) -> str:
     return f'<table class="verdict">{"".join(lines)}</table>'
 
 
-def _pictures(pictures: Sequence[Picture], sheet: Sequence[Sequence[U8]]) -> str:
+def _pictures(pictures: Sequence[Picture], columns: Sequence[str], sheet: Sequence[Sequence[U8]]) -> str:
     lines = []
     worst = min((picture.psnr for picture in pictures), default=None)
     for picture, line in zip(pictures, sheet, strict=True):
         note = " (the worst)" if picture.psnr == worst and len(pictures) > 1 else ""
         cells = "".join(
             f'<figure><img alt="{name}" src="{picture_uri(tile)}"><figcaption>{name}</figcaption></figure>'
-            for name, tile in zip(COLUMNS, line, strict=True)
+            for name, tile in zip(columns, line, strict=True)
         )
         lines.append(f"<h3>frame {picture.frame_id}, {picture.psnr:.1f} dB{note}</h3>")
         lines.append(f'<div class="images">{cells}</div>')

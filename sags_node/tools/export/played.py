@@ -13,7 +13,7 @@ from sags_node.files import check_folder, whole, writing
 from sags_node.kernels.threads import configure_threads
 from sags_node.media.video_file import VideoFile
 from sags_node.messaging import published
-from sags_node.pipeline.pipeline import Pipeline
+from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.pipeline.session import Session
 from sags_node.tools.export.scene import Advance
 from sags_node.types import F32, AnchorStates, FrameResult
@@ -65,7 +65,7 @@ def write_played(session: Session, wanted: Mapping[str, Path], advance: Advance)
         for kind, path in wanted.items():
             with writing(path):
                 products[kind] = KINDS[kind].make(partial[kind], session.source.rate, session.published_size)
-        for done, (number, result, anchors) in enumerate(_played(session), 1):
+        for done, (number, result, anchors) in enumerate(_played(session, "render" in wanted), 1):
             for kind, product in products.items():
                 with writing(wanted[kind]):
                     product.add(number, result, anchors)
@@ -85,14 +85,18 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
 
 
-def _played(session: Session) -> Iterator[tuple[int, FrameResult, AnchorStates]]:
-    """The arguments of `Product.add` for each frame of the recording but those of its warm-up."""
+def _played(session: Session, shown: bool) -> Iterator[tuple[int, FrameResult, AnchorStates]]:
+    """The arguments of `Product.add` for each frame of the recording but those of its warm-up.
+
+    Args:
+        shown: somebody looks at the left view.
+    """
     configure_threads(session.config.engine.threads)
     pipeline = Pipeline(session.config, session.rig)
     budget = pipeline.make_budget()
     with session.source as source:
         for frame in source:
-            result = pipeline.process(frame, budget)
+            result = pipeline.process(frame, budget, FrameRequest(left=shown))
             if frame.warm_up:
                 continue
             if len(pipeline.anchors) == 0 and not result.held:
@@ -178,8 +182,8 @@ class Tracks:
 
 
 class Renders:
-    """An MP4 of the model as the left eye sees it, by the frames' stamps; black where nothing is known, and
-    in frames that were not taken in."""
+    """An MP4 of the left view as consumers are shown it, by the frames' stamps; black where nothing is known,
+    and in frames that were not taken in."""
 
     def __init__(self, file: Path, rate: float, size: tuple[int, int]) -> None:
         self._video = VideoFile(file, rate, size)

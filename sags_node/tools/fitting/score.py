@@ -62,7 +62,7 @@ def score(
         frames: what to measure on.
         segments: named stretches, whose means are given too.
         lpips: measures LPIPS; None: it is left out.
-        images: an existing folder that takes the drawn frames, PNG.
+        pictures: an existing folder that takes the drawn frames, PNG.
         progress: called with the frames done.
 
     Returns:

@@ -207,7 +207,7 @@ def look(pair: RectifiedPair, last: FrameResult, picture: U8, tissue: Bool) -> L
     """Compare an image with the frame mapped last.
 
     Args:
-        image: [h, w, 3] the left one, small.
+        picture: [h, w, 3] the left one, small.
         tissue: [h, w] small, where that frame would have shown tissue but for what covers it.
     """
     step = max(1, pair.camera.width // WIDTH)
