@@ -146,11 +146,15 @@ def evaluate(
     type=click.Choice(["online", "paper", "released"]),
     default="online",
     help="online: one pass of the mapper, then refining; paper: random points, warm-up on the first frame, "
-    "then all together; released: paper, with each number as in the authors' code.",
+    "then all together, images of half the size first, and images half way between frames, too; released: "
+    "neither, and the authors' numbers, but for their spherical harmonics.",
 )
 @click.option("--warm-up", type=click.IntRange(0), help="Iterations; not for online.  [default: 1000]")
 @click.option(
-    "--iterations", type=click.IntRange(0), help="With deformation.  [default: 2000; not online: 3000]"
+    "--iterations",
+    type=click.IntRange(0),
+    help="With deformation; paper does 0.6 times as many before, at half the size.  "
+    "[default: 2000; not online: 3000]",
 )
 @click.option(
     "--tokens",
@@ -200,7 +204,8 @@ def fit(
 
     Every eighth frame is for testing. By default the online mapper plays the recording once, and what it saw
     is refined jointly; --schedule paper is the protocol of the paper: warm-up on the first frame, then all
-    parameters together. --schedule released is the same with each number as in the authors' code.
+    parameters together. Of what it changes, --set midway=false, --set coarse=0 and --set slopes=false each
+    leave out a part.
 
     DATASET is a folder in EndoNeRF or SCARED layout, or any session the node can play. Leaves a checkpoint,
     the model as PLY (standard 3DGS fields, filters folded in), the drawn test frames and figures.json.

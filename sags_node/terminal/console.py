@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -98,22 +98,32 @@ def _print(line: str) -> None:
     console.print(when + line, markup=False, soft_wrap=True)
 
 
+class _TimeLeft(TimeRemainingColumn):
+    """The estimate that the work gave, or else that of its count."""
+
+    def render(self, task: Task) -> Text:
+        left = task.fields.get("left")
+        return super().render(task) if left is None else Text(f"about {time_text(left)} left")
+
+
 @contextmanager
 def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[Callable[..., None]]:
-    """Show a progress bar, which appears at the first advance(done, total=None, description=None). Without a
-    terminal, print a line every `SAY_EVERY` s instead."""
+    """Show a progress bar, which appears at the first advance(done, total=None, description=None, left=None).
+    `left`: s until all ends, where that is known better. Without a terminal, print a line every `SAY_EVERY` s
+    instead."""
     described = TextColumn("{task.description}", markup=False)
-    columns = (described, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (described, BarColumn(), MofNCompleteColumn(), _TimeLeft())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=None, visible=False)
         said = began = now()
         first, last, count = 0, 0, 0  # start, present value and total of the running count
 
-        def advance(done: int, total: int | None = None, description: str | None = None) -> None:
+        def advance(
+            done: int, total: int | None = None, description: str | None = None, left: float | None = None
+        ) -> None:
             nonlocal said, began, first, last, count
-            bar.update(
-                task, completed=done, total=total, description=visible(description or what), visible=True
-            )
+            shown = visible(description or what)
+            bar.update(task, completed=done, total=total, description=shown, visible=True, left=left)
             if console.is_terminal:
                 return
             moment, of = now(), total or 0
@@ -123,8 +133,10 @@ def progress(what: str, now: Callable[[], float] = time.monotonic) -> Iterator[C
             if moment - said >= SAY_EVERY:
                 said = moment
                 rest = ""
-                if of and done > first + 1:  # the first step may have compiled kernels
-                    rest = f", about {time_text((moment - began) / (done - first) * (of - done))} left"
+                if left is None and of and done > first + 1:  # the first step may have compiled kernels
+                    left = (moment - began) / (done - first) * (of - done)
+                if left is not None:
+                    rest = f", about {time_text(left)} left"
                 _print(f"{description or what}: {done}" + ("" if total is None else f" of {total}{rest}"))
 
         yield advance

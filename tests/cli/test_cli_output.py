@@ -403,7 +403,7 @@ def test_a_name_cannot_steer_the_terminal(
 def test_where_no_terminal_is_progress_is_a_line_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
     """With the time that is left, by what was done since the count began: another count is another work. One
     step tells nothing: the first may compile."""
-    times = iter([0.0, 5.0, 10.0, 20.0, 30.0, 31.0, 41.0, 42.0, 52.0])
+    times = iter([0.0, 5.0, 10.0, 20.0, 30.0, 31.0, 41.0, 42.0, 52.0, 62.0])
     with terminal.progress("fitting", lambda: next(times)) as advance:
         for done in (1, 2, 3):
             advance(done, 9)
@@ -412,6 +412,7 @@ def test_where_no_terminal_is_progress_is_a_line_now_and_then(capsys: pytest.Cap
             advance(done, 100, "measuring")
         for done in (1, 51):
             advance(done, 100, "hiding")
+        advance(52, 100, "hiding", 600.0)  # the work knows of more to come
     said = [line.split(" ", 2)[2] for line in capsys.readouterr().err.splitlines()]
     assert said == [
         "fitting: 2 of 9",
@@ -419,6 +420,7 @@ def test_where_no_terminal_is_progress_is_a_line_now_and_then(capsys: pytest.Cap
         "drawing: 4",
         "measuring: 10 of 100, about 3 min left",
         "hiding: 51 of 100, about 10 s left",
+        "hiding: 52 of 100, about 10 min left",
     ]
 
 

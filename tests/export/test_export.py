@@ -16,6 +16,7 @@ from running_node import RunningNode
 from splat_files import splats_of
 
 from sags_node.config.schema import PhantomSource
+from sags_node.engine.rasterizer.views import colours_of
 from sags_node.errors import SagsError
 from sags_node.geometry import project, unproject
 from sags_node.messaging.address import NodeAddress
@@ -30,7 +31,7 @@ from sags_node.tools.export import export
 from sags_node.tools.export import scene as export_scene
 from sags_node.tools.export import surface as export_surface
 from sags_node.tools.export.orbit import orbit
-from sags_node.tools.export.scene import Scene, from_node, from_session
+from sags_node.tools.export.scene import Scene, from_fit, from_node, from_session
 from sags_node.tools.export.surface_files import Surface
 from sags_node.tools.fitting import start
 from sags_node.types import SH_DEGREE_0
@@ -291,6 +292,24 @@ def test_a_fit_is_exported_at_any_time(
     for frames in (9, 11):
         other = (phantom_session, f"source.frames:={frames}", "--fit", tmp_path / "fit")
         refused(2, "export", *other, "--splats", tmp_path / "new.ply", said=("frames",))
+
+
+def test_a_fit_without_filters_is_drawn_without_them(phantom_session: Path, tmp_path: Path) -> None:
+    options = "--schedule paper --warm-up 2 --iterations 1 --max-gaussians 2000 --no-alias-free".split()
+    done = sags("fit", phantom_session, "source.frames:=4", "--out", tmp_path, *options)
+    assert done.exit_code == 0, done.output
+    session = open_session(phantom_session, ["source.pace:=step", "source.loop:=false", "source.frames:=4"])
+    scene = from_fit(tmp_path, session, 0.1, lambda done, of, what: None)
+    shown = cv2.imread(str(tmp_path / "test/000001.png")).astype(float)[
+        ..., ::-1
+    ]  # held out, drawn by the fit
+
+    def off(each: Scene) -> float:
+        drawn = colours_of(each.rasterizer().forward(each.gaussians, each.camera))
+        return float(np.abs(255 * np.clip(drawn, 0, 1) - shown).max())
+
+    assert off(scene) < 0.51  # rounded
+    assert off(replace(scene, antialias=True)) > 2
 
 
 # ---- mistakes --------------------------------------------------------------------------------------------

@@ -67,11 +67,11 @@ def test_of_a_frame_that_was_not_taken_in_its_picture_alone_is_shown(tmp_path: P
 def test_a_node_without_a_right_eye_shows_the_left_one_and_says_so(tmp_path: Path) -> None:
     with node_sockets(tmp_path / "run") as running, making(running, plane_result()):
         feed = Feed(NodeAddress(run_dir=tmp_path / "run"))
-        until(lambda: feed.now((MODEL, RIGHT), steady=True).camera is not None)
-        moment = feed.now((MODEL, RIGHT), steady=True)
-        assert set(moment.pictures) == {LEFT, MODEL} and moment.splats is not None
+        until(lambda: feed.now((SHOWN, RIGHT), steady=True).camera is not None)
+        moment = feed.now((SHOWN, RIGHT), steady=True)
+        assert set(moment.pictures) == {LEFT, SHOWN} and moment.splats is not None
         assert moment.problem is not None and "right/image_rect_color is not published" in moment.problem
-        assert feed.now((MODEL,), steady=True).problem is None, "nobody looks at that eye"
+        assert feed.now((SHOWN,), steady=True).problem is None, "nobody looks at that eye"
         feed.close()
 
 

@@ -197,9 +197,9 @@ def test_frames_without_known_depth_leave_the_range_of_the_depth_colours() -> No
     sheet, seen = Sheet(), moment()
     for unknown in (np.full((32, 40), np.nan, np.float32), np.zeros((32, 40), np.float32)):
         blind = replace(seen, pictures={**seen.pictures, DEPTH: unknown})
-        sheet.draw(blind, FOUR)
-        sheet.draw(seen, FOUR)
-        sheet.draw(blind, FOUR)
+        sheet.draw(blind, ALL)
+        sheet.draw(seen, ALL)
+        sheet.draw(blind, ALL)
         assert sheet.shown == pytest.approx((0.05, 0.08))
 
 
@@ -614,7 +614,7 @@ def test_the_buttons_give_the_moment_that_is_shown_as_files(narrow: Shown) -> No
     with page.expect_download() as download:
         page.get_by_role("button", name="Screenshot").click()
     kept = cv2.imread(str(download.value.path()))
-    sheet = Sheet().draw(at(7), FOUR)
+    sheet = Sheet().draw(at(7), ALL)
     width = round(sheet.shape[1] * kept.shape[0] / sheet.shape[0])
     assert kept.shape[1] > width and (kept[100 * kept.shape[0] // sheet.shape[0], 50 - width] == 90).all()
     narrow.show(Moment("gone"))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sags_node.engine.interface import Rasterizer
-from sags_node.engine.rasterizer.rasterize import make_rasterizer, to_view
+from sags_node.engine.rasterizer.rasterize import to_view
 from sags_node.errors import SagsError
 from sags_node.files import whole
 from sags_node.geometry import rigid
@@ -46,7 +46,7 @@ def write_orbit(path: Path, scene: Scene, degrees: float, seconds: float, advanc
         SagsError: the camera sees nothing of the model, or the video cannot be written.
     """
     camera, count = scene.camera, max(1, round(seconds * RATE))
-    rasterizer = make_rasterizer("numba", camera.width, camera.height)
+    rasterizer = scene.rasterizer()
 
     def draw(eye: Camera) -> tuple[U8, F32]:
         return picture_of(rasterizer, scene.gaussians, eye)

@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 
 from sags_node import __version__
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_folder, whole, writing
 from sags_node.media.video_file import VideoFile
@@ -121,7 +120,7 @@ def write_sequence(
             size += path.stat().st_size
             if rasterizer is None or camera is None:
                 camera = scene.camera
-                rasterizer = make_rasterizer("numba", camera.width, camera.height)
+                rasterizer = scene.rasterizer()
             picture, _ = picture_of(rasterizer, scene.gaussians, scene.camera)
             jpeg = cv2.imencode(
                 ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]

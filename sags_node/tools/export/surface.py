@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from sags_node.engine.rasterizer.confidence import with_confidence
-from sags_node.engine.rasterizer.rasterize import make_rasterizer
 from sags_node.engine.rasterizer.views import colours_of, to_view
 from sags_node.errors import SagsError
 from sags_node.files import whole
@@ -85,15 +84,14 @@ def _drawn(scene: Scene, cameras: list[Camera]) -> Iterator[tuple[F32, F32]]:
     Raises:
         SagsError: the first camera sees nothing.
     """
-    first = cameras[0]
-    rasterizer = make_rasterizer("numba", first.width, first.height)
+    rasterizer = scene.rasterizer()
     for camera in cameras:
         planes = rasterizer.forward(scene.gaussians, camera)
         view = to_view(planes, camera, 0, scene.t_capture_ns)
         view = with_confidence(view, scene.gaussians)
         apart = np.abs(view.depth - rasterizer.median()[0])
         agree = apart < AGREEMENT_PX * view.depth / np.float32(camera.K[0, 0])
-        if camera is first and not agree.any():
+        if camera is cameras[0] and not agree.any():
             raise SagsError("the left camera sees nothing of the model; export another moment")
         yield colours_of(planes), np.where(agree, view.depth, np.float32(0))
 

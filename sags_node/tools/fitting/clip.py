@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 OnFrame = Callable[[StereoFrame, Bool], None]  # the frame as it was recorded, and its tissue mask [H, W]
 
 MEMORY_SHARE = 0.5  # of the free memory: the fit itself needs the rest
+CUT = 0.08  # mean difference of two frames, 0..1; a beating heart stays below half of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +74,13 @@ class Clip:
         if place in {0, len(self.train)} or self.train[place].t_capture_ns == t_ns:
             return None
         return self.train[place - 1], self.train[place]
+
+
+def is_cut(before: ClipFrame, after: ClipFrame) -> bool:
+    """Tell whether two frames show different scenes. Every eighth pixel is enough."""
+    both = (before.tissue & after.tissue)[::8, ::8]
+    apart = cv2.absdiff(before.image, after.image)[::8, ::8][both]
+    return bool(apart.size > 0 and apart.mean() > CUT * 255)
 
 
 def play(
@@ -129,6 +137,7 @@ def read_clip(
     held_out: Callable[[int], bool],
     progress: Callable[[int], None] = lambda done: None,
     on_frame: OnFrame = lambda frame, tissue: None,
+    midway: bool = False,
 ) -> Clip:
     """Play a session once through the node's own front end and keep every frame.
 
@@ -137,6 +146,7 @@ def read_clip(
         held_out: whether the frame of that number is for testing only.
         progress: called with the frames done.
         on_frame: called with each frame.
+        midway: whether images half way between frames must fit into memory, too (`fitting.midway`).
 
     Raises:
         UsageError: see `play`.
@@ -146,7 +156,7 @@ def read_clip(
     test: list[ClipFrame] = []
     for frame in play(session, references=True, on_frame=on_frame):
         if not train and not test:
-            check_memory(frame, session.source.frame_count)
+            _check_memory(frame, session.source.frame_count, midway)
         (test if held_out(frame.frame_id) else train).append(frame)
         progress(len(train) + len(test))
     if not train:
@@ -156,17 +166,15 @@ def read_clip(
     return Clip(train, test)
 
 
-def check_memory(frame: ClipFrame, count: int | None) -> None:
-    """Check that `count` frames of this size fit into memory; None: it is unknown, and nothing is checked.
-
-    Raises:
-        SagsError: they do not.
-    """
+def _check_memory(frame: ClipFrame, count: int | None, midway: bool) -> None:
+    """Check that `count` frames of this size fit into memory, and as many half way between them if `midway`.
+    None: the count is unknown, and nothing is checked."""
     kept = frame.image, frame.tissue, frame.bare, frame.depth
-    needed = (count or 0) * sum(array.nbytes for array in kept)
+    needed = (2 if midway else 1) * (count or 0) * sum(array.nbytes for array in kept)
     free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     if needed > MEMORY_SHARE * free:
+        more, without = (" and images half way between them", "--set midway=false, ") if midway else ("", "")
         raise SagsError(
-            f"{count} frames take {needed / 1e9:.1f} GB, {MEMORY_SHARE * free / 1e9:.1f} GB may be used; "
-            "set source.frames, source.stride or a smaller vision.width and vision.height"
+            f"{count} frames{more} take {needed / 1e9:.1f} GB, {MEMORY_SHARE * free / 1e9:.1f} GB may be "
+            f"used; give {without}source.frames, source.stride or a smaller vision.width and vision.height"
         )

@@ -7,10 +7,10 @@ squared colour residuals and the closed-form colour step, as the online mapper d
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import reduce
+from functools import cached_property, reduce
 from itertools import repeat
 from typing import Any
 
@@ -50,19 +50,33 @@ REFINE_FIELD_SHARE = 0.003  # of the field's rates, which are for learning from 
 REFINE_RELAXATION = 1.6  # of the colour step: a frame is seen again after many others
 REFINE_DECAY = 0.1  # share of their first lengths to which the steps fall
 RELAXATION = 0.9  # of the colour step of the paper's schedule; it falls with the rates, so frames average out
+WARM_UP, HALF, FITTING = "warming up", "fitting at half the size", "fitting"  # stages
 
 
 class Fit:
-    """A model being fitted: `start`, then `iterate` until `done`."""
+    """A model being fitted: `start`, then `iterate` until `done`.
 
-    def __init__(self, clip: Clip, settings: FitSettings, device: str | None = None) -> None:
+    Attributes:
+        seconds: wall time since the clip was read, up to the last `tick`: images half way, start, measuring
+            `prices`, iterations, checkpoints (written and read), pauses. It goes on over `restore`.
+    """
+
+    def __init__(
+        self,
+        clip: Clip,
+        settings: FitSettings,
+        device: str | None = None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
         """
         Args:
             clip: what it learns from.
             settings: of the fit.
             device: where Warp draws, and where torch keeps the model and the images; not for
                 schedule = online. None: the kernels of the CPU.
+            now: the clock, s.
         """
+        self._now, self._counted = now, now()
         seen = np.any([frame.tissue for frame in clip.train], axis=0)
         self.clip = clip
         self.settings = settings = settings.of_clip(int(np.count_nonzero(seen)), len(clip.train))
@@ -72,7 +86,7 @@ class Fit:
         self._cores = ThreadPoolExecutor(cores, initializer=_take_one_core) if cores > 1 else None
         self._device = torch.device(device or "cpu")
         self.iteration = 0
-        self.seconds = 0.0  # spent on starting and iterating
+        self.seconds = 0.0
         self.pruned = self.split = 0
         height, width = clip.train[0].tissue.shape
         self.rasterizer = make_rasterizer("numba", width, height, antialias=settings.antialias)
@@ -82,15 +96,22 @@ class Fit:
         self._rng = np.random.default_rng(settings.seed)
         self._order: list[int] = []
         self._decays = marked(settings.rates.decaying)
-        self._learnt = (*clip.train, *(midway_frames(clip.train) if settings.midway else ()))
-        self._look()
+
+    @cached_property
+    def _learnt(self) -> list[ClipFrame]:
+        """All frames that are learnt. A finished fit that is only drawn needs none half way."""
+        return [*self.clip.train, *(midway_frames(self.clip.train) if self.settings.midway else ())]
+
+    @property
+    def _cap(self) -> int:
+        """The most Gaussians in the current stage."""
+        return self.settings.max_gaussians // (4 if self.is_coarse else 1)
 
     def _look(self) -> None:
         """Prepare the images and the learning rates of the current stage."""
-        settings, frames = self.settings, list(self._learnt)
-        self._cap = settings.max_gaussians
+        settings, frames = self.settings, self._learnt
         if self.is_coarse:
-            frames, self._cap = [frame.halved() for frame in frames], self._cap // 4
+            frames = [frame.halved() for frame in frames]
         self._pictures = Pictures(frames, settings, self._on_device)
         self._rates = row_rates(settings.rates, self._pictures.pixel)
         self._refine_rates = self._rates.copy()
@@ -106,7 +127,7 @@ class Fit:
         Raises:
             SagsError: no frame has depth enough.
         """
-        started = time.perf_counter()
+        self._look()
         settings, exposure = self.settings, self._make_exposure()
         if settings.schedule == "paper":
             on_device = None if self._on_device is None else self._device
@@ -123,7 +144,12 @@ class Fit:
             self.model = RefinedModel(rows, field, exposure, settings.antialias, slopes, residuals)
         self._start_means = np.ascontiguousarray(rows[:, columns.MEAN])
         self._density = self._make_density()
-        self.seconds += time.perf_counter() - started
+        self.tick()
+
+    def tick(self) -> None:
+        """Count the time up to now into `seconds`."""
+        before, self._counted = self._counted, self._now()
+        self.seconds += self._counted - before
 
     @property
     def residual(self) -> float:
@@ -157,30 +183,27 @@ class Fit:
 
     def iterate(self) -> None:
         """Do one step on one training frame, or on `batch_size` of them."""
-        started = time.perf_counter()
         if isinstance(self.model, RefinedModel):
             self._refine(self.model)
         else:
             self._descend()
-        self.seconds += time.perf_counter() - started
+        self.tick()
 
-    def seconds_left(self) -> float:
-        """Estimate the seconds for the remaining iterations: time the drawing and gradients of each kind."""
-        rest = self.total - self.iteration
-        fine = min(rest, self.settings.iterations)
-        plain = max(0, self.warm_up - self.iteration)
-        deformed = rest - fine - plain + (4 if self.is_coarse else 1) * fine
-        seconds = 0.0
-        for with_field, count in ((False, plain), (True, deformed)):
-            took = []
-            for _ in range(3 if count else 0):  # the first may compile kernels and allocate memory
-                started = time.perf_counter()
-                self._differentiated(self._pictures.frames[: self._batch if with_field else 1], with_field)
+    def prices(self) -> dict[str, float]:
+        """Measure what an iteration of each stage still to come takes, s: its drawing and gradients."""
+
+        def took(deformed: bool) -> float:
+            found = []
+            for _ in range(3):  # the first may compile kernels and allocate memory
+                started = self._now()
+                self._differentiated(self._pictures.frames[: self._batch if deformed else 1], deformed)
                 float(self._residual)  # waits for the device
-                took.append(time.perf_counter() - started)
-            seconds += count * min(took, default=0.0)
+                found.append(self._now() - started)
+            return min(found)
+
+        plain, deformed = took(False) if self.iteration < self.warm_up else 0.0, took(True)
         self.model.forget()
-        return seconds
+        return {WARM_UP: plain, HALF: deformed, FITTING: deformed * (4 if self.is_coarse else 1)}
 
     def _differentiated(self, frames: Sequence[ClipFrame], deformed: bool) -> list[Drawing]:
         """Draw training frames and compare them; all that is learnt then holds its gradients."""
@@ -220,7 +243,7 @@ class Fit:
         drawings = self._differentiated(frames, deformed)
         for drawing in drawings:
             self._density.observe(drawing.v_means, drawing.contribution)
-        share = 1.0 if deformed and self.is_coarse else settings.rate_share(*self.stage)
+        share = 1.0 if deformed and self.is_coarse else settings.rate_share(*self.stage[1:])
         colors = 0.0
         if settings.slopes:
             pixels = float(np.mean([np.count_nonzero(frame.tissue) for frame in frames]))
@@ -298,6 +321,7 @@ class Fit:
 
     def state(self) -> dict[str, Any]:
         """The rest of what `restore` needs."""
+        self.tick()
         return {
             "iteration": self.iteration,
             "seconds": self.seconds,
@@ -345,7 +369,8 @@ class Fit:
                 optimizer["state"].setdefault(int(number), {})[key] = torch.from_numpy(values)
         deltas.optimizer.load_state_dict(optimizer)
         self.iteration, self._order = int(state["iteration"]), list(state["order"])
-        self._look()
+        if not self.done:
+            self._look()
         self._density = self._make_density()
         self._density.pull, self._density.seen = map(self._tensor, (arrays["pull"], arrays["seen"]))
         self.seconds = float(state["seconds"])
@@ -354,7 +379,7 @@ class Fit:
 
     def _progress(self) -> float:
         """How far the stage is, 0..1; each stage has its own schedule."""
-        done, of = self.stage
+        _, done, of = self.stage
         return done / max(1, of)
 
     @property
@@ -362,14 +387,19 @@ class Fit:
         return self.settings.batch_size if self.settings.schedule == "paper" else 1
 
     @property
-    def stage(self) -> tuple[int, int]:
-        """The iterations done in the current stage, and how many it has."""
-        before = 0
-        for length in (self.warm_up, self.coarse):
-            if self.iteration < before + length:
-                return self.iteration - before, length
-            before += length
-        return self.iteration - before, self.settings.iterations
+    def stages(self) -> dict[str, int]:
+        """How many iterations each stage has, in their order."""
+        return {WARM_UP: self.warm_up, HALF: self.coarse, FITTING: self.settings.iterations}
+
+    @property
+    def stage(self) -> tuple[str, int, int]:
+        """The current stage, its iterations done, and how many it has."""
+        done = self.iteration
+        for name, length in self.stages.items():
+            if done < length or name == FITTING:
+                break
+            done -= length
+        return name, done, length
 
     def _next_frame(self) -> ClipFrame:
         """The next frame to learn: each comes once in random order, then each comes again."""

@@ -3,30 +3,35 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from statistics import median
 
 import cv2
 import numpy as np
 
 from sags_node.geometry import rigid
-from sags_node.tools.fitting.clip import ClipFrame, check_memory
+from sags_node.tools.fitting.clip import ClipFrame, is_cut
 from sags_node.types import F64
 
 SMOOTH = 1.5  # px, standard deviation of the blur of the flow: OpenCV's jumps from patch to patch
+GAP = 3.5  # usual steps of the clip: one frame held out makes two of one, and a lost one beside it three
 
 
 def midway_frames(frames: Sequence[ClipFrame]) -> list[ClipFrame]:
-    """Make a frame between every two consecutive ones, at the mean of their times.
+    """Make a frame between every two consecutive ones, at the mean of their times; but none across a cut or a
+    gap in time, where nothing says what lay between.
 
     Its colours and depth are the means of both at the same tissue, which is taken to move in a straight line.
     Optical flow matches it (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016, as in
     OpenCV). Where one of both shows no tissue, it has none.
-
-    Raises:
-        SagsError: they do not fit into memory.
     """
-    check_memory(frames[0], len(frames))
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return [_midway(before, after, flow) for before, after in pairwise(frames)]
+    steps = [after.t_capture_ns - before.t_capture_ns for before, after in pairwise(frames)]
+    longest = GAP * median(steps or [0])
+    return [
+        _midway(before, after, flow)
+        for (before, after), step in zip(pairwise(frames), steps, strict=True)
+        if step <= longest and not is_cut(before, after)
+    ]
 
 
 def _midway(before: ClipFrame, after: ClipFrame, flow: cv2.DISOpticalFlow) -> ClipFrame:

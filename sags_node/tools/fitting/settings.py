@@ -180,7 +180,7 @@ PAPER = FitSettings(
     color_softness=0.15,  # more than most differences
     slopes=True,
 )
-# Each number as in the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).
+# The numbers of the authors' code for EndoNeRF (H-Wenfeng/SAGS and EndoGaussian, which it is built on).
 # Their SH degree is 3: with one camera that stands still this is a second rate for the same colours, and is
 # left out; their colour rate is of an SH coefficient, 0.282 of which is a colour. Their unit is 1 mm.
 RELEASED = FitSettings(

@@ -8,7 +8,6 @@ learns these paths by regression, which needs no drawing and so is fast. What it
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -25,21 +24,22 @@ from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model import columns
 from sags_node.model.exposure import Exposure
-from sags_node.tools.fitting.clip import Clip, ClipFrame
+from sags_node.tools.fitting.clip import Clip, ClipFrame, is_cut
 from sags_node.tools.fitting.residuals import Residuals, check_size
 from sags_node.tools.fitting.settings import FitSettings, path_frames
 from sags_node.types import F32, I64, Bool, Gaussians
 
 POOLED_SHARE = 0.01  # of a frame's pixels
 ONLINE_STEPS = 2  # of the mapper per frame
-CUT = 0.08  # mean difference of two frames, 0..1; a beating heart stays below half of it
 PATH_POINTS = 8192  # Gaussians per step of the regression
 PATH_STEPS = 1500
 CARRIERS = 8  # nearest Gaussians whose mean motion tells where a new one was in the first frame
 NEIGHBOURS_AT_A_TIME = 2048  # points whose distances to all others fit on a GPU
 HIDDEN = -5.0  # added to an opacity logit
 
-Progress = Callable[[str, int, int], None]  # what, done, of
+FOLLOW, LEARN = "following the tissue", "learning the paths"  # stages of an online start
+
+Progress = Callable[[str, int, int], None]  # stage, done, of
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,13 +114,6 @@ def _nearest(points: F32, queries: F32, count: int) -> tuple[I64, F32]:
     return found.numpy(), squared.numpy()
 
 
-def _is_cut(before: ClipFrame, after: ClipFrame) -> bool:
-    """Tell whether two frames show different scenes. Every eighth pixel is enough."""
-    both = (before.tissue & after.tissue)[::8, ::8]
-    apart = cv2.absdiff(before.image, after.image)[::8, ::8][both]
-    return bool(apart.size > 0 and apart.mean() > CUT * 255)
-
-
 def follow_online(
     clip: Clip, rasterizer: Rasterizer, exposure: Exposure, settings: FitSettings, progress: Progress
 ) -> tuple[F32, F32, Paths]:
@@ -142,7 +135,7 @@ def follow_online(
     first = _Places()
     for done, frame in enumerate(clip.train):
         observation = frame.observation()
-        if done and _is_cut(clip.train[done - 1], frame):
+        if done and is_cut(clip.train[done - 1], frame):
             mapper.map.restart()
             last = None
         budget.start()
@@ -156,7 +149,7 @@ def follow_online(
             rows[:, columns.COLOR] /= gain
             slopes = mapper.model.slopes / gain.mean()
             seen.append((gaussians.ids.copy(), rows, slopes))  # the mapper goes on writing into its own
-        progress("following the tissue", done + 1, len(clip.train))
+        progress(FOLLOW, done + 1, len(clip.train))
     ids, lives = np.unique(np.concatenate([ids for ids, *_ in seen]), return_counts=True)
     if len(ids) > settings.max_gaussians:  # after a cut in the recording
         ids = np.sort(ids[np.argsort(-lives, kind="stable")[: settings.max_gaussians]])
@@ -219,7 +212,7 @@ def learn_paths(field: Field, rows: F32, paths: Paths, settings: FitSettings, pr
         off: Tensor = (deformed - wanted)[:, columns.MEAN].abs().sum() / len(picked)
         off.backward()  # type: ignore[no-untyped-call]
         field.deltas.step(settings.field_rates.scaled(settings.decay ** (step / PATH_STEPS)))
-        progress("learning the paths", step + 1, PATH_STEPS)
+        progress(LEARN, step + 1, PATH_STEPS)
 
 
 def remainder(field: Field, rows: F32, paths: Paths) -> Residuals:
