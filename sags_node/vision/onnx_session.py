@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from sags_node.config.launch_file import explain
 from sags_node.config.schema import NORMALIZATIONS, NetworkFormat, Normalization, OnnxConfig
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import SagsError, UsageError
@@ -191,10 +192,7 @@ def _validated(tree: Mapping[str, Any], where: str) -> dict[str, Any]:
         }
         checked = NetworkFormat.model_validate(parsed)
     except ValidationError as error:
-        item = error.errors()[0]
-        key = str(item["loc"][0]) if item["loc"] else "format"
-        reason = f"known keys: {', '.join(KEYS)}" if item["type"] == "extra_forbidden" else item["msg"]
-        raise UsageError(f"{where}: {key}: {reason}") from None
+        raise UsageError(explain(error, where, root=NetworkFormat)) from None
     return {key: getattr(checked, key) for key in KEYS if getattr(checked, key) is not None}
 
 
