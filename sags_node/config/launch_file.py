@@ -69,7 +69,7 @@ def load_launch(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         config = LaunchConfig.model_validate(tree)
     except ValidationError as error:
         given = [override.partition(":=")[0] for override in overrides]
-        raise UsageError(_explain(error, name, given)) from None
+        raise UsageError(explain(error, name, given)) from None
     if isinstance(config.source, PhantomSource) and config.rig is not None:
         raise UsageError(
             f"rig: the built-in phantom brings its own calibration; name the launch file or recording that "
@@ -160,7 +160,7 @@ def section_of(kind: type[S], overrides: Sequence[str]) -> S:
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
-        raise UsageError(_explain(error, COMMAND_LINE, root=kind)) from None
+        raise UsageError(explain(error, COMMAND_LINE, root=kind)) from None
 
 
 def known_recording(folder: Path) -> dict[str, Any] | None:
@@ -216,7 +216,7 @@ def with_parameters(config: LaunchConfig, parameters: Mapping[str, Any]) -> Laun
     try:
         return LaunchConfig.model_validate(tree)
     except ValidationError as error:
-        raise UsageError(_explain(error, "parameters")) from None
+        raise UsageError(explain(error, "parameters")) from None
 
 
 def _read_yaml(file: Path) -> dict[str, Any]:
@@ -263,15 +263,20 @@ def _set(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
     node[leaf] = value
 
 
-def _explain(
-    error: ValidationError, name: str, given: Sequence[str] = (), root: type[Section] = LaunchConfig
+def explain(
+    error: ValidationError,
+    name: object,
+    given: Sequence[str] = (),
+    root: type[Section] = LaunchConfig,
+    page: str = "docs/launch.md",
 ) -> str:
-    """One line per mistake: where, what, and for an unknown key the nearest known one.
+    """Return one line per mistake: where, what, and for an unknown key the nearest known one.
 
     Args:
         name: of the file that was read.
         given: keys that were set on the command line instead.
         root: type of the section that was validated.
+        page: that describes its keys; "": none does.
     """
     lines = []
     mistakes = error.errors()
@@ -291,7 +296,8 @@ def _explain(
         else:
             what = _PLAIN.get(item["type"], item["msg"]).removeprefix("Value error, ")
             got = "" if isinstance(item["input"], dict) else f" (got {brief(item['input'])})"
-            lines.append(f"{said}: {where or 'launch file'}: {what}{got}{_described(path, root)}")
+            known = f"; {page}: {about}" if page and (about := _described(path, root)) else ""
+            lines.append(f"{said}: {where + ': ' if where else ''}{what}{got}{known}")
     if len(mistakes) > MOST_MISTAKES:
         lines.append(f"{name}: and {len(mistakes) - MOST_MISTAKES} more")
     return "\n".join(lines)
@@ -306,11 +312,11 @@ _PLAIN = {  # where pydantic's message names types of Python
 
 
 def _described(path: Sequence[str], root: type[Section]) -> str:
-    """What docs/launch.md says of a key, and so its unit; "" where there is no such key."""
+    """What is said of a key, and so its unit; "" where there is no such key."""
     key = path[-1] if path else ""
     fields = [one.model_fields[key] for one in _sections_at(path[:-1], root) if key in one.model_fields]
-    said = next((field.description for field in fields if field.description), None)
-    return "" if said is None else f"; docs/launch.md: {re.split('[.] |; default: ', said)[0]}"
+    said = next((field.description for field in fields if field.description), "")
+    return re.split("[.] |; default: ", said)[0]
 
 
 def _nearest(path: Sequence[str], root: type[Section]) -> str:

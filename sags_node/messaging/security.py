@@ -189,7 +189,9 @@ def check_endpoint(endpoint: str, config: Guarded, section: str = "publish") -> 
         UsageError: not tcp or ipc, or not loopback while neither keys are set nor `insecure`.
     """
     transport, separator, address = endpoint.partition("://")
-    if not separator or transport not in ("tcp", "ipc") or not address:
+    port = address.rpartition(":")[2]  # of tcp; ZeroMQ takes 99999 and binds another one
+    is_port = transport == "ipc" or port == "*" or (port.isdecimal() and int(port) < 1 << 16)
+    if not separator or transport not in ("tcp", "ipc") or not address or not is_port:
         raise UsageError(f"'{endpoint}' is no endpoint; write tcp://127.0.0.1:PORT or ipc:///PATH")
     if transport == "ipc" and address.startswith("@"):
         raise UsageError(f"{endpoint} is open to every user of this machine; write ipc:///PATH")

@@ -153,7 +153,7 @@ class FolderPairs(Pairs):
         self._has_right = right is not None
         self._masks: Masks | None = None
         if tools is not None:
-            some = (files[-1] for files in _spread(self._files))
+            some = (files[-1] for files in some_of(self._files, LOOKED_AT))
             self._masks = Masks(tools, ((file, read_picture(file, STORED)) for file in some), instruments)
             self.oddities += self._masks.oddities
         self.count = len(self.files)
@@ -162,7 +162,7 @@ class FolderPairs(Pairs):
         self._eight_bits: EightBits | None = None  # None: they have 8 bits
         if first.dtype != np.uint8 or levels is not None:
             eyes = [file for files in self._files for file in files[: 1 + self._has_right]]
-            self._eight_bits = EightBits(map(self._samples, _spread(eyes)), levels)
+            self._eight_bits = EightBits(map(self._samples, some_of(eyes, LOOKED_AT)), levels)
             if levels is None:
                 self._eight_bits.tell(left)
         self.at(0)  # checks that the eyes match, by the first pair
@@ -324,8 +324,9 @@ def _at_one_time(folders: Sequence[Sequence[Path]]) -> list[tuple[Path, ...]]:
     ]
 
 
-def _spread(files: Sequence[F]) -> Sequence[F]:
-    return files[:: -(-len(files) // LOOKED_AT)]
+def some_of(files: Sequence[F], count: int) -> Sequence[F]:
+    """Return at most `count` of the files, spread over all."""
+    return files[:: max(1, -(-len(files) // count))]
 
 
 def _size(picture: NDArray[Any]) -> tuple[int, int]:

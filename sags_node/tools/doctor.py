@@ -7,13 +7,14 @@ import glob
 import importlib.metadata
 import os
 import platform
-import socket
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+
+import zmq
 
 from sags_node.checks import Finding, Level, parted
 from sags_node.config.schema import (
@@ -36,6 +37,7 @@ from sags_node.errors import SagsError, UsageError, install
 from sags_node.kernels.cache import cache_root
 from sags_node.messaging.masks import MaskSubscriber
 from sags_node.messaging.security import check_endpoint, read_allow_list, read_key_pair
+from sags_node.messaging.sockets import bind
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import lacks_rig, rig_of
 from sags_node.rig.hand_eye import read_hand_eye
@@ -271,18 +273,17 @@ def _port(endpoint: str, config: Guarded, section: str = "publish") -> Finding:
         check_endpoint(endpoint, config, section)
     except UsageError as error:
         return Finding("error", "cannot be used", str(error))
-    address, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    if endpoint.startswith("ipc:") or port == "*":
+    if endpoint.startswith("ipc:") or endpoint.endswith(":*"):
         return Finding("ok", "needs no port of its own")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    option = "publish.data" if section == "publish" else f"{section}.endpoint"
+    with zmq.Context() as context, context.socket(zmq.PAIR) as probe:
         try:
-            probe.bind((address.replace("*", ""), int(port)))
+            bind(probe, endpoint, option, None)
             return Finding("ok", "free")
-        except (OSError, ValueError, OverflowError) as error:  # taken, not a number, not a port
-            keys = "publish.data and publish.control" if section == "publish" else f"{section}.endpoint"
-            fix = f"stop the other node, or set {keys} to another port"
-            return Finding("warning", str(error), fix)
+        except SagsError as error:
+            found = parted("warning", str(error))
+            taken = "in use" in found.what
+            return replace(found, fix="stop the other node, or " * taken + found.fix)
 
 
 def _keys(key: Path, allow: Sequence[Path]) -> Finding:

@@ -10,18 +10,7 @@ from sags_node.config.schema import NORMALIZATIONS, OnnxConfig, VisionConfig
 from sags_node.errors import UsageError
 from sags_node.types import F32, U8, Bool, Camera, RectifiedPair
 from sags_node.vision.mono_depth import FEWEST_SAMPLES, Measure, MonoDepth
-from sags_node.vision.onnx_session import (
-    DepthNetworkError,
-    Eye,
-    OnnxSession,
-    Size,
-    has_clear_layout,
-    maps_of,
-    read_format,
-    recognise,
-    sizes_of_maps,
-    unfit,
-)  # fmt: skip
+from sags_node.vision.onnx_session import DepthNetworkError, Network, Size, has_clear_layout
 from sags_node.vision.stereo import StereoDepth
 
 log = logging.getLogger(__name__)
@@ -35,13 +24,11 @@ MEANINGS = {True: ("disparity", "depth"), False: ("inverse_depth", "depth")}  # 
 HELP = "docs/networks.md says what the keys mean"
 
 
-class DepthNetwork:
-    """A network as its file and `vision.onnx` describe it. It is run twice at the start.
+class DepthNetwork(Network):
+    """The network of `vision.onnx`. It is run twice at the start.
 
     Attributes:
-        name: of the file.
         is_stereo: it needs both eyes.
-        processor: where it runs, "cuda" or "cpu".
 
     Args:
         size: width and height of the images it will get, px.
@@ -52,21 +39,15 @@ class DepthNetwork:
     """
 
     def __init__(self, config: OnnxConfig, size: Size, focal_baseline: float) -> None:
-        session = OnnxSession(config)
-        self._session = session
-        self.name, self.processor = session.name, session.processor
-        self._said = read_format(config, session.metadata)
-        self._inputs = recognise(session.inputs, self._said, self.name)
-        self.is_stereo = {eye for one in self._inputs for eye in one.eyes} == {"left", "right"}
+        super().__init__(config, size, 1, "unit")  # bytes need no other
+        self.is_stereo = {eye for one in self._fed for eye in one.eyes} == {"left", "right"}
         self._check_description()
-        self._size, self._focal_baseline = size, focal_baseline
-        self._output = self._said.output or session.outputs[0]
-        self._normalization = self._said.normalization or NORMALIZATIONS["unit"]  # bytes need none
-        self._fits = [one.fit(size, self._said.multiple or 1) for one in self._inputs]
+        self._focal_baseline = focal_baseline
+        self._output = self._said.output or self.outputs[0]
         try:
             log.info("%s", self._described(self._warm_up()))
         except DepthNetworkError as error:
-            raise UsageError(f"{error} ({session.description}); {HELP}") from None
+            raise UsageError(f"{error} ({self.description}); {HELP}") from None
 
     def __call__(self, left: U8, right: U8 | None) -> F32:
         """Return disparity [H, W] (px; NaN or <= 0: unknown), or relative inverse depth if monocular.
@@ -77,10 +58,10 @@ class DepthNetwork:
         Raises:
             DepthNetworkError: it failed, or its output is no map, or not finite.
         """
-        numbers = self._run(left, right)
+        numbers = self._map(left, right)
         if np.mean(np.isfinite(numbers)) < FEWEST_FINITE:
             raise DepthNetworkError(f"{self.name}: output {self._output} is not finite")
-        numbers = unfit(numbers, self._fits[-1]) * np.float32(self._said.scale or 1.0)
+        numbers = self._without_padding(numbers) * np.float32(self._said.scale or 1.0)
         if self._said.meaning == "depth":
             known = numbers > 0
             dividend = np.float32(self._focal_baseline if self.is_stereo else 1.0)
@@ -89,18 +70,13 @@ class DepthNetwork:
             numbers *= np.float32(self._size[0] / numbers.shape[1])
         return _resized(numbers, self._size)
 
-    def _run(self, left: U8, right: U8 | None) -> F32:
+    def _map(self, left: U8, right: U8 | None) -> F32:
         """The output's first channel [h, w], a map of the padded image or coarser."""
-        pictures: dict[Eye, U8] = {"left": left} if right is None else {"left": left, "right": right}
-        feeds = {
-            one.name: one.tensor(pictures, fit, self._normalization, self._said.color == "bgr")
-            for one, fit in zip(self._inputs, self._fits, strict=True)
-        }
-        values, fit = self._session.run(feeds)[self._output], self._fits[-1]
-        maps = maps_of(values, fit) if values.dtype.kind in "fiu" else None
+        values = self._outputs(left, right)[self._output]
+        maps = self._maps(values) if values.dtype.kind in "fiu" else None
         if maps is None or len(maps) > MOST_CHANNELS:
             raise DepthNetworkError(
-                f"{self.name}: output {self._output} is not a map of the {sizes_of_maps(fit)}"
+                f"{self.name}: output {self._output} is not a map of the {self._map_sizes}"
             )
         first: F32 = maps[0].astype(np.float32)
         return first
@@ -110,27 +86,27 @@ class DepthNetwork:
         Raises:
             UsageError: a key is missing, or says what this network cannot be.
         """
-        said, session = self._said, self._session
-        if said.output is not None and said.output not in session.outputs:
-            raise UsageError(f"{self.name}: output: its outputs are {', '.join(session.outputs)}")
+        said = self._said
+        if said.output is not None and said.output not in self.outputs:
+            raise UsageError(f"{self.name}: output: its outputs are {', '.join(self.outputs)}")
         meanings = MEANINGS[self.is_stereo]
         if said.meaning is not None and said.meaning not in meanings:
             kind = "stereo" if self.is_stereo else "monocular"
             raise UsageError(f"{self.name}: meaning: a {kind} network gives {' or '.join(meanings)}")
-        is_open = any(one.width is None or one.height is None for one in self._inputs)
+        is_open = any(one.width is None or one.height is None for one in self._fed)
         missing = {
-            "inputs ([left eye's, right eye's])": said.inputs is None and len(self._inputs) > 1,
-            "layout (nchw or nhwc)": said.layout is None and not all(map(has_clear_layout, session.inputs)),
+            "inputs ([left eye's, right eye's])": said.inputs is None and len(self._fed) > 1,
+            "layout (nchw or nhwc)": said.layout is None and not all(map(has_clear_layout, self.inputs)),
             f"normalization ({', '.join(NORMALIZATIONS)}, or {{mean: [], std: []}})": (
-                said.normalization is None and self._inputs[0].dtype != np.uint8
+                said.normalization is None and self._fed[0].dtype != np.uint8
             ),
             "size ([width, height]) or multiple (px, of its sides)": is_open and said.multiple is None,
-            f"output ({' or '.join(session.outputs)})": said.output is None and len(session.outputs) > 1,
+            f"output ({' or '.join(self.outputs)})": said.output is None and len(self.outputs) > 1,
             f"meaning ({' or '.join(meanings)})": said.meaning is None,
         }
         if unsaid := [key for key, is_missing in missing.items() if is_missing]:
             raise UsageError(
-                f"{self.name} ({session.description}) is not described: set in vision.onnx, or in a .yaml "
+                f"{self.name} ({self.description}) is not described: set in vision.onnx, or in a .yaml "
                 f"file beside it: {'; '.join(unsaid)}; {HELP}"
             )
 
@@ -139,16 +115,16 @@ class DepthNetwork:
         The output for noise is not judged."""
         noise = np.random.default_rng(0).integers(0, 256, (self._size[1], self._size[0], 3), np.uint8)
         right = noise if self.is_stereo else None
-        self._run(noise, right)
+        self._map(noise, right)
         started = time.perf_counter()
-        self._run(noise, right)
+        self._map(noise, right)
         return (time.perf_counter() - started) * 1e3
 
     def _described(self, cost: float) -> str:
         """One line for the log."""
         kind, (width, height) = "stereo" if self.is_stereo else "monocular", self._fits[-1].outer
         return (
-            f"depth network {self.name}: {kind}, {self._session.description}; fed {width}x{height} px, "
+            f"depth network {self.name}: {kind}, {self.description}; fed {width}x{height} px, "
             f"{cost:.0f} ms on {self.processor}"
         )
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from sags_node.config.schema import NetworkFormat, Normalization, OnnxConfig
+from sags_node.config.launch_file import explain
+from sags_node.config.schema import NORMALIZATIONS, NetworkFormat, Normalization, OnnxConfig
 from sags_node.config.yaml_reader import parse_yaml, read_yaml
 from sags_node.errors import SagsError, UsageError
 from sags_node.types import F32, U8
@@ -191,10 +192,7 @@ def _validated(tree: Mapping[str, Any], where: str) -> dict[str, Any]:
         }
         checked = NetworkFormat.model_validate(parsed)
     except ValidationError as error:
-        item = error.errors()[0]
-        key = str(item["loc"][0]) if item["loc"] else "format"
-        reason = f"known keys: {', '.join(KEYS)}" if item["type"] == "extra_forbidden" else item["msg"]
-        raise UsageError(f"{where}: {key}: {reason}") from None
+        raise UsageError(explain(error, where, root=NetworkFormat)) from None
     return {key: getattr(checked, key) for key in KEYS if getattr(checked, key) is not None}
 
 
@@ -331,31 +329,61 @@ def _ordered(tensors: Sequence[Tensor], said: NetworkFormat, name: str) -> Seque
     return [by_name[one] for one in said.inputs]
 
 
-def maps_of(values: NDArray[Any], fit: Fit) -> NDArray[Any] | None:
-    """Return an output as maps [C, h, w] of the padded image, full size or coarser; None: it is no map.
+class Network(OnnxSession):
+    """A network as its file and the launch file describe it, fed with images of one size.
 
     Args:
-        values: [1, C, h, w], [1, h, w, C], [C, h, w], [h, w, C] or [h, w].
+        size: width and height of the images it will get, px.
+        multiple: px, of sides that the network and its description leave open.
+        normalization: where the description names none.
+
+    Raises:
+        UsageError: as `OnnxSession`, `read_format` and `recognise`.
     """
-    maps = values[0] if values.ndim == 4 and len(values) == 1 else values
-    maps = maps[None] if maps.ndim == 2 else maps
-    for coarseness in COARSENESS if maps.ndim == 3 else ():
-        shape = -(-fit.outer[1] // coarseness), -(-fit.outer[0] // coarseness)
-        if maps.shape[1:] == shape:
-            return maps
-        if maps.shape[:2] == shape:
-            return maps.transpose(2, 0, 1)
-    return None
 
+    def __init__(
+        self, config: OnnxConfig, size: Size, multiple: int, normalization: str, setting: str = "vision.onnx"
+    ) -> None:
+        super().__init__(config, setting)
+        self._size = size
+        self._said = read_format(config, self.metadata)
+        self._normalization = self._said.normalization or NORMALIZATIONS[normalization]
+        self._fed = recognise(self.inputs, self._said, self.name)
+        self._fits = [one.fit(size, self._said.multiple or multiple) for one in self._fed]
 
-def sizes_of_maps(fit: Fit) -> str:
-    """Return the sizes that `maps_of` accepts, for messages."""
-    width, height = fit.outer
-    return f"{width}x{height} px that it was given, or of a half, a quarter or an eighth of them"
+    def _outputs(self, left: U8, right: U8 | None = None) -> dict[str, NDArray[Any]]:
+        """Run it on images [H, W, 3] RGB; the right one is only looked at by a stereo network."""
+        eyes: dict[Eye, U8] = {"left": left} if right is None else {"left": left, "right": right}
+        bgr = self._said.color == "bgr"
+        fed = zip(self._fed, self._fits, strict=True)
+        return self.run({one.name: one.tensor(eyes, fit, self._normalization, bgr) for one, fit in fed})
 
+    def _maps(self, values: NDArray[Any]) -> NDArray[Any] | None:
+        """An output as maps [C, h, w] of the padded image, full size or coarser; None: it is no map.
 
-def unfit(plane: F32, fit: Fit) -> F32:
-    """Return a map of the padded image without the padding, [h, w] at size `fit.inner`."""
-    if plane.shape[::-1] != fit.outer:
-        plane = cv2.resize(plane, fit.outer, interpolation=cv2.INTER_LINEAR)
-    return plane[: fit.inner[1], : fit.inner[0]]
+        Args:
+            values: [1, C, h, w], [1, h, w, C], [C, h, w], [h, w, C] or [h, w].
+        """
+        maps = values[0] if values.ndim == 4 and len(values) == 1 else values
+        maps = maps[None] if maps.ndim == 2 else maps
+        width, height = self._fits[-1].outer
+        for coarseness in COARSENESS if maps.ndim == 3 else ():
+            shape = -(-height // coarseness), -(-width // coarseness)
+            if maps.shape[1:] == shape:
+                return maps
+            if maps.shape[:2] == shape:
+                return maps.transpose(2, 0, 1)
+        return None
+
+    @property
+    def _map_sizes(self) -> str:
+        """The sizes that `_maps` accepts, for messages."""
+        width, height = self._fits[-1].outer
+        return f"{width}x{height} px that it was given, or of a half, a quarter or an eighth of them"
+
+    def _without_padding(self, plane: F32) -> F32:
+        """A map of the padded image without the padding, [h, w] of `Fit.inner`."""
+        (width, height), outer = self._fits[-1]
+        if plane.shape[::-1] != outer:
+            plane = cv2.resize(plane, outer, interpolation=cv2.INTER_LINEAR)
+        return plane[:height, :width]

@@ -7,25 +7,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sags_node.config.schema import NORMALIZATIONS, OnnxConfig, TissueConfig
+from sags_node.config.schema import OnnxConfig, TissueConfig
 from sags_node.errors import UsageError
 from sags_node.types import U8, Bool
-from sags_node.vision.onnx_session import (
-    DepthNetworkError,
-    Fit,
-    OnnxSession,
-    Size,
-    maps_of,
-    read_format,
-    recognise,
-    sizes_of_maps,
-    unfit,
-)  # fmt: skip
+from sags_node.vision.onnx_session import DepthNetworkError, Network, Size
 
 MULTIPLE = 32  # px, of sides that the network leaves open
 
 
-class TissueNetwork:
+class TissueNetwork(Network):
     """Takes one image, and gives scores of classes, one score, or class numbers, at its size or coarser.
 
     The highest of several scores is the class. Whole numbers are classes. One score is a probability while it
@@ -41,16 +31,10 @@ class TissueNetwork:
 
     def __init__(self, config: TissueConfig, size: Size) -> None:
         assert config.path is not None and config.tissue_is is not None  # the launch file was checked
-        as_onnx = OnnxConfig(path=config.path)
-        self._session = OnnxSession(as_onnx, "vision.tissue")
+        super().__init__(OnnxConfig(path=config.path), size, MULTIPLE, "imagenet", "vision.tissue")
         self._tissue_is = config.tissue_is
-        self._size = size
-        self._said = read_format(as_onnx, self._session.metadata)
-        inputs = recognise(self._session.inputs, self._said, self._session.name)
-        if len(inputs) != 1 or inputs[0].eyes != ("left",):
-            raise UsageError(f"{self._session.name} takes several images; a mask is made of the left one")
-        self._input = inputs[0]
-        self._fit: Fit = self._input.fit(size, self._said.multiple or MULTIPLE)
+        if len(self._fed) != 1 or self._fed[0].eyes != ("left",):
+            raise UsageError(f"{self.name} takes several images; a mask is made of the left one")
         self._is_logit = False
         try:
             self(np.full((size[1], size[0], 3), 128, np.uint8))
@@ -63,26 +47,24 @@ class TissueNetwork:
         Raises:
             DepthNetworkError: the network failed, or its answer is no mask.
         """
-        normalization = self._said.normalization or NORMALIZATIONS["imagenet"]
-        fed = self._input.tensor({"left": image}, self._fit, normalization, self._said.color == "bgr")
-        classes = self._classes(self._session.run({self._input.name: fed}))
+        classes = self._classes(self._outputs(image))
         if self._tissue_is == "white":
             tissue = classes > 0
         elif self._tissue_is == "black":
             tissue = classes == 0
         else:
             tissue = np.isin(classes, self._tissue_is)
-        share: NDArray[np.float32] = cv2.resize(unfit(tissue.astype(np.float32), self._fit), self._size)
+        share: NDArray[np.float32] = cv2.resize(self._without_padding(tissue.astype(np.float32)), self._size)
         return share > 0.5
 
     def _classes(self, outputs: Mapping[str, NDArray[Any]]) -> NDArray[np.intp]:
         """Class numbers [h, w] of the padded image."""
         for name, values in outputs.items():
-            scores = maps_of(values, self._fit)
+            scores = self._maps(values)
             if scores is None or self._said.output not in (None, name):
                 continue
             if not np.isfinite(scores).all():
-                raise DepthNetworkError(f"{self._session.name}: output {name} is not finite")
+                raise DepthNetworkError(f"{self.name}: output {name} is not finite")
             if len(scores) > 1:
                 return np.asarray(scores.argmax(0))
             is_whole = scores.min() >= 0 and np.array_equal(scores, np.rint(scores))
@@ -90,6 +72,4 @@ class TissueNetwork:
                 return np.asarray(scores[0], np.intp)
             self._is_logit |= bool(scores.min() < 0 or scores.max() > 1)
             return np.asarray(scores[0] > (0 if self._is_logit else 0.5), np.intp)
-        raise DepthNetworkError(
-            f"{self._session.name}: no output is a mask of the {sizes_of_maps(self._fit)}"
-        )
+        raise DepthNetworkError(f"{self.name}: no output is a mask of the {self._map_sizes}")

@@ -24,6 +24,7 @@ import zmq
 from command_line import pure_json, refused, sags
 from onnx_networks import save_matcher
 from places import ROOT
+from ports import free_port
 from rich.markup import escape
 from user_files import videos
 
@@ -213,16 +214,21 @@ def test_calib_check_tells_good_from_bad(user_files: Path) -> None:
     refused(2, "calib", "check", user_files / "gone", said=("gone/left.yaml",))
 
 
-def test_doctor_finds_what_the_node_needs(user_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("family", "host"), [(socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "[::1]")])
+def test_doctor_finds_what_the_node_needs(
+    family: int, host: str, user_files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SAGS_DATA", str(user_files / "gone"))
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
+    free = f"tcp://{host}:{free_port()}"
+    with socket.socket(family) as taken:
+        taken.bind((host.strip("[]"), 0))
         taken.listen()
-        mine = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        result = sags("doctor", "--json", f"publish.data:=[{mine}]", "publish.control:=null")
+        mine = f"tcp://{host}:{taken.getsockname()[1]}"
+        result = sags("doctor", "--json", f'publish.data:=["{mine}"]', f"publish.control:={free}")
     checks = {check["name"]: check for check in pure_json(result.stdout)}
     assert result.exit_code == 0 and checks["numba"]["level"] == "ok"
     assert checks[mine]["level"] == "warning" and "in use" in checks[mine]["found"]
+    assert "stop the other node" in checks[mine]["fix"] and checks[free]["found"] == "free"
     assert (
         checks["SAGS_DATA"]["level"] == "warning" and str(user_files / "gone") in checks["SAGS_DATA"]["found"]
     )

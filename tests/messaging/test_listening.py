@@ -92,7 +92,7 @@ def test_one_subscriber_takes_no_view_from_others(tmp_path: Path, monkeypatch: p
 
 @pytest.mark.parametrize("endpoint", [
     "tcp://*:5556", "tcp://0.0.0.0:5556", "tcp://192.168.1.4:5556", "tcp://[::]:5556", "tcp://eth0:5556",
-    "udp://127.0.0.1:1", "127.0.0.1:5556", "tcp://", "ipc://@sags",
+    "udp://127.0.0.1:1", "127.0.0.1:5556", "tcp://", "ipc://@sags", "tcp://127.0.0.1:99999",
 ])  # fmt: skip
 @pytest.mark.parametrize("key", ["data", "control"])
 def test_other_machines_are_refused(tmp_path: Path, key: str, endpoint: str) -> None:

@@ -185,7 +185,7 @@ def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
         ("objects: [{shape: target, anchors: [{pixl: [1, 2]}]}]", "did you mean 'pixel'?"),
         ("object: []", "did you mean 'objects'?"),
         ("objects: []", "objects: "),
-        ("[1, 2]", "a map of keys, it is a list"),
+        ("[1, 2]", "should be a section of keys (got [1, 2])"),
         ("objects: [", "not valid YAML"),
         ("objects: [{color: [1, 2, 3]}]", "needs a file, a shape or a label"),
         ("objects: [{shape: target, file: a.ply}]", "a file or a shape, not both"),
@@ -212,7 +212,7 @@ def test_a_mesh_without_an_end_mark_that_may_have_broken_off_is_warned_of(
         ("objects: [{shape: target, color: [0.2, 0.8, 1]}]", "objects.0.color: a colour is bytes of 0..255"),
         ("{color_key: [0, 0, 1], objects: [{shape: target}]}", "color_key: a colour is bytes of 0..255"),
         ("objects: [{shape: target, color: [9, 9, 9, 255]}]", "how opaque it is says `opacity:`"),
-        ("objects: [{shape: target, color: red}]", "this should be a list, e.g. [40, 220, 255]"),
+        ("objects: [{shape: target, color: red}]", "should be a list, e.g. [a, b] (got 'red')"),
     ],
 )  # fmt: skip
 def test_a_wrong_scene_is_one_clear_message(text: str, said: str, tmp_path: Path) -> None:

@@ -201,7 +201,7 @@ AS_ODD = {"normalization": "unit", "multiple": 1, "meaning": "disparity"}
 @pytest.mark.parametrize(
     ("inputs", "output", "sidecar", "words"),
     [
-        (MATCHER, "", "normalisation: unit", "normalisation: known keys: inputs, layout"),
+        (MATCHER, "", "normalisation: unit", "unknown key 'normalisation'; did you mean 'normalization'"),
         (MATCHER, "", "normalization: half", "normalization: .*one of unit, bytes, imagenet, symmetric"),
         (MATCHER, "", "- 1", "a map of keys"),
         (MATCHER, "", "a: [", "not valid YAML"),

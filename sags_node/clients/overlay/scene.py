@@ -1,9 +1,7 @@
 """What `sags overlay` draws: a YAML file of objects and the anchors that hold them, typed and validated."""
 
-import difflib
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar, get_args
+from typing import Annotated, Literal, Self, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -15,6 +13,7 @@ from pydantic import (
     model_validator,
 )
 
+from sags_node.config.launch_file import explain
 from sags_node.config.schema import Section
 from sags_node.config.yaml_reader import read_yaml
 from sags_node.errors import UsageError
@@ -219,29 +218,4 @@ def _read(root: type[S], file: Path, what: str) -> S:
     try:
         return root.model_validate(read_yaml(file, what))
     except ValidationError as error:
-        raise UsageError(_explain(error, file, root)) from None
-
-
-def _explain(error: ValidationError, file: Path, root: type[Section]) -> str:
-    """One mistake: where, what, and the nearest known key. Unknown keys come first, as they cause others."""
-    first = min(error.errors(), key=lambda item: item["type"] != "extra_forbidden")
-    path = [str(part) for part in first["loc"]]
-    where = ".".join(path)
-    if first["type"] == "extra_forbidden":
-        return f"{file}: unknown key '{where}'; {_nearest(path, root)}"
-    if first["type"] == "missing":
-        return f"{file}: {where} is missing; set it"
-    what = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "tuple_type":
-        what = f"this should be a list, e.g. [40, 220, 255] or [230, 180], it is {first['input']!r}"
-    if first["type"] == "model_type":
-        what = f"this should be a map of keys, it is a {type(first['input']).__name__}"
-    return f"{file}: {where + ': ' if where else ''}{what}"
-
-
-def _nearest(path: Sequence[str], root: type[Section]) -> str:
-    models: dict[str, Any] = {"objects": ObjectSpec, "anchors": AnchorSpec, "pairs": PairSpec}
-    sections = [models[part] for part in path[:-1] if part in models]
-    known = list((sections[-1] if sections else root).model_fields)
-    near = difflib.get_close_matches(path[-1], known, n=1, cutoff=0.5)
-    return f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(known)}"
+        raise UsageError(explain(error, file, root=root, page="")) from None

@@ -6,7 +6,7 @@ from pathlib import Path
 from sags_node.config.launch_file import VIDEO_SUFFIXES
 from sags_node.config.schema import LaunchConfig, PhantomSource, RecordedSource
 from sags_node.errors import SagsError, UsageError
-from sags_node.sources.pictures import pair_files, read_picture, size_text
+from sags_node.sources.pictures import pair_files, read_picture, size_text, some_of
 from sags_node.sources.replay import Recording, Replay
 from sags_node.sources.source import open_source
 from sags_node.types import F32, U8
@@ -33,8 +33,7 @@ def pairs_of_files(named: Sequence[tuple[Path, Path]]) -> list[Pair]:
             files += [(pair[0], pair[1]) for pair in pair_files((left, right))]
         else:
             files.append((left, right))
-    spread = files[:: max(1, -(-len(files) // PAIRS))]
-    pairs = [(read_picture(left), read_picture(right)) for left, right in spread]
+    pairs = [(read_picture(left), read_picture(right)) for left, right in some_of(files, PAIRS)]
     sizes = {picture.shape[1::-1] for pair in pairs for picture in pair}
     if len(sizes) > 1:
         said = " and ".join(size_text(*size) for size in sorted(sizes))

@@ -9,7 +9,7 @@ import numpy as np
 from sags_node.checks import Finding
 from sags_node.config.schema import GeometryConfig
 from sags_node.sources.endonerf import fitting_units
-from sags_node.sources.pictures import list_pictures, read_picture, size_text
+from sags_node.sources.pictures import list_pictures, read_picture, size_text, some_of
 from sags_node.sources.truth import UNKNOWN
 from sags_node.tools.calibration.matches import match_eyes
 from sags_node.types import U8, Bool
@@ -33,7 +33,7 @@ def read_some(files: Sequence[Path], flags: int = cv2.IMREAD_COLOR) -> dict[Path
     Raises:
         SagsError: one cannot be read.
     """
-    chosen = set(files[:: max(1, -(-len(files) // LOOKED_AT))])
+    chosen = set(some_of(files, LOOKED_AT))
     # A link may lead nowhere, as in a data set that was not fetched whole: that file cannot be read, either.
     smallest = min(files, key=lambda file: file.stat().st_size if file.exists() else -1)
     suspects = {files[-1], smallest} - chosen

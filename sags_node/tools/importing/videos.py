@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from sags_node.sources.names import EYE
 from sags_node.sources.pictures import size_text
 from sags_node.sources.videos import VideoPairs
 from sags_node.tools.calibration.matches import match_eyes
-from sags_node.tools.calibration.pictures import Pair
 from sags_node.tools.importing import pictures, timing
 from sags_node.tools.importing.folder import override
 from sags_node.types import U8
@@ -29,9 +28,10 @@ ROWS = 1 / 40  # of the width: as far as rows of eyes that are not rectified dif
 ONE_EYE = "one eye is shown, or both in a way that was not recognised"
 APART = 1.0  # px: eyes see the tissue in different columns; fields of one image do not
 
-
 LAYOUT = "source.geometry.layout:="
 PACKED = {1080: 45, 720: 30}  # rows of an eye, and blank ones below the first: frame packing of HDMI 1.4a
+
+T = TypeVar("T")
 
 
 class Way(NamedTuple):
@@ -85,9 +85,12 @@ def look(files: tuple[Path, ...]) -> list[Finding]:
     """
     found = [finding for file in files for finding in _file(file)]
     if len(files) == 1:
-        return found + _one(files[0], _some(files[0]))
+        return found + _one(files[0], _shown(files[0]))
     with closing(VideoPairs(files[0], files[1], Layout(GeometryConfig()))) as pairs:
-        found += pictures.check_both(*zip(*_some_pairs(pairs), strict=True))
+        some = _some(pairs.reach, pairs.at)
+        found += pictures.check_both(
+            [each.left for each in some], [each.right for each in some if each.right is not None]
+        )
         return [*found, *_late(pairs)]
 
 
@@ -101,7 +104,7 @@ def launch_of(files: tuple[Path, ...]) -> tuple[str, ...]:
     launch = "source.kind:=videos", override("source.left", files[0])
     if len(files) == 2 and all(EYE.search(file.stem) for file in files):
         return *launch, override("source.right", files[1])
-    shown = _some(files[0])
+    shown = _shown(files[0])
     way = way_of(shown)
     if len(files) == 2:
         if way is None:
@@ -149,28 +152,20 @@ def _file(file: Path) -> list[Finding]:
         return [Finding("ok", what), *(parted("warning", each) for each in video.oddities)]
 
 
-def _some(file: Path) -> list[U8]:
+def _shown(file: Path) -> list[U8]:
     """Images spread over a video, RGB."""
     with closing(Video(file)) as video:
-        found = []
-        for number in _spread(video.count):
-            with suppress(LostPictureError):  # it is left out while playing, too
-                picture = video.read(number)
-                if picture is not None:  # else the video ends early, which is logged as when it is played
-                    found.append(picture)
-        return found
+        return _some(video.count, video.read)
 
 
-def _some_pairs(pairs: VideoPairs) -> list[Pair]:
-    """Pairs spread over two videos, as far as both reach."""
+def _some(count: int, read: Callable[[int], T | None]) -> list[T]:
+    """Images or pairs, read by number, spread over a video. It may end early, which is logged as when it is
+    played."""
     found = []
-    both = min(pairs.count, pairs.right.count) if pairs.right is not None and pairs.by_number else pairs.count
-    for index in _spread(both):
-        with suppress(LostPictureError):
-            pair = pairs.at(index)
-            if pair is not None and pair.right is not None:
-                found.append((pair.left, pair.right))
-    return found
+    for number in sorted({round(at) for at in np.linspace(0, count - 1, LOOKED_AT)}):
+        with suppress(LostPictureError):  # it is left out while playing, too
+            found.append(read(number))
+    return [each for each in found if each is not None]
 
 
 def _late(pairs: VideoPairs) -> list[Finding]:
@@ -185,10 +180,6 @@ def _late(pairs: VideoPairs) -> list[Finding]:
             if pair is not None and pair.right is not None:
                 looked.add(pair.left, pair.right)
     return looked.findings()
-
-
-def _spread(count: int) -> list[int]:
-    return sorted({round(at) for at in np.linspace(0, count - 1, LOOKED_AT)})
 
 
 def _one(file: Path, shown: list[U8]) -> list[Finding]:
