@@ -20,7 +20,7 @@ BRIGHTER = 2.0  # largest factor between the light of a source and of the view
 
 
 class Memory:
-    """Keeps frames: recent ones close in time, older ones farther apart, the last before something hid tissue.
+    """Keeps frames: recent ones close in time, older ones farther apart, the last before tissue was hidden.
 
     Attributes:
         frames: the newest first.
