@@ -130,6 +130,7 @@ release: sbom
 	cp out/wheel/sags_node-*.whl out/sbom.json out/release
 	out/tools/bin/python -m build -q --sdist --outdir out/release .
 	out/tools/bin/twine check --strict out/release/sags_node-*
+	$(BIN)/python tests/wheel.py out/release/sags_node-*.tar.gz
 	out/wheel/venv/bin/pip check
 	out/tools/bin/python docs/dev/soup_page.py out/release/sbom.json
 	cd out/release && sha256sum * > SHA256SUMS && cat SHA256SUMS

@@ -1,6 +1,7 @@
 """The wheel in an empty environment: it is built, installed with what it needs, and shows its demo.
 
-`make wheel-test` takes some minutes and 3 GB in out/wheel, so it is none of the tests that always run.
+`make wheel-test` takes some minutes and 3 GB in out/wheel, so it is none of the tests that always run. With
+an sdist as its argument, as in `make release`, it looks whether that installs the same files as the wheel.
 """
 
 import json
@@ -14,7 +15,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "out/wheel"
-NEEDED = ("sags_node/py.typed", "sags_node/clients/bridge/web_page/index.html")
 
 
 def run(*command: object, folder: Path | None = None) -> str:
@@ -39,13 +39,12 @@ def main() -> None:
     home = OUT / "empty"
     home.mkdir(parents=True)
     pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
+    shutil.rmtree(ROOT / "build", ignore_errors=True)  # what was deleted since would be packed from there
     run(*pip, "wheel", "--no-deps", "-w", OUT, ROOT)
     (wheel,) = OUT.glob("sags_node-*.whl")
     with zipfile.ZipFile(wheel) as packed:
-        names = packed.namelist()
-    missing = [name for name in NEEDED if name not in names]
-    strangers = [name for name in names if not name.startswith(("sags_node/", "sags_lab/", "sags_node-"))]
-    assert not missing and not strangers, (missing, strangers)
+        names = {name for name in packed.namelist() if ".dist-info/" not in name}
+    assert names == _files(ROOT), names ^ _files(ROOT)
     print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB, {len(names)} files", flush=True)
 
     sags = _installed(OUT / "client", str(wheel))
@@ -70,6 +69,19 @@ def main() -> None:
     print(f"sags demo: {shown['processed']} frames, {shown['overlay']['frames']} of the overlay", flush=True)
 
 
+def sdist(file: str) -> None:
+    installed = [_installed(OUT / "sdist", file), OUT / "client/bin/sags"]
+    of_sdist, of_wheel = (_files(*sags.parent.parent.glob("lib/python*/site-packages")) for sags in installed)
+    assert of_sdist == of_wheel == _files(ROOT), of_sdist ^ of_wheel
+    print("the sdist:", run(installed[0], "--version", folder=OUT / "empty").strip(), flush=True)
+
+
+def _files(folder: Path) -> set[str]:
+    """The files of our packages below a folder, but for compiled ones."""
+    found = (each for name in ("sags_node", "sags_lab") for each in (folder / name).rglob("*.*"))
+    return {str(each.relative_to(folder)) for each in found if "__pycache__" not in each.parts}
+
+
 def _installed(folder: Path, what: str) -> Path:
     """The command `sags` of an environment of its own."""
     venv.create(folder, with_pip=True)
@@ -79,4 +91,4 @@ def _installed(folder: Path, what: str) -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    sdist(*sys.argv[1:]) if len(sys.argv) > 1 else main()

@@ -11,11 +11,12 @@ from rich.text import Text
 
 from sags_node.config.schema import LaunchConfig, PushRobot, PushSource, Ros2Robot, Ros2Source
 from sags_node.findings import by_code, in_words
+from sags_node.node.health import in_a_line
 from sags_node.node.node import Node
 from sags_node.ros.graph import domain_of, where
 from sags_node.sources.ros2 import absolute, picture_topics
 from sags_node.terminal import text
-from sags_node.terminal.console import tell
+from sags_node.terminal.console import progress, tell
 from sags_node.terminal.notices import Notices
 from sags_node.types import NodeHealth
 
@@ -25,7 +26,8 @@ REFRESH = 4.0  # per second
 def run_node(node: Node, seconds: float | None, console: Console, stop: threading.Event) -> NodeHealth:
     """Run until the source ends, `seconds` have passed or `stop` is set; returns the last health.
 
-    Prints every warning that holds for `1 / REFRESH` s, when it begins and when it ends.
+    Prints every warning that holds for `1 / REFRESH` s, when it begins and when it ends, and without a
+    terminal, now and then, what is published.
 
     Raises:
         SagsError: what ended the node, if something did.
@@ -37,7 +39,9 @@ def run_node(node: Node, seconds: float | None, console: Console, stop: threadin
             with Live(console=console, refresh_per_second=REFRESH, transient=True) as live:
                 _watch(node, deadline, stop, lambda health: live.update(health_table(health)))
         else:
-            _watch(node, deadline, stop, lambda health: None)
+            with progress("") as say:
+                what = "{}; frames published".format
+                _watch(node, deadline, stop, lambda health: say(node.sent, None, what(in_a_line(health))))
         if stop.is_set():
             console.print("stopping")
     finally:

@@ -38,6 +38,7 @@ from sags_node.cli.launching import (
     shown,
     split,
     split_recording,
+    words_of,
 )
 from sags_node.cli.measure import measure
 from sags_node.cli.new import new
@@ -379,13 +380,11 @@ def doctor(launch: tuple[str, ...], json_out: bool) -> None:
 
 
 @main.command("import")
-@path_option(
-    *("--check", "folder"), required=True, metavar="FOLDER", help="Look it over; nothing is changed."
-)
-@click.argument("overrides", nargs=-1, metavar="[key:=value ...]")
+@click.option("--check", metavar="FOLDER", help="The folder, named by an option.")
+@click.argument("said", nargs=-1, metavar="FOLDER [key:=value ...]")
 @as_json
-def import_folder(folder: Path, overrides: tuple[str, ...], json_out: bool) -> None:
-    """Say what a folder is, and what is odd in it.
+def import_folder(check: str | None, said: tuple[str, ...], json_out: bool) -> None:
+    """Say what a folder is, and what is odd in it; nothing is changed.
 
     Each thing that is odd or missing comes with its fix. Looked at are layout, counts and gaps, sizes, black
     borders, interlacing, order of the eyes and rows, mask polarity, unit of depth, and the calibration
@@ -399,7 +398,11 @@ def import_folder(folder: Path, overrides: tuple[str, ...], json_out: bool) -> N
 
     from sags_node.tools.importing.check import check_folder as look_over
 
-    rows = [asdict(finding) for finding in look_over(folder, overrides)]
+    folder, overrides = words_of(said if check is None else [check, *said])
+    if folder is None:
+        raise UsageError("name a folder: sags import my_folder")
+    with progress("looking it over") as advance:
+        rows = [asdict(finding) for finding in look_over(Path(folder), overrides, advance)]
     show_findings(rows, json_out, f"{folder} cannot be played as it is")
 
 

@@ -15,7 +15,7 @@ from sags_node.cli.launching import as_json, file_option, force_option
 from sags_node.errors import SagsError, UsageError
 from sags_node.files import check_file, whole
 from sags_node.terminal import text
-from sags_node.terminal.console import console, show
+from sags_node.terminal.console import console, progress, show
 
 SAID_BY_PICTURES = ("source", "calibration")  # checks of sags doctor that are made already
 
@@ -54,8 +54,8 @@ def new(said: tuple[str, ...], also: tuple[str, ...], out: Path | None, force: b
         named, out = _asked(out)
     file = out or Path(f"{named[0].resolve().stem}.yaml")
     check_file(file, force)
-    with console.status("looking at the images"):
-        found = propose(named, [word for word in words if ":=" in word])
+    with progress("looking it over") as advance:
+        found = propose(named, [word for word in words if ":=" in word], advance)
     rows: list[dict[str, Any]] = [asdict(finding) for finding in found.findings]
     wrong = is_wrong(found.findings)
     if not wrong:

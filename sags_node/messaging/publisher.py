@@ -40,6 +40,7 @@ PENDING_POLL_MS = 10  # between looks for the result of a handler's future
 EARLY_PICTURE = "left/image_rect_color"
 LOOK_SECONDS = 1.0  # between checks that clients can still find this node
 ENOUGH_FILES = 512  # files open at once: 64 peers of two sockets take 256
+FEWEST_FILES = 64  # of them a node takes 25 before its first client; libzmq aborts the process without them
 LAST_WORDS_MS = 200  # longest wait at the end for what is still on its way to a peer
 
 
@@ -71,8 +72,8 @@ class Publisher(Closes):
         thin: thin images that somebody subscribes to, by topic.
 
     Raises:
-        UsageError: an endpoint open to other machines without keys, a key file that cannot be used, or a run
-            directory open to others.
+        UsageError: an endpoint open to other machines without keys, a key file that cannot be used, a run
+            directory open to others, or a process that may open too few files.
         SagsError: an endpoint is taken, or another node holds the same namespace.
     """
 
@@ -112,7 +113,9 @@ class Publisher(Closes):
         self._has_ipc = config.ipc
         self._next_look = 0.0  # at the run directory
         self._seldom = RateLimitedLog()
-        if (most := resource.getrlimit(resource.RLIMIT_NOFILE)[0]) < ENOUGH_FILES:
+        if (most := resource.getrlimit(resource.RLIMIT_NOFILE)[0]) < FEWEST_FILES:
+            raise UsageError(f"only {most} files may be open, not {FEWEST_FILES}: ulimit -n 1024 first")
+        if most < ENOUGH_FILES:
             log.warning("only %d files may be open: many clients would end this; ulimit -n 1024 first", most)
         self._context = zmq.Context()
         try:

@@ -146,13 +146,14 @@ class RecorderProcess:
             return answer
         except SagsError:  # the child has said why, and ends
             self._child.kill()
-            self._child = self._begun  # `status` describes the last one until another begins
             raise
         except TimeoutError:
             self._child.kill()
             raise SagsError(
                 f"the recorder did not begin in {START_SECONDS:g} s; does the disk of {folder} answer?"
             ) from None
+        finally:
+            self._child = self._begun  # after a failure the last one, until another begins
 
     def _snapshot(self) -> Any:
         child = self._running()

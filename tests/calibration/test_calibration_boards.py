@@ -134,7 +134,7 @@ def test_live_takes_new_views_that_are_held_still(chess_pairs: list[tuple[U8, U8
     out = tmp_path / "rig"
     launch.write_text(yaml.safe_dump({"source": {**source, "frames": 1}}))
     code, _, err = sags("--live", launch, *BOARD, "-o", out)
-    assert code == 1 and "no view was taken" in err  # and it may be tried again
+    assert code == 1 and "no view was taken: show the board to both eyes" in err  # and it may be tried again
     launch.write_text(yaml.safe_dump({"source": source}))
     code, said, err = sags("--live", launch, *BOARD, "-o", out, "--json")
     assert code == 0, err

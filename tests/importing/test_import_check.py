@@ -1,5 +1,6 @@
 """Folders with one thing wrong each: it is found, and nothing else is."""
 
+import json
 import re
 import shlex
 import shutil
@@ -20,6 +21,7 @@ from sags_node.config.launch_file import load_launch
 from sags_node.errors import SagsError, UsageError
 from sags_node.pipeline.session import open_session
 from sags_node.rig import read_rig, save_rig
+from sags_node.terminal import console as terminal
 from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
 from sags_node.tools.importing.pictures import combing, lit_box
@@ -498,11 +500,15 @@ def test_the_command_that_plays_a_folder_with_spaces_is_one_for_a_shell(tmp_path
     assert shlex.split(launch) == overrides_of(folder)
 
 
-def test_the_command(tmp_path: Path) -> None:
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = made(tmp_path / "case")
     found = figures_of("import", "--check", folder, "--json")
     assert found[0]["what"] == "case is two folders of images"
+    monkeypatch.setattr(terminal, "SAY_EVERY", 0.0)
+    code, out, said = ran("import", folder, "--json")
+    assert code == 0 and json.loads(out) == found and "playing it: 1 of 3" in said
     refused(2, "import", "--check", tmp_path / "none", said=("does not exist",))
+    refused(2, "import", said=("sags import my_folder",))
 
 
 # ---- what sags run would refuse --------------------------------------------------------------------------

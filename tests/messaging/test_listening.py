@@ -136,6 +136,9 @@ def test_a_limit_of_files_that_clients_may_reach_is_told(
         resource.setrlimit(resource.RLIMIT_NOFILE, (publishing.ENOUGH_FILES - 1, before[1]))
         with publisher(tmp_path / "run"):
             assert "ulimit -n" in caplog.text
+        resource.setrlimit(resource.RLIMIT_NOFILE, (publishing.FEWEST_FILES - 1, before[1]))
+        with pytest.raises(UsageError, match="ulimit -n"), publisher(tmp_path / "run"):
+            pass
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
 

@@ -169,3 +169,5 @@ def test_a_recorder_that_does_not_begin_is_ended(
     with pytest.raises(SagsError, match=r"did not begin in 0\.01 s"):
         recorder.start({"path": str(tmp_path / "bag")}).result(ANSWER)
     assert recorders() == []
+    with pytest.raises(SagsError, match="nothing is being recorded"):
+        recorder.stop().result(ANSWER)

@@ -31,6 +31,7 @@ from sags_node.node.health import MOST_LEFT_OUT, WINDOW, Statistics
 from sags_node.node.node import HEALTH_PERIOD, Node
 from sags_node.pipeline.pipeline import Pipeline
 from sags_node.pipeline.session import open_session
+from sags_node.terminal import console as terminal
 from sags_node.terminal.notices import Notices
 from sags_node.tools.evaluation.measure import FrameRow, MeasureOptions
 from sags_node.tools.evaluation.report import warning_table
@@ -206,6 +207,8 @@ def test_the_mark_is_drawn_over_instruments_in_both_eyes_and_survives_the_colour
 class Playing:
     """A node as `sags run` sees it: what it warns of at each look."""
 
+    sent = 7
+
     def __init__(self, *looks: tuple[Finding, ...]) -> None:
         self._looks = list(looks)
 
@@ -226,6 +229,16 @@ def test_sags_run_says_when_a_warning_begins_and_ends(capsys: pytest.CaptureFixt
     run_node(playing, None, Console(quiet=True), stop=Event())
     began, over = capsys.readouterr().err.splitlines()
     assert BLACK.text in began and "over" in over and BLACK.code in over
+
+
+def test_without_a_terminal_sags_run_says_now_and_then_what_it_does(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal, "SAY_EVERY", 0.0)
+    playing: Any = Playing((), ())
+    run_node(playing, None, Console(quiet=True), stop=Event())
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and all("running" in line and "published: 7" in line for line in lines)
 
 
 def test_the_report_says_when_and_what_to_do() -> None:

@@ -15,6 +15,7 @@ from sags_node.types import F32, U8
 
 NEW_AT = 0.06  # of the diagonal: how far common corners must have moved from every view taken before
 STILL_AT = 0.004  # of the diagonal: how far they may have moved since the frame before
+TO_BOTH = "show the board to both eyes, a chessboard whole"
 
 
 def grab_views(
@@ -62,7 +63,7 @@ def grab_views(
     except KeyboardInterrupt:
         tell(len(taken), "stopped")
     if not taken:
-        raise SagsError("no view was taken: the whole board must be seen by both eyes and held still")
+        raise SagsError(f"no view was taken: {TO_BOTH}, and hold it still")
     return sides
 
 
@@ -71,7 +72,7 @@ def _advice(
 ) -> str:
     """Return what to do so that the frame becomes a new view; empty: it is one."""
     if view is None:
-        return "show the whole board to both eyes"
+        return TO_BOTH
     if before is None or _moved(view, before) > STILL_AT * diagonal:
         return "hold it still"
     if any(_moved(view, old) < NEW_AT * diagonal for old in taken):

@@ -36,7 +36,7 @@ class Calibrated:
     solution: Solution
     size: tuple[int, int]  # px
     pairs: int
-    unseen: list[str]  # images without the whole board in both eyes
+    unseen: list[str]  # images in which the eyes do not both see the board
     hints: list[str]
 
 
@@ -105,7 +105,7 @@ def summarise(calibrated: Calibrated) -> dict[str, Any]:
 def report_table(summary: dict[str, Any]) -> Table:
     """The summary as a table for people."""
     made = text.table()
-    unseen = f", {len(summary['unseen'])} without the whole board" if summary["unseen"] else ""
+    unseen = f", {len(summary['unseen'])} without the board in both eyes" if summary["unseen"] else ""
     made.add_row("views", f"{summary['views']} of {summary['pairs']} pairs{unseen}")
     for name, error in summary["dropped"].items():
         made.add_row("left out", f"{name}: {error:.2f} px from where the others put it")

@@ -41,9 +41,14 @@ from sags_node.vision.watch.color_watch import EXCHANGED, is_blue
 MAKE_ONE = "without one depth has no unit: sags calib stereo makes one (docs/calibration.md), then set rig"
 MOST_NAMED = 4  # files in one sentence
 MOST_SAID = 1 << 16  # lines in the log
+Advance = Callable[[int, int, str], None]  # done, of, what comes
 
 
-def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
+def unseen(done: int, of: int, what: str) -> None:
+    """Show no progress."""
+
+
+def check_folder(folder: Path, overrides: Sequence[str] = (), advance: Advance = unseen) -> list[Finding]:
     """Return what a folder is, what is missing or odd, each with a way to fix it; the last says how to play
     it.
 
@@ -56,6 +61,7 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
         UsageError: it is no folder.
     """
     say.cache_clear()
+    advance(0, 3, "looking at the files")
     contents = recognise(folder)
     fix = "" if contents.level == "ok" else contents.instead
     found = [Finding(contents.level, f"{folder.name or folder} is {contents.what}", fix)]
@@ -70,8 +76,10 @@ def check_folder(folder: Path, overrides: Sequence[str] = ()) -> list[Finding]:
     def look() -> list[Finding]:
         launch.extend([*overrides_of(folder), *overrides])
         config = load_launch(folder, launch)
+        advance(1, 3, "playing it")
         plays = played(config)
         apart = any("clocks_differ_ms" in each.figures for each in plays)  # then rows differ by that
+        advance(2, 3, "looking at the calibration")
         judged = [] if apart else calibrated(config, folder)
         return plays + (judged if is_wrong(plays) else as_warnings(judged))
 

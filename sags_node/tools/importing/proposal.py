@@ -17,7 +17,7 @@ from sags_node.sources.source import recorded_rig
 from sags_node.tools.calibration.eyes import look
 from sags_node.tools.calibration.pictures import pairs_of_session
 from sags_node.tools.importing import pictures, videos
-from sags_node.tools.importing.check import calibrated, once, overrides_of, played
+from sags_node.tools.importing.check import Advance, calibrated, once, overrides_of, played, unseen
 from sags_node.tools.importing.folder import is_video, override
 
 DEVICES = Path("/dev")
@@ -35,7 +35,7 @@ class Proposal:
     findings: list[Finding]
 
 
-def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
+def propose(named: Sequence[Path], overrides: Sequence[str] = (), advance: Advance = unseen) -> Proposal:
     """Try a recording or cameras, and set what fixes their faults.
 
     Args:
@@ -46,11 +46,14 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
         UsageError: what is named is not there or cannot be played, or it has a launch file already.
         SagsError: it cannot be opened, or gives no images.
     """
+    advance(0, 4, "looking at the files")
     launch = [*_launch_of(named, overrides), *overrides]
     config = load_launch(named[0], launch)
+    advance(1, 4, "playing it")
     found = _opened(config)
     if is_wrong(found):
         return Proposal(launch, found)
+    advance(2, 4, "looking at the images")
     looked = [] if isinstance(config.source, EndoNerfSource) else _looked_at(config)
     fixes = list(dict.fromkeys(fix for finding in looked for fix in finding.launch))
     if isinstance(config.source, FoldersSource):  # folders have no geometry
@@ -63,6 +66,7 @@ def propose(named: Sequence[Path], overrides: Sequence[str] = ()) -> Proposal:
             if each.launch and each.launch[0] in done
         ]
         looked = _looked_at(load_launch(named[0], launch))
+    advance(3, 4, "looking at the calibration")
     found += [*looked, *calibrated(load_launch(named[0], launch), named[0])]
     return Proposal(launch, once(found))
 
