@@ -54,6 +54,11 @@ RIGHT_ROW = "{shown[psnr]:.1f} | {shown[warp_psnr]:.1f} | {shown[model_psnr]:.1f
 STEPS = {  # results frame by frame whose depth says how sure it is
     "phantom, exact depth": "phantom_step", "D4D at 60 to 180 mm, depth of a network": "d4d_step",
 }  # fmt: skip
+DISTURBED_ROW = (
+    "`{name}` | {psnr_before:.1f} / {model_psnr_before:.1f} | {psnr_during:.1f} / {model_psnr_during:.1f} "
+    "| {psnr_after:.1f} / {model_psnr_after:.1f} | {model_frames_to_recover} | {confident_depth_p90_mm:.1f} "
+    "| {restarts} | {warned_after_s:.1f} / {cleared_after_s:.1f} | {anchors_back:.0%} | {anchors_wrong:.0%}"
+)
 SURE_ROW = (
     "{depth[coverage]:.0%} | {depth_confidence[sure_share]:.0%} | {depth_confidence[sure_p90_mm]:.2f} mm"
 )
@@ -144,6 +149,7 @@ def pages() -> dict[Path, str]:
         "README.md": (_plain("why.txt"), _plain("headline.txt")),
         "benchmarks/README.md": (_claims(), _live(), _crowd()),
         "benchmarks/depth.md": (_sure(), _predicted()),
+        "benchmarks/disturbances.md": (_disturbed("d4d"), _disturbed("phantom")),
         "benchmarks/ladder.md": (_ladder(), _hosts()),
         "benchmarks/mapping.md": (_right(),),
         "docs/how-it-works.md": (_methods(),),
@@ -216,6 +222,15 @@ def _crowd() -> str:
 def _hosts() -> str:
     titles = " | frames after the first second | latency p50, p99 | dB at full size, all, lift | Gaussians"
     return table(titles, [HOST_ROW.format(**host) for host in result("hosts")["sessions"][0]["hosts"]])
+
+
+def _disturbed(clip: str) -> str:
+    titles = " shown / model, dB | before | during | after | recovers, frames | sure depth, mm | restarts"
+    rows = [
+        DISTURBED_ROW.format(**{what: Figure([found]) for what, found in row.items()})
+        for row in result(f"disturbances_{clip}")["rows"]
+    ]
+    return table(f"{titles} | warned / cleared, s | anchors back | wrong", rows)
 
 
 def _inputs() -> str:
