@@ -20,6 +20,11 @@ def install(extra: str) -> str:
     return f"pip install '.[{extra}]' in a clone, or 'sags-node[{extra}]' from an index that has it"
 
 
+def first_line(error: BaseException) -> str:
+    """What another library's error says, on one line."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
 _LONGEST = 100  # characters of a value in a message
 _repr = Repr()
 _repr.maxstring = _repr.maxother = _LONGEST

@@ -29,11 +29,11 @@ FOLDERS = sorted(PLACES)
 # Lines of Python that a folder may have. What needs more raises its number, and its message says why;
 # one that needs less lowers it.
 LINES = {
-    "benchmarks": 9969,
+    "benchmarks": 10079,
     "sags_lab": 5022,
-    "sags_node": 1299,
+    "sags_node": 1304,
     "sags_node/bags": 1001,
-    "sags_node/cli": 3620,
+    "sags_node/cli": 3619,
     "sags_node/clients": 1,
     "sags_node/clients/bridge": 2541,
     "sags_node/clients/latency": 423,
@@ -43,11 +43,11 @@ LINES = {
     "sags_node/clients/viewer": 1529,
     "sags_node/config": 1530,
     "sags_node/detail": 964,
-    "sags_node/engine": 3997,
+    "sags_node/engine": 4010,
     "sags_node/instruments": 812,
     "sags_node/field": 1963,
     "sags_node/kernels": 1219,
-    "sags_node/mapping": 5535,
+    "sags_node/mapping": 5537,
     "sags_node/media": 909,
     "sags_node/messaging": 5369,
     "sags_node/model": 1077,
@@ -59,14 +59,14 @@ LINES = {
     "sags_node/ros": 319,
     "sags_node/sources": 5924,
     "sags_node/terminal": 413,
-    "sags_node/tools": 570,
+    "sags_node/tools": 579,
     "sags_node/tools/calibration": 1940,
     "sags_node/tools/evaluation": 3127,
     "sags_node/tools/export": 959,
     "sags_node/tools/fitting": 1940,
     "sags_node/tools/importing": 1169,
     "sags_node/vision": 5378,
-    "tests": 50501,
+    "tests": 50627,
 }
 SPARE = 40  # lines between a number and what is there: beyond, it is lowered
 

@@ -1,7 +1,9 @@
 """Benchmark commands of the engine and the offline model."""
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -197,16 +199,38 @@ def bench_ablation(
 
 
 @click.command("gpu")
-@click.option("--small", is_flag=True, help="Tiny sizes and no live runs: does it work, not how fast is it.")
-@click.option("--fit", is_flag=True, help="Also the paper's fit, which takes minutes.")
-@shown("--seconds", type=click.FloatRange(min=1), default=420.0, help="After which no part begins.")
-@measures
-def bench_gpu(small: bool, fit: bool, seconds: float) -> Measured:
-    """Check all that a GPU should do: parity, times, live runs. `make gpu-check` calls it.
+@shown("--device", type=click.Choice(["cuda", "cpu"]), default="cuda", help="cpu: Warp's, which is slow.")
+@click.option("--small", is_flag=True, help="Tiny sizes: does it work, not how fast is it.")
+@shown("--schedule", type=click.Choice(["paper", "released"]), default="paper", help="Of the fit.")
+@shown("--seconds", type=click.FloatRange(min=1), default=480.0, help="After which no part begins.")
+@click.option("--part", help="Only this one, in this process; prints JSON.")
+@figures_option
+def bench_gpu(
+    device: str, small: bool, schedule: str, seconds: float, part: str | None, out: Path | None
+) -> None:
+    """Check all that a GPU should do: parity, times, a fit, live runs. `make gpu-check` calls it.
 
     \b
-    python -m benchmarks gpu --fit --out benchmarks/results/gpu.json
+    python -m benchmarks gpu --out benchmarks/results/gpu.json
+    python -m benchmarks gpu --device cpu --small      # tries all of it without a GPU
     """
-    from benchmarks.gpu.check import gpu_check
+    from benchmarks.gpu.check import gpu_check, parts, run_part, table
 
-    return gpu_check(small, fit, lambda line: click.echo(line, err=True), seconds), []
+    chosen = parts(small, schedule)
+    if part is not None:
+        if part not in chosen:
+            raise UsageError(f"there is no part {part!r}: choose one of {', '.join(chosen)}")
+        click.echo(json.dumps(run_part(part, device, small, schedule)))
+        return
+    check_files(out)
+
+    def keep(figures: dict[str, Any]) -> None:
+        write_json(out, figures)
+        name = [*figures][-1]
+        click.echo(f"{name}: {figures[name].get('error', 'done')}", err=True)
+
+    arguments = ["--device", device, "--schedule", schedule, *["--small"] * small]
+    figures = gpu_check(arguments, chosen, keep, seconds)
+    show(table(figures, chosen))
+    if failed := [name for name, found in figures.items() if "error" in found]:
+        raise SagsError(f"failed: {', '.join(failed)}; what they said is above")

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from sags_node.cli.launching import write_json
 from sags_node.config.schema import DeviceName, EndoNerfSource
-from sags_node.engine.device import choose_device
-from sags_node.errors import SagsError, UsageError
+from sags_node.engine.device import TORCH_WITH_CUDA, choose_device, is_of_warp
+from sags_node.errors import SagsError, UsageError, first_line
 from sags_node.files import check_results, is_result, writing
 from sags_node.kernels.threads import configure_threads
 from sags_node.model.ply import write_ply
@@ -75,7 +75,7 @@ def device_of(wanted: DeviceName, schedule: Schedule) -> str | None:
     if torch.cuda.is_available():
         return "cuda"
     lacks = f"torch {torch.__version__} finds no GPU, and a fit needs it"
-    fix = "install one with CUDA: pip install --force-reinstall torch"
+    fix = f"install one with CUDA: {TORCH_WITH_CUDA}"
     if wanted == "cuda":
         raise UsageError(f"device: cuda: {lacks}; {fix}, or set device:=cpu")
     log.warning("%s: this one runs on the CPU; %s", lacks, fix)
@@ -151,12 +151,11 @@ def fit_session(
             _clear(out, FIGURES, MODEL)
             outlook.expect(fit.prices())
             _iterate(fit, stored, show)
-    except RuntimeError as error:  # which is what torch and Warp raise
-        if device is None:
+    except Exception as error:
+        if device is None or not is_of_warp(error):
             raise
         go_on = "to go on from the checkpoint add --resume and" if stored.is_file() else "start again and"
-        first = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise SagsError(f"the GPU failed: {first}; {go_on} set device:=cpu") from error
+        raise SagsError(f"the GPU failed: {first_line(error)}; {go_on} set device:=cpu") from error
 
     drawn = out / DRAWN
     drawn.mkdir(exist_ok=True)

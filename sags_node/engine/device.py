@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from sags_node.config.schema import DeviceName
-from sags_node.errors import UsageError
+from sags_node.errors import UsageError, first_line
 
 if TYPE_CHECKING:
     import warp as wp
+
+TORCH_WITH_CUDA = "pip install --force-reinstall torch"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,12 @@ def gpu() -> wp.Device:
     return runtime.device_named("cuda")
 
 
+def is_of_warp(error: Exception) -> bool:
+    """Tell whether torch or Warp says that the GPU failed. Warp raises a plain `Exception` where a kernel
+    cannot be compiled or loaded."""
+    return isinstance(error, RuntimeError) or type(error) is Exception
+
+
 def has_gpu() -> bool:
     """Tell whether a GPU's driver seems to be here, usable or not."""
     devices = [*Path("/dev").glob("nvidia[0-9]*"), *Path("/dev").glob("dxg")]  # dxg: WSL
@@ -91,7 +99,11 @@ def _missing_software() -> tuple[str, str] | None:
         return "NVIDIA Warp is not installed", "pip install warp-lang"
     from sags_node.engine.gpu import runtime
 
-    runtime.start()
+    try:
+        runtime.start()
+    except Exception as error:  # whatever a package that is broken, or for another machine, raises
+        reinstall = "pip install --force-reinstall warp-lang"
+        return f"NVIDIA Warp cannot be started: {first_line(error)}", reinstall
     import warp as wp
 
     if not wp.is_cuda_available():

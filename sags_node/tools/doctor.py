@@ -7,6 +7,7 @@ import glob
 import importlib.metadata
 import os
 import platform
+import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -32,7 +33,7 @@ from sags_node.config.schema import (
     RosGraph,
     V4l2Source,
 )
-from sags_node.engine.device import find_gpu, has_gpu
+from sags_node.engine.device import TORCH_WITH_CUDA, find_gpu, has_gpu
 from sags_node.errors import SagsError, UsageError, install
 from sags_node.kernels.cache import cache_root
 from sags_node.messaging.masks import MaskSubscriber
@@ -246,18 +247,26 @@ def check_memory(root: Path = ROOT) -> Finding:
     return Finding("ok", found)
 
 
-def check_gpu(config: LaunchConfig) -> Finding:
-    """Tell whether Warp can draw on a GPU. To have none is a fault only where `device` asks for one."""
+def check_gpu(config: LaunchConfig, root: Path = ROOT) -> Finding:
+    """Tell whether Warp can draw on a GPU, and torch learn there. To have none is a fault only where `device`
+    asks for one."""
     if config.device == "cpu":
         return Finding("ok", f"not used: device is {config.device}")
     found = find_gpu()
+    number = re.search(r"\d{3,}\.[\d.]+", _read(root / "proc/driver/nvidia/version"))
+    driver = f", driver {number[0]}" if number else ""
     if found.kind == "cuda":
-        from sags_node.engine.gpu.runtime import driver
+        import torch
+
+        from sags_node.engine.gpu import runtime
 
         version = importlib.metadata.version("warp-lang")
-        return Finding("ok", f"{found.name}, driver's CUDA {driver()}, Warp {version}")
+        said = f"{found.name}{driver}, CUDA {runtime.driver()}, Warp {version}"
+        if torch.cuda.is_available():
+            return Finding("ok", f"{said}; torch finds it")
+        return Finding("ok", f"{said}; torch does not find it", f"for sags fit: {TORCH_WITH_CUDA}")
     level: Level = "error" if config.device == "cuda" else "warning" if has_gpu() else "ok"
-    return Finding(level, f"not used: {found.reason}", found.fix if level != "ok" else "")
+    return Finding(level, f"not used: {found.reason}{driver}", found.fix if level != "ok" else "")
 
 
 def _kernel_cache() -> Finding:

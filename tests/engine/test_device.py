@@ -1,19 +1,23 @@
 """Which device a launch gets, and what is said of a GPU that cannot be used."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 import warp as wp
 from command_line import refused
-from places import SESSION
+from places import ROOT, SESSION
 
 from sags_node.config.schema import LaunchConfig, MappingConfig
 from sags_node.engine import device as devices
 from sags_node.engine.device import choose_device, find_gpu
+from sags_node.engine.gpu import runtime
 from sags_node.errors import UsageError
 from sags_node.mapping import devices as mapping_devices
 from sags_node.mapping.ladder import GPU_RUNGS
@@ -47,6 +51,15 @@ def without_driver(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(wp, "is_cuda_available", lambda: False)
 
 
+def broken(machine: pytest.MonkeyPatch) -> None:
+    """A wheel for another machine, or half of one."""
+
+    def fails() -> None:
+        raise OSError("warp.so: version `GLIBC_2.34' not found\nand much more")
+
+    machine.setattr(runtime, "start", fails)
+
+
 def usable(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(wp, "is_cuda_available", lambda: True)
     machine.setattr(wp, "get_cuda_driver_version", lambda: (13, 0))
@@ -58,6 +71,7 @@ UNUSABLE = [
     (hidden, "CUDA_VISIBLE_DEVICES hides every GPU", "unset it"),
     (without_warp, "Warp is not installed", "pip install warp-lang"),
     (without_driver, "finds no GPU that its driver can use", "newer driver"),
+    (broken, "Warp cannot be started: warp.so: version `GLIBC_2.34' not found", "--force-reinstall"),
 ]  # fmt: skip
 
 
@@ -77,6 +91,19 @@ def test_a_gpu_that_cannot_be_used_is_explained(
     assert check.level == "error" and reason in check.what and fix in check.fix
 
 
+def test_doctor_names_the_driver(machine: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Also where Warp cannot use it: whether it is too old is the first question."""
+    version = tmp_path / "proc/driver/nvidia/version"
+    version.parent.mkdir(parents=True)
+    version.write_text(
+        "NVRM version: NVIDIA UNIX x86_64 Kernel Module  535.183.01  Sun May 12 19:39:15 UTC 2024\n"
+    )
+    for state in (without_driver, usable):
+        state(machine)
+        find_gpu.cache_clear()
+        assert "driver 535.183.01" in doctor.check_gpu(LaunchConfig(), tmp_path).what
+
+
 def test_a_missing_gpu_ends_the_command_with_one_message(
     machine: pytest.MonkeyPatch, phantom_session: Path
 ) -> None:
@@ -84,6 +111,23 @@ def test_a_missing_gpu_ends_the_command_with_one_message(
     said = ("\nerror: device: cuda cannot be used: this machine has no NVIDIA GPU",)
     for command in (["run"], ["eval", "--pace", "step"]):
         refused(2, *command, phantom_session, "device:=cuda", said=said)
+
+
+@pytest.mark.fault("GPU: a Warp that does not start")
+def test_a_broken_warp_leaves_the_cpu_and_says_why(tmp_path: Path, phantom_session: Path) -> None:
+    package = tmp_path / "warp" / "__init__.py"
+    package.parent.mkdir()
+    package.write_text("raise ImportError('warp.so is of another machine')")
+    card = tmp_path / "nvidia-smi"
+    card.write_text("#!/bin/sh")
+    card.chmod(0o755)
+    paths = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    code = "from sags_node.engine.device import choose_device; print(choose_device('auto').reason)"
+    run = partial(subprocess.run, capture_output=True, text=True, timeout=300, env=os.environ | paths)
+    said = "NVIDIA Warp cannot be started: warp.so is of another machine"
+    assert run([sys.executable, "-c", code], check=True).stdout == f"{said}\n"
+    done = run([sys.executable, "-m", "sags_node", "run", str(phantom_session), "device:=cuda"], check=False)
+    assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
 
 
 def test_a_fit_from_an_online_start_is_refused_on_a_gpu(phantom_session: Path) -> None:
@@ -96,6 +140,13 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
     assert choose_device("cpu").kind == "cpu"
     check = doctor.check_gpu(LaunchConfig())
     assert check.level == "ok" and "H100" in check.what and "CUDA 13.0" in check.what
+    for has_cuda, said, fix in (
+        (True, "torch finds it", ""),
+        (False, "torch does not find it", "for sags fit"),
+    ):
+        machine.setattr(torch.cuda, "is_available", lambda found=has_cuda: found)
+        check = doctor.check_gpu(LaunchConfig())
+        assert said in check.what and check.fix.startswith(fix) and bool(check.fix) == bool(fix)
     cpu = mapping_devices.affordable(LaunchConfig(device="cpu"), 1280, 1024)
     gpu = mapping_devices.affordable(LaunchConfig(), 1280, 1024)
     assert gpu > cpu and mapping_devices.rungs_of(LaunchConfig()) == GPU_RUNGS
@@ -103,17 +154,17 @@ def test_a_usable_gpu_is_chosen_and_gets_more_gaussians(machine: pytest.MonkeyPa
     assert mapping_devices.affordable(fixed, 640, 512) == 5000
 
 
-def test_machines_without_a_gpu_never_wait_for_torch_or_warp() -> None:
+def test_without_a_gpu_or_with_the_cpu_chosen_nothing_waits_for_torch_or_warp() -> None:
     """`auto` looks for the hardware first, and neither a session nor the frame path needs torch."""
     code = f"""
 import sys
 from sags_node.engine import device
-device.has_gpu = lambda: False
-from sags_node.config.schema import LaunchConfig
+device.has_gpu = lambda: has_gpu
 from sags_node.pipeline.session import open_session
 from sags_node.pipeline.warm_up import warm_up
-open_session({str(SESSION)!r})
-warm_up(LaunchConfig())
+for has_gpu, wanted in ((False, "auto"), (True, "cpu")):
+    device.find_gpu.cache_clear()
+    warm_up(open_session({str(SESSION)!r}, ["device:=" + wanted]).config)
 assert "sags_node.mapping.mapper" in sys.modules
 print([name for name in ("torch", "warp") if name in sys.modules])
 """

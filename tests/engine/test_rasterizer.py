@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from engine_scenes import (
     DERIVATIVES,
     EXPONENTIAL,
@@ -464,6 +465,20 @@ def test_pairs_are_made_for_active_tiles_only_and_too_many_are_refused(
     rasterizer.forward(gaussians, WIDE, tiles)
     with pytest.raises(SagsError, match=rf"pairs, the limit is {module.MAX_PAIRS}: .* draw fewer"):
         rasterizer.forward(gaussians, WIDE)
+
+
+def test_pairs_beyond_32_bits_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three Gaussians with a thousand million pairs each: their sum must not turn negative."""
+    use_warp_on_cpu(monkeypatch)
+    add_up = wp.utils.array_scan
+
+    def scan(counts: wp.array, ends: wp.array, inclusive: bool) -> None:
+        counts.numpy()[:] += 1 << 30
+        add_up(counts, ends, inclusive)
+
+    monkeypatch.setattr(wp.utils, "array_scan", scan)
+    with pytest.raises(SagsError, match=r"draw fewer"):
+        make_rasterizer("warp", WIDE.width, WIDE.height).forward(random_gaussians(5, 3, WIDE), WIDE)
 
 
 def test_median_agrees_with_the_twin(backend: Backend) -> None:

@@ -289,7 +289,7 @@ class Fault:
     for_good: bool = False
     calls: int = 0
 
-    def break_(self, monkeypatch: pytest.MonkeyPatch, owner: type, method: str) -> Fault:
+    def break_(self, monkeypatch: pytest.MonkeyPatch, owner: Any, method: str) -> Fault:
         works = getattr(owner, method)
 
         def may_fail(*args: Any, **names: Any) -> Any:
@@ -329,6 +329,26 @@ def test_a_cuda_error_anywhere_leaves_the_cpu_to_go_on(
     assert played.refiner.share == CPU_SHARE
     after, view = played.take(frame(2))
     assert fault.calls == call and psnr(view, frame(2)) > 19 and after.loss > 0
+
+
+@pytest.mark.fault("GPU: taken or full before the first frame (simulated)")
+@pytest.mark.parametrize(
+    ("call", "error", "code"),
+    [
+        ("zeros", RuntimeError("Failed to acquire primary context for device cuda:0"), "gpu_failed"),
+        ("zeros", RuntimeError("Failed to allocate 16384 bytes on device 'cuda:0'"), "gpu_memory"),
+        ("launch", Exception("CUDA kernel build failed with error code 6"), "gpu_failed"),
+    ],
+)
+def test_a_card_that_cannot_be_used_leaves_all_to_the_cpu(
+    call: str, error: Exception, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors as Warp raises them."""
+    monkeypatch.setattr("sags_node.vision.stereo.SMALLEST_SIDE", 16)
+    Fault(error, 1, for_good=True).break_(monkeypatch, wp, call)
+    pipeline, take = pipeline_on("cuda", 1)
+    assert psnr(take(0).views["left"], frame(0)) > 19
+    assert pipeline.warnings["device"][0].code == code
 
 
 @pytest.mark.fault("GPU: out of memory (simulated)")

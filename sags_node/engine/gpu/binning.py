@@ -58,9 +58,10 @@ def tile_columns(s: wp.vec4, r: wp.vec4, row: int, width: int, height: int):
 @wp.kernel(grid_stride=False)
 def count_pairs(
     splats: wp.array2d(dtype=wp.vec4), keys: wp.array(dtype=int), order: wp.array(dtype=int),
-    width: int, height: int, active: wp.array(dtype=int), counts: wp.array(dtype=int),
+    width: int, height: int, active: wp.array(dtype=int), counts: wp.array(dtype=wp.int64),
 ):  # fmt: skip
-    """Count the active tiles that each splat reaches; `counts` is in the order of depth."""
+    """Count the active tiles that each splat reaches; `counts` is in the order of depth. In 64 bits, which
+    hold any sum of them."""
     n = wp.tid()
     total = int(0)
     if keys[n] != FAR_KEY:
@@ -72,22 +73,22 @@ def count_pairs(
             begin, end = tile_columns(s, r, row, width, height)
             for column in range(begin, end):
                 total += active[row * tiles_x + column]
-    counts[n] = total
+    counts[n] = wp.int64(total)
 
 
 @wp.kernel(grid_stride=False)
 def emit_pairs(
     splats: wp.array2d(dtype=wp.vec4), keys: wp.array(dtype=int), order: wp.array(dtype=int),
-    width: int, height: int, active: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ends: wp.array(dtype=int), tiles: wp.array(dtype=int), slots: wp.array(dtype=int),
+    width: int, height: int, active: wp.array(dtype=int), counts: wp.array(dtype=wp.int64),
+    ends: wp.array(dtype=wp.int64), tiles: wp.array(dtype=int), slots: wp.array(dtype=int),
     slot_splats: wp.array(dtype=int), own_slots: wp.array(dtype=wp.vec2i),
 ):  # fmt: skip
     """Write the pairs in the order of depth. `own_slots`: a splat's first slot, and one after its last."""
     n = wp.tid()
     i = order[n]
-    at = ends[n] - counts[n]
-    own_slots[i] = wp.vec2i(at, ends[n])
-    if counts[n] == 0:
+    at, end = int(ends[n] - counts[n]), int(ends[n])
+    own_slots[i] = wp.vec2i(at, end)
+    if at == end:
         return
     tiles_x = (width + TILE - 1) // TILE
     s, r = splats[i, 0], splats[i, 1]

@@ -18,7 +18,7 @@ from sags_node.engine.rasterizer.compositing import TILE_HEIGHT, TILE_WIDTH
 from sags_node.errors import SagsError
 from sags_node.types import F32, I32, Bool, Camera, Gaussians
 
-MAX_PAIRS = 1 << 25  # they take 3 GiB
+MAX_PAIRS = 1 << 26  # 6 GB: what the CPU's engine draws, too, in tiles of twice the size
 SPARE = 1.25  # a buffer that grows gets this many times the size it needs
 KINDS: dict[str, Any] = {
     "means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": float, "colors": wp.vec3,
@@ -58,7 +58,7 @@ class DeviceRasterizer:
         self._active = self._everywhere
         self._starts, self._tile_ends = self._new(self._tiles + 1, int), self._new(self._tiles, int)
         self._view = self._new(20)
-        self._total = wp.zeros(1, dtype=int, device="cpu", pinned=self.device.is_cuda)
+        self._total = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=self.device.is_cuda)
         self._room = self._pair_room = 0
         self._hold(1024)
         self._hold_pairs(4096)
@@ -180,7 +180,7 @@ class DeviceRasterizer:
         self._room = room
         self._splats = self._new((room, projection.RECORD), wp.vec4)
         self._keys, self._order = self._new(2 * room, int), self._new(2 * room, int)  # half is for sorting
-        self._counts, self._ends = self._new(room, int), self._new(room, int)
+        self._counts, self._ends = self._new(room, wp.int64), self._new(room, wp.int64)
         self._own_slots = self._new(room, wp.vec2i)
         self._found = {name: self._new(room, kind) for name, kind in DERIVED.items()}
 

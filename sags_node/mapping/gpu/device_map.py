@@ -40,7 +40,6 @@ class DeviceMap:
         self._deformation: NodeDeformation | None = None
         self.momentum: wp.array
         self.variance: wp.array
-        self._hold_nodes(0)
         self._steps = 0
 
     def begin(self, model: GaussianModel, deformation: NodeDeformation) -> None:

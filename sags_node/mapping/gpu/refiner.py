@@ -16,6 +16,7 @@ import warp as wp
 from sags_node.engine import device
 from sags_node.engine.gpu.rasterizer import DeviceRasterizer, sent
 from sags_node.engine.rasterizer.arguments import view_of
+from sags_node.errors import first_line
 from sags_node.mapping.focus import largest, tile_grid
 from sags_node.mapping.gpu import kernels
 from sags_node.mapping.gpu.device_map import DeviceMap
@@ -41,7 +42,9 @@ def _or_on_the_cpu(
         if self.problem is None:
             try:
                 return method(self, *args, **names)
-            except RuntimeError as error:  # what Warp raises if the driver fails, or memory is full
+            except Exception as error:
+                if not device.is_of_warp(error):
+                    raise
                 self._give_up(error)
         result: Result = getattr(self._cpu, method.__name__)(*args, **names)
         self.loss = self._cpu.loss
@@ -116,8 +119,8 @@ class GpuRefiner(Refiner):
         picture.rasterizer.forward(sent(gaussians, self._device), view_of(camera))
         return picture.fetched(anew=True)
 
-    def _give_up(self, error: RuntimeError) -> None:
-        said = (str(error).strip() or type(error).__name__).splitlines()[0]
+    def _give_up(self, error: Exception) -> None:
+        said = first_line(error)
         full = "allocate" in said  # Warp has no error of its own for it
         remedy = "end what else uses the GPU, or lower mapping.max_gaussians, and " if full else ""
         self.problem = Finding(
