@@ -61,7 +61,7 @@ LINES = {
     "sags_node/terminal": 413,
     "sags_node/tools": 579,
     "sags_node/tools/calibration": 1940,
-    "sags_node/tools/evaluation": 3127,
+    "sags_node/tools/evaluation": 3121,
     "sags_node/tools/export": 959,
     "sags_node/tools/fitting": 1940,
     "sags_node/tools/importing": 1169,

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 
 from sags_node.config.schema import LaunchConfig
+from sags_node.messaging import published
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.quality import metrics
 from sags_node.sources.source import Source
-from sags_node.types import F32, U8, Bool, RectifiedPair, RenderedView, StereoFrame, StereoRig
+from sags_node.types import F32, Bool, RectifiedPair, RenderedView, StereoFrame, StereoRig
 from sags_node.vision.tissue import TissueMask
 
 PLACES = ((0.3, 0.3), (0.5, 0.65), (0.7, 0.35))  # of width and height: the middles of the boxes
@@ -30,7 +30,7 @@ class Curtain(TissueMask):
 def measure_hidden(
     config: LaunchConfig, rig: StereoRig, source: Source, frames: int, progress: Callable[[str, int], None]
 ) -> dict[int, dict[str, float]]:
-    """Play a recording with boxes hidden; return the figures of their pixels by frame number.
+    """Play a recording with boxes hidden; return the figures of their pixels, as published, by frame number.
 
     `psnr` of what is shown there, `model_psnr` of the model alone, `copy_psnr` of the last image in which
     they were seen, shown again; dB, each the mean over the boxes.
@@ -55,17 +55,17 @@ def measure_hidden(
                     until = now + round(seconds * 1e9)
             curtain.drawn = every if now < until else None
             result = pipeline.process(frame, budget, FrameRequest(left=True))
-            truth = metrics.as_float(result.pair.left)
+            truth = metrics.as_float(published.picture(result.pair, "left"))
             if curtain.drawn is None:
                 before = truth
             elif before is not None and not result.held and (curtain.whole & every).any():
-                view = result.views["left"]
+                view, size = result.views["left"], published.size_of(result.pair)
                 pictures = {
-                    "psnr": metrics.as_float(_small(view)),
-                    "model_psnr": metrics.as_float(view.rgb),
+                    "psnr": metrics.as_float(published.colours(view, size)),
+                    "model_psnr": metrics.as_float(view.colours.at(*size)),
                     "copy_psnr": before,
                 }
-                where = [box & curtain.whole for box in boxes]
+                where = [published.nearest(result.pair, box & curtain.whole) for box in boxes]
                 found[frame.frame_id] = {
                     name: float(np.mean([metrics.psnr(picture, truth, box) for box in where if box.any()]))
                     for name, picture in pictures.items()
@@ -83,9 +83,3 @@ def _boxes(width: int, height: int) -> list[Bool]:
         box[rows, round((x - SIZE[0] / 2) * width) : round((x + SIZE[0] / 2) * width)] = True
         boxes.append(box)
     return boxes
-
-
-def _small(view: RenderedView) -> U8:
-    """The image that consumers are shown of a view, at the working size."""
-    size = view.camera.width, view.camera.height
-    return view.rgb if view.shown is None else cv2.resize(view.shown.rgb, size, interpolation=cv2.INTER_AREA)
