@@ -42,7 +42,7 @@ LINES = {
     "sags_node/clients/registration": 518,
     "sags_node/clients/viewer": 1529,
     "sags_node/config": 1530,
-    "sags_node/detail": 964,
+    "sags_node/detail": 966,
     "sags_node/engine": 4010,
     "sags_node/instruments": 812,
     "sags_node/field": 1963,

@@ -10,7 +10,8 @@ from sags_node.detail.seen import MatchedDepth, SeenFrame
 from sags_node.types import F32, Gaussians
 
 EVERY = 0.2  # s between frames that are kept
-HIDDEN = 0.005  # of a frame's pixels were tissue in the frame before, which is kept then
+HIDDEN = 0.002  # of a frame's pixels were tissue in the frame before, which is kept then...
+AT_LEAST = np.ones((9, 9), np.uint8)  # ...in whole squares of so many px: highlights and edges come and go
 MOST = 10  # frames kept
 OLDEST = 10.0  # s: what nobody has seen for longer is drawn as the model has it
 NEARLY = 0.5  # of what the best frame saw: a newer frame that saw more than this is taken instead
@@ -36,7 +37,7 @@ class Memory:
 
     def add(self, frame: SeenFrame) -> None:
         """Take a new frame, and keep the one before it if none was kept for `EVERY`, or if the new one hides
-        `HIDDEN` of its pixels."""
+        something that it saw."""
         last, self._last = self._last, frame
         now = frame.t_capture_ns
         kept = [one for one in self.frames if 0 <= now - one.t_capture_ns <= OLDEST * 1e9]
@@ -53,7 +54,8 @@ class Memory:
 
 
 def _hides(frame: SeenFrame, last: SeenFrame) -> bool:
-    return cv2.countNonZero(cv2.subtract(last.tissue, frame.tissue)) > HIDDEN * frame.tissue.size
+    hidden = cv2.erode(cv2.subtract(last.tissue, frame.tissue), AT_LEAST)
+    return cv2.countNonZero(hidden) > HIDDEN * hidden.size
 
 
 class Matched:
