@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sags_node.detail.seen import MatchedDepth, SeenFrame
-from sags_node.types import F32, Gaussians
+from sags_node.types import F32, U8, Gaussians
 
 EVERY = 0.2  # s between frames that are kept
 HIDDEN = 0.002  # of a frame's pixels were tissue in the frame before, which is kept then...
@@ -54,8 +54,8 @@ class Memory:
 
 
 def _hides(frame: SeenFrame, last: SeenFrame) -> bool:
-    hidden = cv2.erode(cv2.subtract(last.tissue, frame.tissue), AT_LEAST)
-    return cv2.countNonZero(hidden) > HIDDEN * hidden.size
+    hidden: U8 = cv2.erode(cv2.subtract(last.tissue, frame.tissue), AT_LEAST)
+    return bool(cv2.countNonZero(hidden) > HIDDEN * hidden.size)
 
 
 class Matched:
