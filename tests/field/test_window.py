@@ -15,11 +15,13 @@ from sags_node.types import F32
 
 SLOT_NS, SLOTS = 100_000_000, 6
 BOX = np.array([[-0.05, -0.04, 0.03], [0.05, 0.04, 0.1]])
-TOKENS = ["self", "nodes"]
 NEWEST_NS = (SLOTS - 1) * SLOT_NS
 
 # Rows are of order 1 (quaternions, logits, log scales up to 8): a few units in the last place of float32.
 ROUNDING = 4e-6
+
+
+both_tokens = pytest.mark.parametrize("tokens", ["self", "nodes"])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -40,7 +42,7 @@ def some_rows(count: int = 300, seed: int = 0, box: np.ndarray = BOX) -> F32:
 
 def fresh_field(tokens: str, rows: F32) -> Field:
     hexplane = HexPlane(BOX, 0, SLOT_NS, SLOTS, cells=5, levels=2, channels=16)
-    hexplane.advance(NEWEST_NS, _never)
+    hexplane.advance(NEWEST_NS, lambda t_ns: None)
     deltas = Deltas(hexplane, Decoder(hexplane.features, tokens))
     deltas.decoder.awaken(0)
     nodes = spread_nodes(rows[:, columns.MEAN], 40)
@@ -59,10 +61,6 @@ def moving_model(tokens: str) -> WindowModel:
     return WindowModel(some_rows(), field)
 
 
-def _never(t_ns: int) -> None:
-    raise AssertionError(f"the slot at {t_ns} ns retired")
-
-
 def states(model: WindowModel, times_ns: list[int]) -> list[F32]:
     return [model.rows_at(t_ns).detach().numpy() for t_ns in times_ns]
 
@@ -73,7 +71,7 @@ def angles(a: F32, b: F32) -> F32:
     return 2 * np.arccos(np.clip(np.abs((a * b).sum(1)), 0, 1))
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
+@both_tokens
 def test_the_oldest_slot_is_the_canonical_state(tokens: str) -> None:
     model = moving_model(tokens)
     np.testing.assert_allclose(states(model, [0, -SLOT_NS]), [model.table] * 2, atol=ROUNDING)
@@ -82,7 +80,7 @@ def test_the_oldest_slot_is_the_canonical_state(tokens: str) -> None:
     assert angles(moved[:, columns.QUAT], model.table[:, columns.QUAT]).max() > 0.1
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
+@both_tokens
 def test_folding_changes_nothing_that_stays_in_the_window(tokens: str) -> None:
     model = moving_model(tokens)
     canonical = model.table.copy()
@@ -94,22 +92,17 @@ def test_folding_changes_nothing_that_stays_in_the_window(tokens: str) -> None:
     assert np.abs(model.table - canonical)[:, columns.MEAN].max() > 1e-3
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
-def test_new_slots_say_what_the_newest_said(tokens: str) -> None:
+@both_tokens
+@pytest.mark.parametrize("slots", [1, SLOTS, SLOTS + 1, 100])
+def test_new_slots_say_what_the_newest_said(slots: int, tokens: str) -> None:
+    """Also after a gap longer than the window: then the last state is the canonical one."""
     model = moving_model(tokens)
     newest = states(model, [NEWEST_NS])[0]
-    model.advance(NEWEST_NS + SLOT_NS)
-    for state in states(model, [NEWEST_NS, NEWEST_NS + SLOT_NS // 2, NEWEST_NS + SLOT_NS]):
-        np.testing.assert_allclose(state, newest, atol=ROUNDING)
-
-
-@pytest.mark.parametrize("slots", [SLOTS, SLOTS + 1, 100])
-def test_after_a_gap_longer_than_the_window_the_last_state_is_kept(slots: int) -> None:
-    model = moving_model("nodes")
-    newest = states(model, [NEWEST_NS])[0]
     model.advance(NEWEST_NS + slots * SLOT_NS)
-    np.testing.assert_allclose(model.table, newest, atol=2 * ROUNDING)
-    np.testing.assert_allclose(states(model, [NEWEST_NS + slots * SLOT_NS])[0], newest, atol=2 * ROUNDING)
+    later = [NEWEST_NS + share * SLOT_NS // 2 for share in (0, 1, 2, 2 * slots)]
+    np.testing.assert_allclose(states(model, later), [newest] * 4, atol=2 * ROUNDING)
+    if slots >= SLOTS:
+        np.testing.assert_allclose(model.table, newest, atol=2 * ROUNDING)
 
 
 def test_a_thousand_foldings_lose_nothing_and_take_no_memory() -> None:
@@ -124,7 +117,7 @@ def test_a_thousand_foldings_lose_nothing_and_take_no_memory() -> None:
     np.testing.assert_allclose(np.linalg.norm(model.table[:, columns.QUAT], axis=1), lengths, rtol=1e-5)
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
+@both_tokens
 def test_a_gaussian_born_late_is_as_it_was_seen(tokens: str) -> None:
     model = moving_model(tokens)
     t_ns = int(3.4 * SLOT_NS)
@@ -140,7 +133,7 @@ def test_a_gaussian_born_late_is_as_it_was_seen(tokens: str) -> None:
     np.testing.assert_allclose(states(model, [t_ns])[0][300:], born, atol=2 * ROUNDING)
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
+@both_tokens
 def test_a_gaussian_born_on_another_moves_with_it(tokens: str) -> None:
     model = moving_model(tokens)
     t_ns = int(3.4 * SLOT_NS)
@@ -148,12 +141,11 @@ def test_a_gaussian_born_on_another_moves_with_it(tokens: str) -> None:
     twin = states(model, [t_ns])[0][:50]
     twin[:, columns.MEAN] += shift
     model.insert(twin, t_ns)
-    for state, moved in zip(states(model, [0, NEWEST_NS]), (0, NEWEST_NS), strict=True):
-        apart = state[300:, columns.MEAN] - state[:50, columns.MEAN]
-        travelled = states(model, [t_ns])[0][:50, columns.MEAN] - state[:50, columns.MEAN]
-        assert np.median(np.linalg.norm(apart, axis=1)) < 0.2 * np.median(
-            np.linalg.norm(travelled, axis=1)
-        ), moved
+    at_birth = states(model, [t_ns])[0][:50, columns.MEAN]
+    for state in states(model, [0, NEWEST_NS]):
+        apart = np.linalg.norm(state[300:, columns.MEAN] - state[:50, columns.MEAN], axis=1)
+        travelled = np.linalg.norm(at_birth - state[:50, columns.MEAN], axis=1)
+        assert np.median(apart) < 0.2 * np.median(travelled)
 
 
 def test_places_stay_with_their_gaussians() -> None:
@@ -170,7 +162,7 @@ def test_places_stay_with_their_gaussians() -> None:
 # ---- gradients -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
+@both_tokens
 def test_at_the_oldest_slot_the_field_has_nothing_to_learn(tokens: str) -> None:
     model = moving_model(tokens)
     cotangent = torch.from_numpy(np.random.default_rng(77).normal(size=model.table.shape).astype(np.float32))
@@ -185,7 +177,7 @@ def test_at_the_oldest_slot_the_field_has_nothing_to_learn(tokens: str) -> None:
     assert decoder_gradient(0) < 1e-4 * decoder_gradient(NEWEST_NS)
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
+@both_tokens
 def test_a_fresh_field_learns_a_motion_and_leaves_the_oldest_slot_alone(tokens: str) -> None:
     rows = torch.from_numpy(some_rows())
     field = AnchoredField(fresh_field(tokens, rows.numpy()), rows[:, columns.MEAN].numpy())
@@ -202,7 +194,7 @@ def test_a_fresh_field_learns_a_motion_and_leaves_the_oldest_slot_alone(tokens: 
     assert torch.allclose(field.deform(rows, 0), rows, rtol=0, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("tokens", TOKENS)
+@both_tokens
 def test_when_the_field_forgets_the_state_at_that_time_stays(tokens: str) -> None:
     model = moving_model(tokens)
     cells = model.field.deltas.hexplane.cells.detach()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from places import SESSION
@@ -15,6 +16,7 @@ from sags_node.quality.metrics import as_float
 from sags_node.types import U8, FrameResult, Observation, StereoFrame
 
 NOISE = 2.0  # grey levels, standard deviation
+Frames = list[StereoFrame]
 
 
 def opened(*overrides: str) -> Session:
@@ -25,6 +27,12 @@ def opened(*overrides: str) -> Session:
 def frames_of(session: Session) -> list[StereoFrame]:
     with session.source as source:
         return list(source)
+
+
+def fresh(*overrides: str, **how: Any) -> Pipeline:
+    """A pipeline for the session. `how`: see `Pipeline`."""
+    session = opened(*overrides)
+    return Pipeline(session.config, session.rig, **how)
 
 
 def play(

@@ -78,13 +78,6 @@ def steps_of(budget: Budget) -> int:
     return steps
 
 
-def test_step_budget_counts() -> None:
-    budget = StepBudget(3)
-    for _ in range(2):
-        budget.start()
-        assert steps_of(budget) == 3 and not budget.more()
-
-
 def test_steps_fill_the_time_and_leave_room_for_drawing() -> None:
     machine = Machine(before=0.006, step=0.005, after=0.006)
     for _ in range(30):
@@ -165,7 +158,9 @@ def test_fixed_steps_go_before_time() -> None:
 
     steps, timed = budget(iterations=2, budget_ms=1), budget(budget_ms=1)
     assert isinstance(steps, StepBudget) and isinstance(timed, TimeBudget)
-    assert steps_of(steps) == 2
+    for _ in range(2):
+        steps.start()
+        assert steps_of(steps) == 2 and not steps.more()
 
 
 def test_a_budget_that_is_changed_while_running_is_as_if_it_had_been_so() -> None:
@@ -176,8 +171,8 @@ def test_a_budget_that_is_changed_while_running_is_as_if_it_had_been_so() -> Non
             "source.frames:=3", "mapping.max_gaussians:=4000", f"mapping.budget_ms:={budgets[0]}"
         )
         pipeline = Pipeline(session.config, session.rig)
-        for budget in budgets[1:]:
-            pipeline.reconfigure(with_parameters(session.config, {"mapping.budget_ms": budget}))
+        if budgets[1:]:
+            pipeline.reconfigure(with_parameters(session.config, {"mapping.budget_ms": budgets[1]}))
         results = [pipeline.process(frame, StepBudget(2)) for frame in frames_of(session)]
         return [result.snapshot.gaussians.means for result in results]
 

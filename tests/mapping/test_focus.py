@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from engine_scenes import worst_tiles
-from recorded_session import frames_of, opened
+from recorded_session import frames_of, fresh, opened
 
 from sags_node.engine.losses.tissue import COVERED
 from sags_node.engine.rasterizer.rasterize import TILE_HEIGHT, TILE_WIDTH
@@ -15,7 +15,6 @@ from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.focus import EVERY, largest, with_neighbours
 from sags_node.mapping.ladder import Rung
 from sags_node.mapping.refiner import CpuRefiner
-from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import F32, U8, Bool
 
 HEIGHT, WIDTH = 3 * TILE_HEIGHT + 7, 5 * TILE_WIDTH + 3  # no tile divides it
@@ -107,24 +106,22 @@ def test_neighbours_are_all_around_and_stay_inside(place: tuple[int, int]) -> No
 
 def test_the_worst_tiles_are_those_of_what_was_drawn_last(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tiles that were not drawn again are not looked at again: nothing in them has changed."""
-    asked, frame_of, begin = 0, dict[str, Any](), CpuRefiner.begin
+    compared, begin = [], CpuRefiner.begin
 
     def noted(one: CpuRefiner, *given: Any) -> None:
         begin(one, *given)
-        frame_of.update(refiner=one, seen=given[2])
+        seen = given[2]
 
-    def compared(residuals: F32, share: float) -> Bool:
-        nonlocal asked
-        asked += 1
-        found, seen = largest(residuals, share), frame_of["seen"]
-        planes = frame_of["refiner"].planes()
-        np.testing.assert_array_equal(found, worst_tiles(planes, seen.image, seen.tissue, share))
-        return found
+        def compare(residuals: F32, share: float) -> Bool:
+            compared.append(largest(residuals, share))
+            expected = worst_tiles(one.planes(), seen.image, seen.tissue, share)
+            np.testing.assert_array_equal(compared[-1], expected)
+            return compared[-1]
+
+        monkeypatch.setattr(refiner, "largest", compare)
 
     monkeypatch.setattr(CpuRefiner, "begin", noted)
-    monkeypatch.setattr(refiner, "largest", compared)
-    session = opened("mapping.max_gaussians:=4000", "source.frames:=4")
-    pipeline = Pipeline(session.config, session.rig)
-    for frame in frames_of(session):
+    pipeline = fresh("mapping.max_gaussians:=4000")
+    for frame in frames_of(opened("source.frames:=4")):
         pipeline.process(frame, StepBudget(3, Rung(4000, redraw=0.4)))
-    assert asked == 3 * 3  # two steps on what is worst, and what is shown; not in the first frame
+    assert len(compared) == 3 * 3  # two steps on what is worst, and what is shown; not in the first frame

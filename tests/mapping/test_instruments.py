@@ -12,7 +12,7 @@ from sags_node.config.schema import LaunchConfig
 from sags_node.mapping.budget import StepBudget
 from sags_node.phantom.scene import Phantom, PhantomScene
 from sags_node.pipeline.pipeline import Pipeline
-from sags_node.types import U8, Camera, Colours, RenderedView, StereoFrame
+from sags_node.types import U8, Bool, Camera, Colours, RenderedView, StereoFrame
 from sags_node.vision.tissue_classical import LONGEST_DOUBT, InstrumentFinder
 
 
@@ -28,11 +28,16 @@ def drawn(picture: U8) -> RenderedView:
     return RenderedView(0, 0, camera, Colours(picture), plane, plane)
 
 
-def test_grey_and_gold_that_come_in_from_the_edge_are_instruments() -> None:
-    picture = textured_tissue()
+def with_shaft(tissue: U8, wrist: tuple[int, int, int] | None = None) -> U8:
+    picture = tissue.copy()
     picture[SHAFT] = (150, 150, 152)
-    picture[GOLD] = (170, 140, 50)
-    found = InstrumentFinder()(picture)
+    if wrist is not None:
+        picture[GOLD] = wrist
+    return picture
+
+
+def test_grey_and_gold_that_come_in_from_the_edge_are_instruments() -> None:
+    found = InstrumentFinder()(with_shaft(textured_tissue(), (170, 140, 50)))
     truth = np.zeros((HEIGHT, WIDTH), np.bool_)
     truth[SHAFT] = truth[GOLD] = True
     assert iou(found, truth) > 0.9
@@ -40,8 +45,7 @@ def test_grey_and_gold_that_come_in_from_the_edge_are_instruments() -> None:
 
 def test_a_jaw_that_mirrors_tissue_is_found_by_what_it_hides() -> None:
     tissue = textured_tissue()
-    picture = tissue.copy()
-    picture[SHAFT] = picture[GOLD] = (150, 150, 152)
+    picture = with_shaft(tissue, (150, 150, 152))
     jaw = np.zeros((HEIGHT, WIDTH), np.bool_)
     jaw[JAW[0] : JAW[1], JAW[2] : JAW[3]] = True
     picture[jaw] = (150, 100, 97)
@@ -53,8 +57,7 @@ def test_a_jaw_that_mirrors_tissue_is_found_by_what_it_hides() -> None:
 
 def test_highlights_stay_tissue_also_beside_an_instrument() -> None:
     tissue = textured_tissue()
-    picture = tissue.copy()
-    picture[SHAFT] = (150, 150, 152)
+    picture = with_shaft(tissue)
     picture[125:135, 260:300] = 255  # on the instrument
     lights = np.zeros((HEIGHT, WIDTH), np.bool_)
     lights[40:52, 60:72] = True
@@ -105,8 +108,7 @@ def test_a_pale_patch_inside_and_a_dark_picture() -> None:
 def test_tissue_that_the_model_does_not_know_is_let_go_in_time() -> None:
     """Pale tissue moves in from the edge over a redder model that would never be fixed."""
     tissue = textured_tissue()
-    picture = tissue.copy()
-    picture[SHAFT] = (150, 150, 152)
+    picture = with_shaft(tissue)
     moved = np.zeros((HEIGHT, WIDTH), np.bool_)
     moved[150:200, 240:] = True
     picture[moved] = (150, 104, 100)
@@ -125,62 +127,58 @@ def test_tissue_that_the_model_does_not_know_is_let_go_in_time() -> None:
 def test_tissue_that_an_instrument_has_left_is_tissue_at_once() -> None:
     """Where the model drew the instrument itself, which it should not have learnt."""
     tissue = textured_tissue()
-    with_shaft = tissue.copy()
-    with_shaft[SHAFT] = (150, 150, 152)
-    find = InstrumentFinder()
-    assert find(with_shaft, drawn(with_shaft), 0)[SHAFT].mean() > 0.9
-    assert find(tissue, drawn(with_shaft), FRAME_NS)[SHAFT].mean() == 0
+    before, find = with_shaft(tissue), InstrumentFinder()
+    assert find(before, drawn(before), 0)[SHAFT].mean() > 0.9
+    assert find(tissue, drawn(before), FRAME_NS)[SHAFT].mean() == 0
 
 
 def test_noise_makes_a_remembered_mask_flicker_less() -> None:
     """A part in doubt: half of its evidence is noise."""
-    picture = textured_tissue()
-    picture[SHAFT] = (150, 150, 152)
-    picture[GOLD] = (150, 138, 130)
+    picture = with_shaft(textured_tissue(), (150, 138, 130))
     picture[GOLD][::2] = (150, 128, 120)
-    flickering = {}
-    for name in ("remembered", "alone"):
-        find = InstrumentFinder()
-        masks = []
+    flickering = []
+    for remembers in (True, False):
+        find, masks = InstrumentFinder(), []
         for number in range(24):
-            if name == "alone":
-                find = InstrumentFinder()
-            masks.append(find(noisy(picture, number), drawn(picture), number * FRAME_NS))
-        flickering[name] = np.mean([(a != b)[:, 150:].mean() for a, b in pairwise(masks)])
-    assert flickering["alone"] > 0.0005
-    assert flickering["remembered"] < 0.7 * flickering["alone"]
+            each = find if remembers else InstrumentFinder()
+            masks.append(each(noisy(picture, number), drawn(picture), number * FRAME_NS))
+        flickering.append(np.mean([(a != b)[:, 150:].mean() for a, b in pairwise(masks)]))
+    remembered, alone = flickering
+    assert alone > 0.0005
+    assert remembered < 0.7 * alone
+
+
+class Masks:
+    """Masks of instruments against the truth, pixel by pixel, over many frames."""
+
+    def __init__(self) -> None:
+        self.both = self.either = self.lost = self.missed = self.tools = self.others = 0
+
+    def add(self, found: Bool, truth: Bool, usable: Bool) -> None:
+        self.both += np.count_nonzero(found & truth & usable)
+        self.either += np.count_nonzero((found | truth) & usable)
+        self.lost += np.count_nonzero(found & ~truth & usable)
+        self.missed += np.count_nonzero(truth & ~found)
+        self.tools += np.count_nonzero(truth)
+        self.others += np.count_nonzero(usable & ~truth)
 
 
 def test_instruments_of_the_phantom_while_it_is_mapped() -> None:
     """The masks shape the model, and the model the masks."""
     source = PhantomScene(width=WIDTH, height=HEIGHT, seconds=4.0, noise=0.02)
     phantom = Phantom(source)
-    config = LaunchConfig.model_validate(
-        {
-            "source": source,
-            "vision": {"tissue": {"method": "classical", "dilate": 0}},
-            "mapping": {"max_gaussians": 8000},
-        }
-    )
-    pipeline, budget = Pipeline(config, phantom.rig), StepBudget(1)
-    both = either = lost = missed = pixels = tools = 0
+    vision, mapping = {"tissue": {"method": "classical", "dilate": 0}}, {"max_gaussians": 8000}
+    config = LaunchConfig.model_validate({"source": source, "vision": vision, "mapping": mapping})
+    pipeline, budget, masks = Pipeline(config, phantom.rig), StepBudget(1), Masks()
     for number in range(30, 54):
-        frame = phantom.frame(number, 120)
-        stereo = StereoFrame(
-            number, number * FRAME_NS, number * FRAME_NS, frame.left, frame.right, 0, frame.T_world_cam
-        )
+        frame, stamp = phantom.frame(number, 120), number * FRAME_NS
+        stereo = StereoFrame(number, stamp, stamp, frame.left, frame.right, 0, frame.T_world_cam)
         found = ~pipeline.process(stereo, budget).observation.tissue
-        truth = pipeline.rectifier.mask(frame.tool)
-        usable = pipeline.rectifier.mask(np.ones_like(frame.tool))
-        both += np.count_nonzero(found & truth & usable)
-        either += np.count_nonzero((found | truth) & usable)
-        lost += np.count_nonzero(found & ~truth & usable)
-        missed += np.count_nonzero(truth & ~found)
-        pixels += np.count_nonzero(usable & ~truth)
-        tools += np.count_nonzero(truth)
-    assert both / either > 0.8
-    assert lost / pixels < 0.01
-    assert missed / tools < 0.2
+        truth, usable = map(pipeline.rectifier.mask, (frame.tool, np.ones_like(frame.tool)))
+        masks.add(found, truth, usable)
+    assert masks.both / masks.either > 0.8
+    assert masks.lost / masks.others < 0.01
+    assert masks.missed / masks.tools < 0.2
 
 
 def test_instruments_of_a_real_session_by_colour_alone(data_folder: Path) -> None:
@@ -188,18 +186,13 @@ def test_instruments_of_a_real_session_by_colour_alone(data_folder: Path) -> Non
     folder = data_folder / "d4d_pull"
     if not folder.is_dir():
         pytest.skip(f"recording d4d_pull is not under SAGS_DATA ({data_folder})")
-    video = cv2.VideoCapture(str(folder / "2025_03_06-16_49_40_combined_2x2.mp4"))
-    both = either = lost = pixels = index = 0
+    video, masks, index = cv2.VideoCapture(str(folder / "2025_03_06-16_49_40_combined_2x2.mp4")), Masks(), 0
     while video.grab():
         if index % 20 == 0:
             left = cv2.cvtColor(video.retrieve()[1], cv2.COLOR_BGR2RGB)[:540, :675]
             tool = cv2.imread(str(folder / f"toolmask/{index:04d}.png"), cv2.IMREAD_GRAYSCALE) > 127
-            found = InstrumentFinder()(left)
-            both += np.count_nonzero(found & tool)
-            either += np.count_nonzero(found | tool)
-            lost += np.count_nonzero(found & ~tool)
-            pixels += np.count_nonzero(~tool)
+            masks.add(InstrumentFinder()(left), tool, np.ones_like(tool))
         index += 1
     video.release()
-    assert both / either > 0.7
-    assert lost / pixels < 0.01
+    assert masks.both / masks.either > 0.7
+    assert masks.lost / masks.others < 0.01

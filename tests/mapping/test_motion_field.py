@@ -5,12 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from engine_scenes import round_gaussians
-from recorded_session import frames_of, opened
+from recorded_session import frames_of, fresh, opened
 
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.motion_field import HORIZONS, STEADY, MotionField
 from sags_node.model.forecast import gaussians_ahead, points_ahead, reached
-from sags_node.pipeline.pipeline import Pipeline
 from sags_node.types import F32, Camera, Forecast, MotionState, Snapshot
 
 FRAME_S = 1 / 30
@@ -143,10 +142,8 @@ def test_motion_is_remembered_once_somebody_wants_it_predicted() -> None:
     """What nobody asks for costs nothing; and `mapping.field:=false` forbids it."""
     expected = {"null": [False, True], "false": [False, False], "true": [True, True]}
     for said, found in expected.items():
-        session = opened("source.frames:=20", "mapping.max_gaussians:=2000", f"mapping.field:={said}")
-        pipeline = Pipeline(session.config, session.rig)
-        forecasts = []
-        for number, frame in enumerate(frames_of(session)):
+        pipeline, forecasts = fresh("mapping.max_gaussians:=2000", f"mapping.field:={said}"), []
+        for number, frame in enumerate(frames_of(opened("source.frames:=20"))):
             if number == 10:
                 pipeline.predict_motion()
             forecasts.append(pipeline.process(frame, StepBudget(1)).snapshot.forecast is not None)

@@ -1,5 +1,6 @@
 """Anchors that were out of sight for long: found by what surrounds them, and only there."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -9,10 +10,7 @@ import pytest
 from flat_scene import Scene, camera_in_front, flat_means, flat_scene
 
 from sags_node.mapping.anchors import Anchors
-from sags_node.mapping.recall import MOST_PICTURES, Recall
 from sags_node.types import AnchorStates
-from sags_node.vision.landmarks import features_of
-from sags_node.vision.pyramid import pyramid_of
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 320, 256, 250.0, 0.08
 CENTRE = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
@@ -55,6 +53,9 @@ def scene(
     return flat_scene(CAMERA, flat_means(CAMERA, depth, 3.0), gray, depth, 0, stamp, first_id)
 
 
+Look = Callable[..., Scene]
+
+
 def follow(anchors: Anchors, *scenes: Scene) -> AnchorStates:
     for each in scenes:
         anchors.update(*each)
@@ -62,15 +63,21 @@ def follow(anchors: Anchors, *scenes: Scene) -> AnchorStates:
     return anchors.states()
 
 
-def pinned() -> Anchors:
-    """Anchors that were seen for a while, and are out of sight now: another tissue is there."""
+def pinned(look: Look = scene, frames: int = 25) -> Anchors:
+    """Anchors that were seen for a while."""
     anchors = Anchors()
     for u, v in PINNED:
-        anchors.add_pixel(u, v, *scene(0))
-    seen = follow(anchors, *(scene(0.1 * i) for i in range(1, 25)))
+        anchors.add_pixel(u, v, *look(0))
+    seen = follow(anchors, *(look(0.1 * i) for i in range(1, frames)))
     assert (seen.confidence > 0.9).all()
-    gone = follow(anchors, *(scene(2.5 + 0.5 * i, seed=9) for i in range(round(AWAY / 0.5))))
-    assert (gone.confidence < 0.2).all()
+    return anchors
+
+
+def gone(look: Look = scene) -> Anchors:
+    """Those that are out of sight now: another tissue is there."""
+    anchors = pinned(look)
+    found = follow(anchors, *(look(2.5 + 0.5 * i, seed=9) for i in range(round(AWAY / 0.5))))
+    assert (found.confidence < 0.2).all()
     return anchors
 
 
@@ -92,7 +99,7 @@ def test_they_come_back_wherever_the_tissue_is(
     turn: float, scale: float, shift: tuple[float, float], kept: bool
 ) -> None:
     moved = motion(turn, scale, shift)
-    states = back(pinned(), moved=moved, depth=DEPTH / scale, kept=kept)
+    states = back(gone(), moved=moved, depth=DEPTH / scale, kept=kept)
     truth = np.array(PINNED) @ moved[:, :2].T + moved[:, 2]
     assert np.linalg.norm(states.pixels - truth, axis=1).max() < 1.0  # px
     assert (states.confidence > 0.7).all() and (states.visibility == 1).all()
@@ -102,10 +109,7 @@ def test_they_come_back_wherever_the_tissue_is(
 def test_a_new_model_is_told_before_they_come_back() -> None:
     """However its first frame falls between two looks: who takes the newest frame only must see it."""
     for more in range(6):  # tenths of a second: a look comes every five
-        anchors = Anchors()
-        for u, v in PINNED:
-            anchors.add_pixel(u, v, *scene(0))
-        follow(anchors, *(scene(0.1 * i) for i in range(1, 25 + more)))
+        anchors = pinned(frames=25 + more)
         start = 2.4 + 0.1 * more
         for i in range(1, 6):
             told = follow(anchors, scene(start + i / 30, kept=False))
@@ -125,14 +129,14 @@ def test_a_new_model_is_told_before_they_come_back() -> None:
 )
 def test_what_is_not_the_same_tissue_is_refused(how: dict[str, object]) -> None:
     """Better no anchor than one on another place."""
-    confidence = back(pinned(), **how).confidence
+    confidence = back(gone(), **how).confidence
     assert (confidence < 0.2).all(), confidence
 
 
 def test_along_an_edge_it_could_be_anywhere_and_does_not_say_to_be_sure() -> None:
     """Folds and vessels look alike along themselves."""
 
-    def edges(seconds: float, moved: float, seed: int = 0) -> Scene:
+    def edges(seconds: float, moved: float = 0, seed: int = 0) -> Scene:
         observation, *rest = scene(seconds, motion(0, 1, (moved, 0)), seed)
         gray = observation.gray.astype(np.float32)
         if seed == 0:
@@ -141,11 +145,7 @@ def test_along_an_edge_it_could_be_anywhere_and_does_not_say_to_be_sure() -> Non
         noise = np.random.default_rng(round(seconds * 1e3)).normal(0, 1, gray.shape)  # grey levels
         return replace(observation, gray=np.rint(gray + noise).clip(0, 255).astype(np.uint8)), *rest
 
-    anchors = Anchors()
-    for u, v in PINNED:
-        anchors.add_pixel(u, v, *edges(0, 0))
-    assert (follow(anchors, *(edges(0.1 * i, 0) for i in range(1, 25))).confidence > 0.9).all()
-    follow(anchors, *(edges(2.5 + 0.5 * i, 0, seed=9) for i in range(round(AWAY / 0.5))))
+    anchors = gone(edges)
     states = follow(anchors, *(edges(20 + 0.25 * i, 8.0) for i in range(12)))
     away = np.linalg.norm(states.pixels - np.add(PINNED, [8, 0]), axis=1)
     assert (states.confidence[away > 4] < 0.2).all() and (away > 4).sum() >= 3
@@ -164,7 +164,7 @@ def test_depth_is_what_the_model_or_the_frame_says_there_and_never_guessed() -> 
             replace(view, depth=nothing),
         )
 
-    anchors = pinned()
+    anchors = gone()
     states = follow(anchors, *(without_depth(20 + 0.25 * i, 0) for i in range(12)))
     assert (states.confidence > 0.7).tolist() == [False, True, False, False, False]
     assert states.points[1, 2] == pytest.approx(DEPTH, rel=1e-4)
@@ -173,36 +173,17 @@ def test_depth_is_what_the_model_or_the_frame_says_there_and_never_guessed() -> 
     assert states.points[:, 2] == pytest.approx(DEPTH, rel=1e-4)
 
 
-def test_nothing_is_looked_for_while_all_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would cost some milliseconds each time."""
-    anchors = Anchors()
-    anchors.add_pixel(160, 128, *scene(0))
-    monkeypatch.setattr(Recall, "look", lambda *_: pytest.fail("looked"))
-    follow(anchors, *(scene(0.2 * i) for i in range(1, 30)))
-
-
-def test_one_that_was_removed_does_not_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    remembered, ids = Recall(), np.arange(1, len(PINNED) + 1)
-    monkeypatch.setattr("sags_node.mapping.anchors.Recall", lambda: remembered)
-    anchors, (observation, *_) = pinned(), scene(0)
-    features = features_of(pyramid_of(observation), observation.tissue)
-
-    def recalled() -> int:
-        """How many anchors, by any of the images remembered: one at a time."""
-        return max(len(remembered.look(features, ids)) for _ in range(MOST_PICTURES))
-
-    assert recalled() == len(PINNED)
+def test_one_that_was_removed_does_not_come_back() -> None:
+    anchors = gone()
     for anchor in (1, 2, 3):
         anchors.remove(anchor)
-    assert back(anchors).ids.tolist() == [4, 5]
-    for anchor in (4, 5):
-        anchors.remove(anchor)
-    assert recalled() == 0
+    states = back(anchors)
+    assert states.ids.tolist() == [4, 5] and (states.confidence > 0.7).all()
 
 
 def test_the_first_state_of_the_tissue_is_not_forgotten() -> None:
     """However many others came after it."""
-    anchors = pinned()
+    anchors = gone()
     for seed in range(20, 40):
         anchors.add_pixel(160, 128, *scene(30 + 20 * seed, seed=seed))
         follow(anchors, *(scene(30 + 20 * seed + 0.1 * i, seed=seed) for i in range(1, 4)))

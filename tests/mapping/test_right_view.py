@@ -1,15 +1,14 @@
 """The right eye of a stereo display: beside the left image warped there, and what may not come into it."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from engine_scenes import rasterize
-from recorded_session import frames_of, opened, play
+from recorded_session import frames_of, fresh, opened, play
 
-from sags_node.detail.show import Detail
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
+from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapped import Mapped
 from sags_node.mapping.right_eye import right_eye_mask
@@ -18,14 +17,15 @@ from sags_node.messaging import published
 from sags_node.pipeline.pipeline import FrameRequest, Pipeline
 from sags_node.quality import metrics
 from sags_node.tools.evaluation.warp import warp_to_right
-from sags_node.types import F32, U8, Bool, Camera, FrameResult, Gaussians
+from sags_node.types import F32, U8, Bool, FrameResult
 
 FRAMES = 10
 FEW = "mapping.max_gaussians:=6000"
+Played = tuple[Pipeline, list[FrameResult]]
 
 
 @pytest.fixture(scope="module")
-def played() -> tuple[Pipeline, list[FrameResult]]:
+def played() -> Played:
     session = opened(f"source.frames:={FRAMES}", "publish.right:=true", FEW)
     results, _, pipeline = play(session, frames_of(session), steps=1)
     return pipeline, results
@@ -54,14 +54,8 @@ def shown(result: FrameResult) -> U8:
     return published.colours(result.views["right"], published.size_of(result.pair))
 
 
-def model_alone(result: FrameResult) -> U8:
-    """Of the right eye."""
-    camera = result.pair.camera.moved_right(result.pair.baseline)
-    return rasterize(result.snapshot.gaussians, camera).rgb
-
-
 def test_the_right_view_is_better_than_the_left_picture_warped_by_the_same_depth(
-    played: tuple[Pipeline, list[FrameResult]],
+    played: Played,
 ) -> None:
     shown, warped = np.mean([qualities(result) for result in played[1][FRAMES // 2 :]], axis=0)
     assert shown > warped + 0.5, (shown, warped)
@@ -71,10 +65,9 @@ def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
     """Nobody looks, then somebody does, goes, and comes again; beside it a run in which nobody ever does.
     The first image that is seen is better than the model alone."""
     looks = [False] * 4 + [True] * 4 + [False] * 2 + [True] * 2
-    session = opened(f"source.frames:={len(looks)}", FEW)
-    watched, alone = (Pipeline(session.config, session.rig) for _ in range(2))
+    watched, alone = fresh(FEW), fresh(FEW)
     came, looked = 0, False
-    for frame, look in zip(frames_of(session), looks, strict=True):
+    for frame, look in zip(frames_of(opened()), looks, strict=False):
         first, looked = look and not looked, look
         result = watched.process(frame, StepBudget(1), FrameRequest(right=look))
         other = alone.process(frame, StepBudget(1))
@@ -83,28 +76,26 @@ def test_it_is_drawn_while_somebody_looks_and_changes_nothing_else() -> None:
         assert "right" not in other.views
         if first:
             came += 1
-            assert quality(result, shown(result)) > quality(result, model_alone(result))
+            camera = result.pair.camera.moved_right(result.pair.baseline)
+            alone_there = rasterize(result.snapshot.gaussians, camera).rgb
+            assert quality(result, shown(result)) > quality(result, alone_there)
     assert came == 2
 
 
-def test_a_frame_is_drawn_before_its_right_picture_teaches(monkeypatch: pytest.MonkeyPatch) -> None:
-    called: list[str] = []
-    for kind, name in ((Detail, "view"), (Detail, "learn_aside"), (RightView, "draw"), (RightView, "learn")):
-        inner = getattr(kind, name)
-
-        def spied(*args: object, inner: Any = inner, name: str = name, **more: object) -> Any:
-            called.append(name)
-            return inner(*args, **more)
-
-        monkeypatch.setattr(kind, name, spied)
-    session = opened("source.frames:=3", FEW)
-    pipeline = Pipeline(session.config, session.rig)
-    for frame in frames_of(session):
-        called.append("frame")
-        pipeline.process(frame, StepBudget(1), FrameRequest(right=True))
-    frames = " ".join(called).split("frame")[1:]
-    assert all(calls.split()[:2] == ["draw", "view"] for calls in frames)
-    assert "learn_aside" in called and "learn" in called
+def test_a_right_picture_teaches_later_frames_only() -> None:
+    """The second of the right images is darker, and depth is given: it serves the right view alone."""
+    runs = []
+    for darker in (1.0, 0.9):
+        pipeline, views = fresh(FEW), []
+        for i, frame in enumerate(frames_of(opened("source.frames:=4"))):
+            right = (frame.right * (darker if i == 1 else 1.0)).astype(np.uint8)
+            depth = np.full(right.shape[:2], 0.07, np.float32)
+            result = pipeline.process(
+                replace(frame, right=right, depth=depth), StepBudget(1), FrameRequest(right=True)
+            )
+            views.append(shown(result))
+        runs.append(views)
+    assert [np.array_equal(*views) for views in zip(*runs, strict=True)] == [True, True, False, False]
 
 
 def test_who_comes_while_the_input_is_frozen_sees_something() -> None:
@@ -122,54 +113,37 @@ def test_who_comes_while_the_input_is_frozen_sees_something() -> None:
     assert np.array_equal(shown(after), shown(came))
 
 
-class Scene:
-    """The last frame of the fixture, drawn for the right eye again."""
-
-    def __init__(self, result: FrameResult) -> None:
-        self.result, self.count = result, len(result.snapshot.gaussians)
-        camera = result.pair.camera
-        self._rasterizer = make_rasterizer("numba", camera.width, camera.height)
-
-    def show(self, gaussians: Gaussians, camera: Camera) -> F32:
-        planes: F32 = self._rasterizer.forward(gaussians, camera)
-        return planes
-
-    def mapped(self, right_colors: float = 0.0) -> Mapped:
-        colors = np.full((self.count, 3), right_colors, np.float32)
-        return Mapped(replace(self.result.snapshot, right_colors=colors), self.result.views["left"])
-
-
-@pytest.fixture(scope="module")
-def scene(played: tuple[Pipeline, list[FrameResult]]) -> Scene:
-    return Scene(played[1][-1])
-
-
-def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain(
-    played: tuple[Pipeline, list[FrameResult]], scene: Scene
+def test_what_the_right_eye_sees_more_is_learnt_where_it_is_tissue_for_certain_and_fades_elsewhere(
+    played: Played,
 ) -> None:
-    """A right image that is brighter by 0.2 everywhere: Gaussians take over half of what lacks.
-    What is hidden from the right eye learns nothing."""
-    model, baseline = played[0].map.model, scene.result.pair.baseline
-    tissue = scene.result.observation.tissue.copy()
-    tissue[:100] = False
-    view = RightView()
-    drawn, mapped = view.draw(scene.mapped(), baseline, scene.show), scene.mapped()
+    """A right image that is brighter by 0.2 everywhere: Gaussians take over half of what lacks. What is not
+    seen again, as while the right eye is bad, is gone after two seconds."""
+    model, result, view = played[0].map.model, played[1][-1], RightView()
+    camera, baseline = result.pair.camera, result.pair.baseline
+    rasterizer = make_rasterizer("numba", camera.width, camera.height)
+    mapped = Mapped(result.snapshot, result.views["left"])
+    drawn = view.draw(mapped, baseline, rasterizer.forward)
     dim, bright = (np.full(drawn.rgb.shape, level, np.uint8) for level in (102, 153))  # 0.4, 0.6
-    model.right_colors[:] = 0
+    tissue = result.observation.tissue.copy()
+    tissue[:100] = False
+    rows = min(len(result.snapshot.gaussians), model.count)
+    same = np.flatnonzero(model.ids[:rows] == result.snapshot.gaussians.ids[:rows])
+    model.right_colors[:] = 0.2
     view.learn(drawn, dim, mapped, model, bright, tissue, baseline)
-    same = model.ids[: scene.count] == scene.result.snapshot.gaussians.ids[: model.count]
-    learnt = model.right_colors[: len(same)][same]
-    taken = (learnt > 0).all(1)
+    learnt = model.right_colors[same]
+    taken = (learnt > 0.2).all(1)
     assert taken.mean() > 0.2
-    np.testing.assert_allclose(learnt[taken], 0.1, atol=1e-4)
-    pixels = drawn.camera.K @ (
-        drawn.camera.viewmat[:3, :3] @ scene.result.snapshot.gaussians.means[: len(same)][same][taken].T
-        + drawn.camera.viewmat[:3, 3:]
-    )
-    assert (pixels[1] / pixels[2]).min() > 100 - 4
+    np.testing.assert_allclose(learnt[taken], 0.3, atol=1e-4)
+    np.testing.assert_allclose(learnt[~taken], 0.2 * FADING, atol=1e-4)
+    pixels, _ = project(drawn.camera, result.snapshot.gaussians.means[same][taken])
+    assert pixels[:, 1].min() > 100 - 4
+    model.right_colors[:] = 0.2
+    for _ in range(60 // LEARN_EVERY):
+        view.learn(drawn, dim, mapped, model, bright, np.zeros_like(tissue), baseline)
+    assert np.abs(model.right_colors[same]).max() < 0.04
 
 
-def test_what_was_learnt_grows_old_while_nobody_looks(played: tuple[Pipeline, list[FrameResult]]) -> None:
+def test_what_was_learnt_grows_old_while_nobody_looks(played: Played) -> None:
     """As it does where the eye sees nothing: who looks now and then keeps most, who comes after ten seconds
     begins anew."""
     model, view = played[0].map.model, RightView()
@@ -183,19 +157,3 @@ def test_what_was_learnt_grows_old_while_nobody_looks(played: tuple[Pipeline, li
         view.wake(model)
         left.append(float(np.abs(model.right_colors).max()))
     assert left[0] == pytest.approx(0.2 * FADING**3, rel=1e-5) and 0.15 < left[0] and left[1] < 1e-4
-
-
-def test_what_is_not_seen_again_is_gone_after_two_seconds(
-    played: tuple[Pipeline, list[FrameResult]], scene: Scene
-) -> None:
-    """While the right eye is bad nothing is learnt from it, and what it saw before is less and less shown."""
-    model, view = played[0].map.model, RightView()
-    right, baseline = scene.result.pair.right, scene.result.pair.baseline
-    drawn = view.draw(scene.mapped(), baseline, scene.show)
-    assert right is not None
-    model.right_colors[:] = 0.2
-    nothing = np.zeros_like(scene.result.observation.tissue)
-    for _ in range(60 // LEARN_EVERY):
-        view.learn(drawn, drawn.rgb, scene.mapped(), model, right, nothing, baseline)
-    same = model.ids[: scene.count] == scene.result.snapshot.gaussians.ids[: model.count]
-    assert np.abs(model.right_colors[: len(same)][same]).max() < 0.04

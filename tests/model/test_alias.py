@@ -1,8 +1,8 @@
-"""Images stay right at other sizes and distances; the 3D filter where it belongs; exports draw the same."""
+"""Images stay right at other sizes and distances; the 3D filter where it belongs."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,12 +10,10 @@ import pytest
 from engine_scenes import as_bytes, rasterize, round_gaussians
 from flat_scene import camera_in_front, flat_scene
 from following import Following
-from splat_files import splats_of
 
 from benchmarks.quality.alias import VARIANTS, Settings, Trained, train
 from benchmarks.quality.alias_truth import moved, resized
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.geometry import project
 from sags_node.mapping.budget import StepBudget
 from sags_node.mapping.mapped import Mapped
@@ -23,11 +21,9 @@ from sags_node.mapping.mapper import Mapper
 from sags_node.mapping.refiner import CpuRefiner
 from sags_node.mapping.tissue_map import TissueMap
 from sags_node.model.alias_free import FILTER_VARIANCE, smoothing_variances
-from sags_node.model.constant_colours import with_constant_colours
 from sags_node.model.gaussians import GaussianModel
-from sags_node.model.ply import write_ply
 from sags_node.quality.metrics import as_float, psnr
-from sags_node.types import F32, SH_DEGREE_0, Camera, Gaussians, Observation
+from sags_node.types import F32, Camera, Observation
 
 # ---- the 2D filter switched off ----------------------------------------------------------------------------
 
@@ -69,72 +65,44 @@ def pictured_wall(fine: F32) -> Observation:
     return dataclasses.replace(wall, image=as_bytes(shrunk(fine, 1)))
 
 
+Wall = tuple[Observation, dict[str, Trained]]
 SETTINGS = Settings(width=SIDE, height=SIDE, max_gaussians=8000, rounds=1)
 
 
 @pytest.fixture(scope="module")
-def wall() -> tuple[Observation, dict[str, Trained]]:
+def wall() -> Wall:
     observation = pictured_wall(texture())
     return observation, {name: train(observation, VARIANTS[name], SETTINGS) for name in ("both", "none")}
 
 
-def error_db(model: Trained, camera: Camera, truth: F32) -> float:
-    return psnr(model.draw(camera), truth, np.ones(truth.shape[:2], bool))
+def as_trained(observation: Observation) -> tuple[Camera, F32, slice]:
+    return observation.camera, as_float(observation.image), np.s_[:]
 
 
-def test_both_filters_beat_none_at_a_quarter_of_the_size(
-    wall: tuple[Observation, dict[str, Trained]],
-) -> None:
-    observation, models = wall
-    camera, truth = resized(observation.camera, 0.25), shrunk(texture(), 0.25)
-    assert error_db(models["both"], camera, truth) > error_db(models["none"], camera, truth) + 3
-    assert error_db(models["both"], camera, truth) > 32
+def smaller(observation: Observation) -> tuple[Camera, F32, slice]:
+    return resized(observation.camera, 0.25), shrunk(texture(), 0.25), np.s_[:]
 
 
-def test_both_filters_beat_none_from_four_times_the_distance(
-    wall: tuple[Observation, dict[str, Trained]],
-) -> None:
-    """The wall then fills a quarter of the image, as the small image shows it."""
-    observation, models = wall
-    camera = moved(observation.camera, np.array([0, 0, -3 * 0.08]))
+def from_afar(observation: Observation) -> tuple[Camera, F32, slice]:
+    """The wall fills a quarter of the image, as the small image shows it."""
     quarter, first = SIDE // 4, SIDE * 3 // 8
-    inside = slice(first + 2, first + quarter - 2)
-    truth = shrunk(texture(), 0.25)[2:-2, 2:-2]
-    counted = np.ones(truth.shape[:2], bool)
-    both, none = (
-        psnr(models[name].draw(camera)[inside, inside], truth, counted) for name in ("both", "none")
-    )
-    assert both > none + 3
+    camera = moved(observation.camera, np.array([0, 0, -3 * 0.08]))
+    return camera, shrunk(texture(), 0.25)[2:-2, 2:-2], slice(first + 2, first + quarter - 2)
 
 
-def test_filters_cost_nothing_at_the_trained_size(wall: tuple[Observation, dict[str, Trained]]) -> None:
+@pytest.mark.parametrize(
+    ("seen", "gain", "least"), [(smaller, 3.0, 32), (from_afar, 3.0, 0), (as_trained, -0.5, 30)]
+)
+def test_both_filters_beat_none_and_cost_nothing_at_the_trained_size(
+    wall: Wall, seen: Callable[[Observation], tuple[Camera, F32, slice]], gain: float, least: float
+) -> None:
     observation, models = wall
+    camera, truth, where = seen(observation)
+    everywhere = np.ones(truth.shape[:2], bool)
     both, none = (
-        error_db(models[name], observation.camera, as_float(observation.image)) for name in ("both", "none")
+        psnr(models[name].draw(camera)[where, where], truth, everywhere) for name in ("both", "none")
     )
-    assert both > 30
-    assert both > none - 0.5
-
-
-def light_of_a_line(factor: float) -> float:
-    """All light of one bright line 1.4 px thick, drawn `factor` times as large as it was trained, in pixels
-    of the trained size."""
-    camera = camera_in_front(128, 96, 500.0)
-    means = np.array([[0, 0, 0.08]], np.float32)
-    line = dataclasses.replace(
-        round_gaussians(means, 0.08 / 500, 1.0),
-        quats=np.array([[0.99, 0, 0, 0.14]], np.float32),
-        smoothing=smoothing_variances(means, [camera]),
-    )
-    line.scales[:] *= [15, 0.6, 0.1]  # px
-    view = resized(camera, factor)
-    planes = make_rasterizer("numba", view.width, view.height).forward(line, view)
-    return float(planes[0].sum(dtype=np.float64)) / factor**2
-
-
-@pytest.mark.parametrize("factor", [0.25, 0.5, 2, 4])
-def test_a_thin_bright_line_keeps_its_light(factor: float) -> None:
-    assert light_of_a_line(factor) == pytest.approx(light_of_a_line(1), rel=0.02)
+    assert both > none + gain and both > least
 
 
 # ---- the 3D filter's width ---------------------------------------------------------------------------------
@@ -146,45 +114,30 @@ def looking(focal: float, place: tuple[float, float, float] = (0, 0, 0)) -> Came
     return Camera(100, 80, np.array([[focal, 0, 50.0], [0, focal * 0.9, 40], [0, 0, 1]]), T)
 
 
-def test_variance_is_that_of_the_sampling_interval() -> None:
-    means = np.array([[0, 0, 0.08], [0, 0, 0.16], [0.01, -0.005, 0.04]], np.float32)
-    expected = FILTER_VARIANCE * (means[:, 2].astype(float) / 120) ** 2
-    np.testing.assert_allclose(smoothing_variances(means, [looking(120)]), expected, rtol=1e-5)
+def beside(u: float) -> tuple[float, float, float]:
+    """A point that the camera sees at that column."""
+    return (u - 50) / 120 * 0.04, 0, 0.04
 
 
-def test_the_camera_that_sees_finest_counts() -> None:
-    means = np.array([[0, 0, 0.08]], np.float32)
-    near = looking(120, (0, 0, 0.06))
-    assert smoothing_variances(means, [looking(120), near]) == pytest.approx(0.2 * (0.02 / 120) ** 2)
-    assert smoothing_variances(means, [near, looking(120)]) == pytest.approx(0.2 * (0.02 / 120) ** 2)
-    sharp = looking(480)
-    assert smoothing_variances(means, [looking(120), sharp]) == pytest.approx(0.2 * (0.08 / 480) ** 2)
+FAR, NEAR, ASIDE, BEHIND = (0, 0, 0.08), (0, 0, 0.04), (1, 0, 0.02), (0, 0, -0.02)
 
 
-def test_what_no_camera_sees_takes_the_widest_filter() -> None:
-    """Beside the image, behind the camera, not a number."""
-    means = np.array([[0, 0, 0.04], [0, 0, 0.08], [1, 0, 0.02], [0, 0, -0.02], [np.nan, 0, 1]], np.float32)
-    found = smoothing_variances(means, [looking(120)])
-    np.testing.assert_allclose(found[2:], found[1])
-    # a second camera that does see the point on the side
-    found = smoothing_variances(means, [looking(120), looking(120, (1, 0, 0.01))])
-    assert found[2] == pytest.approx(0.2 * (0.01 / 120) ** 2, rel=1e-4)
-
-
-def test_a_little_beyond_the_border_still_counts_as_seen() -> None:
-    def beside(u: float) -> F32:
-        return np.array([[0, 0, 0.08], [(u - 50) / 120 * 0.04, 0, 0.04]], np.float32)
-
-    inside, outside = (smoothing_variances(beside(u), [looking(120)]) for u in (-14.0, -16.0))
-    assert inside[1] == pytest.approx(inside[0] / 4, rel=1e-4)
-    assert outside[1] == outside[0]
-
-
-def test_nothing_seen_is_nothing_filtered() -> None:
-    assert smoothing_variances(np.zeros((0, 3), np.float32), [looking(120)]).shape == (0,)
-    behind = np.array([[0, 0, -1]], np.float32)
-    assert smoothing_variances(behind, [looking(120)]) == 0
-    assert smoothing_variances(behind, []) == 0
+def test_variance_is_that_of_the_finest_sampling_interval() -> None:
+    """What no camera sees (beside the image, behind the camera, not a number) takes the widest."""
+    one, closer, sharper, another = (
+        looking(120), looking(120, (0, 0, 0.06)), looking(480), looking(120, (1, 0, 0.01)),
+    )  # fmt: skip
+    for means, cameras, depths in (
+        ([FAR, NEAR, (0.01, -0.005, 0.16)], [one], [0.08, 0.04, 0.16]),
+        ([FAR], [one, closer], [0.02]), ([FAR], [closer, one], [0.02]), ([FAR], [one, sharper], [0.08 / 4]),
+        ([NEAR, FAR, ASIDE, BEHIND, (np.nan, 0, 1)], [one], [0.04, 0.08, 0.08, 0.08, 0.08]),
+        ([FAR, ASIDE], [one, another], [0.08, 0.01]),
+        ([FAR, beside(-14)], [one], [0.08, 0.04]), ([FAR, beside(-16)], [one], [0.08, 0.08]),
+        ([], [one], []), ([BEHIND], [one], [0]), ([BEHIND], [], [0]),
+    ):  # fmt: skip
+        found = smoothing_variances(np.array(means, np.float32).reshape(-1, 3), cameras)
+        expected = FILTER_VARIANCE * (np.array(depths) / 120) ** 2
+        np.testing.assert_allclose(found, expected, rtol=1e-4, err_msg=f"{means} from {len(cameras)}")
 
 
 # ---- in the mapper, and on the way out ---------------------------------------------------------------------
@@ -218,75 +171,24 @@ def test_first_scales_are_as_drawn_without_a_filter() -> None:
     np.testing.assert_allclose(np.median(filtered.scales, 0), np.median(plain.scales, 0), rtol=0.1)
 
 
-def begun() -> tuple[Mapper, Observation]:
+def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
+    """From farther away nothing is forgotten of what was seen from near by; and what the camera does not see
+    keeps its filter: from elsewhere all of it, from near by half of the tissue."""
     observation = pictured_wall(texture())
     mapper = Mapper(CpuRefiner(partial(make_rasterizer, "numba")), TissueMap(3000))
     mapper.update(observation, None, StepBudget(0))
-    return mapper, observation
-
-
-def test_the_filter_stays_as_narrow_as_the_nearest_look_was() -> None:
-    """From farther away nothing is forgotten of what was seen from near by."""
-    mapper, observation = begun()
-    before = mapper.model.smoothing.copy()
-    far = dataclasses.replace(
-        observation,
-        camera=moved(observation.camera, np.array([0, 0, -0.08])),
-        depth=observation.depth * 2,
-        tissue=np.zeros((SIDE, SIDE), bool),
-    )
-    mapper.update(far, None, StepBudget(0))
-    np.testing.assert_array_equal(mapper.model.smoothing, before)
-    near = dataclasses.replace(far, camera=moved(observation.camera, np.array([0, 0, 0.04])))
-    mapper.update(near, None, StepBudget(0))
-    assert (mapper.model.smoothing <= before).all()
-    assert mapper.model.smoothing.min() == pytest.approx(before.min() / 4, rel=0.1)
-
-
-def test_what_the_camera_does_not_see_keeps_its_filter() -> None:
-    """From near by half of the tissue is out of view; from elsewhere all of it."""
-    mapper, observation = begun()
-    before, means = mapper.model.smoothing.copy(), mapper.model.means.copy()
-    away = dataclasses.replace(observation, tissue=np.zeros((SIDE, SIDE), bool))
-    near = moved(observation.camera, np.array([0, 0, 0.06]))
-    for seen_from in (moved(observation.camera, np.array([1.0, 0, 0])), near):
-        mapper.update(dataclasses.replace(away, camera=seen_from), None, StepBudget(0))
-        np.testing.assert_array_equal(mapper.model.means, means)
-        pixels, _ = project(seen_from, means)
+    model = mapper.model
+    hidden = dataclasses.replace(observation, tissue=np.zeros((SIDE, SIDE), bool))
+    before, means = model.smoothing.copy(), model.means.copy()
+    for place, depth in ((0, 0, -0.08), 2), ((1.0, 0, 0), 1), ((0, 0, 0.06), 1):
+        camera = moved(observation.camera, np.array(place))
+        looked = dataclasses.replace(hidden, camera=camera, depth=depth * observation.depth)
+        mapper.update(looked, None, StepBudget(0))
+        np.testing.assert_array_equal(model.means, means)
+        pixels, _ = project(camera, means)
         outside = (np.abs(pixels - SIDE / 2) > 0.7 * SIDE).any(1)  # farther than the margin
-        assert outside.mean() > 0.3
-        np.testing.assert_array_equal(mapper.model.smoothing[outside], before[outside])
-        assert (mapper.model.smoothing > 0).all()
+        unchanged = outside if place[2] > 0 else np.ones_like(outside)
+        np.testing.assert_array_equal(model.smoothing[unchanged], before[unchanged])
     inside = (np.abs(pixels - SIDE / 2) < 0.5 * SIDE).all(1)
-    assert inside.any() and (mapper.model.smoothing[inside] < 0.5 * before[inside]).all()
-
-
-def test_a_ply_file_draws_the_same_without_knowing_the_filter(tmp_path: Path) -> None:
-    model, _, observation = mapped(smoothing=True)
-    file = tmp_path / "model.ply"
-    write_ply(file, model.gaussians())
-    rows = splats_of(file)
-
-    def columns(*wanted: str) -> F32:
-        return np.stack([rows[name] for name in wanted], 1)
-
-    read = Gaussians(
-        means=columns("x", "y", "z"),
-        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
-        opacities=1 / (1 + np.exp(-rows["opacity"])),
-        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_DEGREE_0) + np.float32(0.5),
-        ids=np.arange(len(rows["x"])),
-    )
-    written = with_constant_colours(model.gaussians())
-    found, drawn = rasterize(read, observation.camera), rasterize(written, observation.camera)
-    step = 1 / 255  # a logit's last bit may carry a pixel over the cut-off
-    apart = np.abs(found.rgb.astype(int) - drawn.rgb)
-    assert apart.max() <= 1 and apart.mean() < 1e-3
-    np.testing.assert_allclose(found.alpha, drawn.alpha, atol=step)
-
-
-def test_folding_twice_changes_nothing() -> None:
-    model, _, _ = mapped(smoothing=True)
-    once = bake_filter(model.gaussians())
-    assert bake_filter(once) is once
+    assert outside.mean() > 0.3 and inside.any()
+    np.testing.assert_allclose(model.smoothing[inside], before[inside] / 16, rtol=0.1)

@@ -3,10 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-from engine_scenes import camera
+from engine_scenes import camera, round_gaussians
+from flat_scene import flat_means
 
 from sags_node.engine.rasterizer.rasterize import make_rasterizer
-from sags_node.geometry import unproject
 from sags_node.model.constant_colours import with_constant_colours
 from sags_node.types import F32, Gaussians
 
@@ -21,19 +21,14 @@ def drawn(gaussians: Gaussians) -> F32:
 
 def scene() -> Gaussians:
     """Flat Gaussians side by side, 7 cm away, as those of tissue."""
-    y, x = np.mgrid[4 : VIEW.height : 6, 4 : VIEW.width : 6].reshape(2, -1)
-    count, rng = len(x), np.random.default_rng(2)
-    pixel = 0.07 / VIEW.K[0, 0]
-    places = np.stack([x, y], 1).astype(np.float32)
-    return Gaussians(
-        means=unproject(VIEW, places, np.full(count, 0.07, np.float32)).astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=(pixel * rng.uniform([2, 2, 0.5], [3.5, 3.5, 1], (count, 3))).astype(np.float32),
-        opacities=rng.uniform(0.2, 0.5, count).astype(np.float32),
-        colors=rng.uniform(0.3, 0.7, (count, 3)).astype(np.float32),
-        ids=np.arange(count),
-        depth_errors=np.ones(count, np.float32),
-        slopes=(rng.normal(0, 0.06, (count, 3)) * [1, 0, 0]).astype(np.float32),
+    rng, means = np.random.default_rng(2), flat_means(VIEW, 0.07, 6.0)
+    pixel, shape = 0.07 / VIEW.K[0, 0], means.shape
+    return replace(
+        round_gaussians(means, pixel, rng.uniform(0.3, 0.7, shape)),
+        scales=(pixel * rng.uniform([2, 2, 0.5], [3.5, 3.5, 1], shape)).astype(np.float32),
+        opacities=rng.uniform(0.2, 0.5, len(means)).astype(np.float32),
+        depth_errors=np.ones(len(means), np.float32),
+        slopes=(rng.normal(0, 0.06, shape) * [1, 0, 0]).astype(np.float32),
     )
 
 

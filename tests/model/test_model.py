@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from splat_files import splats_of
 
+from sags_node.engine.rasterizer.smoothing import bake_filter
 from sags_node.errors import SagsError
 from sags_node.model import deformation as deformation_module
 from sags_node.model.deformation import NodeDeformation
@@ -38,15 +39,13 @@ def filled_model_with_nodes(nodes: int) -> tuple[GaussianModel, NodeDeformation]
 def test_removal_keeps_every_row_with_its_identity() -> None:
     model = filled_model(patch(100))
     model.colors[:, 0] = np.arange(100)
-    before = {int(i): m.copy() for i, m in zip(model.ids, model.means, strict=True)}
     dead = np.zeros(100, bool)
     dead[[0, 3, 50, 98, 99]] = True
+    means = model.means.copy()
     assert model.remove(dead) == 5
-    assert model.count == 95
-    assert set(model.ids) == set(range(100)) - {0, 3, 50, 98, 99}
-    for i, mean, color in zip(model.ids, model.means, model.colors, strict=True):
-        assert np.array_equal(mean, before[int(i)])
-        assert color[0] == i
+    assert model.count == 95 and set(model.ids) == set(np.flatnonzero(~dead))
+    np.testing.assert_array_equal(model.means, means[model.ids])
+    np.testing.assert_array_equal(model.colors[:, 0], model.ids)
 
 
 def test_capacity_is_never_exceeded_and_ids_are_never_reused() -> None:
@@ -116,13 +115,27 @@ def test_new_tissue_far_away_gets_nodes_of_its_own() -> None:
 
 
 def test_ply_holds_what_viewers_expect_and_nothing_is_overwritten(tmp_path: Path) -> None:
+    """The 3D filter is folded in: they do not know it."""
     model = filled_model(patch(7))
-    file = tmp_path / "model.ply"
-    write_ply(file, model.snapshot())
+    model.quats[:] = np.random.default_rng(0).normal(size=(7, 4))
+    model.colors[:] = np.random.default_rng(1).uniform(0, 1, (7, 3))
+    model.smoothing[:] = 1e-8  # m^2
+    file, seen = tmp_path / "model.ply", bake_filter(model.gaussians())
+    write_ply(file, model.gaussians())
     table = splats_of(file)
-    assert len(table["x"]) == 7
-    assert np.allclose(np.exp(table["scale_0"]), 2e-4)
-    assert np.allclose(1 / (1 + np.exp(-table["opacity"])), 0.9)
-    assert np.allclose(0.5 + 0.28209479 * table["f_dc_1"], 0.5)
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([table[name] for name in names], 1)
+
+    assert (seen.scales > 1.05 * model.scales).all()
+    np.testing.assert_allclose(columns("x", "y", "z"), seen.means)
+    np.testing.assert_allclose(np.exp(columns("scale_0", "scale_1", "scale_2")), seen.scales, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-table["opacity"])), seen.opacities, rtol=1e-5)
+    colors = 0.5 + 0.28209479 * columns("f_dc_0", "f_dc_1", "f_dc_2")
+    np.testing.assert_allclose(colors, seen.colors, atol=1e-5)
+    quats = columns("rot_0", "rot_1", "rot_2", "rot_3")
+    np.testing.assert_allclose(
+        quats, seen.quats / np.linalg.norm(seen.quats, axis=1, keepdims=True), atol=1e-6
+    )
     with pytest.raises(SagsError, match="exists already"):
         write_ply(file, model.snapshot())
