@@ -10,7 +10,10 @@ import pytest
 from flat_scene import Scene, camera_in_front, flat_means, flat_scene
 
 from sags_node.mapping.anchors import Anchors
+from sags_node.mapping.recall import MOST_PICTURES, Recall
 from sags_node.types import AnchorStates
+from sags_node.vision.landmarks import features_of
+from sags_node.vision.pyramid import pyramid_of
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 320, 256, 250.0, 0.08
 CENTRE = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
@@ -173,12 +176,31 @@ def test_depth_is_what_the_model_or_the_frame_says_there_and_never_guessed() -> 
     assert states.points[:, 2] == pytest.approx(DEPTH, rel=1e-4)
 
 
-def test_one_that_was_removed_does_not_come_back() -> None:
-    anchors = gone()
+def test_nothing_is_looked_for_while_all_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would cost some milliseconds each time."""
+    anchors = Anchors()
+    anchors.add_pixel(160, 128, *scene(0))
+    monkeypatch.setattr(Recall, "look", lambda *_: pytest.fail("looked"))
+    follow(anchors, *(scene(0.2 * i) for i in range(1, 30)))
+
+
+def test_one_that_was_removed_does_not_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    remembered, ids = Recall(), np.arange(1, len(PINNED) + 1)
+    monkeypatch.setattr("sags_node.mapping.anchors.Recall", lambda: remembered)
+    anchors, (observation, *_) = gone(), scene(0)
+    features = features_of(pyramid_of(observation), observation.tissue)
+
+    def recalled() -> int:
+        """How many anchors, by any of the images remembered: one at a time."""
+        return max(len(remembered.look(features, ids)) for _ in range(MOST_PICTURES))
+
+    assert recalled() == len(PINNED)
     for anchor in (1, 2, 3):
         anchors.remove(anchor)
-    states = back(anchors)
-    assert states.ids.tolist() == [4, 5] and (states.confidence > 0.7).all()
+    assert back(anchors).ids.tolist() == [4, 5]
+    for anchor in (4, 5):
+        anchors.remove(anchor)
+    assert recalled() == 0
 
 
 def test_the_first_state_of_the_tissue_is_not_forgotten() -> None:
