@@ -25,9 +25,10 @@ def eye_of(rgb: U8) -> int:
     return int(rgb[..., 2].mean() > 100)
 
 
-def write_png(file: Path, rgb: U8) -> None:
+def write_png(file: Path, shown: np.ndarray) -> None:
+    """RGB [H, W, 3], or grey [H, W]."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(file), rgb[..., ::-1])
+    assert cv2.imwrite(str(file), shown[..., ::-1] if shown.ndim == 3 else shown)
 
 
 def write_video(file: Path, pictures: list[U8], rate: float = 25.0, codec: str = "MJPG") -> Path:

@@ -11,11 +11,16 @@ from places import HELPERS
 
 
 @contextmanager
-def sending(command: Sequence[object], **variables: str) -> Iterator[subprocess.Popen[bytes]]:
+def sending(
+    command: Sequence[object], stderr: int | None = None, **variables: str
+) -> Iterator[subprocess.Popen[bytes]]:
     """A process that sends; has begun when this returns, since imports take seconds."""
     words, environment = [str(word) for word in command], {**os.environ, **variables}
-    with killed(subprocess.Popen(words, env=environment, stdout=subprocess.PIPE)) as process:
-        assert process.stdout is not None and process.stdout.readline() == b"sending\n"
+    started = subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=stderr)
+    with killed(started) as process:
+        assert process.stdout is not None
+        while (line := process.stdout.readline()) != b"sending\n":
+            assert line, "it has ended"
         yield process
 
 

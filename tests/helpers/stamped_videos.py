@@ -45,6 +45,7 @@ def write(
     matrix: int | None = None,
     told: tuple[int, int] | None = None,
     ticks: int = TICKS,
+    turned: tuple[int, bool] = (0, False),
 ) -> Path:
     """A video of one stream.
 
@@ -52,6 +53,7 @@ def write(
         seconds: when each image is shown; default: at the rate.
         matrix: ITU code by which RGB becomes YUV; default: FFmpeg's, BT.601.
         ticks: of which stamps are multiples, 1/s.
+        turned: how a player is to show it: by so many degrees, and mirrored.
         told: codes of matrix and range that the file is tagged with; default: none.
     """
     with av.open(str(file), "w", format=format, options=muxer or {}) as container:
@@ -61,6 +63,8 @@ def write(
                 stream = container.add_stream(codec, rate)
                 stream.height, stream.width = picture.shape[:2]
                 stream.pix_fmt, stream.options = pixels, options or {}
+                if any(turned):
+                    stream.set_display_rotation(turned[0], hflip=turned[1])
                 if seconds is not None:
                     stream.codec_context.time_base = Fraction(1, ticks)
                 if aspect is not None:

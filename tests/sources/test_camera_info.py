@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import bag_files as files
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from bag_files import BASELINE, HEIGHT, MS, ROS2, START, WIDTH, Row, eye_of, picture, play
 from command_line import ran
+from numbered_pictures import write_png
 from places import SESSION
 
 from sags_node.config.launch_file import load_launch
@@ -20,7 +22,7 @@ from sags_node.sources.pictures import read_picture
 from sags_node.sources.rectified import as_named, named_rectified
 from sags_node.tools.calibration.guess import guess_rig
 from sags_node.tools.importing.check import check_folder, overrides_of
-from sags_node.types import Eye, RectifiedPair, StereoFrame, StereoRig
+from sags_node.types import U8, Eye, StereoFrame, StereoRig
 from sags_node.vision.rectify import Rectifier
 
 # ---- images that are rectified already -----------------------------------------------------------------
@@ -68,39 +70,62 @@ def test_a_calibration_that_does_not_say_P_is_told_of(
     assert ("does not say how images were rectified" in caplog.text) != says_P
 
 
+Shown = Sequence[tuple[U8, U8]]  # images of the left and the right eye
+Scope = tuple[StereoRig, Shown, Shown]
+
+
 @pytest.fixture(scope="module")
-def scope() -> tuple[StereoRig, list[StereoFrame], list[RectifiedPair]]:
-    """Turned eyes with distortion: frames as their cameras give them, and rectified."""
+def scope() -> Scope:
+    """Turned eyes with distortion: images as their cameras give them, and rectified."""
     rig = load_rig(SESSION / "calib")
-    frames = []
+    rectifier = Rectifier(rig, rig.left.width, rig.left.height)
+    raw, rectified = [], []
     for index in (0, 20):
         left, right = (read_picture(SESSION / f"{side}/{index:04}.jpg") for side in ("left", "right"))
-        frames.append(StereoFrame(index, 0, 0, left, right))
-    rectifier = Rectifier(rig, rig.left.width, rig.left.height)
-    return rig, frames, [rectifier(frame) for frame in frames]
+        pair = rectifier(StereoFrame(index, 0, 0, left, right))
+        raw.append((left, right))
+        rectified.append((pair.left, pair.right))
+    return rig, raw, rectified
 
 
-Pairs = Sequence[StereoFrame | RectifiedPair]
+NOTHING = 0, 0, 0, 0
 
 
-def bag(folder: Path, rig: StereoRig, pairs: Pairs, name: str) -> tuple[Path, list[str]]:
+def bag_of(
+    folder: Path,
+    said: Sequence[tuple[Eye, Eye]],
+    shown: Shown = (),
+    name: str = "image_raw",
+    ahead_ms: int = 0,
+    rois: Sequence[tuple[int, int, int, int]] = (NOTHING, NOTHING),
+    **options: object,
+) -> Path:
+    """A bag whose camera_info says one after the other of these, if any, each with a pair of images of one
+    moment; the right one is stamped by a clock that may be ahead."""
     rows: list[Row] = []
-    for number, pair in enumerate(pairs):
-        for side, eye, rgb in (("left", rig.left, pair.left), ("right", rig.right, pair.right)):
-            assert rgb is not None
-            stamp = START + number * 40 * MS
-            rows.append((f"/rig/{side}/{name}", files.image(ROS2, rgb, stamp), stamp))
-            rows.append((f"/rig/{side}/camera_info", files.camera_info(ROS2, stamp, eye), stamp))
-    return files.write_rosbag2(folder / "bag", rows), []
+    for number, pair in enumerate(shown or numbered(len(said))):
+        taken = START + number * 40 * MS
+        for eye, side in enumerate(("left", "right")):
+            stamp = taken + eye * ahead_ms * MS
+            if said:
+                info = files.camera_info(ROS2, stamp, said[number][eye], roi=rois[eye], **options)
+                rows.append((f"/rig/{side}/camera_info", info, taken))
+            rows.append((f"/rig/{side}/{name}", files.image(ROS2, pair[eye], stamp), taken))
+    return files.write_rosbag2(folder / "bag", rows)
 
 
-def folders(folder: Path, rig: StereoRig, pairs: Pairs, name: str) -> tuple[Path, list[str]]:
-    for number, pair in enumerate(pairs):
-        for side, rgb in (("left", pair.left), ("right", pair.right)):
-            assert rgb is not None
-            file = folder / name.format(side) / f"{number}.png"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(file), rgb[..., ::-1])
+def numbered(count: int) -> list[tuple[U8, U8]]:
+    return [(picture(number, 0), picture(number, 1)) for number in range(count)]
+
+
+def bag(folder: Path, rig: StereoRig, shown: Shown, name: str) -> tuple[Path, list[str]]:
+    return bag_of(folder, [(rig.left, rig.right)] * len(shown), shown, name), []
+
+
+def folders(folder: Path, rig: StereoRig, shown: Shown, name: str) -> tuple[Path, list[str]]:
+    for number, pair in enumerate(shown):
+        for side, rgb in zip(("left", "right"), pair, strict=True):
+            write_png(folder / name.format(side) / f"{number}.png", rgb)
     save_rig(rig, folder / "calib")
     return folder, overrides_of(folder)
 
@@ -109,9 +134,7 @@ def folders(folder: Path, rig: StereoRig, pairs: Pairs, name: str) -> tuple[Path
     ("write", "name"),
     [(bag, "image_rect"), (bag, "image_rect_color"), (folders, "{}_rectified"), (folders, "{}")],
 )
-def test_what_is_rectified_already_is_never_rectified_twice(
-    scope: tuple[StereoRig, list[StereoFrame], list[RectifiedPair]], tmp_path: Path, write, name: str
-) -> None:
+def test_nothing_is_rectified_twice(scope: Scope, tmp_path: Path, write: Any, name: str) -> None:
     """By its name, or without one by its rows. A rectifier then has nothing to do, and depth is right."""
     rig, raw, rectified = scope
     path, overrides = write(tmp_path / "case", rig, rectified, name)
@@ -129,9 +152,7 @@ def test_what_is_rectified_already_is_never_rectified_twice(
     assert open_session(path, [*overrides, "source.pace:=step"]).rig.left.distortion.any()
 
 
-def test_a_calibration_that_was_made_with_rectified_pictures_stays_as_it_is(
-    scope: tuple[StereoRig, list[StereoFrame], list[RectifiedPair]], tmp_path: Path
-) -> None:
+def test_a_calibration_made_with_rectified_pictures_stays_as_it_is(scope: Scope, tmp_path: Path) -> None:
     rig, _, rectified = scope
     left, right = (
         replace(eye, K=np.diag([1.1, 1.1, 1]) @ eye.P[:, :3], R=np.eye(3), distortion=np.zeros(5))
@@ -144,39 +165,23 @@ def test_a_calibration_that_was_made_with_rectified_pictures_stays_as_it_is(
 # ---- camera_info -----------------------------------------------------------------------------------------
 
 
-def said_bag(
-    folder: Path,
-    said: Sequence[tuple[Eye, Eye]],
-    rois: Sequence[tuple[int, int, int, int]] = 2 * [(0, 0, 0, 0)],
-    **options: object,
-) -> Path:
-    """A bag whose camera_info says one after the other of these, each with a pair of images."""
-    rows: list[Row] = []
-    for number, eyes in enumerate(said):
-        stamp = START + number * 40 * MS
-        for eye, side in enumerate(("left", "right")):
-            info = files.camera_info(ROS2, stamp, eyes[eye], roi=rois[eye], **options)
-            rows.append((f"/rig/{side}/camera_info", info, stamp))
-            rows.append((f"/rig/{side}/image_raw", files.image(ROS2, picture(number, eye), stamp), stamp))
-    return files.write_rosbag2(folder / "bag", rows)
-
-
-def eyes(focal: float) -> tuple[Eye, Eye]:
-    return eye_of(0, focal), eye_of(1, focal)
-
-
-def zeros() -> tuple[Eye, Eye]:
-    left, right = (replace(eye, K=0 * eye.K, R=0 * eye.R, P=0 * eye.P) for eye in eyes(80.0))
+def eyes(focal: float = 80.0, factor: float = 1.0, **changed: int) -> tuple[Eye, Eye]:
+    """Both, of a sensor that may have another size; their matrices times a factor."""
+    left, right = (
+        replace(eye, K=factor * eye.K, R=factor * eye.R, P=factor * eye.P, **changed)
+        for eye in (eye_of(0, focal), eye_of(1, focal))
+    )
     return left, right
 
 
 def test_zeros_are_passed_over(tmp_path: Path) -> None:
-    path = said_bag(tmp_path, [zeros(), zeros(), eyes(80.0), zeros(), eyes(80.0)])
+    zeros = eyes(factor=0)
+    path = bag_of(tmp_path, [zeros, zeros, eyes(), zeros, eyes()])
     assert open_session(path).rig.left.K[0, 0] == 80
 
 
 def test_a_calibration_that_changes_is_refused_and_its_parts_can_be_played(tmp_path: Path) -> None:
-    path = said_bag(tmp_path, [eyes(100.0)] * 2 + [eyes(80.0)] * 3)
+    path = bag_of(tmp_path, [eyes(100.0)] * 2 + [eyes(80.0)] * 3)
     with pytest.raises(UsageError, match=r"changes while it is played .*0\.08 s .*fx 100 to 80 px") as error:
         open_session(path)
     remedies = [word.strip(",") for word in str(error.value).split() if ":=" in word]
@@ -191,98 +196,79 @@ def test_a_calibration_that_changes_is_refused_and_its_parts_can_be_played(tmp_p
 
 def test_what_is_read_out_and_binned(tmp_path: Path) -> None:
     """A point of the sensor lies in the image where offset and division put it, REP 104: the middle of the
-    first binned pixel is the middle of 2 x 3 pixels of the sensor."""
-    sensor = [replace(eye, width=160, height=200) for eye in eyes(80.0)]
-    roi, binning = (20, 30, 2 * WIDTH, 3 * HEIGHT), (2, 3)
-    path = said_bag(tmp_path, [(sensor[0], sensor[1])], [roi, roi], binning=binning)
-    rig = open_session(path).rig
+    first binned pixel is the middle of 2 x 3 pixels of the sensor. The right eye begins two columns later."""
+    sensor = eyes(width=160, height=200)
+    rois = [(20 + more, 30, 2 * WIDTH, 3 * HEIGHT) for more in (0, 4)]
+    rig = open_session(bag_of(tmp_path, [sensor], rois=rois, binning=(2, 3))).rig
     assert (rig.left.width, rig.left.height) == (WIDTH, HEIGHT)
     ray = np.array([0.21, -0.13, 1.0])
-    at = (sensor[0].K @ ray)[:2]
-    expected = ((at - [20, 30]) - [0.5, 1.0]) / [2, 3]
-    for matrix in (rig.left.K, rig.left.P[:, :3]):
-        np.testing.assert_allclose((matrix @ ray)[:2], expected)
+    for eye, raw, columns in ((rig.left, sensor[0], 20), (rig.right, sensor[1], 24)):
+        expected = ((raw.K @ ray)[:2] - [columns, 30] - [0.5, 1.0]) / [2, 3]
+        for matrix in (eye.K, eye.P[:, :3]):
+            np.testing.assert_allclose((matrix @ ray)[:2], expected)
     assert rig.baseline == pytest.approx(BASELINE)
-    impossible = said_bag(tmp_path / "b", [(sensor[0], sensor[1])], 2 * [(150, 0, 20, 20)])
-    with pytest.raises(UsageError, match=r"roi 150,0 20x20 .* is no part of 160x200 px"):
-        open_session(impossible)
 
 
-def test_eyes_that_read_out_other_rows_are_told_so_and_other_columns_are_applied(tmp_path: Path) -> None:
-    left, right = (replace(eye, width=2 * WIDTH, height=2 * HEIGHT) for eye in eyes(80.0))
-    size = WIDTH, HEIGHT
-    columns = said_bag(tmp_path / "a", [(left, right)], [(3, 9, *size), (5, 9, *size)])
-    rig = open_session(columns).rig
-    assert rig.left.P[0, 2] - rig.right.P[0, 2] == left.P[0, 2] - right.P[0, 2] + 2
-    rows = said_bag(tmp_path / "b", [(left, right)], [(3, 9, *size), (3, 4, *size)])
-    with pytest.raises(UsageError, match=r"begin 5 rows apart \(roi.*same rows.*or calibrate .*set rig"):
-        open_session(rows)
-    save_rig(rig, tmp_path / "told")
-    assert open_session(rows, [f"rig:={tmp_path / 'told'}"]).rig.right.P[1, 2] == rig.right.P[1, 2]
+SENSOR, SIZE = eyes(width=2 * WIDTH, height=2 * HEIGHT), (WIDTH, HEIGHT)
 
 
-@pytest.mark.parametrize("model", ["equidistant", "fisheye", "kannala_brandt4"])
-def test_other_models_are_refused(model: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=f"distortion model '{model}' is not supported"):
-        open_session(said_bag(tmp_path, [eyes(80.0)], model=model))
-
-
-def test_turned_pictures_need_a_calibration_of_their_own(tmp_path: Path) -> None:
-    """As images that are cut need one: camera_info is of what the cameras send."""
-    path, turned = said_bag(tmp_path, [eyes(80.0)]), "source.geometry.flip:=both"
-    with pytest.raises(UsageError, match=r"camera_info is of .*flip: both turns .*leave flip out.*set rig"):
-        open_session(path, [turned])
-    save_rig(open_session(path).rig, tmp_path / "rig")
-    assert open_session(path, [turned, f"rig:={tmp_path / 'rig'}"]).rig.left.K[0, 0] == 80
+@pytest.mark.parametrize(
+    ("said", "how", "words"),
+    [
+        *((eyes(), {"model": model}, f"distortion model '{model}' is not supported")
+          for model in ("equidistant", "fisheye", "kannala_brandt4")),
+        (SENSOR, {"rois": 2 * [(120, 0, 20, 20)]}, r"roi 120,0 20x20 .* is no part of 128x96 px"),
+        (SENSOR, {"rois": [(3, 9, *SIZE), (3, 4, *SIZE)]},
+         r"begin 5 rows apart \(roi.*same rows.*or calibrate .*set rig"),
+        # As images that are cut need a calibration of their own: camera_info is of what the cameras send.
+        (eyes(), {}, r"camera_info is of .*flip: both turns .*leave flip out.*set rig"),
+    ],
+)  # fmt: skip
+def test_camera_info_that_does_not_fit_is_refused_where_no_calibration_is_told(
+    said: tuple[Eye, Eye], how: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    path = bag_of(tmp_path, [said], **how)
+    turned = [] if how else ["source.geometry.flip:=both"]
+    with pytest.raises(UsageError, match=words):
+        open_session(path, turned)
+    save_rig(StereoRig("told", *eyes()), tmp_path / "told")
+    assert open_session(path, [*turned, f"rig:={tmp_path / 'told'}"]).rig.left.K[0, 0] == 80
 
 
 # ---- topics and clocks -----------------------------------------------------------------------------------
 
 
-def test_a_topic_of_both_eyes_is_split_as_a_live_one(tmp_path: Path) -> None:
+def topic_of_both(folder: Path, high: int = 1) -> Path:
+    """Beside each other."""
     rows: list[Row] = []
-    for number in range(3):
-        both = np.concatenate([picture(number, 0), picture(number, 1)], axis=1)
+    for number, pair in enumerate(numbered(3)):
+        both = np.repeat(np.hstack(pair), high, axis=0)
         rows.append(("/scope/image_raw", files.image(ROS2, both, START + number * 40 * MS), START))
-    path = files.write_rosbag2(tmp_path / "bag", rows)
+    return files.write_rosbag2(folder / "bag", rows)
+
+
+def test_a_topic_of_both_eyes_is_split_as_a_live_one(tmp_path: Path) -> None:
+    path = topic_of_both(tmp_path)
     with pytest.raises(UsageError, match=r"source\.geometry\.layout"):
         play(path)
-    for said in ({}, {"left": "scope/image_raw"}):
-        frames = play(path, geometry={"layout": "side_by_side"}, **said)
-        for number, frame in enumerate(frames):
-            assert np.array_equal(frame.left, picture(number, 0))
-            assert frame.right is not None and np.array_equal(frame.right, picture(number, 1))
-    right_first = play(path, geometry={"layout": "side_by_side", "first": "right"})
-    assert np.array_equal(right_first[0].left, picture(0, 1))
+    for first, said in ((0, {}), (0, {"left": "scope/image_raw"}), (1, {})):
+        geometry = {"layout": "side_by_side", "first": ("left", "right")[first]}
+        for number, frame in enumerate(play(path, geometry=geometry, **said)):
+            assert np.array_equal(frame.left, picture(number, first))
+            assert frame.right is not None and np.array_equal(frame.right, picture(number, 1 - first))
 
 
 def test_squeezed_eyes_of_a_topic_are_told_of_and_guessed_so(tmp_path: Path) -> None:
-    """Beside each other, each at half of its width, as a 3D mixer sends them."""
-    rows: list[Row] = []
-    for number in range(3):
-        eyes = (np.repeat(picture(number, eye), 2, axis=0) for eye in (0, 1))
-        rows.append(("/scope/image_raw", files.image(ROS2, np.hstack([*eyes]), START + number * MS), START))
-    bag, said = files.write_rosbag2(tmp_path / "bag", rows), ["source.geometry.layout:=side_by_side"]
-    config = load_launch(bag, said)
+    """Each at half of its width, as a 3D mixer sends them."""
+    bag, said = topic_of_both(tmp_path, high=2), ["source.geometry.layout:=side_by_side"]
     assert any("2 times as wide as high" in finding.what for finding in check_folder(bag, said))
-    K = guess_rig(config.source).left.K
+    K = guess_rig(load_launch(bag, said).source).left.K
     assert K[1, 1] == 2 * K[0, 0]
-
-
-def clocks(folder: Path, count: int, ahead_ms: int) -> Path:
-    """Images of one moment in both eyes, of which the right one is stamped by a clock that is ahead."""
-    rows: list[Row] = []
-    for number in range(count):
-        for eye, side in enumerate(("left", "right")):
-            taken = START + number * 40 * MS
-            message = files.image(ROS2, picture(number, eye), taken + eye * ahead_ms * MS)
-            rows.append((f"/rig/{side}/image_raw", message, taken))
-    return files.write_rosbag2(folder / "bag", rows)
 
 
 @pytest.mark.parametrize("ahead_ms", [-400, 400, 3200, 3_600_000])
 def test_clocks_that_differ_are_told_and_can_be_set(ahead_ms: int, tmp_path: Path) -> None:
-    path = clocks(tmp_path, 100, ahead_ms)
+    path = bag_of(tmp_path, [], numbered(100), ahead_ms=ahead_ms)
     said = [finding for finding in check_folder(path) if "source.clocks:=two" in finding.fix]
     assert len(said) == 1 and "clocks" in said[0].what
     for number, frame in enumerate(play(path, clocks="two")):

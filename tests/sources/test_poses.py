@@ -29,6 +29,7 @@ from sags_node.sources.robot import Posed, open_robot, rectified
 from sags_node.types import F64, StereoFrame
 
 MS, S = 1_000_000, 1_000_000_000
+Sample = tuple[float, int]  # place along x, m; time, ns
 
 
 def shifted(x: float) -> F64:
@@ -37,11 +38,15 @@ def shifted(x: float) -> F64:
     return T
 
 
-def moving(seconds: float = 3.0, rate: int = 50, begun: int = 0) -> PoseTrack:
-    """A scope that moves by 0.1 m/s."""
+def moving(seconds: float, begun: int = 0) -> list[Sample]:
+    """Of a scope that moves by 0.1 m/s."""
+    return [(0.002 * number, begun + number * 20 * MS) for number in range(round(seconds * 50))]
+
+
+def track_of(samples: list[Sample]) -> PoseTrack:
     track = PoseTrack()
-    for number in range(round(seconds * rate)):
-        told(track, shifted(0.1 * number / rate), begun + number * S // rate)
+    for x, t_ns in samples:
+        told(track, shifted(x), t_ns)
     return track
 
 
@@ -71,35 +76,32 @@ def no_pose(t_ns: int, kind: str = "zeros") -> bytes:
 @pytest.mark.fault("robot: NaN, or a quaternion of zeros")
 @pytest.mark.parametrize("kind", ["zeros", "NaN", "twice as long"])
 def test_a_message_that_is_no_pose_is_none_at_its_time(kind: str) -> None:
-    track = moving(1.0)
+    track = track_of(moving(1.0))
     with pytest.raises(SagsError, match="numbers that are no pose"):
         track.add(no_pose(S + 20 * MS, kind), cdr.POSE)
     told(track, shifted(0.102), S + 20 * MS)
     np.testing.assert_allclose(track.at(S + 10 * MS)[0, 3], 0.1, atol=2e-3)
 
 
+def tf(*transforms: tuple[str, str, float, int], **wrong: float) -> bytes:
+    """A message of transforms: parent, child, place along x in m, time in ns; `wrong`: parts of the first
+    one's quaternion."""
+    message, made = None, []
+    for parent, child, x, t_ns in transforms:
+        message = cdr.decode(bytes(cdr.transform(shifted(x), t_ns).parts[0]), topics.TF)
+        (one,) = message.transforms
+        made.append(replace(one, header=replace(one.header, frame_id=parent), child_frame_id=child))
+    moved = made[0].transform
+    made[0] = replace(made[0], transform=replace(moved, rotation=replace(moved.rotation, **wrong)))
+    return encoded(replace(message, transforms=made), topics.TF)
+
+
 def test_of_a_message_with_several_frames_only_the_wrong_one_is_left_out() -> None:
     track = PoseTrack("world", "scope")
-    for number in range(3):
-        message = cdr.decode(bytes(cdr.transform(shifted(0.1), number * 50 * MS).parts[0]), topics.TF)
-        good = replace(
-            message.transforms[0],
-            header=replace(message.transforms[0].header, frame_id="world"),
-            child_frame_id="scope",
-        )
-        zero = replace(good.transform.rotation, x=0.0, y=0.0, z=0.0, w=0.0)
-        wrong = replace(good, child_frame_id="arm", transform=replace(good.transform, rotation=zero))
+    for t_ns in (0, 50 * MS, 100 * MS):
         with pytest.raises(SagsError, match="the pose of arm"):
-            track.add(encoded(replace(message, transforms=[wrong, good]), topics.TF), topics.TF)
+            track.add(tf(("world", "arm", 0.1, t_ns), ("world", "scope", 0.1, t_ns), w=0.0), topics.TF)
     assert track.at(60 * MS)[0, 3] == pytest.approx(0.1)
-
-
-def test_a_message_that_was_overtaken_ends_nothing() -> None:
-    track = PoseTrack()
-    for number in (0, 1, 3, 2, 4, 4):
-        told(track, shifted(0.002 * number), number * 20 * MS)
-    for t_ns in (10 * MS, 50 * MS, 70 * MS):  # 0.1 m/s, from the first sample on
-        assert track.at(t_ns)[0, 3] == pytest.approx(1e-10 * t_ns)
 
 
 def test_a_pose_lies_between_its_neighbours() -> None:
@@ -114,79 +116,53 @@ def test_a_pose_lies_between_its_neighbours() -> None:
         assert np.linalg.norm(cv2.Rodrigues(off[:3, :3])[0]) < 0.35 * straight
 
 
-def test_nothing_is_carried_on_beyond_what_is_known() -> None:
-    track = moving(3.0, begun=S)
-    newest = S + 149 * 20 * MS
-    assert track.at(newest)[0, 3] == pytest.approx(0.298)
-    assert problem(track, newest + 1) == "pose_stopped"
-    assert problem(track, S - 1) == "pose_missing"
-    assert problem(PoseTrack(), 0) == "pose_missing"
-
-
-def test_a_gap_is_not_bridged() -> None:
-    track = moving(1.0)
-    told(track, shifted(0.1), 1_300 * MS)
-    assert problem(track, 1_100 * MS) == "pose_missing"
-    assert track.at(980 * MS)[0, 3] == pytest.approx(0.098)
+Answers = dict[int, str | float]  # by time, ns: the place along x, m, or the code of the problem
+KNOWN: dict[str, tuple[list[Sample], Answers]] = {
+    "nothing": ([], {0: "pose_missing"}),
+    "nothing is carried on beyond what is known": (
+        moving(3.0, begun=S),
+        {S - 1: "pose_missing", S + 2980 * MS: 0.298, S + 2980 * MS + 1: "pose_stopped"}),
+    "a gap": ([*moving(1.0), (0.1, 1300 * MS)], {980 * MS: 0.098, 1100 * MS: "pose_missing"}),
+    "a message that was overtaken": (
+        [(0.002 * number, number * 20 * MS) for number in (0, 1, 3, 2, 4, 4)],
+        {10 * MS: 0.001, 50 * MS: 0.005, 70 * MS: 0.007}),
+    "10 cm further at once, said until a second after it": (
+        [*moving(1.0), *((x + 0.2, t_ns + S) for x, t_ns in moving(2.0))],
+        {970 * MS: 0.097, 990 * MS: "pose_jumped", S + 500 * MS: "pose_jumped", S + JUMP_HELD_NS: 0.3}),
+    "another's poses 30 cm aside, and 15 ms late: between those that are there already": (
+        [one for n in range(100) for one in ((0.1, S + 10 * n * MS), (0.4, S + (10 * n - 15) * MS))],
+        {S + 500 * MS: "pose_jumped"}),
+    "millimetres, at rest": ([(120.0, S + 20 * n * MS) for n in range(3)], {S + 10 * MS: "pose_too_far"}),
+    "started anew": (
+        [*moving(2.0, begun=100 * S), *((0.5, number * 20 * MS) for number in range(10))],
+        {100 * MS: 0.5, 101 * S: "pose_stopped"}),
+}  # fmt: skip
 
 
 @pytest.mark.fault("robot: its pose jumps by 10 cm")
-def test_a_jump_is_said_until_a_second_after_it() -> None:
-    track = moving(1.0)
-    for number in range(100):
-        told(track, shifted(0.2 + 0.002 * number), S + number * 20 * MS)  # 10 cm further at once
-    assert track.at(970 * MS)[0, 3] == pytest.approx(0.097)
-    assert problem(track, 990 * MS) == "pose_jumped"
-    assert problem(track, S + 500 * MS) == "pose_jumped"
-    after = S + JUMP_HELD_NS
-    assert track.at(after)[0, 3] == pytest.approx(0.3)
-
-
 @pytest.mark.fault("robot: two programs tell its pose on one topic")
-def test_what_was_overtaken_jumps_too() -> None:
-    """The other one's poses lie 30 cm aside, and come 15 ms late: between those that are there already."""
-    track = PoseTrack()
-    for number in range(100):
-        told(track, shifted(0.1), S + 10 * number * MS)
-        told(track, shifted(0.4), S + (10 * number - 15) * MS)
-    assert problem(track, S + 500 * MS) == "pose_jumped"
-
-
 @pytest.mark.fault("robot: it tells millimetres")
-def test_poses_in_millimetres_are_told_also_at_rest() -> None:
-    track = PoseTrack()
-    for number in range(3):
-        told(track, shifted(120.0), S + 20 * number * MS)
-    assert problem(track, S + 10 * MS) == "pose_too_far"
-
-
 @pytest.mark.fault("robot: started anew, its clock begins at zero")
-def test_a_robot_that_was_started_anew_is_followed() -> None:
-    track = moving(2.0, begun=100 * S)
-    for number in range(10):
-        told(track, shifted(0.5), number * 20 * MS)
-    assert track.at(100 * MS)[0, 3] == pytest.approx(0.5)
-    assert problem(track, 101 * S) == "pose_stopped"
+@pytest.mark.parametrize("case", KNOWN)
+def test_a_pose_is_told_where_it_is_known(case: str) -> None:
+    samples, answers = KNOWN[case]
+    track = track_of(samples)
+    for t_ns, answer in answers.items():
+        if isinstance(answer, str):
+            assert problem(track, t_ns) == answer
+        else:
+            assert track.at(t_ns)[0, 3] == pytest.approx(answer)
 
 
 def test_frames_of_tf_are_chained_also_across_branches() -> None:
     track = PoseTrack("camera_base", "/tip")
-
-    def tell(parent: str, child: str, x: float, fixed: bool, stamp: int = 0) -> None:
-        make = ROS2.types
-        header = make["std_msgs/msg/Header"](make["builtin_interfaces/msg/Time"](0, stamp), parent)
-        turn = make["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-        moved = make["geometry_msgs/msg/Transform"](make["geometry_msgs/msg/Vector3"](x, 0.0, 0.0), turn)
-        one = make["geometry_msgs/msg/TransformStamped"](header, child, moved)
-        track.add(encoded(make[topics.TF]([one]), topics.TF), topics.TF, fixed)
-
-    tell("world", "/camera_base", 1.0, fixed=True)
+    track.add(tf(("world", "/camera_base", 1.0, 0)), topics.TF, True)
     assert problem(track, 0) == "pose_missing"
-    tell("world", "arm", 5.0, fixed=True)
+    track.add(tf(("world", "arm", 5.0, 0)), topics.TF, True)
     for number in range(3):
-        tell("arm", "tip", 0.01 * number, False, number * 50 * MS)
+        track.add(tf(("arm", "tip", 0.01 * number, number * 50 * MS)), topics.TF, False)
     with pytest.raises(SagsError, match="world is in world itself"):
-        tell("world", "world", 0.3, fixed=True)
+        track.add(tf(("world", "world", 0.3, 0)), topics.TF, True)
     assert track.at(75 * MS)[0, 3] == pytest.approx(4.015)
 
 
@@ -252,7 +228,7 @@ def test_a_pose_on_its_way_is_waited_for() -> None:
             now = time.time_ns()
             for number in range(-10, 1):
                 sender.send(shifted(0.001 * number), now + number * 20 * MS)
-            until(lambda: _known(robot.track, now))
+            until(lambda: robot.track.newest_ns == now)
             later = threading.Timer(0.06, lambda: sender.send(shifted(0.002), now + 40 * MS))
             later.start()
             assert robot.track.at(now + 20 * MS, timeout=60.0)[0, 3] == pytest.approx(0.001)
@@ -265,28 +241,19 @@ def test_a_pose_on_its_way_is_waited_for() -> None:
         robot.close()
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        shifted(0.1).T,
-        np.diag([1.0, 1, -1, 1]),
-        np.diag([1000.0, 1000, 1000, 1]),
-        np.zeros((4, 4)),
-        np.full((4, 4), np.nan),
-        np.eye(4)[:3],
-    ],
-    ids=["transposed", "mirrored", "scaled", "zeros", "nan", "3x4"],
-)
+WRONG = {
+    "transposed": shifted(0.1).T,
+    "mirrored": np.diag([1.0, 1, -1, 1]),
+    "scaled": np.diag([1000.0, 1000, 1000, 1]),
+    "zeros": np.zeros((4, 4)),
+    "nan": np.full((4, 4), np.nan),
+    "3x4": np.eye(4)[:3],
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
 @pytest.mark.fault("robot: a program hands in a transposed, mirrored or scaled pose")
-def test_a_matrix_that_is_no_pose_is_not_sent(wrong: F64) -> None:
+def test_a_matrix_that_is_no_pose_is_not_sent(name: str) -> None:
     """A quaternion of it would be a good one, of another pose."""
     with PoseSender("tcp://127.0.0.1:1") as sender, pytest.raises(ValueError, match="is it transposed"):
-        sender.send(wrong)
-
-
-def _known(track: PoseTrack, t_ns: int) -> bool:
-    try:
-        track.at(t_ns)
-    except NoPoseError:
-        return False
-    return True
+        sender.send(WRONG[name])

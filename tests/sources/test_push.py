@@ -13,11 +13,11 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
-from command_line import killed
 from independent_client import zmq_socket
 from live_taking import Taker
 from made_messages import MS, meta
 from places import ROOT
+from sending import sending
 from stereo_sender import paint_number
 from waiting import until
 
@@ -130,43 +130,37 @@ def test_each_sender_is_told_what_is_no_picture_of_an_eye(source: PushedPictures
 
 @pytest.mark.fault("image: a sender's has the wrong size")
 def test_wrong_sizes_damaged_files_and_messages_are_told_and_do_no_harm(source: PushedPictures) -> None:
-    with zmq_socket(zmq.DEALER, source.endpoint) as stranger:
+    with zmq_socket(zmq.DEALER, source.endpoint) as stranger, FrameSender(source.endpoint) as sender:
         for parts in ([b""], [b"x"] * 9, [b"a/left/image_raw", b"\xc1", b"data"], [b"t"] * 100):
             stranger.send_multipart(parts)
-        with FrameSender(source.endpoint) as sender:
-            send_until_told(sender, "damaged", b"\xff\xd8 no JPEG", b"\xff\xd8 no JPEG")
-        with FrameSender(source.endpoint) as sender:
-            send_until_told(sender, "320x120 px, it must be 160x120", *[numbered(1, 320)] * 2)
-            assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
+        send_until_told(sender, "damaged", b"\xff\xd8 no JPEG", b"\xff\xd8 no JPEG")
+        send_until_told(sender, "320x120 px, it must be 160x120", *[numbered(1, 320)] * 2)
+        assert sender.receipt is not None and sender.receipt.refused > 0 and sender.receipt.taken == 0
         until(lambda: [finding.code for finding in source.findings] == ["sent_refused"])
         assert stranger.poll(60_000)
 
 
-def test_only_listed_keys_get_in(tmp_path: Path) -> None:
+def test_only_listed_keys_get_in_and_other_machines_need_keys(tmp_path: Path) -> None:
     for name in ("node", "friend", "stranger"):
-        write_key_pair(tmp_path / name, name)
-    config = PushSource(
-        endpoint=ANYWHERE, key=tmp_path / "node/node.key", allow=(tmp_path / "friend/friend.pub",)
-    )
-    node = read_key_pair(tmp_path / "node/node.key").public
-    source = PushedPictures(config, (160, 120))
+        write_key_pair(tmp_path, name)
+    said = {"key": tmp_path / "node.key", "allow": (tmp_path / "friend.pub",)}
+    source = PushedPictures(PushSource(endpoint=ANYWHERE, **said), (160, 120))
 
-    def keys(name: str) -> ClientKeys:
-        return ClientKeys(read_key_pair(tmp_path / name / f"{name}.key"), node)
+    node = read_key_pair(tmp_path / "node.key").public
+
+    def sender(name: str) -> FrameSender:
+        return FrameSender(source.endpoint, keys=ClientKeys(read_key_pair(tmp_path / f"{name}.key"), node))
 
     with Taker(source) as taker:
-        with FrameSender(source.endpoint, keys=keys("stranger")) as sender:
-            send_until_told(sender, "refuses this key", numbered(1), numbered(1))
-        with FrameSender(source.endpoint) as sender:
-            send_until_told(sender, "", numbered(1), numbered(1))
-            assert "wants a key" in str(sender.problem) or sender.receipt is None
+        with sender("stranger") as stranger:
+            send_until_told(stranger, "refuses this key", numbered(1), numbered(1))
+        with FrameSender(source.endpoint) as keyless:
+            send_until_told(keyless, "", numbered(1), numbered(1))
+            assert "wants a key" in str(keyless.problem) or keyless.receipt is None
         assert taker.numbers == []
-        with FrameSender(source.endpoint, keys=keys("friend")) as sender:
-            sender.send(numbered(3), numbered(3))
+        with sender("friend") as friend:
+            friend.send(numbered(3), numbered(3))
             until(lambda: taker.numbers == [(3, 3)])
-
-
-def test_other_machines_need_keys() -> None:
     with pytest.raises(UsageError, match=r"source\.key and source\.allow"):
         PushedPictures(PushSource(endpoint="tcp://*:5558"))
 
@@ -208,14 +202,10 @@ def test_a_sender_that_sends_nothing_misses_no_answer(source: PushedPictures, sh
 
 
 def test_the_sender_of_the_phantom_ends_with_ctrl_c_and_explains_itself(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "examples/send_phantom.py")]
-    said = subprocess.run([*command, "--help"], capture_output=True, text=True, check=True, timeout=60).stdout
+    script = [sys.executable, ROOT / "examples/send_phantom.py"]
+    said = subprocess.run([*script, "--help"], capture_output=True, text=True, check=True, timeout=60).stdout
     assert "\n    python examples/send_phantom.py push\n" in said
-    command += ["push", "--size", "160", "128", "--endpoint", f"ipc://{tmp_path}/in"]
-    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    with killed(program) as process:
-        assert process.stdout is not None
-        while process.stdout.readline() != "sending\n":
-            assert process.poll() is None
+    command = [*script, "push", "--size", "160", "128", "--endpoint", f"ipc://{tmp_path}/in"]
+    with sending(command, stderr=subprocess.PIPE) as process:
         process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=30)[1] == "" and process.returncode == 130
+        assert process.communicate(timeout=30)[1] == b"" and process.returncode == 130

@@ -8,11 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from bag_files import ROS1, ROS2, stereo_rows, write_rosbag1, write_rosbag2
-from mistakes import frames_until_error, refused_at_opening
+from mistakes import refused_at_opening
 from numbered_pictures import HEIGHT, WIDTH, numbers, picture, recordings, write_png, write_video
 from places import SESSION
 
@@ -21,7 +20,7 @@ from sags_node.errors import SagsError, UsageError
 from sags_node.pipeline.session import open_session
 from sags_node.sources.replay import Recording
 from sags_node.sources.source import open_source
-from sags_node.types import StereoFrame
+from sags_node.types import F64, StereoFrame
 
 # ---- at opening ------------------------------------------------------------------------------------------
 
@@ -30,18 +29,24 @@ def folders_of(folder: Path, left: str = "l", right: str = "r", **said: Any) -> 
     return cfg.FoldersSource(left=folder / left, right=folder / right, **said)
 
 
-def posed(folder: Path, **arrays: np.ndarray) -> Recording:
-    np.savez(folder / "poses.npz", **arrays)
-    return folders_of(folder, poses=folder / "poses.npz")
+def posed(folder: Path, poses: np.ndarray, name: str = "T_world_cam", **said: Any) -> Recording:
+    np.savez(folder / "poses.npz", **{name: poses})
+    return folders_of(folder, poses=folder / "poses.npz", **said)
 
 
-def write_depth(file: Path, width: int = WIDTH, height: int = HEIGHT) -> None:
-    file.parent.mkdir(exist_ok=True)
-    assert cv2.imwrite(str(file), np.full((height, width), 5000, np.uint16))
+def moving_by(step: float, count: int = 8) -> F64:
+    """Poses of a scope along x."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = step * np.arange(count)
+    return poses
 
 
 def measured(folder: Path) -> Recording:
     return folders_of(folder, reference=cfg.ReferenceConfig(depth=folder / "depth"))
+
+
+def write_depth(file: Path, width: int = WIDTH, height: int = HEIGHT) -> None:
+    write_png(file, np.full((height, width), 5000, np.uint16))
 
 
 def tracked(folder: Path, frames: list[float]) -> Recording:
@@ -50,10 +55,19 @@ def tracked(folder: Path, frames: list[float]) -> Recording:
 
 
 def torn_poses(folder: Path) -> Recording:
-    config = posed(folder, T_world_cam=np.tile(np.eye(4), (8, 1, 1)))
-    data = (folder / "poses.npz").read_bytes()
-    (folder / "poses.npz").write_bytes(data[: len(data) // 2])
+    config = posed(folder, moving_by(0.0))
+    cut(folder / "poses.npz", -1000)
     return config
+
+
+def vast_poses(folder: Path) -> Recording:
+    """They are refused before memory is taken for them."""
+    header = io.BytesIO()
+    claimed = {"descr": "<f8", "fortran_order": False, "shape": (10**9, 4, 4)}
+    np.lib.format.write_array_header_1_0(header, claimed)
+    with zipfile.ZipFile(folder / "poses.npz", "w") as archive:
+        archive.writestr("T_world_cam.npy", header.getvalue() + bytes(128))
+    return folders_of(folder, poses=folder / "poses.npz")
 
 
 def beyond(folder: Path) -> Recording:
@@ -74,13 +88,19 @@ MISTAKES: list[tuple[Callable[[Path], Recording], str]] = [
     (lambda at: folders_of(at, start=60), "source.start 60.0 s lies behind the recording's end at 0.27 s"),
     (beyond, r"the box \[40, 0, 32, 24\] .* leaves the image: an eye of .*lr.avi is 64x24 px"),
     (lambda at: folders_of(at, poses=at / "poses.npz"), "poses.npz does not exist; check the path"),
-    (lambda at: posed(at, T_world_cam=np.eye(4)),
-     r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
-    (lambda at: posed(at, poses=np.eye(4)[None]), "poses.npz holds no array 'T_world_cam'"),
-    (lambda at: posed(at, T_world_cam=np.full((8, 4, 4), {}, dtype=object)), "'T_world_cam' is object"),
+    (lambda at: posed(at, np.eye(4)), r"'T_world_cam' is float64 \[4, 4\], wanted numbers \[any, 4, 4\]"),
+    (lambda at: posed(at, np.eye(4)[None], "poses"), "poses.npz holds no array 'T_world_cam'"),
+    (lambda at: posed(at, np.full((8, 4, 4), {}, dtype=object)), "'T_world_cam' is object"),
     (torn_poses, "poses.npz is not a readable npz file"),
-    (lambda at: write_png(at / "depth/first.png", picture(0))
-     or measured(at),
+    (vast_poses, "claims an impossible size"),
+    *((lambda at, count=count, stride=stride: posed(at, moving_by(0.0, count), stride=stride),
+       f"poses.npz holds {count} poses, the recording 8 images of the left")
+      for count, stride in ((3, 1), (32, 1), (7, 1), (9, 1), (4, 2))),
+    (lambda at: posed(at, moving_by(1e-3).swapaxes(1, 2)),
+     "of frame 1 is no rotation and translation; is it transposed"),
+    (lambda at: posed(at, moving_by(1e-3) * [2, 2, 2, 1]), "of frame 0 is no rotation and translation"),
+    (lambda at: posed(at, moving_by(2.0)), "the camera by 14 m.*of millimetres divide them by 1000"),
+    (lambda at: write_png(at / "depth/first.png", picture(0)) or measured(at),
      "first.png: reference depth files are named by frame number"),
     (lambda at: [write_depth(at / f"depth/{n:03d}.png") for n in range(1, 9)] and measured(at),
      "depth knows frame 8, but the recording's 8 frames are numbered from 0 to 7; number the"),
@@ -106,21 +126,7 @@ def test_mistakes_at_opening(tmp_path: Path, mistake: Callable[[Path], Recording
     assert isinstance(error, UsageError) or (mistake, message) in DAMAGED
 
 
-def test_impossible_array_size_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
-    recordings(tmp_path)
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f8", "fortran_order": False, "shape": (10**9, 4, 4)}
-    )
-    with zipfile.ZipFile(tmp_path / "poses.npz", "w") as archive:
-        archive.writestr("T_world_cam.npy", header.getvalue() + bytes(128))
-    with pytest.raises(UsageError, match="claims an impossible size"):
-        open_source(folders_of(tmp_path, poses=tmp_path / "poses.npz"))
-
-
-def test_depth_that_has_another_pictures_name_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_depth_named_by_the_next_frame_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Every third frame, counted from 1, has numbers that are all there."""
     recordings(tmp_path)
     for number in range(8, 0, -1):
@@ -140,12 +146,9 @@ def test_reference_depth_of_another_shape_is_refused(tmp_path: Path, width: int,
     recordings(tmp_path)
     write_depth(tmp_path / "depth/000.png", WIDTH // 2, HEIGHT // 2)  # smaller: the same view
     write_depth(tmp_path / "depth/001.png", width, height)
-    with open_source(measured(tmp_path)) as source:
-        frames = iter(source)
-        first = next(frames).reference
-        assert first is not None and first.depth is not None
-        with pytest.raises(SagsError, match=f"001.png is {width}x{height} px, of another shape .*32x24"):
-            next(frames)
+    (frame,), said = played(measured(tmp_path))
+    assert frame.reference is not None and frame.reference.depth is not None
+    assert re.search(f"001.png is {width}x{height} px, of another shape .*32x24", said)
 
 
 def test_reference_depth_of_65535_counts_is_not_known(tmp_path: Path) -> None:
@@ -153,67 +156,17 @@ def test_reference_depth_of_65535_counts_is_not_known(tmp_path: Path) -> None:
     counts = np.full((HEIGHT, WIDTH), 6000, np.uint16)
     counts[:2], counts[2:4] = 65535, 0
     write_png(tmp_path / "depth/000.png", counts)
-    with open_source(measured(tmp_path)) as source:
-        reference = next(iter(source)).reference
-    assert reference is not None and reference.depth is not None
+    reference = played(measured(tmp_path))[0][0].reference
     assert reference.depth.dtype == np.float32 and not reference.depth[:4].any()
     np.testing.assert_allclose(reference.depth[4:], 0.06, rtol=1e-6)
 
 
-@pytest.mark.fault("file: an image is cut off")
-@pytest.mark.fault("file: an image has another size")
-@pytest.mark.parametrize(
-    ("damage", "said"),
-    [
-        (lambda file: file.write_bytes(file.read_bytes()[:-20]), "L7.png is damaged or cut off"),
-        (lambda file: write_png(file, np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8)), "L7.png is 32x26 px but"),
-    ],
-)
-def test_a_wrong_picture_in_the_middle_is_named(
-    folders: cfg.FoldersSource, damage: Callable[[Path], object], said: str
-) -> None:
-    damage(folders.left / "L7.png")
-    frames, message = frames_until_error(folders)
-    assert len(frames) == 7 and said in message
-
-
-@pytest.mark.parametrize(("count", "stride"), [(4, 1), (48, 1), (11, 1), (13, 1), (6, 2)])
-def test_poses_of_other_pictures_are_refused(
-    folders: cfg.FoldersSource, tmp_path: Path, count: int, stride: int
-) -> None:
-    np.savez(tmp_path / "poses.npz", T_world_cam=np.tile(np.eye(4), (count, 1, 1)))
-    config = folders.model_copy(update={"poses": tmp_path / "poses.npz", "stride": stride})
-    refused_at_opening(lambda: config, rf"poses.npz holds {count} poses, the recording 12 images of the left")
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda pose: pose.swapaxes(1, 2), "of frame 1 is no rotation and translation; is it transposed"),
-        (lambda pose: pose * np.array([2.0, 2, 2, 1]), "of frame 0 is no rotation and translation"),
-        (lambda pose: in_unit(pose, 1e3), "moves the camera by 11 m.*of millimetres divide them by 1000"),
-    ],
-)
-def test_poses_that_no_scope_can_have_are_refused(
-    folders: cfg.FoldersSource, tmp_path: Path, change: Callable[[np.ndarray], np.ndarray], said: str
-) -> None:
-    poses = np.tile(np.eye(4), (12, 1, 1))
-    poses[:, 0, 3] = 1e-3 * np.arange(12)  # m
-    config = folders.model_copy(update={"poses": tmp_path / "poses.npz"})
-    for given in (poses, in_unit(poses, 90)):  # 0.99 m: as far as from one end of a patient to the other
-        np.savez(tmp_path / "poses.npz", T_world_cam=given)
-        with open_source(config) as source:
-            np.testing.assert_array_equal([frame.T_world_cam for frame in source], given)
-    np.savez(tmp_path / "poses.npz", T_world_cam=change(poses))
-    with pytest.raises(UsageError, match=said):
-        open_source(config)
-
-
-def in_unit(poses: np.ndarray, per_metre: float) -> np.ndarray:
-    """With translations in a unit of which a metre has so many."""
-    factors = np.ones((4, 4))
-    factors[:3, 3] = per_metre
-    return poses * factors
+@pytest.mark.parametrize("step", [1e-3, 0.14])
+def test_poses_that_a_scope_can_have_are_played(step: float, tmp_path: Path) -> None:
+    """Up to 0.98 m: as far as from one end of a patient to the other."""
+    recordings(tmp_path)
+    frames, _ = played(posed(tmp_path, moving_by(step)))
+    np.testing.assert_array_equal([frame.T_world_cam for frame in frames], moving_by(step))
 
 
 # ---- files that are deleted, cut off, replaced or still being written while they are played ------------
@@ -221,9 +174,10 @@ def in_unit(poses: np.ndarray, per_metre: float) -> np.ndarray:
 
 AT = 3  # frames are taken before the file changes
 COUNT = 150  # frames of a recording that is too long to be in a buffer
+TALLER = np.zeros((HEIGHT + 2, WIDTH, 3), np.uint8)
 
 
-def played(config: Recording, change: Callable[[], object]) -> tuple[list[StereoFrame], str]:
+def played(config: Recording, change: Callable[[], object] = lambda: None) -> tuple[list[StereoFrame], str]:
     """The frames of a recording that changes while it is played, and the error that ends it, if one does."""
     frames = []
     with open_source(config) as source:
@@ -238,22 +192,31 @@ def played(config: Recording, change: Callable[[], object]) -> tuple[list[Stereo
     return frames, ""
 
 
+def cut(file: Path, behind: int = 0) -> None:
+    """To nothing, unless told: what a reader has in its buffer is at most what it has read ahead."""
+    file.write_bytes(file.read_bytes()[:behind])
+
+
 def add_a_pair(folder: Path) -> None:
     for eye, name in enumerate("lr"):
         write_png(folder / f"{name}/008.png", picture(8, eye))
 
 
+@pytest.mark.fault("file: an image is cut off")
+@pytest.mark.fault("file: an image has another size")
 @pytest.mark.fault("file: an image is deleted while it is played")
 @pytest.mark.fault("file: a folder of images grows while it is played")
 @pytest.mark.fault("file: a video is deleted while it is played")
 @pytest.mark.parametrize(
     ("kind", "change", "count", "said"),
     [
+        ("folders", lambda folder: cut(folder / "l/007.png", -20), 7, "l/007.png is damaged or cut off"),
+        ("folders", lambda folder: write_png(folder / "r/007.png", TALLER), 7, "r/007.png is 32x26 px but"),
         ("folders", lambda folder: (folder / "r/006.png").unlink(), 6, "r/006.png"),
         ("folders", add_a_pair, 8, ""),
         ("videos", lambda folder: (folder / "r.avi").unlink(), 8, ""),
     ],
-    ids=["an image is deleted", "images come", "a video is deleted"],
+    ids=["cut off", "another size", "an image is deleted", "images come", "a video is deleted"],
 )
 def test_what_is_there_is_played_and_what_is_gone_is_named(
     kind: str, change: Callable[[Path], object], count: int, said: str, tmp_path: Path
@@ -292,37 +255,28 @@ def test_a_file_that_is_cut_off_is_named(
     write: Callable[[Path], tuple[Recording, Path]], said: str, parts: int, tmp_path: Path
 ) -> None:
     config, file = write(tmp_path)
-    whole, _ = played(config, lambda: None)
+    whole, _ = played(config)
     frames, error = played(config, lambda: cut(file))
     assert AT <= len(frames) < len(whole) == COUNT and re.search(said.format(len(frames)), error)
     for frame, true in zip(frames[: len(frames) - parts], whole, strict=False):
         assert np.array_equal(frame.left, true.left) and np.array_equal(frame.right, true.right)
 
 
-def cut(file: Path) -> None:
-    """To nothing: what a reader has in its buffer is at most what it has read ahead."""
-    with file.open("r+b") as opened:
-        opened.truncate(0)
-
-
 @pytest.mark.fault("calibration: deleted or overwritten while it is used")
 @pytest.mark.fault("launch file: broken while it is used")
 def test_what_was_read_at_the_start_may_change(tmp_path: Path) -> None:
-    folder = tmp_path / "session"
+    folder, overrides = tmp_path / "session", ["source.pace:=step", "source.frames:=6"]
     shutil.copytree(SESSION, folder)
-    overrides = ["source.pace:=step", "source.frames:=6"]
-    with open_session(SESSION, overrides).source as source:
-        true = list(source)
+
+    def break_all() -> None:
+        (folder / "launch.yaml").write_text("source: [")
+        (folder / "calib/left.yaml").write_bytes(b"\xff")
+        (folder / "calib/right.yaml").unlink()
+
     session = open_session(folder, overrides)
     rig, config = session.rig, session.config.model_copy(deep=True)
-    frames = []
-    with session.source as source:
-        for frame in source:
-            frames.append(frame)
-            if len(frames) == AT:
-                (folder / "launch.yaml").write_text("source: [")
-                (folder / "calib/left.yaml").write_bytes(b"\xff")
-                (folder / "calib/right.yaml").unlink()
+    true, _ = played(session.config.source)
+    frames, _ = played(session.config.source, break_all)
     assert len(frames) == 6 and (session.rig, session.config) == (rig, config)
     for frame, one in zip(frames, true, strict=True):
         assert np.array_equal(frame.left, one.left) and np.array_equal(frame.right, one.right)

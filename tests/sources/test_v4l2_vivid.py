@@ -53,9 +53,7 @@ def guest() -> dict[str, Any]:
 
 def test_two_cameras_give_pairs(guest: dict[str, Any]) -> None:
     pairs = guest["two"]
-    assert pairs["frames"] == 12
-    assert pairs["sizes"] == [[180, 320, 3]]
-    assert pairs["rate"] == 30
+    assert (pairs["frames"], pairs["sizes"], pairs["rate"]) == (12, [[180, 320, 3]], 30)
     assert pairs["left_advances"] and pairs["right_advances"] and pairs["ids_advance"]
     assert pairs["largest_skew_ms"] <= 20
     assert 0 <= pairs["age_ms"] < 5000  # stamps are of this wall clock
@@ -64,24 +62,17 @@ def test_two_cameras_give_pairs(guest: dict[str, Any]) -> None:
 
 def test_one_camera_side_by_side(guest: dict[str, Any]) -> None:
     halves = guest["side_by_side"]
-    assert halves["frames"] == 6
-    assert halves["sizes"] == [[360, 320, 3]]
-    assert halves["largest_skew_ms"] == 0
-    assert halves["left_advances"]
+    assert halves["frames"] == 6 and halves["sizes"] == [[360, 320, 3]]
+    assert halves["largest_skew_ms"] == 0 and halves["left_advances"]
 
 
-def test_driver_that_sets_another_size_is_refused(guest: dict[str, Any]) -> None:
+def test_another_size_and_a_missing_camera_are_said(guest: dict[str, Any]) -> None:
     assert "/dev/video0: wanted 333x217 px, the driver gives 320x180" in guest["wrong_size"]
     assert "source.width" in guest["wrong_size"]
-
-
-def test_missing_camera_names_those_present(guest: dict[str, Any]) -> None:
     assert guest["missing"] == "camera /dev/video7 does not exist; present: /dev/video0, /dev/video1"
 
 
 def test_unplugged_cameras_are_opened_again(guest: dict[str, Any]) -> None:
     replug = guest["replug"]
-    assert replug["vanished"]
-    assert replug["before"] >= 3
+    assert replug["vanished"] and replug["before"] >= 3 and replug["ended"]
     assert replug["after"] >= replug["before"] + 3
-    assert replug["ended"]
